@@ -1,0 +1,58 @@
+"""Array types with their shapes, and the checks of arguments at the public edge."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug.errors import InputError
+
+Vector = Float[np.ndarray, "n"]
+Matrix = Float[np.ndarray, "rows columns"]
+
+
+def as_signal(values: Any, name: str) -> Matrix:
+    """Samples as a float matrix (N, channels); a vector is one channel.
+
+    Raises:
+        InputError: not numeric, more than two axes, or a cell that is not finite (named by its row).
+    """
+    try:
+        array = np.asarray(values)
+        if np.iscomplexobj(array):
+            raise InputError(f"`{name}` is complex; expected real numbers.")
+        array = np.array(array, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"`{name}` is not an array of numbers: {error}.") from None
+    if array.ndim == 1:
+        array = array[:, None]
+    if array.ndim != 2:
+        raise InputError(f"`{name}` has {array.ndim} axes; expected (samples,) or (samples, channels).")
+    bad = np.argwhere(~np.isfinite(array))
+    if bad.size:
+        row, column = bad[0]
+        raise InputError(
+            f"`{name}` is not finite at row {row}, channel {column}: found {array[row, column]}. "
+            "Remove the row or split the experiment there."
+        )
+    return array
+
+
+def check_unique(names: Iterable[str], what: str) -> None:
+    """Raise InputError where a name stands twice."""
+    seen: set[str] = set()
+    for name in names:
+        if name in seen:
+            raise InputError(f"{what} '{name}' is given twice; names must differ.")
+        seen.add(name)
+
+
+def check_choice(value: str, choices: Iterable[str], what: str) -> str:
+    """Return `value` if it is one of `choices`, otherwise raise InputError naming them."""
+    choices = tuple(choices)
+    if value not in choices:
+        raise InputError(f"{what} must be one of {', '.join(choices)}; got '{value}'.")
+    return value

@@ -1,0 +1,179 @@
+"""The baseline: physics that is linear in its parameters, ŷ_k = φ(x_k) θ (eq:fp_model)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from orthaug._arrays import check_unique
+from orthaug.errors import InputError
+from orthaug.expressions import RESERVED, Expression, Lag, parse
+from orthaug.regressors import Layout, in_order
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One entry of θ: name, initial value θ⁰ and unit."""
+
+    name: str
+    initial: float = 0.0
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Term:
+    """`parameter * regressor`, a summand of one output; the same parameter in several terms shares θ.
+
+    `fixed` keeps `initial` as a known coefficient: the term is subtracted from the output first and the
+    learner is not made orthogonal to it. `output` may be left out where there is only one.
+    """
+
+    parameter: str
+    regressor: str
+    initial: float = 0.0
+    unit: str = ""
+    output: str | None = None
+    fixed: bool = False
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """φ and the parameters it multiplies; make one with `from_terms` or `from_function`.
+
+    Examples:
+        >>> spring = Baseline.from_terms([Term("a", "y[k-1]", initial=0.9), Term("b", "u[k-1]")])
+        >>> spring.names
+        ('a', 'b')
+    """
+
+    parameters: tuple[Parameter, ...]
+    terms: tuple[Term, ...] = ()
+    constants: tuple[tuple[str, float], ...] = ()
+    function: Callable[[Any], Any] | None = field(default=None, repr=False)
+
+    @classmethod
+    def from_terms(cls, terms: Sequence[Term], constants: Mapping[str, float] | None = None) -> Baseline:
+        """One term per summand; expressions may use the names in `constants`.
+
+        Raises:
+            InputError: an expression that is not arithmetic on lagged channels, or terms of one parameter
+                that disagree on its initial value, unit or being fixed.
+        """
+        if not terms:
+            raise InputError("the baseline has no terms; give at least one, such as y[k-1].")
+        constants = dict(constants or {})
+        for name, value in constants.items():
+            if not name.isidentifier() or name in RESERVED:
+                raise InputError(f"'{name}' cannot name a constant; {', '.join(sorted(RESERVED))} are taken.")
+            if not math.isfinite(value):
+                raise InputError(f"the constant '{name}' must be a finite number; got {value}.")
+        known: dict[str, Term] = {}
+        for term in terms:
+            if not math.isfinite(term.initial):
+                raise InputError(f"the initial value of '{term.parameter}' must be finite; got {term.initial}.")
+            first = known.setdefault(term.parameter, term)
+            for attribute in ("initial", "unit", "fixed"):
+                if getattr(first, attribute) != getattr(term, attribute):
+                    raise InputError(
+                        f"the terms of '{term.parameter}' disagree on `{attribute}`: "
+                        f"{getattr(first, attribute)!r} and {getattr(term, attribute)!r}."
+                    )
+        parameters = tuple(Parameter(t.parameter, t.initial, t.unit) for t in known.values() if not t.fixed)
+        baseline = cls(parameters, tuple(terms), tuple(sorted(constants.items())))
+        _ = baseline.expressions  # report what does not parse here, not at first use
+        return baseline
+
+    @classmethod
+    def from_function(cls, function: Callable[[Any], Any], parameters: Sequence[str | Parameter]) -> Baseline:
+        """From a JAX function φ(x) of the regressor x (nx,) in `Lags` order, returning (ny, nθ)."""
+        entries = tuple(p if isinstance(p, Parameter) else Parameter(p) for p in parameters)
+        check_unique((p.name for p in entries), "parameter")
+        return cls(entries, function=function)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameter names in order of first appearance."""
+        return tuple(p.name for p in self.parameters)
+
+    @property
+    def initial(self) -> np.ndarray:
+        """θ⁰, (nθ,)."""
+        return np.array([p.initial for p in self.parameters], dtype=float)
+
+    @cached_property
+    def expressions(self) -> tuple[Expression, ...]:
+        """The parsed regressor of each term."""
+        parsed = []
+        for term in self.terms:
+            try:
+                parsed.append(parse(term.regressor, dict(self.constants)))
+            except InputError as error:
+                raise InputError(f"baseline term '{term.parameter}': {error}") from None
+        return tuple(parsed)
+
+    @property
+    def lags(self) -> tuple[Lag, ...]:
+        """The raw lags that the expressions read (none known for a function)."""
+        return tuple(dict.fromkeys(lag for expression in self.expressions for lag in expression.lags))
+
+    def check_channels(self, outputs: Sequence[str], inputs: Sequence[str]) -> None:
+        """Raise InputError for a term that uses an unknown channel, an output at lag 0 or an unknown output."""
+        for term, expression in zip(self.terms, self.expressions, strict=True):
+            try:
+                in_order(expression.lags, outputs, inputs)
+            except InputError as error:
+                raise InputError(f"baseline term '{term.parameter}' = {term.regressor}: {error}") from None
+            if term.output is None and len(outputs) != 1:
+                raise InputError(
+                    f"baseline term '{term.parameter}' = {term.regressor}: `output` is missing; one of {', '.join(outputs)}."
+                )
+            if term.output is not None and term.output not in outputs:
+                raise InputError(
+                    f"baseline term '{term.parameter}' = {term.regressor}: unknown output '{term.output}'; "
+                    f"known are {', '.join(outputs)}."
+                )
+
+    def phi(self, x: Any, layout: Layout, outputs: Sequence[str], xp: Any) -> Any:
+        """φ(x), (…, ny, nθ), of regressors x (…, nx); several terms of a parameter and output add up."""
+        if self.function is not None:
+            return self._call(x, len(outputs), xp)
+        return self._matrix([p.name for p in self.parameters], x, layout, outputs, xp)
+
+    def known(self, x: Any, layout: Layout, outputs: Sequence[str], xp: Any) -> Any:
+        """The sum of the fixed terms, (…, ny)."""
+        fixed = {term.parameter: term.initial for term in self.terms if term.fixed}
+        if not fixed:
+            return xp.zeros((*x.shape[:-1], len(outputs)))
+        return self._matrix(list(fixed), x, layout, outputs, xp) @ xp.asarray(list(fixed.values()))
+
+    def _matrix(self, names: list[str], x: Any, layout: Layout, outputs: Sequence[str], xp: Any) -> Any:
+        columns = {lag: x[..., j] for j, lag in enumerate(layout)}
+        entries = [[xp.zeros(x.shape[:-1]) for _ in names] for _ in outputs]
+        for term, expression in zip(self.terms, self.expressions, strict=True):
+            if term.parameter in names:
+                row = outputs.index(term.output) if term.output is not None else 0
+                column = names.index(term.parameter)
+                entries[row][column] = entries[row][column] + expression.evaluate(columns, xp)
+        if not names:
+            return xp.zeros((*x.shape[:-1], len(outputs), 0))
+        return xp.stack([xp.stack(row, axis=-1) for row in entries], axis=-2)
+
+    def _call(self, x: Any, ny: int, xp: Any) -> Any:
+        assert self.function is not None
+        if x.ndim == 1:
+            phi = self.function(x)
+        else:
+            from orthaug._jax import jax
+
+            phi = jax.vmap(self.function)(x)
+        wanted = (*x.shape[:-1], ny, len(self.parameters))
+        if np.shape(phi) != wanted:
+            raise InputError(
+                f"the baseline function returned shape {np.shape(phi)[x.ndim - 1:]} for one row; expected (ny, nθ) = {wanted[x.ndim - 1:]}."
+            )
+        return xp.asarray(phi)

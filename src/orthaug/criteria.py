@@ -1,0 +1,92 @@
+"""Criteria: what is minimised over the learner's weights, as normal equations from one pass over rows.
+
+Rows are whitened: each output is divided by its standard deviation, and all rows by the RMS of what the
+physics leaves unexplained, so a residual of 1 is as large as the baseline's own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from jaxtyping import Array, Float
+
+from orthaug._jax import jnp
+from orthaug.gram import gram, row_sum
+from orthaug.learners import Bound
+
+
+class Chunks(NamedTuple):
+    """Rows of the prediction criterion in chunks of m rows; zero gain and zero entries are padding."""
+
+    z: Float[Array, "k nz m"]
+    """Scaled learner features."""
+    q: Float[Array, "k ny nt m"]
+    """Orthonormal basis of the physics."""
+    e: Float[Array, "k ny m"]
+    """P⊥Y, what the physics cannot express."""
+    gain: Float[Array, "k ny m"]
+    """Unit of the learner's output in whitened rows."""
+
+
+class Hold(NamedTuple):
+    """`‖target − matrix QᵀF‖²`: how a structure holds the learner's share in the span of the physics."""
+
+    matrix: Float[Array, "nt nt"]
+    target: Float[Array, "nt"]
+
+
+class Overlap(NamedTuple):
+    """What an earlier pass found of the learner in the span of the physics."""
+
+    jacobian: Float[Array, "nt nw"]
+    """QᵀJ."""
+    values: Float[Array, "nt"]
+    """QᵀF."""
+
+
+class Normal(NamedTuple):
+    """Gauss-Newton quantities of `‖r‖²`: `hessian` = JᵀJ, `gradient` = Jᵀr (downhill), `loss` = ‖r‖²."""
+
+    hessian: Float[Array, "nw nw"]
+    gradient: Float[Array, "nw"]
+    loss: Float[Array, ""]
+    overlap: Overlap
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """One-step prediction error with θ eliminated (F1): `‖P⊥(Y − F)‖²` plus the structure's `Hold`.
+
+    θ minimises the rest exactly for any w, so it is not an unknown here. The Gram matrix of `[Q r J]`
+    gives everything: `JᵀP⊥J = JᵀJ − (QᵀJ)ᵀ(QᵀJ)` (F4). Where J lies almost in the span of Q that
+    difference cancels, so each chunk first subtracts the share that the previous pass found.
+    """
+
+    bound: Bound
+
+    def __call__(self, w: Float[Array, "nw"], chunks: Chunks, hold: Hold, before: Overlap) -> Normal:
+        total = row_sum(lambda chunk: self._blocks(w, chunk, before), chunks)
+        nt = before.values.shape[0]
+        g_qr, g_qj = total[:nt, nt], total[:nt, nt + 1 :]
+        g_rr, g_jr, g_jj = total[nt, nt], total[nt + 1 :, nt], total[nt + 1 :, nt + 1 :]
+        overlap = Overlap(before.jacobian + g_qj, before.values - g_qr)
+        held = hold.matrix @ overlap.jacobian
+        miss = hold.target - hold.matrix @ overlap.values
+        return Normal(
+            hessian=g_jj - g_qj.T @ g_qj + held.T @ held,
+            gradient=g_jr - g_qj.T @ g_qr + held.T @ miss,
+            loss=g_rr - g_qr @ g_qr + miss @ miss,
+            overlap=overlap,
+        )
+
+    def _blocks(self, w: Float[Array, "nw"], chunk: Chunks, before: Overlap) -> Float[Array, "n n"]:
+        """Gram matrix of the columns `[Q r J]` of one chunk, each column a row of `columns`."""
+        values, jacobian = self.bound.jacobian(w, chunk.z, chunk.gain)
+        q = jnp.moveaxis(chunk.q, 1, 0)  # (nt, ny, m)
+        residual = chunk.e - values
+        for i in range(q.shape[0]):  # unrolled, so that it fuses with the derivative
+            residual = residual + before.values[i] * q[i]
+            jacobian = jacobian - before.jacobian[i][:, None, None] * q[i]
+        columns = jnp.concatenate([q, residual[None], jacobian])
+        return gram(columns.reshape(columns.shape[0], -1))

@@ -1,0 +1,15 @@
+"""What can go wrong because of what was asked, always with the remedy in the text."""
+
+from __future__ import annotations
+
+
+class InputError(ValueError):
+    """Bad input: names what was found and what was expected. The command line exits with 2."""
+
+
+class RankError(InputError):
+    """The physics columns are linearly dependent on the data; names the parameters involved."""
+
+
+class TrainingError(ArithmeticError):
+    """Training produced no finite model. The command line exits with 1."""

@@ -1,0 +1,5 @@
+"""Solvers: frozen declarations that minimise a criterion over the learner's weights."""
+
+from orthaug.solvers.levenberg_marquardt import LevenbergMarquardt
+
+__all__ = ["LevenbergMarquardt"]

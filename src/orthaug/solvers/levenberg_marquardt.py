@@ -1,0 +1,217 @@
+"""Levenberg-Marquardt on normal equations, with ridge or evidence regularisation, compiled whole.
+
+The step solves `(H + (α + μ) I) d = g − α w`. Damping with the identity and Nielsen's update (Madsen,
+Nielsen and Tingleff 2004, algorithm 3.16) converges from Xavier starts on normalised data. One trial
+costs one pass over the rows, which is at once the next step's linearisation.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from orthaug._jax import jax, jnp
+from orthaug.criteria import Normal, Overlap
+
+RUNNING, CONVERGED, NO_DESCENT, NON_FINITE = range(4)
+_FIRST_DAMPING = 1e-3  # of the largest curvature
+_LARGEST_DAMPING = 1e12  # of the largest curvature: no step is short enough to descend
+_SECONDS_PER_BURST = 0.5  # how often progress is told and Ctrl-C is heard
+
+
+class State(NamedTuple):
+    """The iterate with its linearisation; plain arrays, so a run can pause and go on."""
+
+    w: Float[Array, "nw"]
+    normal: Normal
+    damping: Float[Array, ""]
+    growth: Float[Array, ""]
+    ridge: Float[Array, ""]
+    effective: Float[Array, ""]
+    iteration: Int[Array, ""]
+    accepted: Int[Array, ""]
+    small: Int[Array, ""]
+    code: Int[Array, ""]
+
+
+class Options(NamedTuple):
+    """Numbers of a run that the compiled program takes as arguments."""
+
+    tolerance: Float[Array, ""]
+    evidence: Any
+    samples: Float[Array, ""]
+
+
+class Run(NamedTuple):
+    """What one run from one start found."""
+
+    w: Float[Array, "nw"]
+    normal: Normal
+    ridge: float
+    effective: float
+    """Effective number of weights, `tr(H (H + αI)⁻¹)`."""
+    iterations: int
+    code: int
+    seconds: float
+
+
+Progress = Callable[[int, float], None]
+"""Called now and then with the iteration and the loss."""
+
+
+@dataclass(frozen=True)
+class LevenbergMarquardt:
+    """Declaration of the solver.
+
+    Args:
+        iterations: trial steps at most.
+        tolerance: two successive steps that lower the objective by less than this fraction end the run.
+    """
+
+    iterations: int = 300
+    tolerance: float = 1e-8
+
+    def minimise(
+        self,
+        linearise: Callable[..., Normal],
+        w: Float[Array, "nw"],
+        arguments: tuple[Any, ...],
+        overlap: Overlap,
+        *,
+        ridge: float = 0.0,
+        evidence: bool = False,
+        samples: int,
+        progress: Progress | None = None,
+    ) -> Run:
+        """Minimise `‖r(w)‖² + α‖w‖²` from `w`.
+
+        Args:
+            linearise: hashable; `(w, *arguments, overlap) -> Normal`.
+            overlap: a first guess of the learner's share in the physics, zeros will do.
+            ridge: α in normalised units; with `evidence` where it starts.
+            evidence: choose α by MacKay's re-estimation after every accepted step.
+            samples: residuals less the physics' own parameters, for the noise variance.
+        """
+        began = time.perf_counter()
+        options = Options(jnp.asarray(self.tolerance), jnp.asarray(evidence), jnp.asarray(float(samples)))
+        state = _start(linearise, w, arguments, overlap, jnp.asarray(ridge), options)
+        burst = 1
+        while int(state.code) == RUNNING and int(state.iteration) < self.iterations:
+            tick = time.perf_counter()
+            stop = min(int(state.iteration) + burst, self.iterations)
+            state = jax.block_until_ready(_advance(linearise, state, arguments, options, jnp.asarray(stop)))
+            spent = time.perf_counter() - tick
+            burst = int(np.clip(burst * _SECONDS_PER_BURST / max(spent, 1e-6), 1, 4 * burst))
+            if progress is not None:
+                progress(int(state.iteration), float(state.normal.loss))
+        return Run(
+            state.w,
+            state.normal,
+            float(state.ridge),
+            float(state.effective),
+            int(state.iteration),
+            int(state.code),
+            time.perf_counter() - began,
+        )
+
+
+@partial(jax.jit, static_argnames="linearise")
+def _start(
+    linearise: Any, w: Any, arguments: tuple[Any, ...], overlap: Overlap, ridge: Any, options: Options
+) -> State:
+    def refine(_: Any, normal: Normal) -> Normal:
+        return linearise(w, *arguments, normal.overlap)
+
+    zero = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(linearise, w, *arguments, overlap))
+    # twice: the second pass has the first one's overlap to subtract
+    normal = jax.lax.fori_loop(0, 2, refine, zero._replace(overlap=overlap))
+    curvature = jnp.max(jnp.diag(normal.hessian), initial=0.0)
+    finite = jnp.isfinite(normal.loss) & jnp.all(jnp.isfinite(normal.hessian))
+    nothing = curvature <= 1e-20 * jnp.maximum(normal.loss, 1e-300)
+    return State(
+        w=w,
+        normal=normal,
+        damping=_FIRST_DAMPING * jnp.maximum(curvature, 1e-300),
+        growth=jnp.asarray(2.0),
+        ridge=ridge,
+        effective=_effective_weights(normal.hessian, ridge),
+        iteration=jnp.asarray(0),
+        accepted=jnp.asarray(0),
+        small=jnp.asarray(0),
+        code=jnp.where(finite, jnp.where(nothing, CONVERGED, RUNNING), NON_FINITE),
+    )
+
+
+@partial(jax.jit, static_argnames="linearise")
+def _advance(linearise: Any, state: State, arguments: tuple[Any, ...], options: Options, stop: Any) -> State:
+    return jax.lax.while_loop(
+        lambda s: (s.code == RUNNING) & (s.iteration < stop),
+        lambda s: _trial(linearise, s, arguments, options),
+        state,
+    )
+
+
+def _trial(linearise: Any, state: State, arguments: tuple[Any, ...], options: Options) -> State:
+    """One damped step: accept it, or damp more."""
+    w, normal, alpha = state.w, state.normal, state.ridge
+    downhill = normal.gradient - alpha * w
+    shifted = normal.hessian + (alpha + state.damping) * jnp.eye(w.shape[0])
+    step = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(shifted), downhill)
+    trial = linearise(w + step, *arguments, normal.overlap)
+
+    before = normal.loss + alpha * (w @ w)
+    after = trial.loss + alpha * ((w + step) @ (w + step))
+    gain = (before - after) / (step @ (state.damping * step + downhill))
+    ok = jnp.isfinite(after) & (after < before) & jnp.all(jnp.isfinite(trial.hessian))
+
+    small = jnp.where(ok, jnp.where(before - after < options.tolerance * before, state.small + 1, 0), state.small)
+    accepted = state.accepted + ok
+    damping = jnp.where(
+        ok, state.damping * jnp.maximum(1 / 3, 1 - (2 * gain - 1) ** 3), state.damping * state.growth
+    )
+    stuck = damping > _LARGEST_DAMPING * jnp.max(jnp.diag(normal.hessian), initial=1e-300)
+    code = jnp.where(small >= 2, CONVERGED, RUNNING)
+    code = jnp.where(stuck, jnp.where(accepted > 0, CONVERGED, NO_DESCENT), code)
+    moved = jax.tree.map(lambda new, old: jnp.where(ok, new, old), (w + step, trial), (w, normal))
+    ridge, effective = jax.lax.cond(
+        ok & options.evidence,
+        lambda: _evidence(moved[0], moved[1], alpha, options.samples),
+        lambda: (alpha, state.effective),
+    )
+    return State(
+        w=moved[0],
+        normal=moved[1],
+        damping=damping,
+        growth=jnp.where(ok, 2.0, 2 * state.growth),
+        ridge=ridge,
+        effective=effective,
+        iteration=state.iteration + 1,
+        accepted=accepted,
+        small=small,
+        code=code,
+    )
+
+
+def _evidence(w: Any, normal: Normal, alpha: Any, samples: Any) -> tuple[Any, Any]:
+    """MacKay's fixed point: `γ = tr(H(H + αI)⁻¹)`, `α = γ σ² / ‖w‖²` with `σ² = ‖r‖² / (N − γ)`."""
+    effective = _effective_weights(normal.hessian, alpha)
+    variance = normal.loss / jnp.maximum(samples - effective, 1.0)
+    found = effective * variance / jnp.maximum(w @ w, 1e-300)
+    return jnp.clip(found, 1e-12, 1e12), effective
+
+
+def _effective_weights(hessian: Any, alpha: Any) -> Any:
+    """tr(H (H + αI)⁻¹), with directions below rounding counted as absent."""
+    n = hessian.shape[0]
+    if n == 0:
+        return jnp.asarray(0.0)
+    values = jnp.linalg.eigvalsh(jnp.where(jnp.isfinite(hessian), hessian, 0.0))
+    values = jnp.maximum(values, 0.0)
+    floor = n * jnp.finfo(float).eps * values[-1]
+    return jnp.sum(jnp.where(values > floor, values / (values + alpha + floor), 0.0))
