@@ -130,7 +130,8 @@ class Baseline:
                 raise InputError(f"baseline term '{term.parameter}' = {term.regressor}: {error}") from None
             if term.output is None and len(outputs) != 1:
                 raise InputError(
-                    f"baseline term '{term.parameter}' = {term.regressor}: `output` is missing; one of {', '.join(outputs)}."
+                    f"baseline term '{term.parameter}' = {term.regressor}: `output` is missing; "
+                    f"one of {', '.join(outputs)}."
                 )
             if term.output is not None and term.output not in outputs:
                 raise InputError(
@@ -174,6 +175,7 @@ class Baseline:
         wanted = (*x.shape[:-1], ny, len(self.parameters))
         if np.shape(phi) != wanted:
             raise InputError(
-                f"the baseline function returned shape {np.shape(phi)[x.ndim - 1:]} for one row; expected (ny, nθ) = {wanted[x.ndim - 1:]}."
+                f"the baseline function returned shape {np.shape(phi)[x.ndim - 1 :]} for one row; "
+                f"expected (ny, nθ) = {wanted[x.ndim - 1 :]}."
             )
         return xp.asarray(phi)

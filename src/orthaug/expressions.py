@@ -137,7 +137,9 @@ def _check_call(node: ast.Call, text: str) -> None:
     if name is None or node.keywords or any(isinstance(a, ast.Starred) for a in node.args):
         raise InputError(f"'{text}': '{ast.unparse(node)}' is not allowed; functions are {', '.join(FUNCTIONS)}.")
     if name not in FUNCTIONS:
-        raise InputError(f"'{text}': unknown function '{name}'{_nearest(name, FUNCTIONS)}; known are {', '.join(FUNCTIONS)}.")
+        raise InputError(
+            f"'{text}': unknown function '{name}'{_nearest(name, FUNCTIONS)}; known are {', '.join(FUNCTIONS)}."
+        )
     wanted = "two or more arguments" if name in ("min", "max") else "one argument"
     if (len(node.args) < 2) if name in ("min", "max") else (len(node.args) != 1):
         raise InputError(f"'{text}': {name} takes {wanted}, got {len(node.args)}.")

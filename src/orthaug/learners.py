@@ -102,7 +102,9 @@ class Function:
     """Any JAX function `f(weights, z) -> (ny,)` with `initial(key) -> weights`, a pytree of float arrays.
 
     Examples:
-        >>> quadratic = Function(lambda w, z: w @ jnp.stack([z[0] ** 2, z[0] ** 3])[None].T, lambda key: jnp.zeros((1, 2)))
+        >>> quadratic = Function(lambda w, z: w * z[:1] ** 2, initial=lambda key: jnp.zeros(1))
+        >>> Bound(quadratic, nz=1, ny=1).values(jnp.array([3.0]), jnp.array([2.0]))
+        Array([12.], dtype=float64)
     """
 
     function: Callable[[Tree, Any], Any]
@@ -178,12 +180,17 @@ class Bound:
         tree = jax.eval_shape(lambda key: self.learner.init(key, self.nz, self.ny), jax.random.key(0))
         leaves, treedef = jax.tree.flatten(tree)
         if any(not jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves):
-            raise InputError("the learner's weights must be float arrays; found " + ", ".join(str(leaf.dtype) for leaf in leaves) + ".")
+            raise InputError(
+                "the learner's weights must be float arrays; found "
+                + ", ".join(str(leaf.dtype) for leaf in leaves)
+                + "."
+            )
         object.__setattr__(self, "_shape", (treedef, tuple(leaf.shape for leaf in leaves)))
         out = jax.eval_shape(self.learner.apply, tree, jax.ShapeDtypeStruct((self.nz,), float))
         if getattr(out, "shape", None) != (self.ny,):
             raise InputError(
-                f"the learner returned shape {getattr(out, 'shape', type(out).__name__)} for one row; expected (ny,) = ({self.ny},)."
+                f"the learner returned shape {getattr(out, 'shape', type(out).__name__)} for one row; "
+                f"expected (ny,) = ({self.ny},)."
             )
 
     @property
@@ -200,16 +207,16 @@ class Bound:
         flat = [jnp.ravel(jnp.asarray(leaf, dtype=float)) for leaf in leaves]
         return jnp.concatenate(flat) if flat else jnp.zeros(0)
 
-    def leaves(self, w: Float[Array, "nw"]) -> list[Float[Array, "..."]]:
+    def leaves(self, w: Float[Array | np.ndarray, "nw"]) -> list[Float[Array, "..."]]:
         """The weight arrays that the vector holds, in the tree's order."""
         pieces, offset = [], 0
         for shape in self._shape[1]:
             size = math.prod(shape)
-            pieces.append(w[offset : offset + size].reshape(shape))
+            pieces.append(jnp.reshape(w[offset : offset + size], shape))
             offset += size
         return pieces
 
-    def values(self, w: Float[Array, "nw"], z: Float[Array, "nz"]) -> Float[Array, "ny"]:
+    def values(self, w: Float[Array | np.ndarray, "nw"], z: Float[Array, "nz"]) -> Float[Array, "ny"]:
         """f(z; w) for one row."""
         return self.from_leaves(self.leaves(w), z)
 

@@ -15,10 +15,13 @@ from orthaug.expressions import RESERVED
 
 @dataclass(frozen=True)
 class Channel:
-    """A named signal with its unit."""
+    """A named signal with its unit, and how files hold it: `value = scale * cell + offset` of `column`."""
 
     name: str
     unit: str = ""
+    column: str = ""
+    scale: float = 1.0
+    offset: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier() or self.name in RESERVED:
@@ -26,6 +29,17 @@ class Channel:
                 f"'{self.name}' cannot name a channel; use letters, digits and underscores, "
                 f"not starting with a digit, and none of {', '.join(sorted(RESERVED))}."
             )
+
+        if not (np.isfinite(self.scale) and self.scale != 0 and np.isfinite(self.offset)):
+            raise InputError(
+                f"channel '{self.name}': `scale` must be finite and not 0, `offset` finite; "
+                f"got {self.scale} and {self.offset}."
+            )
+
+    @property
+    def file_column(self) -> str:
+        """The column of a file that holds it; by default the one of its name."""
+        return self.column or self.name
 
     @property
     def label(self) -> str:
@@ -35,18 +49,23 @@ class Channel:
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """One uninterrupted run: `inputs` (N, nu) and `outputs` (N, ny), row k taken at the same instant."""
+    """One uninterrupted run: `inputs` (N, nu) and `outputs` (N, ny), row k taken at the same instant.
+
+    `source` and `first_row` say where it came from, for messages.
+    """
 
     inputs: Matrix
     outputs: Matrix
     source: str = ""
+    first_row: int = 0
 
     def __len__(self) -> int:
         return len(self.inputs)
 
     def rows(self, start: int | None, stop: int | None) -> Experiment:
         """The half-open range of rows `[start, stop)` as an experiment of its own."""
-        return replace(self, inputs=self.inputs[start:stop], outputs=self.outputs[start:stop])
+        first = self.first_row + range(len(self))[start:stop].start
+        return replace(self, inputs=self.inputs[start:stop], outputs=self.outputs[start:stop], first_row=first)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +128,8 @@ class Record:
         y_signal = np.empty((rows, 0)) if y_signal is None else y_signal
         if len(u_signal) != len(y_signal):
             raise InputError(
-                f"`y` has {len(y_signal)} rows but `u` has {len(u_signal)}. Give both the same length, or drop the last rows."
+                f"`y` has {len(y_signal)} rows but `u` has {len(u_signal)}. "
+                "Give both the same length, or drop the last rows."
             )
         return cls(
             _channels(inputs, "u", u_signal.shape[1]),
@@ -128,7 +148,8 @@ class Record:
                 raise InputError(f"records with other channels cannot be joined: {first!r} and {other!r}.")
             if not np.isclose(other.sampling_time, first.sampling_time, rtol=1e-6):
                 raise InputError(
-                    f"records of different sampling time cannot be joined: {first.sampling_time} s and {other.sampling_time} s."
+                    "records of different sampling time cannot be joined: "
+                    f"{first.sampling_time} s and {other.sampling_time} s."
                 )
         return replace(first, experiments=tuple(e for record in records for e in record.experiments))
 

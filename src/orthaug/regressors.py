@@ -33,7 +33,7 @@ class Lags:
 
     na: int | Sequence[int] = 0
     nb: int | Sequence[int] = 0
-    nk: int | Sequence[int] = 0
+    nk: int | Sequence[int] = 1
 
     def layout(self, outputs: Sequence[str], inputs: Sequence[str]) -> Layout:
         """The raw lags in regressor order.
@@ -45,16 +45,16 @@ class Lags:
         nb = _per_channel(self.nb, inputs, "nb", "input")
         nk = _per_channel(self.nk, inputs, "nk", "input")
         past_outputs = [Lag(name, i) for name, n in zip(outputs, na, strict=True) for i in range(1, n + 1)]
-        past_inputs = [
-            Lag(name, i) for name, n, d in zip(inputs, nb, nk, strict=True) for i in range(d, d + n)
-        ]
+        past_inputs = [Lag(name, i) for name, n, d in zip(inputs, nb, nk, strict=True) for i in range(d, d + n)]
         return (*past_outputs, *past_inputs)
 
 
 def _per_channel(value: int | Sequence[int], names: Sequence[str], key: str, kind: str) -> list[int]:
     values = [value] * len(names) if isinstance(value, int) else list(value)
     if len(values) != len(names):
-        raise InputError(f"`{key}` has {len(values)} numbers but there are {len(names)} {kind}s; give one number, or one per {kind}.")
+        raise InputError(
+            f"`{key}` has {len(values)} numbers but there are {len(names)} {kind}s; give one number, or one per {kind}."
+        )
     if any(isinstance(v, bool) or not isinstance(v, int) or v < 0 for v in values):
         raise InputError(f"`{key}` must be whole numbers, 0 or more; got {value}.")
     return values
@@ -71,7 +71,9 @@ def in_order(lags: Iterable[Lag], outputs: Sequence[str], inputs: Sequence[str])
         if lag.channel not in place:
             raise InputError(f"'{lag}' uses the unknown channel '{lag.channel}'; known are {', '.join(place)}.")
         if lag.lag == 0 and lag.channel in outputs:
-            raise InputError(f"'{lag}' is the output that is to be predicted; outputs are used from lag 1, {lag.channel}[k-1].")
+            raise InputError(
+                f"'{lag}' is the output that is to be predicted; outputs are used from lag 1, {lag.channel}[k-1]."
+            )
     return tuple(sorted(set(lags), key=lambda lag: (place[lag.channel], lag.lag)))
 
 
@@ -114,7 +116,8 @@ def stack_rows(record: Record, layout: Layout) -> Rows:
         if len(experiment) <= start:
             name = experiment.source or f"experiment {i}"
             raise InputError(
-                f"{name} has {len(experiment)} rows, too few: the largest lag is {start}, so at least {start + 1} are needed."
+                f"{name} has {len(experiment)} rows, too few: the largest lag is {start}, "
+                f"so at least {start + 1} are needed."
             )
     x = [lag_matrix(experiment, layout, record, start) for experiment in record.experiments]
     y = [experiment.outputs[start:] for experiment in record.experiments]
@@ -123,25 +126,27 @@ def stack_rows(record: Record, layout: Layout) -> Rows:
 
 @dataclass(frozen=True)
 class Features:
-    """What the learner sees of the regressor: some raw lags, or expressions of them."""
+    """What the learner sees of the regressor: expressions, most often single raw lags."""
 
-    entries: tuple[Lag | Expression, ...]
+    entries: tuple[Expression, ...]
+
+    @classmethod
+    def of(cls, layout: Layout) -> Features:
+        """All raw lags of a layout."""
+        return cls(tuple(Expression(str(lag)) for lag in layout))
 
     @property
     def lags(self) -> tuple[Lag, ...]:
         """The raw lags that the features read."""
-        found: list[Lag] = []
-        for entry in self.entries:
-            found.extend([entry] if isinstance(entry, Lag) else entry.lags)
-        return tuple(dict.fromkeys(found))
+        return tuple(dict.fromkeys(lag for entry in self.entries for lag in entry.lags))
 
     def evaluate(self, x: Any, layout: Layout, xp: Any) -> Any:
         """Features (…, nz) of regressors (…, nx), by `xp` (numpy or jax.numpy)."""
-        columns = {lag: x[..., j] for j, lag in enumerate(layout)}
-        values = [columns[e] if isinstance(e, Lag) else e.evaluate(columns, xp) for e in self.entries]
-        if not values:
+        if not self.entries:
             return xp.zeros((*x.shape[:-1], 0))
-        return xp.stack([xp.broadcast_to(xp.asarray(v, dtype=float), x.shape[:-1]) for v in values], axis=-1)
+        columns = {lag: x[..., j] for j, lag in enumerate(layout)}
+        values = [xp.asarray(entry.evaluate(columns, xp), dtype=float) for entry in self.entries]
+        return xp.stack([xp.broadcast_to(v, x.shape[:-1]) for v in values], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -122,9 +122,7 @@ class LevenbergMarquardt:
 
 
 @partial(jax.jit, static_argnames="linearise")
-def _start(
-    linearise: Any, w: Any, arguments: tuple[Any, ...], overlap: Overlap, ridge: Any, options: Options
-) -> State:
+def _start(linearise: Any, w: Any, arguments: tuple[Any, ...], overlap: Overlap, ridge: Any, options: Options) -> State:
     def refine(_: Any, normal: Normal) -> Normal:
         return linearise(w, *arguments, normal.overlap)
 
@@ -172,9 +170,7 @@ def _trial(linearise: Any, state: State, arguments: tuple[Any, ...], options: Op
 
     small = jnp.where(ok, jnp.where(before - after < options.tolerance * before, state.small + 1, 0), state.small)
     accepted = state.accepted + ok
-    damping = jnp.where(
-        ok, state.damping * jnp.maximum(1 / 3, 1 - (2 * gain - 1) ** 3), state.damping * state.growth
-    )
+    damping = jnp.where(ok, state.damping * jnp.maximum(1 / 3, 1 - (2 * gain - 1) ** 3), state.damping * state.growth)
     stuck = damping > _LARGEST_DAMPING * jnp.max(jnp.diag(normal.hessian), initial=1e-300)
     code = jnp.where(small >= 2, CONVERGED, RUNNING)
     code = jnp.where(stuck, jnp.where(accepted > 0, CONVERGED, NO_DESCENT), code)

@@ -1,0 +1,63 @@
+# Everything runs in .venv, which the first target makes once and keeps until a dependency changes.
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help setup demo test check bench clean
+
+BIN := .venv/bin
+STAMP := .venv/ready
+LOG := .venv/setup.log
+PYTHONS := python3.13 python3.12 python3.11 python3
+
+help:  ## list the targets
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 14
+
+setup: $(STAMP)  ## make the environment .venv (the others do it when it is needed)
+
+demo: $(STAMP)  ## fit the built-in mass-spring-damper example
+	@$(BIN)/orthaug demo
+
+test: $(STAMP)  ## run the whole test suite
+	@$(BIN)/python -m pytest -q
+
+check: $(STAMP)  ## ruff, pyright and the architecture test
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/pyright
+	@$(BIN)/python -m pytest -q tests/test_architecture.py
+
+bench: $(STAMP)  ## run the benchmarks, one after another
+	@set -e; for file in benchmarks/*.py; do \
+	    if [ -e "$$file" ]; then echo "== $$file"; $(BIN)/python "$$file"; fi; \
+	done
+
+clean:  ## remove the environment and everything that was built
+	@rm -rf .venv build dist .pytest_cache .ruff_cache .hypothesis orthaug-out
+	@find . -name .git -prune -o -type d \( -name __pycache__ -o -name '*.egg-info' \) -prune -exec rm -rf {} +
+
+# A name on the path may be a stand-in that does not run, or a Python without venv: each one is tried.
+# Messages of pip are shown without addresses; the log has them in full.
+$(STAMP): pyproject.toml constraints.txt
+	@if ! $(BIN)/python -c 'import pip' 2>/dev/null; then \
+	    found=; \
+	    for python in $(PYTHONS); do \
+	        "$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 || continue; \
+	        found="$$python"; \
+	        "$$python" -c 'import ensurepip, venv' >/dev/null 2>&1 || continue; \
+	        "$$python" -m venv --clear .venv >/dev/null 2>&1 && break; \
+	    done; \
+	    if [ -z "$$found" ]; then \
+	        echo "orthaug needs Python 3.11 or newer; none of these is: $(PYTHONS). Install one and run make again." >&2; \
+	        exit 1; \
+	    elif ! $(BIN)/python -c 'import pip' 2>/dev/null; then \
+	        echo "$$found cannot make a virtual environment. On Debian and Ubuntu: apt-get install python3-venv." >&2; \
+	        exit 1; \
+	    fi; \
+	fi
+	@echo "Setting up .venv (once, a minute or two) ..." >&2
+	@if ! $(BIN)/python -m pip install --disable-pip-version-check -c constraints.txt -e '.[dev]' >$(LOG) 2>&1; then \
+	    sed '/Looking in /d; s|[a-z+]*://[^ ]*|...|g' $(LOG) | tail -n 20 >&2; \
+	    echo "Installing the dependencies failed (all of the messages: $(LOG)). Is the package index in reach?" >&2; \
+	    exit 1; \
+	fi
+	@touch $@

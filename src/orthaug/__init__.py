@@ -1,0 +1,87 @@
+"""orthaug: physics with a learned correction, and parameters that keep all that physics can explain.
+
+Names load on first use, so that `orthaug --help` and reading data do not import JAX.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "InputError": "errors",
+    "RankError": "errors",
+    "TrainingError": "errors",
+    "Channel": "record",
+    "Experiment": "record",
+    "Record": "record",
+    "read_record": "readers",
+    "Lags": "regressors",
+    "Baseline": "baseline",
+    "Parameter": "baseline",
+    "Term": "baseline",
+    "MLP": "learners",
+    "Function": "learners",
+    "EquinoxModule": "learners",
+    "External": "learners",
+    "Additive": "structures",
+    "Orthogonal": "structures",
+    "LevenbergMarquardt": "solvers",
+    "estimate": "estimation",
+    "orthogonalise": "estimation",
+    "Estimate": "result",
+    "Status": "result",
+    "Model": "model",
+    "Response": "model",
+    "Trajectory": "model",
+    "scores": "metrics",
+    "identifiability": "excitation",
+    "load": "storage",
+    "synthetic": "",
+}
+__all__ = sorted(_HOME)
+
+if TYPE_CHECKING:
+    from orthaug import synthetic as synthetic
+    from orthaug.baseline import Baseline as Baseline
+    from orthaug.baseline import Parameter as Parameter
+    from orthaug.baseline import Term as Term
+    from orthaug.errors import InputError as InputError
+    from orthaug.errors import RankError as RankError
+    from orthaug.errors import TrainingError as TrainingError
+    from orthaug.estimation import estimate as estimate
+    from orthaug.estimation import orthogonalise as orthogonalise
+    from orthaug.excitation import identifiability as identifiability
+    from orthaug.learners import MLP as MLP
+    from orthaug.learners import EquinoxModule as EquinoxModule
+    from orthaug.learners import External as External
+    from orthaug.learners import Function as Function
+    from orthaug.metrics import scores as scores
+    from orthaug.model import Model as Model
+    from orthaug.model import Response as Response
+    from orthaug.model import Trajectory as Trajectory
+    from orthaug.readers import read_record as read_record
+    from orthaug.record import Channel as Channel
+    from orthaug.record import Experiment as Experiment
+    from orthaug.record import Record as Record
+    from orthaug.regressors import Lags as Lags
+    from orthaug.result import Estimate as Estimate
+    from orthaug.result import Status as Status
+    from orthaug.solvers import LevenbergMarquardt as LevenbergMarquardt
+    from orthaug.storage import load as load
+    from orthaug.structures import Additive as Additive
+    from orthaug.structures import Orthogonal as Orthogonal
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'orthaug' has no attribute '{name}'")
+    home = _HOME[name]
+    module = import_module(f"orthaug.{home or name}")
+    value = getattr(module, name) if home else module
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

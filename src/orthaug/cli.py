@@ -1,0 +1,261 @@
+"""The command line: arguments in, text out. Results go to standard output, progress and errors to standard error."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from orthaug import __version__
+from orthaug.errors import InputError, TrainingError
+
+if TYPE_CHECKING:
+    from orthaug.jobs import Fitted, Progress
+    from orthaug.model import Response
+
+app = typer.Typer(
+    name="orthaug",
+    help="Fit physics together with a learned correction, so that the physics keeps all that physics can explain.",
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+SpecPath = Annotated[Path, typer.Argument(metavar="SPEC", help="Spec file (TOML).")]
+ModelPath = Annotated[Path, typer.Argument(metavar="MODEL", help="Result folder of `fit`, or its model/.")]
+DataPath = Annotated[Path, typer.Argument(metavar="DATA", help="Data file with the model's channels.")]
+OutFolder = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Result folder.")]
+OutFile = Annotated[Path | None, typer.Option("--out", metavar="FILE", help="CSV file; standard output without it.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the summary.")]
+
+
+def main() -> None:
+    """Entry point: runs the command and turns errors into one line and an exit code."""
+    try:
+        code = app(standalone_mode=False)
+    except InputError as error:
+        _fail(f"error: {error}", 2)
+    except TrainingError as error:
+        _fail(f"training failed: {error}", 1)
+    except KeyboardInterrupt:
+        _fail(f"interrupted{_progress_text()}; nothing was written", 130)
+    except BrokenPipeError:
+        sys.stderr.close()
+        sys.exit(0)
+    except Exception as error:
+        complaint = getattr(error, "format_message", None)  # typer's own, about arguments
+        if complaint is None:
+            raise
+        _fail(f"error: {complaint()}", getattr(error, "exit_code", 2))
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _version(show: bool) -> None:
+    if show:
+        typer.echo(f"orthaug {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def demo(out: OutFolder = None) -> None:
+    """Fit the paper's mass-spring-damper, additive and orthogonal, and compare with the true parameters."""
+    from orthaug.jobs import check_output
+
+    folder = out or Path("orthaug-out/demo")
+    check_output(folder)
+    _prepare_jax()
+    from orthaug import demo as demonstration
+
+    with _progress(2 * demonstration.RESTARTS, demonstration.ITERATIONS) as progress:
+        text = demonstration.run(folder, progress)
+    typer.echo(text)
+    typer.echo(f"\nwritten to {folder}")
+
+
+@app.command()
+def check(spec: SpecPath, as_json: AsJson = False) -> None:
+    """Report excitation, identifiability and bias of data and physics; trains nothing."""
+    from orthaug import jobs
+    from orthaug.excitation import require_rank
+
+    job = jobs.open_job(spec, require_full_rank=False)
+    report = jobs.plain(jobs.check_report(job))
+    typer.echo(_json(report) if as_json else _check_text(report))
+    try:
+        require_rank(job.problem.excitation, job.problem.rows.y.size)
+    except InputError as error:
+        raise type(error)(f"{spec}: {error}") from None
+
+
+@app.command()
+def fit(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False) -> None:
+    """Fit a spec, print a summary and write the result folder."""
+    from orthaug import jobs
+
+    folder = out or Path("orthaug-out") / spec.stem
+    jobs.check_output(folder)
+    job = jobs.open_job(spec)
+    _prepare_jax()
+    training = job.spec.training
+    with _progress(training.restarts, training.iterations, job.spec.learner.kind != "none") as progress:
+        fitted = jobs.fit_job(job, progress)
+    jobs.write_result(fitted, folder)
+    if as_json:
+        typer.echo(_json(fitted.result))
+    else:
+        typer.echo(fitted.fit.summary() if fitted.fit.status.ok else "")
+        typer.echo(_scores_text(fitted))
+        typer.echo(f"\nwritten to {folder}")
+    if not fitted.fit.status.ok:
+        raise TrainingError(f"{fitted.fit.status.message}. The account is in {folder / 'result.json'}.")
+
+
+@app.command()
+def simulate(
+    model: ModelPath,
+    data: DataPath,
+    out: OutFile = None,
+    initial: Annotated[
+        str | None,
+        typer.Option("--initial", metavar="measured|zero|INIT", help="Outputs before the first step; INIT is a CSV."),
+    ] = None,
+) -> None:
+    """Free run of a saved model on a data file."""
+    from orthaug import runs
+
+    opened = runs.open_run(model, data)
+    start = runs.read_initial(initial, opened)
+    _prepare_jax()
+    _write_response(opened.model.simulate(opened.record, initial=start), out)
+
+
+@app.command()
+def predict(
+    model: ModelPath,
+    data: DataPath,
+    horizon: Annotated[int, typer.Option("--horizon", metavar="H", help="Steps ahead.")] = 1,
+    out: OutFile = None,
+) -> None:
+    """h-step-ahead prediction of a saved model on a data file."""
+    from orthaug import runs
+
+    opened = runs.open_run(model, data, need_outputs=True)
+    _prepare_jax()
+    _write_response(opened.model.predict(opened.record, horizon=horizon), out)
+
+
+def _unbuilt(name: str) -> None:
+    @app.command(name, hidden=True, context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
+    def refuse(context: typer.Context) -> None:
+        raise InputError(f"`orthaug {name}` is not built yet in this version.")
+
+
+for _name in ("compare", "split", "design", "export", "reproduce"):
+    _unbuilt(_name)
+
+
+def _prepare_jax() -> None:
+    from orthaug._jax import use_compilation_cache
+
+    use_compilation_cache()
+
+
+def _fail(message: str, code: int) -> None:
+    sys.stderr.write(message + "\n")
+    sys.exit(code)
+
+
+_last_progress: list[str] = []
+
+
+def _progress_text() -> str:
+    return f" {_last_progress[-1]}" if _last_progress else ""
+
+
+@contextmanager
+def _progress(runs: int, iterations: int, wanted: bool = True) -> Iterator[Progress | None]:
+    """A progress bar on standard error where that is a terminal; elsewhere only what Ctrl-C will say."""
+    if not wanted:
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("compiling", total=runs * iterations)
+
+        def tell(run: int, iteration: int, loss: float) -> None:
+            text = f"run {run + 1} of {runs}, iteration {iteration}, loss {loss:.3g}"
+            _last_progress[:] = [f"during {text}"]
+            bar.update(task, completed=run * iterations + iteration, description=text)
+
+        yield tell
+    _last_progress.clear()
+
+
+def _write_response(response: Response, out: Path | None) -> None:
+    from orthaug import runs
+
+    for text in runs.warnings(response):
+        sys.stderr.write(f"warning: {text}\n")
+    runs.write_csv(response, out)
+
+
+def _json(content: Any) -> str:
+    return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
+
+
+def _check_text(report: dict[str, Any]) -> str:
+    found, ident = report["excitation"], report["identifiability"]
+    condition = f"{found['condition']:.4g}" if found["condition"] is not None else "infinite"
+    lines = [
+        f"parameters       {', '.join(report['parameters']) or 'none'}",
+        f"regressor        {', '.join(report['regressor'])}",
+        f"usable rows      {report['rows']}",
+        f"excitation       rank {found['rank']} of {found['columns']} on the data, condition {condition}",
+        f"identifiability  rank {ident['rank']} of {ident['columns']} at random points: "
+        + ("the parameters can be told apart" if ident["identifiable"] else "no data can tell the parameters apart"),
+    ]
+    for group in ident["inseparable"]:
+        lines.append(f"  inseparable by any data: {', '.join(group)}")
+    if ident["identifiable"]:
+        for group in found["collinear"]:
+            lines.append(f"  not excited separately by these data: {', '.join(group)}")
+    lines += [f"warning: {text}" for text in report["warnings"]]
+    return "\n".join(lines)
+
+
+def _scores_text(fitted: Fitted) -> str:
+    """The scores as a table, one line per part, kind and output."""
+    rows = []
+    outputs = fitted.job.problem.record.outputs
+    for part, kinds in fitted.result["scores"].items():
+        for kind, entry in kinds.items():
+            for i, channel in enumerate(outputs):
+                cells = [entry[key][i] if entry[key] is not None else None for key in ("rmse", "nrmse", "fit")]
+                rmse, nrmse, percent = ("–" if c is None else f"{c:.6g}" for c in cells)
+                rows.append((part, kind, channel.name, f"{rmse} {channel.unit}".strip(), nrmse, percent))
+    if not rows:
+        return ""
+    table = [("part", "horizon", "output", "RMSE", "NRMSE", "FIT %"), *rows]
+    widths = [max(len(row[i]) for row in table) for i in range(6)]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in table]
+    told = {f"warning: {w}" for w in fitted.fit.warnings}
+    more = [f"warning: {w}" for w in fitted.result["warnings"] if f"warning: {w}" not in told]
+    return "\n".join(["", *lines, *more])

@@ -1,0 +1,46 @@
+"""Statistics of θ: noise covariance, standard errors and intervals under the training measure.
+
+The calibrated form `(Σψᵀψ)⁻¹(ΣψᵀΣ_eψ)(Σψᵀψ)⁻¹` for the criterion `1/N Σ‖ε‖²` (Ljung 1999, ch. 9): the
+factor 2 of the paper's eq:cov_approx cancels against the second derivative of the criterion.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.special
+from jaxtyping import Float
+
+from orthaug._arrays import Matrix, Vector
+from orthaug.projection import Projection
+
+
+def degrees_of_freedom(projection: Projection, effective: float) -> Vector:
+    """Rows of each output less what the fit has used up of them, (ny,).
+
+    The physics uses `Σ_k ‖Q_ki‖²` of output i (its share of nθ), the learner its effective weights.
+    """
+    rows, ny, _ = projection.q.shape
+    return rows - np.sum(projection.q**2, axis=(0, 2)) - effective / ny
+
+
+def noise_covariance(residual: Float[np.ndarray, "N ny"], freedom: Vector) -> Matrix | None:
+    """Σ_e (ny, ny) in the outputs' units; None where the fit leaves no degree of freedom."""
+    if np.any(freedom < 0.5):
+        return None
+    return residual.T @ residual / np.sqrt(np.outer(freedom, freedom))
+
+
+def theta_covariance(projection: Projection, weight: Vector, noise: Matrix) -> Matrix:
+    """Cov θ̂ (nθ, nθ) of θ̂ = Φ⁺Y. For one output this is the textbook s²(ΦᵀΦ)⁻¹."""
+    whitened = noise * np.outer(weight, weight)
+    factor = projection.covariance_factor()
+    if projection.q.shape[1] == 1:
+        return whitened[0, 0] * factor @ factor.T
+    middle = np.einsum("kit,ij,kjs->ts", projection.q, whitened, projection.q, optimize=True)
+    return factor @ middle @ factor.T
+
+
+def interval(value: Vector, std: Vector, freedom: float, level: float = 0.95) -> Float[np.ndarray, "n 2"]:
+    """Student-t interval of each entry, (n, 2)."""
+    reach = scipy.special.stdtrit(max(freedom, 1.0), 0.5 + level / 2) * std
+    return np.stack([value - reach, value + reach], axis=-1)

@@ -1,0 +1,290 @@
+"""The one verb: fit physics and learner to a record."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._arrays import Matrix, Vector
+from orthaug._jax import jax, jnp
+from orthaug.baseline import Baseline
+from orthaug.covariance import degrees_of_freedom, noise_covariance, theta_covariance
+from orthaug.errors import InputError
+from orthaug.excitation import ILL_CONDITIONED
+from orthaug.learners import MLP, Bound, External, Learner
+from orthaug.model import Form, Model, Numbers
+from orthaug.problem import Problem, pose
+from orthaug.record import Record
+from orthaug.regressors import Lags, Scaling
+from orthaug.result import Estimate, Restart, Status
+from orthaug.solvers.levenberg_marquardt import CONVERGED, NO_DESCENT, NON_FINITE, LevenbergMarquardt, Run
+from orthaug.structures import Additive, Orthogonal, Structure
+from orthaug.training import Task
+
+_CODES = {CONVERGED: "converged", NO_DESCENT: "no_descent", NON_FINITE: "non_finite"}
+
+Progress = Callable[[int, int, float], None]
+"""Called now and then with the number of the restart, the iteration and the loss."""
+
+
+def estimate(
+    record: Record,
+    baseline: Baseline,
+    *,
+    lags: Lags | None = None,
+    learner: Learner | None = MLP(),  # noqa: B008  (frozen)
+    structure: Structure = Orthogonal(),  # noqa: B008  (frozen)
+    solver: LevenbergMarquardt = LevenbergMarquardt(),  # noqa: B008  (frozen)
+    regularization: str | float = "none",
+    restarts: int = 1,
+    seed: int = 0,
+    initial: Estimate | Model | None = None,
+    progress: Progress | None = None,
+) -> Estimate:
+    """Fit `y_k = φ(x_k)θ + learner(x_k) + e_k` by one-step prediction error (eq:cost_fun).
+
+    θ is solved, never iterated (F1): with the orthogonal structure it is `Φ⁺Y` whatever the learner does.
+
+    Args:
+        record: measured inputs and outputs.
+        baseline: the physics.
+        lags: the learner's regressor; None for the raw lags that the baseline's expressions use.
+        learner: a declaration such as `MLP(hidden=(16,))`; None for physics alone.
+        structure: `Orthogonal()` or `Additive()`.
+        solver: how the learner's weights are found.
+        regularization: "none", "evidence" (MacKay; the weights' prior is estimated too), or a number: the
+            ridge α on the weights, against squared errors in units of the baseline's RMS residual.
+        restarts: runs from initial weights of seeds `seed … seed + restarts - 1`; the lowest loss is kept.
+        seed: of the initial weights.
+        initial: warm start from an earlier estimate or model: its learner, features, scaling and weights.
+        progress: called about twice a second with (restart, iteration, loss).
+
+    Raises:
+        InputError: data and physics that do not fit together; RankError where θ is not determined.
+
+    Examples:
+        >>> import numpy as np
+        >>> from orthaug.baseline import Term
+        >>> u = np.linspace(-1, 1, 200)
+        >>> record = Record.from_arrays(u=u, y=2 * u + u**2)
+        >>> fit = estimate(record, Baseline.from_terms([Term("gain", "u[k]")]), learner=MLP(hidden=(4,)))
+        >>> f"{fit.theta[0]:.3f}"
+        '2.000'
+    """
+    _check_arguments(regularization, restarts)
+    if initial is not None:
+        return _refit(record, baseline, lags, structure, solver, regularization, initial, progress)
+    problem = pose(record, baseline, lags, None if learner is None else learner.inputs)
+    if learner is None:
+        return _conclude(problem, structure, _nothing_learned(problem), Status("exact", 0, 0.0, np.nan))
+    task = Task.of(problem, learner)
+    starts = [task.bound.init(jax.random.key(seed + i)) for i in range(restarts)]
+    return _train(task, starts, seed, structure, solver, regularization, progress)
+
+
+def orthogonalise(
+    record: Record, baseline: Baseline, function: Callable[[Any], Any], lags: Lags | None = None
+) -> Estimate:
+    """Split a model trained elsewhere into physics and an orthogonal rest (F2).
+
+    Args:
+        record: the rows over which the rest is made orthogonal, usually the training data.
+        baseline: the physics.
+        function: `g(x)` on NumPy regressors (N, nx) in `Lags` order, giving (N, ny); from any toolbox.
+        lags: the regressor that `function` expects; None for the raw lags of the baseline.
+
+    Returns:
+        An estimate whose model predicts what `function` does, with `θ = Φ⁺G` and the learner `g − φθ`.
+        There are no standard errors: they belong to how `function` was trained.
+    """
+    problem = pose(record, baseline, lags)
+    ny, nz = len(problem.outputs), len(problem.features.entries)
+    bound = Bound(External(function, ny=ny), nz, ny)
+    values = np.asarray(jax.vmap(lambda z: bound.values(jnp.zeros(0), z))(jnp.asarray(problem.feature_rows())))
+    learned = _Learned(bound, np.zeros(0), Scaling(np.zeros(nz), np.ones(nz)), np.ones(ny), values)
+    return _conclude(problem, _Given(), learned, Status("exact", 0, 0.0, np.nan))
+
+
+def _refit(
+    record: Record,
+    baseline: Baseline,
+    lags: Lags | None,
+    structure: Structure,
+    solver: LevenbergMarquardt,
+    regularization: str | float,
+    initial: Estimate | Model,
+    progress: Progress | None,
+) -> Estimate:
+    """Go on from an earlier model's weights, in its scaling."""
+    model = initial.model if isinstance(initial, Estimate) else initial
+    bound, numbers = model.form.bound, model.numbers
+    if bound is None:
+        raise InputError("`initial` is physics alone and has nothing to start from; leave it out.")
+    problem = pose(record, baseline, lags, tuple(str(entry) for entry in model.form.features.entries))
+    if len(problem.outputs) != bound.ny:
+        raise InputError(f"`initial` has {bound.ny} outputs, the record {len(problem.outputs)}; fit anew.")
+    scaling = Scaling(np.asarray(numbers.centre), np.asarray(numbers.halfwidth))
+    task = Task.of(problem, bound.learner, scaling, np.asarray(numbers.gain))
+    return _train(task, [jnp.asarray(numbers.weights)], 0, structure, solver, regularization, progress)
+
+
+def _train(
+    task: Task,
+    starts: list[Any],
+    seed: int,
+    structure: Structure,
+    solver: LevenbergMarquardt,
+    regularization: str | float,
+    progress: Progress | None,
+) -> Estimate:
+    """Run from every start and conclude with the best."""
+    runs = [task.run(solver, w, regularization, _tell(progress, i, task)) for i, w in enumerate(starts)]
+    losses = np.array([task.mean_square(run.normal.loss) for run in runs])
+    best = int(np.nanargmin(losses)) if np.isfinite(losses).any() else 0
+    restarts = tuple(
+        Restart(seed + i, float(loss) if np.isfinite(loss) else None, run.iterations, _code(run), i == best)
+        for i, (run, loss) in enumerate(zip(runs, losses, strict=True))
+    )
+    run = runs[best]
+    values = task.values(run.w)
+    code = _code(run) if np.isfinite(values).all() else "non_finite"
+    learned = _Learned(
+        task.bound, np.asarray(run.w), task.scaling, task.unit, values, run.effective, task.gram(run), run
+    )
+    status = Status(code, run.iterations, sum(r.seconds for r in runs), np.nan)
+    return _conclude(task.problem, structure, learned, status, restarts)
+
+
+@dataclass(frozen=True, eq=False)
+class _Learned:
+    """What training left: the learner with its weights, and its values F (N, ny) at the training rows."""
+
+    bound: Bound | None
+    weights: Vector
+    scaling: Scaling
+    unit: Vector
+    values: Float[np.ndarray, "N ny"]
+    effective: float = 0.0
+    gram: Matrix | None = None
+    run: Run | None = None
+
+
+def _nothing_learned(problem: Problem) -> _Learned:
+    nothing, zeros = np.zeros(0), np.zeros(len(problem.outputs))
+    phi = problem.projection.phi
+    gram = np.tensordot(phi, phi, axes=([0, 1], [0, 1]))
+    return _Learned(None, nothing, Scaling(nothing, nothing), zeros, np.zeros_like(problem.target), 0.0, gram)
+
+
+@dataclass(frozen=True)
+class _Given:
+    """The structure of a function trained elsewhere: `c = 0`, all of it is the learner's."""
+
+    name: str = "orthogonal"
+
+    def split(self, least_squares: Vector, aux: Vector) -> tuple[Vector, Vector]:
+        return aux, aux
+
+
+def _conclude(
+    problem: Problem, structure: Structure, learned: _Learned, status: Status, restarts: tuple[Restart, ...] = ()
+) -> Estimate:
+    """Solve θ, split it from the learner, and attach statistics."""
+    projection, weight = problem.projection, problem.weight
+    whitened = learned.values * weight
+    usable = status.code != "non_finite"
+    aux = projection.solve(whitened) if usable else np.zeros(len(problem.baseline.names))
+    theta, theta_aux = structure.split(projection.solve(problem.whitened_target), aux)
+    residual = problem.whitened_target - whitened - projection.phi @ (theta - theta_aux)
+    freedom = degrees_of_freedom(projection, learned.effective)
+    noise = noise_covariance(residual / weight, freedom) if usable else None
+    unique = not (isinstance(structure, Additive) and learned.bound) and not isinstance(structure, _Given)
+    form = Form(problem.baseline, problem.features, problem.layout, problem.outputs, learned.bound)
+    numbers = Numbers(
+        theta, theta_aux, learned.weights, learned.scaling.centre, learned.scaling.halfwidth, learned.unit
+    )
+    record = problem.record
+    return Estimate(
+        model=Model(
+            form=form,
+            numbers=numbers,
+            outputs=record.outputs,
+            inputs=record.inputs,
+            sampling_time=record.sampling_time,
+            structure=structure.name,
+            largest_output=np.max([np.abs(e.outputs).max(axis=0) for e in record.experiments], axis=0),
+            gram=learned.gram,
+            noise=noise,
+        ),
+        status=Status(status.code, status.iterations, status.seconds, float(np.mean(residual**2))),
+        restarts=restarts,
+        excitation=problem.excitation,
+        covariance=theta_covariance(projection, weight, noise) if unique and noise is not None else None,
+        freedom=float(freedom.min()),
+        effective_weights=learned.effective,
+        defect=_defect(problem, whitened, aux),
+        problem=problem,
+        warnings=tuple(_warnings(problem, structure, learned, noise)),
+    )
+
+
+def _defect(problem: Problem, whitened: np.ndarray, aux: Vector) -> float | None:
+    """‖QᵀF̃‖ / ‖F‖ with F̃ = F − Φ θ_aux as the model computes it (eq:orth_property); None for F = 0."""
+    size = np.linalg.norm(whitened)
+    if not 0 < size < np.inf:
+        return None
+    return float(np.linalg.norm(problem.projection.coordinates(whitened - problem.projection.phi @ aux)) / size)
+
+
+def _warnings(problem: Problem, structure: Structure, learned: _Learned, noise: Matrix | None) -> list[str]:
+    found = []
+    condition = problem.excitation.condition
+    if condition is not None and condition > ILL_CONDITIONED:
+        found.append(
+            f"the physics is ill-conditioned on the data (condition {condition:.1e} of the scaled columns): "
+            "θ is determined, but small changes of the data move it far."
+        )
+    run = learned.run
+    if run is not None and run.code == CONVERGED and run.iterations == 0:
+        found.append(
+            "the learner lies in the span of the physics (P⊥J = 0): there is nothing for it to learn that the "
+            "physics does not express already. Give it another form or other inputs, or leave it out."
+        )
+    if isinstance(structure, Additive) and learned.bound:
+        found.append(
+            "θ of the additive structure is not unique (it depends on the learner's initial weights), so it has no "
+            "standard error; use the orthogonal structure for parameters."
+        )
+    elif isinstance(structure, _Given):
+        found.append("no standard errors: the function was trained elsewhere.")
+    elif noise is None:
+        found.append(
+            f"no standard errors: {len(problem.rows)} rows leave no degrees of freedom for "
+            f"{len(problem.baseline.names)} parameters and {learned.effective:.1f} effective weights; "
+            "use more data or a smaller learner."
+        )
+    return found
+
+
+def _code(run: Run) -> str:
+    return _CODES.get(run.code, "iteration_limit")
+
+
+def _tell(progress: Progress | None, restart: int, task: Task) -> Callable[[int, float], None] | None:
+    if progress is None:
+        return None
+    return lambda iteration, loss: progress(restart, iteration, task.mean_square(loss))
+
+
+def _check_arguments(regularization: str | float, restarts: int) -> None:
+    if isinstance(regularization, str):
+        if regularization not in ("none", "evidence"):
+            raise InputError(f"`regularization` must be none, evidence or a number; got '{regularization}'.")
+    elif not (np.isfinite(regularization) and regularization >= 0):
+        raise InputError(f"`regularization` must be 0 or more; got {regularization}.")
+    if isinstance(restarts, bool) or not isinstance(restarts, int) or restarts < 1:
+        raise InputError(f"`restarts` must be a whole number, 1 or more; got {restarts}.")

@@ -1,0 +1,59 @@
+"""Folders that appear whole or not at all: written beside their place, then renamed."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from orthaug.errors import InputError
+
+
+def check_replaceable(folder: Path, is_ours: Callable[[Path], bool]) -> None:
+    """Raise InputError unless `folder` can be written: it is absent, empty or ours, in a place that can be written."""
+    if folder.exists() or folder.is_symlink():
+        if not folder.is_dir():
+            raise InputError(f"{folder}: not a folder; give another name.")
+        if any(folder.iterdir()) and not is_ours(folder):
+            raise InputError(
+                f"{folder}: holds something that is not an orthaug result; give another folder, or empty it."
+            )
+    ancestor = _nearest_ancestor(folder)
+    if not ancestor.is_dir():
+        raise InputError(f"{folder}: cannot be written; {ancestor} is not a folder.")
+    try:
+        Path(tempfile.mkdtemp(prefix=".orthaug-", dir=ancestor)).rmdir()
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror} in {ancestor}).") from None
+
+
+@contextmanager
+def whole_folder(folder: Path, is_ours: Callable[[Path], bool]) -> Iterator[Path]:
+    """A temporary folder that takes the place of `folder` at the end, and vanishes on any exception."""
+    check_replaceable(folder, is_ours)
+    folder = folder.absolute()
+    created = [p for p in folder.parents if not p.exists()]
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}-partial-", dir=folder.parent))
+    try:
+        partial.chmod(0o755)
+        yield partial
+        if folder.exists():
+            old = Path(tempfile.mkdtemp(prefix=f".{folder.name}-old-", dir=folder.parent))
+            folder.rename(old / folder.name)
+            partial.rename(folder)
+            shutil.rmtree(old)
+        else:
+            partial.rename(folder)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        for parent in created:
+            if parent.is_dir() and not any(parent.iterdir()):
+                parent.rmdir()
+        raise
+
+
+def _nearest_ancestor(folder: Path) -> Path:
+    return next(parent for parent in folder.absolute().parents if parent.exists())

@@ -1,0 +1,317 @@
+"""What the commands do: a spec in, a result out. Parsing of arguments and printing is the CLI's."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from orthaug import __version__
+from orthaug.errors import InputError
+from orthaug.excitation import Excitation, identifiability
+from orthaug.folders import check_replaceable, whole_folder
+from orthaug.problem import Problem, pose
+from orthaug.readers import read_record
+from orthaug.record import Record
+from orthaug.spec import Part, Spec, load_spec
+
+if TYPE_CHECKING:
+    from orthaug.model import Model
+    from orthaug.result import Estimate
+
+SCHEMA = 1
+Progress = Callable[[int, int, float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedPart:
+    """A part of the data: its record, and how many leading samples of each experiment are not scored."""
+
+    name: str
+    record: Record
+    skip: int
+    files: tuple[dict[str, Any], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """A spec with its data read and checked: everything before training, without JAX."""
+
+    path: Path
+    spec: Spec
+    train: LoadedPart
+    tests: tuple[LoadedPart, ...]
+    problem: Problem
+    warnings: tuple[str, ...]
+
+    @property
+    def parts(self) -> tuple[LoadedPart, ...]:
+        return (self.train, *self.tests)
+
+
+def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
+    """Read the spec and all its data, and pose the problem.
+
+    Raises:
+        InputError: anything wrong with spec, files or physics; one line that names it.
+    """
+    spec = load_spec(path)
+    try:
+        baseline, learner_inputs = spec.physics_terms(), spec.learner_inputs()
+        train = _load(spec, spec.data.train, path.parent, "train")
+        tests = tuple(_load(spec, part, path.parent, f"tests.{name}") for name, part in spec.data.tests.items())
+        lags = spec.lag_orders() if spec.learner.kind != "none" else None
+        problem = pose(train.record, baseline, lags, learner_inputs, require_full_rank=require_full_rank)
+        problem.feature_rows()
+        for part in (train, *tests):
+            _check_scorable(part, problem.rows.start, train.record.sampling_time)
+    except InputError as error:
+        message = str(error)
+        raise type(error)(message if message.startswith(str(path.parent)) else f"{path}: {message}") from None
+    parts = {"train": spec.data.train, **{f"tests.{k}": v for k, v in spec.data.tests.items()}}
+    warnings = tuple(
+        f"{name}: one row in {part.every} is kept without a filter; content above the new Nyquist frequency folds back."
+        for name, part in parts.items()
+        if part.every > 1
+    )
+    return Job(path, spec, train, tests, problem, warnings)
+
+
+def _load(spec: Spec, part: Part, folder: Path, name: str) -> LoadedPart:
+    unknown = [channel for channel in part.columns if channel not in (*spec.data.inputs, *spec.data.outputs)]
+    if unknown:
+        raise InputError(f"'data.{name}.columns': '{unknown[0]}' is neither an input nor an output.")
+    records, files = [], []
+    for file in part.files:
+        record = read_record(
+            folder / file,
+            inputs=spec.channels(spec.data.inputs),
+            outputs=spec.channels(spec.data.outputs),
+            sampling_time=spec.data.sampling_time,
+            time=spec.data.time,
+            rows=part.rows,  # type: ignore[arg-type]  (lists of two, checked by the spec)
+            every=part.every,
+            columns=part.columns,
+        )
+        records.append(record)
+        digest = hashlib.sha256((folder / file).read_bytes()).hexdigest()
+        files.append({"file": file, "sha256": digest, "rows": len(record)})
+    return LoadedPart(name, Record.join(records), part.skip, tuple(files))
+
+
+def _check_scorable(part: LoadedPart, start: int, sampling_time: float) -> None:
+    if abs(part.record.sampling_time - sampling_time) > 1e-3 * sampling_time:
+        raise InputError(
+            f"data.{part.name}: sampled every {part.record.sampling_time:g} s, the training data every "
+            f"{sampling_time:g} s; one model has one sampling time."
+        )
+    first = max(start, part.skip)
+    for experiment in part.record.experiments:
+        if len(experiment) <= first:
+            raise InputError(
+                f"{experiment.source}: data.{part.name} has {len(experiment)} rows, too few; the first {first} are "
+                f"lags or skipped, so at least {first + 1} are needed."
+            )
+
+
+def check_report(job: Job) -> dict[str, Any]:
+    """What `orthaug check` tells: excitation on the data, identifiability of the physics; nothing is trained."""
+    problem = job.problem
+    found = identifiability(problem.baseline, problem.layout, problem.outputs, problem.rows.x)
+    return {
+        "schema": SCHEMA,
+        "orthaug": __version__,
+        "data": _data(job),
+        "parameters": list(problem.baseline.names),
+        "regressor": [str(lag) for lag in problem.layout],
+        "rows": len(problem.rows),
+        "excitation": _excitation(problem.excitation) | {"collinear": [list(g) for g in problem.excitation.collinear]},
+        "identifiability": {
+            "identifiable": found.full_rank,
+            "rank": found.rank,
+            "columns": found.columns,
+            "inseparable": [list(group) for group in found.collinear],
+        },
+        "bias": None,
+        "warnings": list(job.warnings),
+    }
+
+
+def run_fit(job: Job, progress: Progress | None = None) -> Estimate:
+    """Train as the spec says."""
+    from orthaug.estimation import estimate
+    from orthaug.learners import MLP
+    from orthaug.solvers import LevenbergMarquardt
+    from orthaug.structures import Additive, Orthogonal
+
+    spec, training = job.spec, job.spec.training
+    learner = None
+    if spec.learner.kind == "mlp":
+        learner = MLP(tuple(spec.learner.hidden), spec.learner.activation, spec.learner_inputs())
+    return estimate(
+        job.train.record,
+        job.problem.baseline,
+        lags=spec.lag_orders() if learner is not None else None,
+        learner=learner,
+        structure={"additive": Additive(), "orthogonal": Orthogonal()}[spec.structure.kind],
+        solver=LevenbergMarquardt(training.iterations),
+        regularization=training.regularization,
+        restarts=training.restarts,
+        seed=training.seed,
+        progress=progress,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A fit with its scores on every part, and the content of result.json."""
+
+    job: Job
+    fit: Estimate
+    result: dict[str, Any]
+
+
+def fit_job(job: Job, progress: Progress | None = None) -> Fitted:
+    """Train, score every part, and put the result together."""
+    fit = run_fit(job, progress)
+    warnings = [*job.warnings, *fit.warnings]
+    scores = {}
+    if fit.status.ok:
+        for part in job.parts:
+            scores[part.name] = _scores(fit.model, part, warnings)
+    spec = job.spec.model_dump(mode="json", exclude_unset=True)
+    status = fit.status
+    result = {
+        "schema": SCHEMA,
+        "orthaug": __version__,
+        "spec": spec,
+        "data": _data(job),
+        "status": {
+            "code": status.code,
+            "message": status.message,
+            "iterations": status.iterations,
+            "seconds": status.seconds,
+            "loss": status.loss,
+        },
+        "restarts": [
+            {"seed": r.seed, "loss": r.loss, "iterations": r.iterations, "chosen": r.chosen} for r in fit.restarts
+        ],
+        "parameters": _parameters(fit),
+        "physical_parameters": None,
+        "structure": fit.model.structure,
+        "measure": job.spec.structure.measure.kind if fit.model.structure == "orthogonal" else None,
+        "orthogonality_defect": fit.defect if fit.model.structure == "orthogonal" else None,
+        "excitation": _excitation(fit.excitation),
+        "scores": scores,
+        "bias": None,
+        "residuals": None,
+        "validation": None,
+        "warnings": warnings,
+    }
+    return Fitted(job, fit, plain(result))
+
+
+def is_result(folder: Path) -> bool:
+    """Whether a folder holds a result that orthaug wrote."""
+    try:
+        content = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(content, dict) and "schema" in content and "orthaug" in content
+
+
+def check_output(folder: Path) -> None:
+    """Raise InputError early where the result could not be written."""
+    check_replaceable(folder, is_result)
+
+
+def write_result(fitted: Fitted, folder: Path) -> None:
+    """result.json, model/ and figures/, whole or not at all; without a model where training failed."""
+    with whole_folder(folder, is_result) as partial:
+        fill_result(fitted, partial)
+
+
+def fill_result(fitted: Fitted, folder: Path) -> None:
+    """Write the files of a result into an existing folder."""
+    from orthaug import plots, storage
+
+    text = json.dumps(fitted.result, indent=1, ensure_ascii=False, allow_nan=False)
+    (folder / "result.json").write_text(text + "\n", encoding="utf-8")
+    if not fitted.fit.status.ok:
+        return
+    (folder / "model").mkdir()
+    storage.write(fitted.fit.model, folder / "model")
+    (folder / "figures").mkdir()
+    part = fitted.job.parts[-1]
+    one_step, free = fitted.fit.model.predict(part.record), fitted.fit.model.simulate(part.record)
+    where = f"{part.name}, {fitted.fit.model.structure}"
+    for name, figure in (
+        ("prediction", plots.output_figure(one_step, f"one-step prediction ({where})")),
+        ("simulation", plots.output_figure(free, f"free run ({where})")),
+        ("residual", plots.residual_figure(one_step, f"one-step residual ({where})")),
+        ("components", plots.components_figure(one_step, f"parts of the one-step prediction ({where})")),
+    ):
+        plots.save(figure, folder / "figures" / f"{name}.png")
+
+
+def plain(value: Any) -> Any:
+    """The same with None for every number that is not finite: JSON has no NaN."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return value
+
+
+def _scores(model: Model, part: LoadedPart, warnings: list[str]) -> dict[str, Any]:
+    """Scores of a part; what does not exist is None, with a sentence in `warnings`."""
+    found = {}
+    for kind, response in (("prediction", model.predict(part.record)), ("simulation", model.simulate(part.record))):
+        scored = response.scores(part.skip)
+        found[kind] = scored.as_dict()
+        runaway = next((t.diverged for t in response.trajectories if t.diverged), None)
+        if runaway is not None:
+            step, output = runaway
+            found[kind] = {"rmse": None, "nrmse": None, "fit": None}
+            warnings.append(
+                f"{part.name}: the free run diverged in output '{output}' at step {step}; no simulation scores."
+            )
+        elif found[kind]["rmse"] is None or None in found[kind]["rmse"]:
+            warnings.append(f"{part.name}: the {kind} has values that are not finite; no scores.")
+        elif found[kind]["nrmse"] is None or None in found[kind]["nrmse"]:
+            warnings.append(
+                f"{part.name}: an output is constant over the scored samples, so its NRMSE and FIT do not exist."
+            )
+    return found
+
+
+def _data(job: Job) -> dict[str, Any]:
+    return {
+        "train": list(job.train.files),
+        **({"tests": {part.name.removeprefix("tests."): list(part.files) for part in job.tests}} if job.tests else {}),
+    }
+
+
+def _excitation(found: Excitation) -> dict[str, Any]:
+    return {"rank": found.rank, "columns": found.columns, "condition": found.condition}
+
+
+def _parameters(fit: Estimate) -> list[dict[str, Any]]:
+    std, ci = fit.std, fit.interval
+    return [
+        {
+            "name": p.name,
+            "unit": p.unit,
+            "initial": p.initial,
+            "value": float(fit.theta[i]) if fit.status.ok else None,
+            "std": None if std is None else float(std[i]),
+            "ci95": None if ci is None else [float(v) for v in ci[i]],
+        }
+        for i, p in enumerate(fit.problem.baseline.parameters)
+    ]

@@ -1,0 +1,399 @@
+"""The fitted model ŷ_k = φ(x_k)θ + (f(x_k) − φ(x_k)θ_aux): prediction, free run and its two parts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from orthaug._arrays import Matrix, Vector, as_signal
+from orthaug._jax import jax, jnp
+from orthaug.baseline import Baseline
+from orthaug.errors import InputError
+from orthaug.learners import Bound
+from orthaug.metrics import Scores, scores
+from orthaug.record import Channel, Experiment, Record
+from orthaug.regressors import Features, Layout, lag_matrix, largest_lag
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+AnyArray = Array | np.ndarray
+
+_BATCH = 4096  # rows per compiled call; records of any length share the program
+_RUNAWAY = 1e6  # times the largest training output: a free run beyond this has diverged
+
+
+@dataclass(frozen=True)
+class Form:
+    """What a model computes, without its numbers: hashable, so compiled programs are reused."""
+
+    baseline: Baseline
+    features: Features
+    layout: Layout
+    outputs: tuple[str, ...]
+    bound: Bound | None
+
+    @property
+    def start(self) -> int:
+        """The first row of an experiment that can be predicted."""
+        return largest_lag(self.layout)
+
+
+class Numbers(NamedTuple):
+    """The numbers of a model."""
+
+    theta: Float[AnyArray, "nt"]
+    theta_aux: Float[AnyArray, "nt"]
+    weights: Float[AnyArray, "nw"]
+    centre: Float[AnyArray, "nz"]
+    halfwidth: Float[AnyArray, "nz"]
+    gain: Float[AnyArray, "ny"]
+    """Unit of the learner's output, in the outputs' units."""
+
+
+class Parts(NamedTuple):
+    """The prediction of a row in parts: `baseline` = φθ + fixed terms, `learner` = f − φθ_aux, `raw` = f."""
+
+    baseline: Any
+    learner: Any
+    raw: Any
+
+
+def parts(form: Form, numbers: Numbers, x: Float[Array, "nx"]) -> Parts:
+    """The prediction at one regressor x (nx,), each part (ny,) (eq:orth_param)."""
+    phi = form.baseline.phi(x, form.layout, form.outputs, jnp)
+    known = form.baseline.known(x, form.layout, form.outputs, jnp)
+    if form.bound is None:
+        raw = jnp.zeros(len(form.outputs))
+    else:
+        z = (form.features.evaluate(x, form.layout, jnp) - numbers.centre) / numbers.halfwidth
+        raw = numbers.gain * form.bound.values(numbers.weights, z)
+    return Parts(known + phi @ numbers.theta, raw - phi @ numbers.theta_aux, raw)
+
+
+@partial(jax.jit, static_argnames="form")
+def _predict_rows(form: Form, numbers: Numbers, x: Float[Array, "m nx"]) -> Parts:
+    return jax.vmap(lambda row: parts(form, numbers, row))(x)
+
+
+@partial(jax.jit, static_argnames="form")
+def _free_run(form: Form, numbers: Numbers, past: Float[Array, "na ny"], inputs: Float[Array, "T nu"]) -> Parts:
+    """One scan over the rows; `past` holds the outputs before the first one, newest first."""
+
+    def step(past: Any, row: Any) -> tuple[Any, Parts]:
+        found = parts(form, numbers, _regressor(form, past, row))
+        return _push(past, found.baseline + found.learner), found
+
+    return jax.lax.scan(step, past, inputs)[1]
+
+
+@partial(jax.jit, static_argnames="form")
+def _ahead(
+    form: Form, numbers: Numbers, past: Float[Array, "m na ny"], inputs: Float[Array, "m T nu"], horizon: Any
+) -> Parts:
+    """The last of `horizon` free-run steps from each of m starts."""
+    one = jax.vmap(lambda p, row: parts(form, numbers, _regressor(form, p, row)))
+
+    def step(i: Any, carry: tuple[Any, Parts]) -> tuple[Any, Parts]:
+        found = one(carry[0], inputs[:, i])
+        return jax.vmap(_push)(carry[0], found.baseline + found.learner), found
+
+    nothing = jnp.zeros((past.shape[0], len(form.outputs)))
+    return jax.lax.fori_loop(0, horizon, step, (past, Parts(nothing, nothing, nothing)))[1]
+
+
+def _regressor(form: Form, past: Any, inputs: Any) -> Any:
+    """x of the outputs' past (na, ny), newest first, and the row of lagged inputs."""
+    lags = [(lag.lag - 1, form.outputs.index(lag.channel)) for lag in form.layout if lag.channel in form.outputs]
+    back, channel = np.array(lags, dtype=int).reshape(-1, 2).T
+    return jnp.concatenate([past[back, channel], inputs])
+
+
+def _push(past: Any, y: Any) -> Any:
+    return jnp.concatenate([y[None], past[:-1]]) if past.shape[0] else past
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A model along one experiment; arrays (N, ny) are NaN on rows without a value (the first lags).
+
+    `baseline + learner` is the model's output; `learner_before` is f, before θ_aux moved its share of
+    the physics to θ. `diverged` is the row and output at which a free run left all bounds, if it did.
+    """
+
+    baseline: Matrix
+    learner: Matrix
+    learner_before: Matrix
+    measured: Matrix | None
+    start: int
+    diverged: tuple[int, str] | None = None
+
+    @property
+    def model(self) -> Matrix:
+        return self.baseline + self.learner
+
+    @property
+    def baseline_before(self) -> Matrix:
+        """φ(θ − θ_aux): what goes with `learner_before`."""
+        return self.model - self.learner_before
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """Trajectories of every experiment of a record; `horizon` in steps, None for a free run (simulation)."""
+
+    trajectories: tuple[Trajectory, ...]
+    horizon: int | None
+    outputs: tuple[Channel, ...]
+    sampling_time: float
+
+    @property
+    def model(self) -> Matrix:
+        """The model's output (N, ny), experiments one after another."""
+        return np.concatenate([t.model for t in self.trajectories])
+
+    def __repr__(self) -> str:
+        kind = "simulation" if self.horizon is None else f"{self.horizon}-step prediction"
+        return f"Response({kind}, {len(self.trajectories)} experiment(s), {len(self.model)} samples)"
+
+    def scores(self, skip: int | tuple[int, ...] = 0) -> Scores:
+        """Scores over all experiments; the first `skip` samples of each (or of each its own) are not counted.
+
+        Raises:
+            InputError: no measured outputs, or no sample left to score.
+        """
+        skips = (skip,) * len(self.trajectories) if isinstance(skip, int) else skip
+        measured, model = [], []
+        for trajectory, first in zip(self.trajectories, skips, strict=True):
+            if trajectory.measured is None:
+                raise InputError("the record has no measured outputs to compare with.")
+            rows = slice(max(trajectory.start, first), None)
+            measured.append(trajectory.measured[rows])
+            model.append(trajectory.model[rows])
+        if not sum(len(m) for m in measured):
+            raise InputError(f"no samples are left to score after the first {max(skips)}.")
+        return scores(np.concatenate(measured), np.concatenate(model))
+
+    def to_frame(self, experiment: int = 0) -> pd.DataFrame:
+        """A table with `time` and, per output, measured, model, baseline and learner."""
+        import pandas as pd
+
+        trajectory = self.trajectories[experiment]
+        columns: dict[str, Any] = {"time": np.arange(len(trajectory.model)) * self.sampling_time}
+        for i, channel in enumerate(self.outputs):
+            if trajectory.measured is not None:
+                columns[channel.name] = trajectory.measured[:, i]
+            columns[f"{channel.name}_model"] = trajectory.model[:, i]
+            columns[f"{channel.name}_baseline"] = trajectory.baseline[:, i]
+            columns[f"{channel.name}_learner"] = trajectory.learner[:, i]
+        return pd.DataFrame(columns)
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A fitted model; `estimate` makes it, `save` and `load` keep it.
+
+    `gram` (nθ + nw)² is the Gram matrix of `[Φ J]` over the training rows in whitened outputs,
+    `noise` (ny, ny) the noise covariance: with them a later split has intervals too.
+    """
+
+    form: Form
+    numbers: Numbers
+    outputs: tuple[Channel, ...]
+    inputs: tuple[Channel, ...]
+    sampling_time: float
+    structure: str
+    largest_output: Vector
+    gram: Matrix | None = None
+    noise: Matrix | None = None
+
+    def __repr__(self) -> str:
+        learner = self.form.bound.learner if self.form.bound else "none"
+        return f"Model({self.structure}, θ: {', '.join(self.form.baseline.names) or 'none'}, learner: {learner})"
+
+    @property
+    def theta(self) -> Vector:
+        """θ̂ (nθ,)."""
+        return np.asarray(self.numbers.theta)
+
+    @property
+    def theta_aux(self) -> Vector:
+        """θ_aux (nθ,), fixed after training."""
+        return np.asarray(self.numbers.theta_aux)
+
+    def components(self, record: Record) -> Response:
+        """One-step prediction of every row in its parts, before and after projection."""
+        return self.predict(record, horizon=1)
+
+    def predict(self, record: Record, horizon: int = 1) -> Response:
+        """Predict each row from outputs measured up to `horizon` samples before it.
+
+        Raises:
+            InputError: a record without outputs, other channels, a horizon below 1, too few rows.
+        """
+        if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1:
+            raise InputError(f"`horizon` must be a whole number of steps, 1 or more; got {horizon}.")
+        record = self._fitting(record, need_outputs=True)
+        trajectories = []
+        for experiment in record.experiments:
+            first = self.form.start + horizon - 1
+            self._check_rows(experiment, first)
+            if horizon == 1 or not self._memory:
+                x = lag_matrix(experiment, self.form.layout, record, first)
+                found = _in_batches(lambda rows: _predict_rows(self.form, self.numbers, rows), (x,))
+            else:
+                found = self._predict_ahead(experiment, record, int(horizon))
+            trajectories.append(_trajectory(found, experiment.outputs, len(experiment), first))
+        return Response(tuple(trajectories), int(horizon), self.outputs, record.sampling_time)
+
+    def simulate(self, record: Record, initial: str | Any = "measured") -> Response:
+        """Free run: the outputs' past is the model's own, from the first usable row on.
+
+        Args:
+            record: inputs, and outputs where they are measured.
+            initial: the outputs on the rows before the first usable one: "measured" (from the record),
+                "zero", or an array (rows, ny) that holds them.
+
+        Raises:
+            InputError: other channels, too few rows, or initial values that are not there.
+        """
+        record = self._fitting(record, need_outputs=False)
+        trajectories = []
+        for experiment in record.experiments:
+            self._check_rows(experiment, self.form.start)
+            measured = experiment.outputs if record.outputs else None
+            past = self._initial(initial, measured)
+            found = self._run(past, experiment, record)
+            trajectories.append(self._bounded(found, measured, len(experiment)))
+        return Response(tuple(trajectories), None, self.outputs, record.sampling_time)
+
+    def save(self, folder: Any) -> None:
+        """Write the model to a folder, as safetensors and JSON; `orthaug.load` reads it."""
+        from orthaug.storage import save
+
+        save(self, folder)
+
+    @property
+    def _memory(self) -> int:
+        """How many past outputs the model feeds back."""
+        return max((lag.lag for lag in self.form.layout if lag.channel in self.form.outputs), default=0)
+
+    def _input_rows(self, experiment: Experiment, record: Record, start: int) -> Matrix:
+        layout = tuple(lag for lag in self.form.layout if lag.channel not in self.form.outputs)
+        return lag_matrix(experiment, layout, record, start)
+
+    def _run(self, past: Matrix, experiment: Experiment, record: Record) -> Parts:
+        inputs = self._input_rows(experiment, record, self.form.start)
+        if not self._memory:
+            x = lag_matrix(experiment, self.form.layout, record, self.form.start)
+            return _in_batches(lambda rows: _predict_rows(self.form, self.numbers, rows), (x,))
+        steps = len(inputs)
+        padded = np.zeros((_bucket(steps), inputs.shape[1]))
+        padded[:steps] = inputs
+        found = _free_run(self.form, self.numbers, jnp.asarray(past), jnp.asarray(padded))
+        return Parts(*(np.asarray(part)[:steps] for part in found))
+
+    def _predict_ahead(self, experiment: Experiment, record: Record, horizon: int) -> Parts:
+        start = self.form.start
+        inputs = self._input_rows(experiment, record, start)
+        windows = np.lib.stride_tricks.sliding_window_view(inputs, horizon, axis=0).swapaxes(1, 2)
+        outputs = experiment.outputs[: len(experiment) - horizon]
+        past = np.stack([outputs[start - i - 1 : len(outputs) - i] for i in range(self._memory)], axis=1)
+        return _in_batches(lambda p, u: _ahead(self.form, self.numbers, p, u, horizon), (past[: len(windows)], windows))
+
+    def _initial(self, initial: Any, measured: Matrix | None) -> Matrix:
+        """The last `_memory` outputs before the first usable row, newest first."""
+        start, memory, ny = self.form.start, self._memory, len(self.outputs)
+        if isinstance(initial, str) and initial == "zero":
+            return np.zeros((memory, ny))
+        if isinstance(initial, str) and initial == "measured":
+            if measured is None:
+                raise InputError(
+                    "the record has no measured outputs to start from; use initial='zero' or give the values."
+                )
+            rows = measured[:start]
+        else:
+            rows = as_signal(initial, "initial")
+            if rows.shape[1] != ny:
+                raise InputError(f"`initial` has {rows.shape[1]} columns; expected one per output, {ny}.")
+            if len(rows) < memory:
+                raise InputError(f"`initial` has {len(rows)} rows; expected the first {start} outputs of the record.")
+            rows = rows[:start]
+        return rows[len(rows) - memory :][::-1].copy()
+
+    def _bounded(self, found: Parts, measured: Matrix | None, rows: int) -> Trajectory:
+        """A free run cut where it left all bounds."""
+        trajectory = _trajectory(found, measured, rows, self.form.start)
+        with np.errstate(all="ignore"):
+            wild = ~(np.abs(trajectory.model[self.form.start :]) <= _RUNAWAY * self.largest_output)
+        if not wild.any():
+            return trajectory
+        step = int(np.argmax(wild.any(axis=1)))
+        output = self.outputs[int(np.argmax(wild[step]))].name
+        cut = Parts(*(np.where(np.arange(len(part))[:, None] < step, part, np.nan) for part in found))
+        bounded = _trajectory(cut, measured, rows, self.form.start)
+        return Trajectory(**{**bounded.__dict__, "diverged": (step + self.form.start, output)})
+
+    def _check_rows(self, experiment: Experiment, first: int) -> None:
+        if len(experiment) <= first:
+            name = experiment.source or "the record"
+            raise InputError(f"{name} has {len(experiment)} rows, too few: the first value is at row {first}.")
+
+    def _fitting(self, record: Record, *, need_outputs: bool) -> Record:
+        """The record's channels in the model's order, by name.
+
+        Raises:
+            InputError: a channel is missing, or the sampling time differs by more than 0.1 %.
+        """
+        if not np.isclose(record.sampling_time, self.sampling_time, rtol=1e-3):
+            raise InputError(
+                f"the record is sampled every {record.sampling_time:g} s, the model every {self.sampling_time:g} s; "
+                "resample the record."
+            )
+        with_outputs = need_outputs or bool(record.outputs)
+        names = {kind: [c.name for c in getattr(record, kind)] for kind in ("inputs", "outputs")}
+        wanted = {"inputs": self.inputs, "outputs": self.outputs if with_outputs else ()}
+        for kind, channels in wanted.items():
+            missing = [c.name for c in channels if c.name not in names[kind]]
+            if missing:
+                found = ", ".join(names[kind]) or "none"
+                raise InputError(f"the record lacks the {kind[:-1]} {', '.join(missing)} of the model; it has {found}.")
+        order = {kind: [names[kind].index(c.name) for c in channels] for kind, channels in wanted.items()}
+        experiments = tuple(
+            Experiment(e.inputs[:, order["inputs"]], e.outputs[:, order["outputs"]], e.source, e.first_row)
+            for e in record.experiments
+        )
+        return Record(self.inputs, wanted["outputs"], record.sampling_time, experiments)
+
+
+def _bucket(steps: int) -> int:
+    """Lengths grow by powers of two, so that few programs are compiled."""
+    return max(256, 1 << (steps - 1).bit_length())
+
+
+def _in_batches(function: Callable[..., Parts], rows: tuple[Matrix, ...]) -> Parts:
+    """`function` over batches of rows, padded to one shape, its results concatenated."""
+    count = len(rows[0])
+    size = min(_BATCH, _bucket(count))
+    pieces = []
+    for begin in range(0, count, size):
+        batch = [array[begin : begin + size] for array in rows]
+        padding = size - len(batch[0])
+        padded = [np.concatenate([b, np.repeat(b[-1:], padding, axis=0)]) if padding else b for b in batch]
+        found = function(*(jnp.asarray(b) for b in padded))
+        pieces.append([np.asarray(part)[: size - padding] for part in found])
+    return Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True)))
+
+
+def _trajectory(found: Parts, measured: Matrix | None, rows: int, first: int) -> Trajectory:
+    def whole(values: Any) -> Matrix:
+        padded = np.full((rows, values.shape[1]), np.nan)
+        padded[first:] = values
+        return padded
+
+    return Trajectory(whole(found.baseline), whole(found.learner), whole(found.raw), measured, first)

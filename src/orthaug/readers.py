@@ -1,0 +1,126 @@
+"""Records from files: rows, ranges and sampling time of named channels.
+
+Rows count from 0 behind the header; messages name the file's own line, column and what stands there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from orthaug.errors import InputError
+from orthaug.record import Channel, Experiment, Record
+from orthaug.tables import Table, read_table
+
+RowRange = tuple[int, int] | list[int]
+
+
+def read_record(
+    path: str | Path,
+    *,
+    inputs: Sequence[str | Channel] = (),
+    outputs: Sequence[str | Channel] = (),
+    sampling_time: float | None = None,
+    time: str | None = None,
+    rows: RowRange | Sequence[RowRange] | None = None,
+    every: int = 1,
+    columns: Mapping[str, str] | None = None,
+) -> Record:
+    """Read one file; several row ranges are experiments of their own.
+
+    Args:
+        path: `.csv`, `.tsv`, `.parquet` or `.npz`.
+        inputs, outputs: channel names, or `Channel`s with column, unit, scale and offset.
+        sampling_time: seconds between rows; or `time`, the column that holds the instants.
+        rows: half-open range `(start, stop)` of data rows, or several; None for all.
+        every: keep each n-th row (no filter); the sampling time is multiplied.
+        columns: this file's column for a channel, `{"position": "yVal"}`.
+
+    Raises:
+        InputError: no such file, wrong type, missing columns, cells that are empty or no finite numbers.
+    """
+    path = Path(path)
+    channels = [[c if isinstance(c, Channel) else Channel(c) for c in group] for group in (inputs, outputs)]
+    column_of = {c.name: (columns or {}).get(c.name, c.file_column) for group in channels for c in group}
+    if sampling_time is not None and time is not None:
+        raise InputError("give `sampling_time` or `time`, not both.")
+    if isinstance(every, bool) or every < 1:
+        raise InputError(f"`every` must be a whole number, 1 or more; got {every}.")
+    wanted: list[str] = list(dict.fromkeys([*column_of.values(), *([time] if time else [])]))
+    if not wanted:
+        raise InputError("no channels are asked for; name inputs, outputs or both.")
+    table = _trim(read_table(path, wanted))
+    total = len(next(iter(table.columns.values())))
+    experiments, steps = [], []
+    for start, stop in _ranges(rows, total, path):
+        _check_cells(table, wanted, start, stop)
+        pick = slice(start, stop, every)
+        signals = [
+            np.stack([c.scale * table.columns[column_of[c.name]][pick] + c.offset for c in group], axis=-1)
+            if group
+            else np.empty((len(range(start, stop, every)), 0))
+            for group in channels
+        ]
+        experiments.append(Experiment(signals[0], signals[1], str(path), start))
+        if time:
+            steps.append(_uniform_step(table, time, start, stop))
+    step = steps[0] if time else (1.0 if sampling_time is None else sampling_time)
+    if any(not np.isclose(s, step, rtol=1e-3) for s in steps):
+        raise InputError(f"{path}: the sampling time in column '{time}' differs between row ranges: {steps} s.")
+    return Record(tuple(channels[0]), tuple(channels[1]), step * every, tuple(experiments))
+
+
+def _trim(table: Table) -> Table:
+    """Without the rows at the end in which every used column is empty (blank lines, longer unused columns)."""
+    longest = max(table.filled.values())
+    if longest == 0:
+        raise InputError(f"{table.path}: there are no data rows in {', '.join(table.columns)}.")
+    if len(set(table.filled.values())) > 1:
+        listing = ", ".join(f"'{name}' {length}" for name, length in table.filled.items())
+        raise InputError(
+            f"{table.path}: the used columns have unequal lengths: {listing} rows. Give all the same length."
+        )
+    return replace(table, columns={name: values[:longest] for name, values in table.columns.items()})
+
+
+def _ranges(rows: RowRange | Sequence[RowRange] | None, total: int, path: Path) -> list[tuple[int, int]]:
+    """Half-open ranges of rows, each checked against the file."""
+    if rows is None:
+        return [(0, total)]
+    pairs: list = [rows] if all(isinstance(entry, int | np.integer) for entry in rows) else list(rows)
+    for pair in pairs:
+        if len(pair) != 2 or not 0 <= pair[0] < pair[1]:
+            raise InputError(f"{path}: rows {list(pair)} is no half-open range [start, stop] with 0 ≤ start < stop.")
+        if pair[1] > total:
+            raise InputError(f"{path}: rows {list(pair)} reaches past the end; the file has {total} data rows.")
+    return [(int(start), int(stop)) for start, stop in pairs]
+
+
+def _check_cells(table: Table, columns: Sequence[str], start: int, stop: int) -> None:
+    for name in columns:
+        bad = np.flatnonzero(~np.isfinite(table.columns[name][start:stop]))
+        if bad.size:
+            row = start + int(bad[0])
+            found = table.cell(name, row)
+            what = f"found '{found}'" if found else "the cell is empty"
+            raise InputError(f"{table.path}: {table.where(row)}, column '{name}': {what}; expected a finite number.")
+
+
+def _uniform_step(table: Table, time: str, start: int, stop: int) -> float:
+    """Mean step of the time column, checked to be even enough that no sample is missing."""
+    instants = table.columns[time][start:stop]
+    if len(instants) < 2:
+        raise InputError(f"{table.path}: one row is too few to tell the sampling time from column '{time}'.")
+    steps = np.diff(instants)
+    mean = float(steps.mean())
+    odd = np.flatnonzero(np.abs(steps - mean) > 0.5 * abs(mean)) if mean > 0 else np.array([0])
+    if odd.size:
+        row = start + int(odd[0]) + 1
+        raise InputError(
+            f"{table.path}: {table.where(row)}, column '{time}': a step of {steps[odd[0]]:g} s where {mean:g} s is the "
+            "mean; expected evenly sampled, rising time. Resample, or take row ranges without gaps."
+        )
+    return mean

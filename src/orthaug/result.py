@@ -1,0 +1,173 @@
+"""The result of an estimation: parameters with intervals, status with cause and remedy, the model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from orthaug._arrays import Matrix, Vector
+from orthaug.covariance import interval
+from orthaug.excitation import Excitation
+from orthaug.model import Model
+from orthaug.problem import Problem
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MESSAGES: Mapping[str, str] = MappingProxyType(
+    {
+        "exact": "",
+        "converged": "",
+        "iteration_limit": (
+            "training stopped at its limit of iterations while the loss was still falling; "
+            "the model is usable, more iterations may improve it"
+        ),
+        "no_descent": (
+            "no step lowered the loss; the start is already a minimum, or the learner's gradient is wrong. "
+            "Try another seed or another activation"
+        ),
+        "non_finite": (
+            "the loss is not finite at the start: (a) a learner input grows without bound, "
+            "(b) the learner returns NaN, or (c) channels differ by many orders of magnitude. "
+            "Rescale the channels or choose other learner inputs"
+        ),
+    }
+)
+
+
+@dataclass(frozen=True)
+class Status:
+    """How training ended: `code` is one of `MESSAGES`, `message` its cause and remedy.
+
+    `loss` is the mean of squared errors with every output divided by its standard deviation.
+    """
+
+    code: str
+    iterations: int
+    seconds: float
+    loss: float
+
+    @property
+    def message(self) -> str:
+        return MESSAGES[self.code]
+
+    @property
+    def ok(self) -> bool:
+        """Whether there is a usable model."""
+        return self.code != "non_finite"
+
+
+@dataclass(frozen=True)
+class Restart:
+    """One run from its own initial weights."""
+
+    seed: int
+    loss: float | None
+    iterations: int
+    code: str
+    chosen: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What `estimate` returns. Print `fit.summary()`; use `fit.model`; read `fit.parameters`."""
+
+    model: Model
+    status: Status
+    restarts: tuple[Restart, ...]
+    excitation: Excitation
+    covariance: Matrix | None
+    """Cov θ̂ (nθ, nθ); None where θ has no standard error."""
+    freedom: float
+    """Degrees of freedom of the residual, rows less parameters less effective weights."""
+    effective_weights: float
+    defect: float | None
+    """‖QᵀF̃‖ / ‖F‖ over the training rows; None without a learner."""
+    problem: Problem = field(repr=False)
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def theta(self) -> Vector:
+        """θ̂ (nθ,)."""
+        return self.model.theta
+
+    @property
+    def std(self) -> Vector | None:
+        """Standard errors of θ̂ (nθ,)."""
+        return None if self.covariance is None else np.sqrt(np.diag(self.covariance))
+
+    @property
+    def interval(self) -> Matrix | None:
+        """95 % intervals of θ̂ (nθ, 2)."""
+        std = self.std
+        return None if std is None else interval(self.theta, std, self.freedom)
+
+    @cached_property
+    def parameters(self) -> pd.DataFrame:
+        """Table with a row per parameter: unit, initial, value, std, and the 95 % interval."""
+        import pandas as pd
+
+        baseline = self.problem.baseline
+        nothing = np.full(len(baseline.names), np.nan)
+        ci = self.interval if self.interval is not None else np.stack([nothing, nothing], axis=-1)
+        return pd.DataFrame(
+            {
+                "unit": [p.unit for p in baseline.parameters],
+                "initial": baseline.initial,
+                "value": self.theta,
+                "std": self.std if self.std is not None else nothing,
+                "ci95_low": ci[:, 0],
+                "ci95_high": ci[:, 1],
+            },
+            index=pd.Index(baseline.names, name="parameter"),
+        )
+
+    def __repr__(self) -> str:
+        values = ", ".join(f"{n} = {v:.6g}" for n, v in zip(self.problem.baseline.names, self.theta, strict=True))
+        return f"Estimate({self.model.structure}, {self.status.code}, loss {self.status.loss:.3g}, {values})"
+
+    def summary(self) -> str:
+        """A page of text: status, parameters, excitation, warnings."""
+        return "\n".join(summary_lines(self))
+
+
+def summary_lines(fit: Estimate) -> Sequence[str]:
+    """The lines of `Estimate.summary`."""
+    status, baseline = fit.status, fit.problem.baseline
+    bound = fit.model.form.bound
+    learner = (
+        "none" if bound is None else f"{bound.learner}, {bound.size} weights, {fit.effective_weights:.1f} effective"
+    )
+    lines = [
+        f"structure   {fit.model.structure}",
+        f"learner     {learner}",
+        f"data        {fit.problem.record!r}, {len(fit.problem.rows)} usable rows",
+        f"status      {status.code}, {status.iterations} iterations, {status.seconds:.2f} s, loss {status.loss:.6g}",
+    ]
+    if status.message:
+        lines.append(f"            {status.message}")
+    if fit.defect is not None and fit.model.structure == "orthogonal":
+        lines.append(f"orthogonal  ‖QᵀF̃‖/‖F‖ = {fit.defect:.1e}")
+    condition = fit.excitation.condition
+    lines.append(
+        f"excitation  rank {fit.excitation.rank} of {fit.excitation.columns}"
+        + (f", condition {condition:.3g}" if condition else "")
+    )
+    width = max([9, *(len(name) for name in baseline.names)])
+    lines += ["", f"{'parameter':<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  {'initial':>11}  unit"]
+    std, ci = fit.std, fit.interval
+    for i, parameter in enumerate(baseline.parameters):
+        spread = f"{std[i]:11.4g}" if std is not None else f"{'–':>11}"
+        reach = f"[{ci[i, 0]:13.7g}, {ci[i, 1]:13.7g}]" if ci is not None else f"{'–':^29}"
+        lines.append(
+            f"{parameter.name:<{width}}  {fit.theta[i]:14.8g}  {spread}  {reach}  "
+            f"{parameter.initial:11.5g}  {parameter.unit}".rstrip()
+        )
+    if fit.warnings:
+        lines += ["", *(f"warning: {text}" for text in fit.warnings)]
+    return lines

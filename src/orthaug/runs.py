@@ -1,0 +1,84 @@
+"""Saved models on data files: what `orthaug simulate` and `orthaug predict` do."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from orthaug.errors import InputError
+from orthaug.readers import read_record
+from orthaug.record import Record
+from orthaug.tables import check_readable, has_column
+
+if TYPE_CHECKING:
+    from orthaug.model import Model, Response
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A model with the record it is to run on."""
+
+    model: Model
+    record: Record
+    source: Path
+
+
+def open_run(model: Path, data: Path, *, need_outputs: bool = False) -> Run:
+    """Load a model and read its channels from a file; outputs only where the file has them, unless needed.
+
+    Raises:
+        InputError: no model, no file, missing columns.
+    """
+    check_readable(data)
+    from orthaug.storage import load
+
+    loaded = load(model)
+    held = [c for c in loaded.outputs if has_column(data, c.file_column)]
+    if need_outputs or len(held) == len(loaded.outputs):
+        held = list(loaded.outputs)
+    elif held:
+        missing = [c.name for c in loaded.outputs if c not in held]
+        raise InputError(f"{data}: has some of the model's outputs but not {', '.join(missing)}; give all or none.")
+    record = read_record(data, inputs=loaded.inputs, outputs=held, sampling_time=loaded.sampling_time)
+    return Run(loaded, record, data)
+
+
+def read_initial(initial: str | None, run: Run) -> str | Any:
+    """The `initial` of `Model.simulate`: measured where the data have outputs, zero otherwise, or a CSV's rows."""
+    if initial is None:
+        return "measured" if run.record.outputs else "zero"
+    if initial in ("measured", "zero"):
+        if initial == "measured" and not run.record.outputs:
+            raise InputError(f"{run.source}: has no measured outputs to start from; use --initial zero or a CSV.")
+        return initial
+    record = read_record(initial, outputs=run.model.outputs, sampling_time=run.model.sampling_time)
+    return record.experiments[0].outputs
+
+
+def warnings(response: Response) -> list[str]:
+    """What the reader of a response must know."""
+    return [
+        f"the free run diverged in output '{t.diverged[1]}' at step {t.diverged[0]}; it has no values from there on."
+        for t in response.trajectories
+        if t.diverged
+    ]
+
+
+def write_csv(response: Response, out: Path | None) -> None:
+    """One row per data row, empty cells where there is no value; to a file (whole or not at all) or standard output."""
+    frame = response.to_frame()
+    if out is None:
+        frame.to_csv(sys.stdout, index=False)
+        return
+    partial = out.with_name(f".{out.name}.partial")
+    try:
+        frame.to_csv(partial, index=False)
+        partial.replace(out)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise InputError(f"{out}: cannot be written ({error.strerror}).") from None
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise

@@ -1,0 +1,284 @@
+"""The spec file: TOML in, checked declarations out (the contract's section "Spec file").
+
+Every error is one line that names the file, the key, what was found and what was expected.
+"""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from orthaug.baseline import Baseline, Term
+from orthaug.errors import InputError
+from orthaug.record import Channel
+from orthaug.regressors import Lags
+from orthaug.tables import check_readable
+
+Count = Annotated[int, Field(ge=0, strict=True)]
+Positive = Annotated[int, Field(ge=1, strict=True)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Orders = Count | list[Count]
+Range = Annotated[list[Count], Field(min_length=2, max_length=2)]
+
+
+class Section(BaseModel):
+    """A table of the spec; unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Part(Section):
+    """Files of training or test data; each file, and each row range, is an experiment."""
+
+    files: Annotated[list[str], Field(min_length=1)]
+    rows: Range | Annotated[list[Range], Field(min_length=1)] | None = None
+    every: Positive = 1
+    skip: Count = 0
+    columns: dict[str, str] = {}
+
+
+class ChannelSection(Section):
+    """How files hold a channel: value = scale * cell + offset of column."""
+
+    column: str = ""
+    unit: str = ""
+    scale: Finite = 1.0
+    offset: Finite = 0.0
+
+
+class Data(Section):
+    """Channels, sampling time and parts."""
+
+    sampling_time: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    time: str | None = None
+    inputs: list[str] = []
+    outputs: Annotated[list[str], Field(min_length=1)]
+    train: Part
+    validation: Part | None = None
+    tests: dict[str, Part] = {}
+    channels: dict[str, ChannelSection] = {}
+
+    @model_validator(mode="after")
+    def _one_time(self) -> Data:
+        if self.sampling_time is not None and self.time is not None:
+            raise ValueError("`sampling_time` and `time` are both given; expected one of them")
+        for name in self.channels:
+            if name not in (*self.inputs, *self.outputs):
+                known = ", ".join((*self.inputs, *self.outputs))
+                raise ValueError(f"`channels.{name}` is neither an input nor an output; expected one of {known}")
+        return self
+
+
+class LagsSection(Section):
+    """The learner's regressor, as MATLAB means the orders."""
+
+    na: Orders = 0
+    nb: Orders = 0
+    nk: Orders = 1
+
+
+class TermSection(Section):
+    """One column of φ."""
+
+    parameter: Annotated[str, Field(min_length=1)]
+    regressor: str | float
+    initial: Finite = 0.0
+    unit: str = ""
+    output: str | None = None
+    fixed: bool = False
+    min: float | None = None
+    max: float | None = None
+
+
+class BaselineSection(Section):
+    """The physics."""
+
+    terms: Annotated[list[TermSection], Field(min_length=1)]
+    constants: dict[str, Finite] = {}
+
+
+class LearnerSection(Section):
+    """The learned correction."""
+
+    kind: Literal["mlp", "none"] = "mlp"
+    hidden: list[Positive] = [16]
+    activation: Literal["tanh", "relu", "gelu", "sigmoid", "silu", "elu", "softplus", "identity"] = "tanh"
+    inputs: list[str] | None = None
+
+
+class MeasureSection(Section):
+    """The set of regressor points on which physics and learner are made orthogonal."""
+
+    kind: Literal["training", "symmetrized", "uniform", "samples"] = "training"
+    box: dict[str, Annotated[list[Finite], Field(min_length=2, max_length=2)]] = {}
+    files: list[str] = []
+    rows: Range | list[Range] | None = None
+    every: Positive = 1
+
+
+class StructureSection(Section):
+    """How physics and learner share the fitted function."""
+
+    kind: Literal["additive", "orthogonal", "orthogonal-penalty", "baseline-penalty"] = "orthogonal"
+    weight: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1.0
+    measure: MeasureSection = MeasureSection()
+
+
+class TrainingSection(Section):
+    """Solver, criterion and regularisation."""
+
+    solver: Literal["levenberg-marquardt", "adam-lbfgs"] = "levenberg-marquardt"
+    iterations: Positive = 300
+    adam_iterations: Count = 500
+    lbfgs_iterations: Count = 1000
+    learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1e-3
+    focus: Literal["prediction", "simulation"] = "prediction"
+    segment: Count = 512
+    washout: Count = 40
+    restarts: Positive = 1
+    seed: Count = 0
+    regularization: Literal["none", "evidence"] | Annotated[float, Field(ge=0, allow_inf_nan=False)] = "none"
+
+
+class Spec(Section):
+    """A whole spec file; absent sections take their defaults."""
+
+    data: Data
+    lags: LagsSection | None = None
+    baseline: BaselineSection
+    physics: dict[str, Any] | None = None
+    learner: LearnerSection = LearnerSection()
+    structure: StructureSection = StructureSection()
+    training: TrainingSection = TrainingSection()
+
+    def channels(self, names: list[str]) -> tuple[Channel, ...]:
+        """The named channels with unit, column, scale and offset."""
+        given = self.data.channels
+        return tuple(Channel(name, **(given[name].model_dump() if name in given else {})) for name in names)
+
+    def lag_orders(self) -> Lags | None:
+        """The learner's orders; None for the raw lags that the baseline uses."""
+        if self.lags is None:
+            return None
+        return Lags(*(tuple(v) if isinstance(v, list) else v for v in (self.lags.na, self.lags.nb, self.lags.nk)))
+
+    def physics_terms(self) -> Baseline:
+        """The baseline as declared."""
+        terms = [Term(t.parameter, str(t.regressor), t.initial, t.unit, t.output, t.fixed) for t in self.baseline.terms]
+        return Baseline.from_terms(terms, self.baseline.constants)
+
+    def learner_inputs(self) -> tuple[str, ...] | None:
+        """What the learner sees; None for all lags."""
+        return tuple(self.learner.inputs) if self.learner.inputs is not None and self.learner.kind != "none" else None
+
+
+def load_spec(path: Path) -> Spec:
+    """Read and check a spec file.
+
+    Raises:
+        InputError: no such file, broken TOML, unknown or missing keys, values of the wrong kind, or a part
+            of the contract that is not built yet.
+    """
+    check_readable(path)
+    try:
+        with path.open("rb") as file:
+            content = tomllib.load(file)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: broken TOML: {' '.join(str(error).split())}.") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file; expected TOML in UTF-8.") from None
+    try:
+        spec = Spec.model_validate(content)
+    except ValidationError as error:
+        raise InputError(f"{path}: {_first_message(error, content)}.") from None
+    try:
+        _refuse_unbuilt(spec)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return spec
+
+
+def _refuse_unbuilt(spec: Spec) -> None:
+    """Parts of the contract that this version does not build yet."""
+    training = spec.training
+    unbuilt = {
+        "[physics]": spec.physics is not None,
+        "[data.validation]": spec.data.validation is not None,
+        f'structure.kind = "{spec.structure.kind}"': spec.structure.kind.endswith("penalty"),
+        f'structure.measure.kind = "{spec.structure.measure.kind}"': spec.structure.measure.kind != "training",
+        f'training.solver = "{training.solver}"': training.solver != "levenberg-marquardt",
+        f'training.focus = "{training.focus}"': training.focus != "prediction",
+        "baseline.terms: bounds `min` and `max`": any(
+            t.min is not None or t.max is not None for t in spec.baseline.terms
+        ),
+    }
+    for what, used in unbuilt.items():
+        if used:
+            raise InputError(f"{what} is not built yet in this version; leave it out.")
+
+
+def _first_message(error: ValidationError, content: dict[str, Any]) -> str:
+    """The first error as `key: found …; expected …`."""
+    errors = error.errors()
+    # of a union every branch complains: the deepest complaint is about what was meant
+    first = errors[0]
+    key = _key(first["loc"], content)
+    kind, found = first["type"], first["input"]
+    if kind == "extra_forbidden":
+        *parents, name = [part for part in first["loc"] if isinstance(part, str | int)]
+        known = _known_keys(parents)
+        close = difflib.get_close_matches(str(name), known, n=1)
+        hint = f"did you mean '{close[0]}'?" if close else f"known are {', '.join(known)}"
+        return f"unknown key '{key}', {hint}"
+    if kind == "missing":
+        return f"the key '{key}' is missing"
+    if kind == "value_error":
+        return (
+            f"'{key}': {first['msg'].removeprefix('Value error, ')}"
+            if key
+            else first["msg"].removeprefix("Value error, ")
+        )
+    same_key = [e["msg"] for e in errors if _key(e["loc"], content) == key]
+    expected = " or ".join(
+        dict.fromkeys(m.removeprefix("Input should be ").replace("a valid ", "a ") for m in same_key)
+    )
+    return f"'{key}': found {found!r}; expected {expected}"
+
+
+def _key(location: tuple[Any, ...], content: Any) -> str:
+    """The key's path in the file; pydantic's names of union branches are not part of it."""
+    text = ""
+    for i, part in enumerate(location):
+        if isinstance(part, int):
+            text += f"[{part}]"
+            content = content[part] if isinstance(content, list) and part < len(content) else None
+        elif isinstance(content, dict) and (part in content or i == len(location) - 1):
+            text += f".{part}" if text else part
+            content = content.get(part)
+    return text
+
+
+def _known_keys(parents: list[Any]) -> list[str]:
+    """The keys of the section at a path such as ["data", "tests", "steps"]."""
+    model: Any = Spec
+    for part in parents:
+        if isinstance(part, int) or not isinstance(model, type):
+            continue
+        field = model.model_fields.get(part)
+        model = _section_of(field.annotation) if field else model
+    return list(model.model_fields) if isinstance(model, type) else []
+
+
+def _section_of(annotation: Any) -> Any:
+    """The Section class inside an annotation such as `dict[str, Part] | None`."""
+    if isinstance(annotation, type) and issubclass(annotation, Section):
+        return annotation
+    for inner in getattr(annotation, "__args__", ()):
+        found = _section_of(inner)
+        if found is not None:
+            return found
+    return None

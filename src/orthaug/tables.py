@@ -1,0 +1,234 @@
+"""Files to named columns of floats, by the file's ending; what is no number is kept to be named later."""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import zipfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from orthaug._arrays import Vector
+from orthaug.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Columns of a file as floats; NaN where the cell is empty or no number, `where` and `cell` to say so.
+
+    `filled` counts the rows of each column up to its last cell that holds anything; `first_line` is the
+    file's line of row 0, for text files.
+    """
+
+    path: Path
+    columns: Mapping[str, Vector]
+    filled: Mapping[str, int]
+    first_line: int | None = None
+    cell: Callable[[str, int], str] = lambda column, row: "nan"
+
+    def where(self, row: int) -> str:
+        """`line 17 (row 15)` in a text file, `row 15` otherwise."""
+        return f"row {row}" if self.first_line is None else f"line {self.first_line + row} (row {row})"
+
+
+def read_table(path: Path, columns: Sequence[str]) -> Table:
+    """The named columns of a file.
+
+    Raises:
+        InputError: no such file, an unknown ending, content that does not fit it, or missing columns.
+    """
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise InputError(f"{path}: unknown file type '{path.suffix}'; known are {', '.join(_READERS)}.")
+    check_readable(path)
+    return reader(path, columns)
+
+
+def has_column(path: Path, name: str) -> bool:
+    """Whether the file has a column (or variable) of that name."""
+    try:
+        read_table(path, (name,))
+    except InputError:
+        return False
+    return True
+
+
+def check_readable(path: Path) -> None:
+    """Raise InputError unless `path` is a file with something in it."""
+    if not path.exists():
+        raise InputError(f"{path}: no such file.")
+    if not path.is_file():
+        raise InputError(f"{path}: not a file.")
+    try:
+        with path.open("rb") as file:
+            empty = not file.read(1)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+    if empty:
+        raise InputError(f"{path}: the file is empty (0 bytes).")
+
+
+def _read_text(path: Path, columns: Sequence[str]) -> Table:
+    """CSV and TSV as they are found: byte-order mark, trailing separators, units in headers, decimal commas."""
+    import pandas as pd
+
+    try:
+        header, header_line, separator = _header(path)
+    except (UnicodeDecodeError, csv.Error):
+        raise InputError(f"{path}: not a text table; expected UTF-8 text with a header row.") from None
+    _check_present(path, columns, header)
+    place = {name: str(header.index(name)) for name in columns}
+    decimal = "," if separator == ";" else "."
+
+    def read(**options: Any) -> pd.DataFrame:
+        return pd.read_csv(
+            path,
+            sep=separator,
+            header=None,
+            names=[str(i) for i in range(len(header))],
+            usecols=list(place.values()),
+            index_col=False,
+            skiprows=header_line,
+            skip_blank_lines=False,
+            keep_default_na=False,
+            encoding="utf-8-sig",
+            **options,
+        )
+
+    try:
+        frame = read(dtype=np.float64, na_values=[""], decimal=decimal)
+        texts, held = None, frame.notna()
+    except pd.errors.EmptyDataError:
+        raise InputError(f"{path}: there are no data rows below the header.") from None
+    except ValueError:  # something is no number: read again as text, to be able to name it
+        try:
+            texts = read(dtype=str).fillna("").apply(lambda column: column.str.strip())
+        except ValueError as error:
+            raise InputError(f"{path}: not a readable table ({' '.join(str(error).split())}).") from None
+        frame = texts.apply(lambda column: pd.to_numeric(column.str.replace(decimal, "."), errors="coerce"))
+        held = texts != ""
+
+    values = {name: np.asarray(frame[place[name]], dtype=float) for name in columns}
+
+    def cell(column: str, row: int) -> str:
+        if texts is not None:
+            return " ".join(str(texts.loc[row, place[column]]).split())
+        value = values[column][row]
+        return "" if np.isnan(value) else str(value)
+
+    filled = {name: _up_to_last(np.asarray(held[place[name]])) for name in columns}
+    return Table(path, values, filled, header_line + 1, cell)
+
+
+def _header(path: Path) -> tuple[list[str], int, str]:
+    """Column names, the number of lines up to and with the header, and the separator."""
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        line, number = "", 0
+        while not line.strip():
+            line, number = file.readline(), number + 1
+            if not line:
+                raise InputError(f"{path}: the file holds only blank lines.")
+    if "\0" in line:
+        raise csv.Error("NUL byte")
+    tab = path.suffix.lower() == ".tsv"
+    separator = "\t" if tab else ";" if ";" in line and "," not in line else ","
+    return [name.strip() for name in next(csv.reader([line], delimiter=separator))], number, separator
+
+
+def _up_to_last(held: np.ndarray) -> int:
+    return int(np.flatnonzero(held)[-1]) + 1 if held.any() else 0
+
+
+def _read_parquet(path: Path, columns: Sequence[str]) -> Table:
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    except ImportError:
+        raise InputError(f"{path}: reading Parquet needs pyarrow; install orthaug[parquet].") from None
+    try:
+        names = pq.read_schema(path).names
+        _check_present(path, columns, names)
+        frame = pq.read_table(path, columns=list(columns)).to_pandas()
+    except (pa.ArrowInvalid, OSError) as error:
+        raise InputError(f"{path}: not a readable Parquet file ({_short(error)}).") from None
+    return _full(path, {name: _as_floats(frame[name].to_numpy(), name, path) for name in columns})
+
+
+def _read_npz(path: Path, columns: Sequence[str]) -> Table:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            held = {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, TypeError, AttributeError, zipfile.BadZipFile, EOFError):
+        raise InputError(f"{path}: not a readable .npz archive of plain arrays.") from None
+    return _full(path, {name: pick_variable(path, name, held) for name in columns})
+
+
+def pick_variable(path: Path, name: str, held: Mapping[str, Any]) -> Vector:
+    """A channel in a file of variables: a vector (1×N or N×1), or a matrix column written `"U[2]"`."""
+    variable, column = name, None
+    if name not in held and name.endswith("]") and "[" in name:
+        variable, _, index = name[:-1].rpartition("[")
+        column = int(index) if index.strip().isdigit() else None
+    shapes = {key: np.shape(value) for key, value in held.items()}
+    listing = ", ".join(f"{key} {'×'.join(map(str, shape)) or 'scalar'}" for key, shape in shapes.items()) or "nothing"
+    if variable not in held:
+        raise InputError(f"{path}: no variable '{variable}'{_nearest(variable, held)}; the file holds {listing}.")
+    array = np.asarray(held[variable])
+    if column is not None:
+        if array.ndim != 2 or column >= array.shape[1]:
+            raise InputError(
+                f"{path}: '{name}' asks for column {column} (counted from 0) of {variable}; the file holds {listing}."
+            )
+        array = array[:, column]
+    if array.ndim == 2 and 1 in array.shape:
+        array = array.ravel()
+    if array.ndim != 1:
+        raise InputError(
+            f"{path}: '{name}' is no vector; write a column of a matrix as \"{variable}[0]\". The file holds {listing}."
+        )
+    return _as_floats(array, name, path)
+
+
+def _full(path: Path, columns: Mapping[str, Vector]) -> Table:
+    """A table of a file type that has no empty cells."""
+    return Table(path, columns, {name: len(values) for name, values in columns.items()})
+
+
+def _as_floats(array: np.ndarray, name: str, path: Path) -> Vector:
+    if np.iscomplexobj(array):
+        raise InputError(f"{path}: '{name}' is complex; expected real numbers.")
+    try:
+        return np.asarray(array, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"{path}: column '{name}' holds {array.dtype} values; expected numbers.") from None
+
+
+_READERS: dict[str, Callable[[Path, Sequence[str]], Table]] = {
+    ".csv": _read_text,
+    ".tsv": _read_text,
+    ".parquet": _read_parquet,
+    ".npz": _read_npz,
+}
+
+
+def _check_present(path: Path, columns: Sequence[str], header: Sequence[str]) -> None:
+    for name in columns:
+        if name not in header:
+            known = ", ".join(f"'{h}'" for h in header if h) or "no column names"
+            raise InputError(f"{path}: no column '{name}'{_nearest(name, header)}; the file has {known}.")
+        if list(header).count(name) > 1:
+            raise InputError(f"{path}: the column '{name}' stands {list(header).count(name)} times; names must differ.")
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    known = list(known)
+    close = [k for k in known if k.lower().startswith(name.lower())] or difflib.get_close_matches(name, known, n=1)
+    return f", did you mean '{close[0]}'?" if close else ""
+
+
+def _short(error: Exception) -> str:
+    return " ".join(str(error).split())[:120]

@@ -1,0 +1,70 @@
+"""Small problems that several tests share."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from orthaug._jax import jax, jnp
+from orthaug.criteria import Chunks, Hold, Overlap, Prediction
+from orthaug.gram import chunk_shape, in_chunks
+from orthaug.learners import Bound, Learner
+
+
+class Problem(NamedTuple):
+    """A prediction problem whose rows are chosen directly, not read from a record."""
+
+    criterion: Prediction
+    z: np.ndarray
+    """Features (N, nz)."""
+    q: np.ndarray
+    """Orthonormal basis of the physics (N, ny, nt)."""
+    e: np.ndarray
+    """P⊥Y (N, ny)."""
+    gain: np.ndarray
+    """(N, ny)."""
+    chunks: Chunks
+    hold: Hold
+
+    @property
+    def bound(self) -> Bound:
+        return self.criterion.bound
+
+    @property
+    def arguments(self) -> tuple[Chunks, Hold]:
+        """What the solver hands to the criterion."""
+        return self.chunks, self.hold
+
+    @property
+    def nothing(self) -> Overlap:
+        """No overlap known yet."""
+        nt = self.q.shape[2]
+        return Overlap(jnp.zeros((nt, self.bound.size)), jnp.zeros(nt))
+
+
+def problem(
+    learner: Learner, z: np.ndarray, y: np.ndarray, phi: np.ndarray, gain: np.ndarray | None = None, limit: int = 64
+) -> Problem:
+    """Rows in chunks of at most about `limit`, padded; no share of the learner is held."""
+    rows, ny, nt = phi.shape
+    q = np.linalg.qr(phi.reshape(rows * ny, nt))[0].reshape(rows, ny, nt)
+    e = y
+    for _ in range(2):
+        e = e - q @ np.tensordot(q, e, axes=([0, 1], [0, 1]))
+    gain = np.ones_like(y) if gain is None else gain
+    shape = chunk_shape(rows, limit)
+    chunks = Chunks(*(jnp.asarray(in_chunks(values, shape)) for values in (z, q, e, gain)))
+    hold = Hold(jnp.zeros((nt, nt)), jnp.zeros(nt))
+    return Problem(Prediction(Bound(learner, z.shape[1], ny)), z, q, e, gain, chunks, hold)
+
+
+def linear_columns(given: Problem) -> np.ndarray:
+    """P⊥J (N ny, nw) of a learner that is linear in its weights, by automatic differentiation at zero."""
+    w = jnp.zeros(given.bound.size)
+    jacobian = jax.jacrev(lambda w: given.gain * jax.vmap(lambda row: given.bound.values(w, row))(given.z))(w)
+    columns = np.asarray(jacobian).reshape(given.e.size, -1)
+    q = given.q.reshape(given.e.size, -1)
+    for _ in range(2):
+        columns = columns - q @ (q.T @ columns)
+    return columns

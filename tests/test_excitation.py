@@ -1,0 +1,108 @@
+"""Excitation: rank, condition, and the names of what cannot be told apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from orthaug.baseline import Baseline, Term
+from orthaug.errors import InputError, RankError
+from orthaug.excitation import excitation, identifiability, require_rank
+from orthaug.expressions import Lag
+from orthaug.projection import Projection
+
+A, B, C, D = np.random.default_rng(5).normal(size=(4, 30))
+
+
+def of(*columns, names="abcdefg"):
+    """Excitation of the R factor of these columns."""
+    phi = np.stack(columns, axis=1)[:, None]
+    return excitation(Projection.factor(phi).r, list(names[: len(columns)]))
+
+
+def test_full_rank():
+    found = of(A, 1e9 * B, 1e-9 * C)
+    assert (found.rank, found.columns, found.collinear) == (3, 3, ())
+    assert found.full_rank
+    require_rank(found, 30)
+    unit = np.stack([v / np.linalg.norm(v) for v in (A, B, C)], axis=1)
+    np.testing.assert_allclose(found.condition, np.linalg.cond(unit), rtol=1e-12)
+
+
+def test_condition_of_nearly_parallel_columns():
+    found = of(A, A + 1e-6 * B)
+    assert found.full_rank and 1e5 < found.condition < 1e8
+    assert of(A, A + 1e-11 * B).full_rank  # ill-conditioned, not deficient
+    assert not of(A, A + 1e-15 * B).full_rank
+
+
+def test_collinear_columns_are_named():
+    found = of(A, B, 2 * A - B, C)
+    assert (found.rank, found.condition, found.collinear) == (3, None, (("a", "b", "c"),))
+    message = r"rank-deficient on the data \(rank 3 of 4\): the columns of a, b, c are linearly dependent. Remove"
+    with pytest.raises(RankError, match=message):
+        require_rank(found, 30)
+    assert issubclass(RankError, InputError)
+
+
+def test_groups_are_kept_apart():
+    found = of(A, B, 3 * A, C, -B, 5 * A)
+    assert found.rank == 3
+    assert found.collinear == (("a", "c", "f"), ("b", "e"))
+    with pytest.raises(RankError, match="the columns of a, c, f are linearly dependent; the columns of b, e are"):
+        require_rank(found, 30)
+
+
+def test_zero_column():
+    found = of(A, 0 * A, B)
+    assert (found.rank, found.collinear) == (2, (("b",),))
+    with pytest.raises(RankError, match="rank 2 of 3.: the column of b is zero"):
+        require_rank(found, 30)
+
+
+def test_zero_and_collinear():
+    found = of(A, 0 * A, 2 * A)
+    assert (found.rank, found.collinear) == (1, (("a", "c"), ("b",)))
+
+
+def test_all_zero():
+    found = of(0 * A, 0 * A)
+    assert (found.rank, found.condition, found.collinear) == (0, None, (("a",), ("b",)))
+
+
+def test_no_parameters():
+    found = excitation(np.zeros((0, 0)), [])
+    assert (found.rank, found.columns, found.condition, found.collinear) == (0, 0, None, ())
+    assert found.full_rank
+    require_rank(found, 0)
+
+
+def test_more_columns_than_rows():
+    found = of(A[:2], B[:2], C[:2])
+    assert (found.rank, found.columns, found.condition) == (2, 3, None)
+    assert found.collinear == (("a", "b", "c"),)
+    with pytest.raises(RankError, match="2 usable rows for 3 parameters; give at least as many rows as parameters"):
+        require_rank(found, 2)
+
+
+LAYOUT = (Lag("y", 1), Lag("u", 0))
+
+
+def test_identifiable_but_not_excited():
+    baseline = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "u[k]")])
+    x = np.stack([A, 2 * A], axis=1)
+    assert identifiability(baseline, LAYOUT, ("y",), x).full_rank
+    assert not excitation(Projection.factor(baseline.phi(x, LAYOUT, ("y",), np)).r, baseline.names).full_rank
+
+
+def test_not_identifiable():
+    baseline = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "u[k]"), Term("c", "y[k-1] - 2*u[k]")])
+    found = identifiability(baseline, LAYOUT, ("y",), np.stack([A, B], axis=1))
+    assert (found.rank, found.collinear) == (2, (("a", "b", "c"),))
+
+
+def test_identifiability_leaves_out_points_without_a_value():
+    baseline = Baseline.from_terms([Term("a", "sqrt(y[k-1])"), Term("b", "1")])
+    assert identifiability(baseline, LAYOUT, ("y",), np.stack([A, B], axis=1)).full_rank
+    fixed = Baseline.from_terms([Term("a", "1", fixed=True)])
+    assert identifiability(fixed, LAYOUT, ("y",), np.stack([A, B], axis=1)).full_rank

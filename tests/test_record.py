@@ -1,0 +1,124 @@
+"""Records: what is kept of arrays, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from orthaug.errors import InputError
+from orthaug.record import Channel, Experiment, Record
+
+STEPS = np.arange(6.0)
+
+
+def test_from_arrays():
+    record = Record.from_arrays(u=STEPS, y=np.stack([STEPS, -STEPS], axis=1), sampling_time=0.5)
+    assert [c.name for c in record.inputs] == ["u"]
+    assert [c.name for c in record.outputs] == ["y1", "y2"]
+    assert [c.name for c in record.channels] == ["y1", "y2", "u"]
+    assert record.experiments[0].inputs.shape == (6, 1)
+    assert record.experiments[0].outputs.shape == (6, 2)
+    assert len(record) == 6
+
+
+def test_names_and_units():
+    record = Record.from_arrays(STEPS, STEPS, inputs=[Channel("force", "N")], outputs=["position"])
+    assert record.inputs[0].label == "force [N]"
+    assert record.outputs[0].label == "position"
+    assert repr(record) == "Record(1 experiment, 6 samples, Ts = 1 s, inputs: force; outputs: position)"
+
+
+def test_without_inputs_or_without_outputs():
+    autonomous = Record.from_arrays(y=STEPS)
+    assert autonomous.experiments[0].inputs.shape == (6, 0)
+    assert "inputs: none; outputs: y" in repr(autonomous)
+    to_simulate = Record.from_arrays(u=STEPS)
+    assert to_simulate.experiments[0].outputs.shape == (6, 0)
+
+
+def test_arrays_are_copied_and_made_float():
+    y = np.arange(4)
+    record = Record.from_arrays(y=y)
+    y[0] = 100
+    np.testing.assert_array_equal(record.experiments[0].outputs[:, 0], [0.0, 1.0, 2.0, 3.0])
+    assert record.experiments[0].outputs.dtype == float
+
+
+def test_rows_and_split():
+    record = Record.from_arrays(y=STEPS, source="run.csv")
+    part = record.rows(2, 5)
+    np.testing.assert_array_equal(part.experiments[0].outputs[:, 0], [2, 3, 4])
+    assert part.experiments[0].source == "run.csv"
+    assert part.experiments[0].first_row == 2
+    assert part.rows(1).experiments[0].first_row == 3
+    first, rest = record.split(0.5)
+    assert (len(first), len(rest)) == (3, 3)
+    assert rest.experiments[0].first_row == 3
+
+
+def test_join_keeps_experiments_apart():
+    record = Record.join(Record.from_arrays(y=STEPS, sampling_time=0.1, source=str(i)) for i in range(3))
+    assert [e.source for e in record.experiments] == ["0", "1", "2"]
+    assert len(record) == 18
+    assert repr(record).startswith("Record(3 experiments, 18 samples, Ts = 0.1 s")
+    with pytest.raises(InputError, match="`rows` needs a record of one experiment; this one has 3"):
+        record.rows(0, 1)
+    with pytest.raises(InputError, match="`split` needs a record of one experiment"):
+        record.split(0.5)
+
+
+def test_join_refuses_what_does_not_fit():
+    record = Record.from_arrays(y=STEPS)
+    with pytest.raises(InputError, match=r"other channels cannot be joined: .*outputs: y\).*outputs: z\)"):
+        Record.join([record, Record.from_arrays(y=STEPS, outputs=["z"])])
+    with pytest.raises(InputError, match=r"different sampling time cannot be joined: 1.0 s and 2.0 s"):
+        Record.join([record, Record.from_arrays(y=STEPS, sampling_time=2.0)])
+    with pytest.raises(InputError, match="at least one"):
+        Record.join([])
+
+
+@pytest.mark.parametrize("fraction", [0.0, 1.0, -0.5, float("nan")])
+def test_split_fraction(fraction):
+    with pytest.raises(InputError, match="`fraction` must lie between 0 and 1"):
+        Record.from_arrays(y=STEPS).split(fraction)
+
+
+REFUSED = [
+    ({}, "needs `u`, `y` or both; got neither"),
+    ({"u": STEPS[1:], "y": STEPS}, "`y` has 6 rows but `u` has 5. Give both the same length, or drop the last rows"),
+    ({"y": [1.0, float("nan")]}, "`y` is not finite at row 1, channel 0: found nan. Remove the row or split"),
+    ({"u": [[1.0, 2.0], [3.0, float("inf")]]}, "`u` is not finite at row 1, channel 1: found inf"),
+    ({"y": ["a", "b"]}, "`y` is not an array of numbers: could not convert"),
+    ({"y": [[1.0], [2.0, 3.0]]}, "`y` is not an array of numbers"),
+    ({"y": [1j, 2.0]}, "`y` is complex; expected real numbers"),
+    ({"y": np.zeros((2, 2, 2))}, r"`y` has 3 axes; expected \(samples,\) or \(samples, channels\)"),
+    ({"y": 1.0}, "`y` has 0 axes"),
+    ({"y": STEPS, "sampling_time": 0.0}, "sampling time must be a positive number of seconds; got 0.0"),
+    ({"y": STEPS, "sampling_time": -1.0}, "sampling time must be a positive number"),
+    ({"y": STEPS, "sampling_time": float("nan")}, "sampling time must be a positive number"),
+    ({"y": STEPS, "outputs": ["a", "b"]}, "2 names for 1 channels of `y`; give one name for each column"),
+    ({"u": STEPS, "y": STEPS, "inputs": ["a"], "outputs": ["a"]}, "channel 'a' is given twice; names must differ"),
+    ({"y": STEPS, "outputs": ["position (mm)"]}, r"'position \(mm\)' cannot name a channel; use letters"),
+    ({"y": STEPS, "outputs": ["2nd"]}, "'2nd' cannot name a channel"),
+    ({"y": STEPS, "outputs": [""]}, "'' cannot name a channel"),
+    ({"y": STEPS, "outputs": ["k"]}, "'k' cannot name a channel"),
+    ({"y": STEPS, "outputs": ["sin"]}, "'sin' cannot name a channel"),
+    # expressions cannot use these: a word of Python's own, and the micro sign, which Python reads as the Greek letter
+    ({"y": STEPS, "outputs": ["in"]}, "'in' cannot name a channel"),
+    ({"y": STEPS, "outputs": ["\N{MICRO SIGN}"]}, "'\N{MICRO SIGN}' cannot name a channel"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), REFUSED, ids=range(len(REFUSED)))
+def test_refused(arguments, message):
+    with pytest.raises(InputError, match=message):
+        Record.from_arrays(**arguments)
+
+
+def test_a_record_needs_an_experiment():
+    with pytest.raises(InputError, match="at least one experiment; got none"):
+        Record((), (Channel("y"),), 1.0, ())
+
+
+def test_experiment_length():
+    assert len(Experiment(np.zeros((3, 0)), np.zeros((3, 1)))) == 3
