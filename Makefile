@@ -28,7 +28,7 @@ check: $(STAMP)  ## ruff, pyright and the architecture test
 
 bench: $(STAMP)  ## run the benchmarks, one after another
 	@set -e; for file in benchmarks/*.py; do \
-	    if [ -e "$$file" ]; then echo "== $$file"; $(BIN)/python "$$file"; fi; \
+	    if grep -qs __main__ "$$file"; then echo "== $$file"; $(BIN)/python "$$file"; fi; \
 	done
 
 clean:  ## remove the environment and everything that was built

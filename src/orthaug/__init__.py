@@ -28,7 +28,7 @@ _HOME = {
     "Orthogonal": "structures",
     "LevenbergMarquardt": "solvers",
     "estimate": "estimation",
-    "orthogonalise": "estimation",
+    "orthogonalize": "estimation",
     "Estimate": "result",
     "Status": "result",
     "Model": "model",
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from orthaug.errors import RankError as RankError
     from orthaug.errors import TrainingError as TrainingError
     from orthaug.estimation import estimate as estimate
-    from orthaug.estimation import orthogonalise as orthogonalise
+    from orthaug.estimation import orthogonalize as orthogonalize
     from orthaug.excitation import identifiability as identifiability
     from orthaug.learners import MLP as MLP
     from orthaug.learners import EquinoxModule as EquinoxModule

@@ -42,8 +42,8 @@ def main() -> None:
         _fail(f"error: {error}", 2)
     except TrainingError as error:
         _fail(f"training failed: {error}", 1)
-    except KeyboardInterrupt:
-        _fail(f"interrupted{_progress_text()}; nothing was written", 130)
+    except KeyboardInterrupt as interrupt:
+        _fail(f"interrupted{''.join(f' during {text}' for text in interrupt.args)}; nothing was written", 130)
     except BrokenPipeError:
         sys.stderr.close()
         sys.exit(0)
@@ -179,16 +179,9 @@ def _fail(message: str, code: int) -> None:
     sys.exit(code)
 
 
-_last_progress: list[str] = []
-
-
-def _progress_text() -> str:
-    return f" {_last_progress[-1]}" if _last_progress else ""
-
-
 @contextmanager
 def _progress(runs: int, iterations: int, wanted: bool = True) -> Iterator[Progress | None]:
-    """A progress bar on standard error where that is a terminal; elsewhere only what Ctrl-C will say."""
+    """A progress bar on standard error where that is a terminal; Ctrl-C is told what it stopped."""
     if not wanted:
         yield None
         return
@@ -197,16 +190,19 @@ def _progress(runs: int, iterations: int, wanted: bool = True) -> Iterator[Progr
 
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    reached = "the start of training"
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("compiling", total=runs * iterations)
 
         def tell(run: int, iteration: int, loss: float) -> None:
-            text = f"run {run + 1} of {runs}, iteration {iteration}, loss {loss:.3g}"
-            _last_progress[:] = [f"during {text}"]
-            bar.update(task, completed=run * iterations + iteration, description=text)
+            nonlocal reached
+            reached = f"run {run + 1} of {runs}, iteration {iteration}, loss {loss:.3g}"
+            bar.update(task, completed=run * iterations + iteration, description=reached)
 
-        yield tell
-    _last_progress.clear()
+        try:
+            yield tell
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(reached) from None
 
 
 def _write_response(response: Response, out: Path | None) -> None:

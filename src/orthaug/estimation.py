@@ -86,7 +86,7 @@ def estimate(
     return _train(task, starts, seed, structure, solver, regularization, progress)
 
 
-def orthogonalise(
+def orthogonalize(
     record: Record, baseline: Baseline, function: Callable[[Any], Any], lags: Lags | None = None
 ) -> Estimate:
     """Split a model trained elsewhere into physics and an orthogonal rest (F2).

@@ -11,7 +11,7 @@ from orthaug.model import Response
 
 # Okabe-Ito: told apart by every reader
 _BLACK, _BLUE, _ORANGE, _GREEN = "#000000", "#0072B2", "#E69F00", "#009E73"
-_WINDOW = 400  # samples of a long record that are shown, so that single swings can be seen
+_WINDOW = 250  # samples of a long record that are shown, so that single swings can be seen
 _SIZE = (7.0, 2.4)  # inches per panel
 
 
@@ -84,4 +84,4 @@ def _window(response: Response) -> tuple[np.ndarray, slice]:
 
 
 def _legend(axis) -> None:  # noqa: ANN001  (a matplotlib Axes)
-    axis.legend(loc="upper right", fontsize=8, frameon=True, framealpha=0.9, ncols=2)
+    axis.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, fontsize=8, frameon=False, ncols=2)

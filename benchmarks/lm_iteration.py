@@ -1,0 +1,55 @@
+"""One Levenberg-Marquardt iteration (a pass over the rows, the step, the acceptance) against NumPy's bare `J.T @ J`.
+
+Both in the same process, in turn. Run: python benchmarks/lm_iteration.py
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from machine import alternate, describe
+
+from orthaug import MLP, Baseline, LevenbergMarquardt, Record, Term
+from orthaug._jax import jax
+from orthaug.problem import pose
+from orthaug.regressors import Lags
+from orthaug.training import Task
+
+CASES = (  # rows, lags, neurons, weights, iterations per timing, repeats, allowed ratio
+    (10_000, Lags(na=2, nb=1, nk=1), 16, 81, 20, 15, 1.5),
+    (100_000, Lags(na=3, nb=3, nk=1), 32, 257, 3, 7, 2.0),
+)
+
+
+def task(rows: int, lags: Lags, neurons: int) -> Task:
+    """A noisy nonlinear record on which training does not end early."""
+    rng = np.random.default_rng(0)
+    u, y = rng.normal(size=rows + 3), np.zeros(rows + 3)
+    for k in range(3, len(y)):
+        y[k] = 0.5 * y[k - 1] - 0.3 * y[k - 2] + u[k - 1] + 0.3 * np.tanh(2 * u[k - 1] * y[k - 1]) + 0.1 * rng.normal()
+    baseline = Baseline.from_terms([Term(n, e) for n, e in (("a1", "y[k-1]"), ("a2", "y[k-2]"), ("b1", "u[k-1]"))])
+    record = Record.from_arrays(u, y).rows(0, rows + max(lags.na, lags.nb))  # type: ignore[type-var]
+    return Task.of(pose(record, baseline, lags), MLP((neurons,)))
+
+
+def main() -> None:
+    print(describe())
+    print("| rows | weights | LM iteration | `J.T @ J` | ratio | allowed |\n|---|---|---|---|---|---|")
+    for rows, lags, neurons, weights, iterations, repeats, allowed in CASES:
+        posed = task(rows, lags, neurons)
+        assert posed.bound.size == weights and len(posed.problem.rows) == rows
+        start = posed.bound.init(jax.random.key(0))
+        jacobian = np.random.default_rng(1).normal(size=(rows, weights))
+
+        def train(n: int, posed: Task = posed, start: object = start) -> None:
+            run = posed.run(LevenbergMarquardt(n, tolerance=0.0), start, "none", None)
+            assert run.iterations == n, "training ended early"
+
+        # the start (two passes, an eigenvalue problem) is paid once a run: take the difference of two lengths
+        short, _ = alternate(lambda: train(iterations), lambda: None, repeats)
+        long, bare = alternate(lambda: train(3 * iterations), lambda j=jacobian: j.T @ j, repeats)
+        one = (long - short) / (2 * iterations)
+        print(f"| {rows} | {weights} | {1e3 * one:.2f} ms | {1e3 * bare:.2f} ms | {one / bare:.2f} | {allowed} |")
+
+
+if __name__ == "__main__":
+    main()

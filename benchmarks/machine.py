@@ -1,0 +1,38 @@
+"""What the numbers were measured on, and how a ratio is taken."""
+
+from __future__ import annotations
+
+import datetime
+import os
+import platform
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+
+
+def describe() -> str:
+    """Processor, cores, versions and date in one line."""
+    model = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        names = [
+            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")
+        ]
+        model = names[0] if names else model
+    versions = ", ".join(f"{name} {version(name)}" for name in ("jax", "numpy", "scipy"))
+    return f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}, {versions}, {datetime.date.today()}"
+
+
+def alternate(first: Callable[[], object], second: Callable[[], object], repeats: int) -> tuple[float, float]:
+    """Median seconds of two calls taken in turn, so that both see the same machine; one warm call before."""
+    times: tuple[list[float], list[float]] = ([], [])
+    first(), second()
+    for _ in range(repeats):
+        for call, spent in zip((first, second), times, strict=True):
+            began = time.perf_counter()
+            call()
+            spent.append(time.perf_counter() - began)
+    return float(np.median(times[0])), float(np.median(times[1]))

@@ -1,0 +1,69 @@
+"""Which unit of the learner's output to choose (DESIGN F5): test RMSE for units of 1 to 100 residual deviations.
+
+The unit is the prior under evidence regularisation, and the size of a Xavier start without. Medians over
+12 noise draws (the first is the paper's) or over initialisations. Run: python benchmarks/output_unit.py
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from machine import describe
+
+import orthaug as oa
+from orthaug import synthetic
+from orthaug._jax import jax
+from orthaug.problem import pose
+from orthaug.training import OUTPUT_UNIT, Task
+
+UNITS = (1, 3, 10, 30, 100)
+
+
+def test_rmse(example: synthetic.Example, unit: float, seed: int, regularization: str, iterations: int) -> float:
+    """RMSE of the one-step prediction on the test record."""
+    problem = pose(example.train, example.baseline)
+    usual = Task.of(problem, oa.MLP())
+    task = Task.of(problem, oa.MLP(), usual.scaling, usual.unit * unit / OUTPUT_UNIT)
+    solver = oa.LevenbergMarquardt(iterations)
+    run = task.run(solver, task.bound.init(jax.random.key(seed)), regularization, None)
+    c = problem.projection.solve((problem.target - task.values(run.w)) * problem.weight)
+    test = pose(example.test, example.baseline)
+    z = task.scaling(test.feature_rows())
+    values = np.asarray(jax.vmap(lambda row: task.bound.values(run.w, row))(z)) * task.unit
+    model = test.projection.phi @ c / test.weight + values
+    return float(np.sqrt(np.mean((test.target - model) ** 2)))
+
+
+def noisy(data_set: int, draw: int) -> synthetic.Example:
+    """The paper's own draw of 30 dB noise, or another one."""
+    if draw == 0:
+        return synthetic.static(data_set, noise=True)
+    example = synthetic.static(data_set)
+    experiment = example.train.experiments[0]
+    noise = np.random.default_rng(draw).normal(0.0, synthetic.NOISE_30_DB, experiment.outputs.shape)
+    return dataclasses.replace(example, train=oa.Record.from_arrays(experiment.inputs, experiment.outputs + noise))
+
+
+def main() -> None:
+    print(describe())
+    print(
+        "| unit | set 1, noise | set 3, noise | set 1, 10 starts, paper's draw | set 1, no noise | MSD, no reg. | MSD |"
+    )
+    print("|---|---|---|---|---|---|---|")
+    msd, clean = synthetic.mass_spring_damper(), synthetic.static(1)
+    for unit in UNITS:
+        columns = (
+            [test_rmse(noisy(1, draw), unit, 0, "evidence", 300) for draw in range(12)],
+            [test_rmse(noisy(3, draw), unit, 0, "evidence", 300) for draw in range(12)],
+            [test_rmse(noisy(1, 0), unit, seed, "evidence", 300) for seed in range(10)],
+            [test_rmse(clean, unit, seed, "none", 300) for seed in range(10)],
+            [test_rmse(msd, unit, seed, "none", 100) for seed in range(5)],
+            [test_rmse(msd, unit, seed, "evidence", 100) for seed in range(5)],
+        )
+        cells = " | ".join(f"{np.median(c):.2e} (≤ {max(c):.1e})" for c in columns)
+        print(f"| {unit} | {cells} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
