@@ -45,8 +45,8 @@ def main() -> None:
             assert run.iterations == n, "training ended early"
 
         # the start (two passes, an eigenvalue problem) is paid once a run: take the difference of two lengths
-        short, _ = alternate(lambda: train(iterations), lambda: None, repeats)
-        long, bare = alternate(lambda: train(3 * iterations), lambda j=jacobian: j.T @ j, repeats)
+        short, _ = alternate(lambda n=iterations: train(n), lambda: None, repeats)
+        long, bare = alternate(lambda n=3 * iterations: train(n), lambda j=jacobian: j.T @ j, repeats)
         one = (long - short) / (2 * iterations)
         print(f"| {rows} | {weights} | {1e3 * one:.2f} ms | {1e3 * bare:.2f} ms | {one / bare:.2f} | {allowed} |")
 

@@ -98,6 +98,11 @@ def test_function_of_the_wrong_shape(x):
         baseline.phi(x, LAYOUT, ("y",), jnp)
 
 
+def test_what_one_term_says_holds_for_all_of_its_parameter():
+    baseline = Baseline.from_terms([Term("a", "y[k-1]"), Term("a", "u[k]", initial=0.5, unit="1/s"), Term("b", "1")])
+    assert baseline.parameters == (Parameter("a", 0.5, "1/s"), Parameter("b"))
+
+
 REFUSED = [
     ([], {}, r"has no terms; give at least one, such as y\[k-1\]"),
     ([Term("a", "y[k+1]")], {}, "baseline term 'a': .*looks ahead"),
@@ -115,7 +120,8 @@ REFUSED = [
     ([Term("a", "1")], {"c": float("inf")}, "the constant 'c' must be a finite number; got inf"),
     ([Term("a", 1)], {}, "baseline term 'a'"),
     ([Term("a", "1")], {"c": "0.1"}, "the constant 'c' must be a finite number; got"),
-    ([Term("a", "1", initial=None)], {}, "the initial value of 'a' must be .*finite.*; got None"),
+    ([Term("a", "1", initial="x")], {}, "the initial value of 'a' must be .*finite.*; got 'x'"),
+    ([Term("a", "1", fixed=True)], {}, "'a' is fixed but gives no `initial`"),
 ]
 
 

@@ -39,7 +39,7 @@ _HOME = {
     "load": "storage",
     "synthetic": "",
 }
-__all__ = sorted(_HOME)
+__all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
 
 if TYPE_CHECKING:
     from orthaug import synthetic as synthetic

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from orthaug._arrays import check_unique
 from orthaug.errors import InputError
-from orthaug.expressions import RESERVED, Expression, Lag, parse
+from orthaug.expressions import RESERVED, Expression, Lag, is_name, parse
 from orthaug.regressors import Layout, in_order
 
 
@@ -29,14 +29,15 @@ class Parameter:
 class Term:
     """`parameter * regressor`, a summand of one output; the same parameter in several terms shares θ.
 
-    `fixed` keeps `initial` as a known coefficient: the term is subtracted from the output first and the
-    learner is not made orthogonal to it. `output` may be left out where there is only one.
+    `initial` and `unit` may be left out where another term of the parameter gives them, or none does (0
+    and no unit). `fixed` keeps `initial` as a known coefficient: the term is subtracted from the output
+    first and the learner is not made orthogonal to it. `output` may be left out where there is only one.
     """
 
     parameter: str
     regressor: str
-    initial: float = 0.0
-    unit: str = ""
+    initial: float | None = None
+    unit: str | None = None
     output: str | None = None
     fixed: bool = False
 
@@ -68,23 +69,13 @@ class Baseline:
             raise InputError("the baseline has no terms; give at least one, such as y[k-1].")
         constants = dict(constants or {})
         for name, value in constants.items():
-            if not name.isidentifier() or name in RESERVED:
+            if not is_name(name):
                 raise InputError(f"'{name}' cannot name a constant; {', '.join(sorted(RESERVED))} are taken.")
-            if not math.isfinite(value):
-                raise InputError(f"the constant '{name}' must be a finite number; got {value}.")
-        known: dict[str, Term] = {}
-        for term in terms:
-            if not math.isfinite(term.initial):
-                raise InputError(f"the initial value of '{term.parameter}' must be finite; got {term.initial}.")
-            first = known.setdefault(term.parameter, term)
-            for attribute in ("initial", "unit", "fixed"):
-                if getattr(first, attribute) != getattr(term, attribute):
-                    raise InputError(
-                        f"the terms of '{term.parameter}' disagree on `{attribute}`: "
-                        f"{getattr(first, attribute)!r} and {getattr(term, attribute)!r}."
-                    )
-        parameters = tuple(Parameter(t.parameter, t.initial, t.unit) for t in known.values() if not t.fixed)
-        baseline = cls(parameters, tuple(terms), tuple(sorted(constants.items())))
+            if not _is_number(value):
+                raise InputError(f"the constant '{name}' must be a finite number; got {value!r}.")
+        terms = _agreed(terms)
+        parameters = {t.parameter: Parameter(t.parameter, t.initial or 0.0, t.unit or "") for t in terms if not t.fixed}
+        baseline = cls(tuple(parameters.values()), tuple(terms), tuple(sorted(constants.items())))
         _ = baseline.expressions  # report what does not parse here, not at first use
         return baseline
 
@@ -147,7 +138,7 @@ class Baseline:
 
     def known(self, x: Any, layout: Layout, outputs: Sequence[str], xp: Any) -> Any:
         """The sum of the fixed terms, (…, ny)."""
-        fixed = {term.parameter: term.initial for term in self.terms if term.fixed}
+        fixed = {term.parameter: term.initial or 0.0 for term in self.terms if term.fixed}
         if not fixed:
             return xp.zeros((*x.shape[:-1], len(outputs)))
         return self._matrix(list(fixed), x, layout, outputs, xp) @ xp.asarray(list(fixed.values()))
@@ -179,3 +170,31 @@ class Baseline:
                 f"expected (ny, nθ) = {wanted[x.ndim - 1 :]}."
             )
         return xp.asarray(phi)
+
+
+def _agreed(terms: Sequence[Term]) -> list[Term]:
+    """The terms with what one of them says about a parameter said by all of them."""
+    said: dict[tuple[str, str], Any] = {}
+    for term in terms:
+        if term.initial is not None and not _is_number(term.initial):
+            raise InputError(f"the initial value of '{term.parameter}' must be a finite number; got {term.initial!r}.")
+        for attribute in ("initial", "unit", "fixed"):
+            value = getattr(term, attribute)
+            if value is not None and said.setdefault((term.parameter, attribute), value) != value:
+                first = said[term.parameter, attribute]
+                raise InputError(f"the terms of '{term.parameter}' disagree on `{attribute}`: {first!r} and {value!r}.")
+    for term in terms:
+        if term.fixed and (term.parameter, "initial") not in said:
+            raise InputError(f"the term of '{term.parameter}' is fixed but gives no `initial`: its known coefficient.")
+    return [
+        replace(
+            term,
+            initial=float(said.get((term.parameter, "initial"), 0.0)),
+            unit=said.get((term.parameter, "unit"), ""),
+        )
+        for term in terms
+    ]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float | np.number) and math.isfinite(value)

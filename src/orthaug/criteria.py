@@ -76,7 +76,7 @@ class Prediction:
         return Normal(
             hessian=g_jj - g_qj.T @ g_qj + held.T @ held,
             gradient=g_jr - g_qj.T @ g_qr + held.T @ miss,
-            loss=g_rr - g_qr @ g_qr + miss @ miss,
+            loss=jnp.maximum(g_rr - g_qr @ g_qr, 0.0) + miss @ miss,  # a difference may round below zero
             overlap=overlap,
         )
 

@@ -9,7 +9,10 @@ from __future__ import annotations
 
 import ast
 import difflib
+import keyword
 import math
+import unicodedata
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -67,12 +70,23 @@ class Expression:
     @cached_property
     def lags(self) -> tuple[Lag, ...]:
         """The raw lags that the expression reads, in order of first appearance."""
-        nodes = (node for node in ast.walk(self._tree) if isinstance(node, ast.Subscript))
+        nodes = [node for node in ast.walk(self._tree) if isinstance(node, ast.Subscript)]
+        nodes.sort(key=lambda node: node.col_offset)  # `walk` goes level by level
         return tuple(dict.fromkeys(_lag(node, self.text) for node in nodes))
 
     def evaluate(self, columns: Mapping[Lag, Any], xp: Any) -> Any:
         """Value for `columns[lag]` (scalars or arrays of one shape), computed by `xp` (numpy or jax.numpy)."""
         return _evaluate(self._tree, columns, dict(self.constants), xp, self.text)
+
+
+def is_name(name: str) -> bool:
+    """Whether expressions can use `name`: Python reads an identifier in its normal form only."""
+    return (
+        name.isidentifier()
+        and not keyword.iskeyword(name)
+        and name not in RESERVED
+        and unicodedata.normalize("NFKC", name) == name
+    )
 
 
 def parse(text: str, constants: Mapping[str, float] | None = None) -> Expression:
@@ -82,13 +96,17 @@ def parse(text: str, constants: Mapping[str, float] | None = None) -> Expression
         InputError: anything that is not arithmetic on lagged channels, with the offending piece named.
     """
     constants = dict(constants or {})
+    if not isinstance(text, str):
+        raise InputError(f"an expression must be text such as 'y[k-1]'; got {text!r}.")
     text = " ".join(text.split())
     if not text:
         raise InputError("An expression is empty; write for example y[k-1], or 1 for an offset.")
     if len(text) > _MAX_LENGTH:
         raise InputError(f"An expression has {len(text)} characters; at most {_MAX_LENGTH} are read.")
     try:
-        tree = ast.parse(text, mode="eval").body
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Python's own remarks about text that is refused below
+            tree = ast.parse(text, mode="eval").body
         used: set[str] = set()
         _check(tree, text, constants, used)
     except (SyntaxError, ValueError) as error:

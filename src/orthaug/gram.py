@@ -24,13 +24,17 @@ def chunk_shape(rows: int, limit: int = CHUNK_ROWS) -> tuple[int, int]:
     return count, -(-size // 8) * 8
 
 
-def in_chunks(values: Float[np.ndarray, "N ..."], shape: tuple[int, int]) -> Float[np.ndarray, "k ... m"]:
-    """Rows (N, …) as chunks (k, …, m) with zeros behind the last row."""
+def in_chunks(
+    values: Float[np.ndarray, "N ..."], shape: tuple[int, int], *, repeat: bool = False
+) -> Float[np.ndarray, "k ... m"]:
+    """Rows (N, …) as chunks (k, …, m) with zeros behind the last row, or `repeat`s of it."""
     count, size = shape
     padded = np.zeros((count, *values.shape[1:], size))
     for i in range(count):
         piece = values[i * size : (i + 1) * size]
         padded[i, ..., : len(piece)] = np.moveaxis(piece, 0, -1)
+        if repeat and len(piece) < size:
+            padded[i, ..., len(piece) :] = values[-1][..., None]
     return padded
 
 

@@ -71,6 +71,10 @@ class MLP:
     inputs: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.hidden, tuple | list):
+            raise InputError(f"`hidden` must be a tuple of neurons per layer, such as (16,); got {self.hidden!r}.")
+        if isinstance(self.inputs, str):
+            raise InputError(f"`inputs` must be a tuple of expressions, such as ('{self.inputs}',); got one text.")
         object.__setattr__(self, "hidden", tuple(self.hidden))
         if self.inputs is not None:
             object.__setattr__(self, "inputs", tuple(self.inputs))
@@ -129,7 +133,8 @@ class EquinoxModule:
     def _static(self) -> Any:
         import equinox as eqx
 
-        return eqx.partition(self.build(jax.random.key(0)), eqx.is_inexact_array)[1]
+        with jax.ensure_compile_time_eval():  # asked for while tracing, kept for later traces
+            return eqx.partition(self.build(jax.random.key(0)), eqx.is_inexact_array)[1]
 
     def init(self, key: Array, nz: int, ny: int) -> Tree:
         import equinox as eqx
@@ -163,7 +168,10 @@ class External:
 
     def _call(self, z: Any) -> np.ndarray:
         z = np.asarray(z)
-        values = np.asarray(self.function(z.reshape(-1, z.shape[-1])), dtype=float)
+        rows = z.reshape(-1, z.shape[-1])
+        values = np.asarray(self.function(rows), dtype=float)
+        if values.shape != (len(rows), self.ny) and (values.shape, self.ny) != ((len(rows),), 1):
+            raise InputError(f"the external model returned shape {values.shape}; expected ({len(rows)}, {self.ny}).")
         return values.reshape(*z.shape[:-1], self.ny)
 
 
@@ -240,5 +248,6 @@ class Bound:
 
         values, per_output = jax.vmap(one_row, in_axes=(None, -1, -1), out_axes=-1)(self.leaves(w), z, gain)
         batch = z.shape[-1]
-        columns = [jnp.concatenate([g.reshape(-1, batch) for g in grads]) for grads in per_output]
+        none = jnp.zeros((0, batch))  # a learner may have no weights
+        columns = [jnp.concatenate([none, *(g.reshape(-1, batch) for g in grads)]) for grads in per_output]
         return values, jnp.stack(columns, axis=1) if len(columns) > 1 else columns[0][:, None, :]

@@ -10,7 +10,7 @@ import numpy as np
 
 from orthaug._arrays import Matrix, as_signal, check_unique
 from orthaug.errors import InputError
-from orthaug.expressions import RESERVED
+from orthaug.expressions import RESERVED, is_name
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Channel:
     offset: float = 0.0
 
     def __post_init__(self) -> None:
-        if not self.name.isidentifier() or self.name in RESERVED:
+        if not is_name(self.name):
             raise InputError(
                 f"'{self.name}' cannot name a channel; use letters, digits and underscores, "
                 f"not starting with a digit, and none of {', '.join(sorted(RESERVED))}."
@@ -142,6 +142,8 @@ class Record:
     def join(cls, records: Iterable[Record]) -> Record:
         """One record of the experiments of several, kept apart."""
         records = tuple(records)
+        if not records:
+            raise InputError("a record needs at least one experiment; got none.")
         first = records[0]
         for other in records[1:]:
             if (other.inputs, other.outputs) != (first.inputs, first.outputs):

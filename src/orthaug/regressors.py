@@ -50,14 +50,14 @@ class Lags:
 
 
 def _per_channel(value: int | Sequence[int], names: Sequence[str], key: str, kind: str) -> list[int]:
-    values = [value] * len(names) if isinstance(value, int) else list(value)
+    values = list(value) if isinstance(value, Sequence | np.ndarray) else [value] * len(names)
     if len(values) != len(names):
         raise InputError(
             f"`{key}` has {len(values)} numbers but there are {len(names)} {kind}s; give one number, or one per {kind}."
         )
-    if any(isinstance(v, bool) or not isinstance(v, int) or v < 0 for v in values):
+    if any(isinstance(v, bool) or not isinstance(v, int | np.integer) or v < 0 for v in values):
         raise InputError(f"`{key}` must be whole numbers, 0 or more; got {value}.")
-    return values
+    return [int(v) for v in values]
 
 
 def in_order(lags: Iterable[Lag], outputs: Sequence[str], inputs: Sequence[str]) -> Layout:

@@ -86,8 +86,8 @@ class TermSection(Section):
 
     parameter: Annotated[str, Field(min_length=1)]
     regressor: str | float
-    initial: Finite = 0.0
-    unit: str = ""
+    initial: Finite | None = None
+    unit: str | None = None
     output: str | None = None
     fixed: bool = False
     min: float | None = None

@@ -50,8 +50,9 @@ class Task:
         unit = np.asarray(OUTPUT_UNIT * spread / problem.weight if unit is None else unit)
         shape = chunk_shape(len(z))
         gain = np.broadcast_to(unit * problem.weight / rms, e.shape)
-        pieces = (scaling(z), problem.projection.q, e / rms, gain)
-        return cls(problem, bound, scaling, unit, rms, Chunks(*(jnp.asarray(in_chunks(p, shape)) for p in pieces)))
+        padded = in_chunks(scaling(z), shape, repeat=True)  # zeros may be where the learner has no value
+        pieces = (padded, *(in_chunks(p, shape) for p in (problem.projection.q, e / rms, gain)))
+        return cls(problem, bound, scaling, unit, rms, Chunks(*map(jnp.asarray, pieces)))
 
     def run(self, solver: LevenbergMarquardt, w: Any, regularization: str | float, progress: Progress | None) -> Run:
         """One run from the weights `w`; `regularization` as in `estimate`."""

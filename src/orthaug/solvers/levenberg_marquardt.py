@@ -33,7 +33,6 @@ class State(NamedTuple):
     damping: Float[Array, ""]
     growth: Float[Array, ""]
     ridge: Float[Array, ""]
-    effective: Float[Array, ""]
     iteration: Int[Array, ""]
     accepted: Int[Array, ""]
     small: Int[Array, ""]
@@ -114,7 +113,7 @@ class LevenbergMarquardt:
             state.w,
             state.normal,
             float(state.ridge),
-            float(state.effective),
+            float(_effective_weights(state.normal.hessian, state.ridge)),
             int(state.iteration),
             int(state.code),
             time.perf_counter() - began,
@@ -138,7 +137,6 @@ def _start(linearise: Any, w: Any, arguments: tuple[Any, ...], overlap: Overlap,
         damping=_FIRST_DAMPING * jnp.maximum(curvature, 1e-300),
         growth=jnp.asarray(2.0),
         ridge=ridge,
-        effective=_effective_weights(normal.hessian, ridge),
         iteration=jnp.asarray(0),
         accepted=jnp.asarray(0),
         small=jnp.asarray(0),
@@ -173,12 +171,10 @@ def _trial(linearise: Any, state: State, arguments: tuple[Any, ...], options: Op
     damping = jnp.where(ok, state.damping * jnp.maximum(1 / 3, 1 - (2 * gain - 1) ** 3), state.damping * state.growth)
     stuck = damping > _LARGEST_DAMPING * jnp.max(jnp.diag(normal.hessian), initial=1e-300)
     code = jnp.where(small >= 2, CONVERGED, RUNNING)
-    code = jnp.where(stuck, jnp.where(accepted > 0, CONVERGED, NO_DESCENT), code)
+    code = jnp.where(stuck, jnp.where((accepted > 0) | _level(normal, downhill, before), CONVERGED, NO_DESCENT), code)
     moved = jax.tree.map(lambda new, old: jnp.where(ok, new, old), (w + step, trial), (w, normal))
-    ridge, effective = jax.lax.cond(
-        ok & options.evidence,
-        lambda: _evidence(moved[0], moved[1], alpha, options.samples),
-        lambda: (alpha, state.effective),
+    ridge = jax.lax.cond(
+        ok & options.evidence, lambda: _evidence(moved[0], moved[1], alpha, options.samples), lambda: alpha
     )
     return State(
         w=moved[0],
@@ -186,7 +182,6 @@ def _trial(linearise: Any, state: State, arguments: tuple[Any, ...], options: Op
         damping=damping,
         growth=jnp.where(ok, 2.0, 2 * state.growth),
         ridge=ridge,
-        effective=effective,
         iteration=state.iteration + 1,
         accepted=accepted,
         small=small,
@@ -194,14 +189,20 @@ def _trial(linearise: Any, state: State, arguments: tuple[Any, ...], options: Op
     )
 
 
-def _evidence(w: Any, normal: Normal, alpha: Any, samples: Any) -> tuple[Any, Any]:
+def _level(normal: Normal, downhill: Any, objective: Any) -> Any:
+    """Residual and Jacobian are orthogonal to rounding (MINPACK's gtol): no step can descend from a minimum."""
+    size = jnp.sqrt(jnp.maximum(jnp.diag(normal.hessian), 0.0) * objective)
+    return jnp.all(jnp.abs(downhill) <= 1e-7 * size)
+
+
+def _evidence(w: Any, normal: Normal, alpha: Any, samples: Any) -> Any:
     """MacKay's fixed point: `γ = tr(H(H + αI)⁻¹)`, `α = γ σ² / ‖w‖²` with `σ² = ‖r‖² / (N − γ)`."""
     effective = _effective_weights(normal.hessian, alpha)
     variance = normal.loss / jnp.maximum(samples - effective, 1.0)
-    found = effective * variance / jnp.maximum(w @ w, 1e-300)
-    return jnp.clip(found, 1e-12, 1e12), effective
+    return jnp.clip(effective * variance / jnp.maximum(w @ w, 1e-300), 1e-12, 1e12)
 
 
+@jax.jit
 def _effective_weights(hessian: Any, alpha: Any) -> Any:
     """tr(H (H + αI)⁻¹), with directions below rounding counted as absent."""
     n = hessian.shape[0]
