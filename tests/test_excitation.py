@@ -104,5 +104,5 @@ def test_not_identifiable():
 def test_identifiability_leaves_out_points_without_a_value():
     baseline = Baseline.from_terms([Term("a", "sqrt(y[k-1])"), Term("b", "1")])
     assert identifiability(baseline, LAYOUT, ("y",), np.stack([A, B], axis=1)).full_rank
-    fixed = Baseline.from_terms([Term("a", "1", fixed=True)])
+    fixed = Baseline.from_terms([Term("a", "1", initial=1.0, fixed=True)])
     assert identifiability(fixed, LAYOUT, ("y",), np.stack([A, B], axis=1)).full_rank

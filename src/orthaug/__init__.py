@@ -37,6 +37,7 @@ _HOME = {
     "scores": "metrics",
     "identifiability": "excitation",
     "load": "storage",
+    "save": "storage",
     "synthetic": "",
 }
 __all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
@@ -69,6 +70,7 @@ if TYPE_CHECKING:
     from orthaug.result import Status as Status
     from orthaug.solvers import LevenbergMarquardt as LevenbergMarquardt
     from orthaug.storage import load as load
+    from orthaug.storage import save as save
     from orthaug.structures import Additive as Additive
     from orthaug.structures import Orthogonal as Orthogonal
 

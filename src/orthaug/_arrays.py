@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from orthaug.errors import InputError
 
-Vector = Float[np.ndarray, "n"]
-Matrix = Float[np.ndarray, "rows columns"]
+Vector = Float[np.ndarray, "_"]
+Matrix = Float[np.ndarray, "_ _"]
 
 
 def as_signal(values: Any, name: str) -> Matrix:

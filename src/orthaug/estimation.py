@@ -226,18 +226,18 @@ def _conclude(
         covariance=theta_covariance(projection, weight, noise) if unique and noise is not None else None,
         freedom=float(freedom.min()),
         effective_weights=learned.effective,
-        defect=_defect(problem, whitened, aux),
+        defect=_defect(problem, whitened, theta_aux),
         problem=problem,
         warnings=tuple(_warnings(problem, structure, learned, noise)),
     )
 
 
-def _defect(problem: Problem, whitened: np.ndarray, aux: Vector) -> float | None:
+def _defect(problem: Problem, whitened: np.ndarray, theta_aux: Vector) -> float | None:
     """‖QᵀF̃‖ / ‖F‖ with F̃ = F − Φ θ_aux as the model computes it (eq:orth_property); None for F = 0."""
     size = np.linalg.norm(whitened)
     if not 0 < size < np.inf:
         return None
-    return float(np.linalg.norm(problem.projection.coordinates(whitened - problem.projection.phi @ aux)) / size)
+    return float(np.linalg.norm(problem.projection.coordinates(whitened - problem.projection.phi @ theta_aux)) / size)
 
 
 def _warnings(problem: Problem, structure: Structure, learned: _Learned, noise: Matrix | None) -> list[str]:

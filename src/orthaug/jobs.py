@@ -204,7 +204,7 @@ def fit_job(job: Job, progress: Progress | None = None) -> Fitted:
         "physical_parameters": None,
         "structure": fit.model.structure,
         "measure": job.spec.structure.measure.kind if fit.model.structure == "orthogonal" else None,
-        "orthogonality_defect": fit.defect if fit.model.structure == "orthogonal" else None,
+        "orthogonality_defect": fit.defect,
         "excitation": _excitation(fit.excitation),
         "scores": scores,
         "bias": None,

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -35,6 +35,7 @@ ACTIVATIONS: dict[str, Callable[[Any], Any]] = {
 _GAIN = {"tanh": 5 / 3, "relu": math.sqrt(2.0)}  # Xavier gains; 1 for the others
 
 
+@runtime_checkable
 class Learner(Protocol):
     """What `estimate(learner=…)` takes: hashable, with `inputs` and these two methods.
 

@@ -196,7 +196,7 @@ class Response:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A fitted model; `estimate` makes it, `save` and `load` keep it.
+    """A fitted model; `estimate` makes it, `orthaug.save` and `orthaug.load` keep it.
 
     `gram` (nθ + nw)² is the Gram matrix of `[Φ J]` over the training rows in whitened outputs,
     `noise` (ny, ny) the noise covariance: with them a later split has intervals too.
@@ -271,12 +271,6 @@ class Model:
             found = self._run(past, experiment, record)
             trajectories.append(self._bounded(found, measured, len(experiment)))
         return Response(tuple(trajectories), None, self.outputs, record.sampling_time)
-
-    def save(self, folder: Any) -> None:
-        """Write the model to a folder, as safetensors and JSON; `orthaug.load` reads it."""
-        from orthaug.storage import save
-
-        save(self, folder)
 
     @property
     def _memory(self) -> int:
@@ -376,7 +370,7 @@ def _bucket(steps: int) -> int:
     return max(256, 1 << (steps - 1).bit_length())
 
 
-def _in_batches(function: Callable[..., Parts], rows: tuple[Matrix, ...]) -> Parts:
+def _in_batches(function: Callable[..., Parts], rows: tuple[np.ndarray, ...]) -> Parts:
     """`function` over batches of rows, padded to one shape, its results concatenated."""
     count = len(rows[0])
     size = min(_BATCH, _bucket(count))

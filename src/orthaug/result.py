@@ -87,7 +87,7 @@ class Estimate:
     """Degrees of freedom of the residual, rows less parameters less effective weights."""
     effective_weights: float
     defect: float | None
-    """‖QᵀF̃‖ / ‖F‖ over the training rows; None without a learner."""
+    """‖QᵀF̃‖ / ‖F‖ over the training rows: how much of the learner the physics could express; None without one."""
     problem: Problem = field(repr=False)
     warnings: tuple[str, ...] = ()
 
@@ -151,7 +151,7 @@ def summary_lines(fit: Estimate) -> Sequence[str]:
     ]
     if status.message:
         lines.append(f"            {status.message}")
-    if fit.defect is not None and fit.model.structure == "orthogonal":
+    if fit.defect is not None:
         lines.append(f"orthogonal  ‖QᵀF̃‖/‖F‖ = {fit.defect:.1e}")
     condition = fit.excitation.condition
     lines.append(

@@ -7,11 +7,12 @@ share in the span of the physics, and which part of `c = θ − θ_aux` is calle
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from orthaug._arrays import Vector
 
 
+@runtime_checkable
 class Structure(Protocol):
     """What `estimate(structure=…)` takes."""
 

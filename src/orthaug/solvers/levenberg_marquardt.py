@@ -22,6 +22,7 @@ from orthaug.criteria import Normal, Overlap
 RUNNING, CONVERGED, NO_DESCENT, NON_FINITE = range(4)
 _FIRST_DAMPING = 1e-3  # of the largest curvature
 _LARGEST_DAMPING = 1e12  # of the largest curvature: no step is short enough to descend
+_SPANNED = 1e-22  # of ‖J‖²: what rounding leaves of a Jacobian in the span of the physics
 _SECONDS_PER_BURST = 0.5  # how often progress is told and Ctrl-C is heard
 
 
@@ -113,7 +114,7 @@ class LevenbergMarquardt:
             state.w,
             state.normal,
             float(state.ridge),
-            float(_effective_weights(state.normal.hessian, state.ridge)),
+            float(_effective_weights(state.normal, state.ridge)),
             int(state.iteration),
             int(state.code),
             time.perf_counter() - began,
@@ -130,7 +131,7 @@ def _start(linearise: Any, w: Any, arguments: tuple[Any, ...], overlap: Overlap,
     normal = jax.lax.fori_loop(0, 2, refine, zero._replace(overlap=overlap))
     curvature = jnp.max(jnp.diag(normal.hessian), initial=0.0)
     finite = jnp.isfinite(normal.loss) & jnp.all(jnp.isfinite(normal.hessian))
-    nothing = curvature <= 1e-20 * jnp.maximum(normal.loss, 1e-300)
+    nothing = curvature <= _SPANNED * _largest_column(normal)  # P⊥J = 0: the paper's Example 1
     return State(
         w=w,
         normal=normal,
@@ -197,18 +198,22 @@ def _level(normal: Normal, downhill: Any, objective: Any) -> Any:
 
 def _evidence(w: Any, normal: Normal, alpha: Any, samples: Any) -> Any:
     """MacKay's fixed point: `γ = tr(H(H + αI)⁻¹)`, `α = γ σ² / ‖w‖²` with `σ² = ‖r‖² / (N − γ)`."""
-    effective = _effective_weights(normal.hessian, alpha)
+    effective = _effective_weights(normal, alpha)
     variance = normal.loss / jnp.maximum(samples - effective, 1.0)
     return jnp.clip(effective * variance / jnp.maximum(w @ w, 1e-300), 1e-12, 1e12)
 
 
 @jax.jit
-def _effective_weights(hessian: Any, alpha: Any) -> Any:
-    """tr(H (H + αI)⁻¹), with directions below rounding counted as absent."""
-    n = hessian.shape[0]
+def _effective_weights(normal: Normal, alpha: Any) -> Any:
+    """tr(H (H + αI)⁻¹), with directions that are rounding beside the columns of J counted as absent."""
+    n = normal.hessian.shape[0]
     if n == 0:
         return jnp.asarray(0.0)
-    values = jnp.linalg.eigvalsh(jnp.where(jnp.isfinite(hessian), hessian, 0.0))
-    values = jnp.maximum(values, 0.0)
-    floor = n * jnp.finfo(float).eps * values[-1]
-    return jnp.sum(jnp.where(values > floor, values / (values + alpha + floor), 0.0))
+    values = jnp.linalg.eigvalsh(jnp.where(jnp.isfinite(normal.hessian), normal.hessian, 0.0))
+    floor = n * jnp.finfo(float).eps * _largest_column(normal)
+    return jnp.sum(jnp.where(values > floor, values / (values + alpha), 0.0))
+
+
+def _largest_column(normal: Normal) -> Any:
+    """The largest ‖J_i‖², before the projection."""
+    return jnp.max(jnp.diag(normal.hessian) + jnp.sum(normal.overlap.jacobian**2, axis=0), initial=0.0)

@@ -1,0 +1,77 @@
+"""Models by plain loops over time, to compare with: Python's own `eval` for terms, NumPy for the network."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from orthaug.learners import MLP
+from orthaug.model import Model
+from orthaug.record import Experiment, Record
+
+FUNCTIONS = {name: getattr(np, name) for name in ("sin", "cos", "exp", "abs", "sign", "tanh")}
+
+
+def row(model: Model, signals: dict[str, np.ndarray], k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(φθ + fixed terms, f − φθ_aux, f) at time k, each (ny,), from the signals before k (inputs up to k)."""
+    form, numbers = model.form, model.numbers
+    names = {**FUNCTIONS, **dict(form.baseline.constants), **signals, "k": k}
+    baseline, moved, raw = np.zeros((3, len(form.outputs)))
+    for term in form.baseline.terms:
+        i = form.outputs.index(term.output or form.outputs[0])
+        value = eval(term.regressor, {"__builtins__": {}}, names)
+        if term.fixed:
+            baseline[i] += term.initial * value
+        else:
+            j = form.baseline.names.index(term.parameter)
+            baseline[i] += numbers.theta[j] * value
+            moved[i] += numbers.theta_aux[j] * value
+    if form.bound is not None:
+        z = np.array([float(eval(str(e), {"__builtins__": {}}, names)) for e in form.features.entries])
+        raw = np.asarray(numbers.gain) * network(model, (z - numbers.centre) / numbers.halfwidth)
+    return baseline, raw - moved, raw
+
+
+def network(model: Model, z: np.ndarray) -> np.ndarray:
+    """The tanh network of a model at scaled features (nz,)."""
+    bound = model.form.bound
+    assert isinstance(bound.learner, MLP) and bound.learner.activation == "tanh"
+    leaves = [np.asarray(leaf) for leaf in bound.leaves(np.asarray(model.numbers.weights))]
+    for weight, bias in zip(leaves[:-2:2], leaves[1:-2:2], strict=True):
+        z = np.tanh(weight @ z + bias)
+    return leaves[-2] @ z + leaves[-1]
+
+
+def signals_of(experiment: Experiment, record: Record) -> dict[str, np.ndarray]:
+    """Channel name → samples; copies, so that a loop may write to them."""
+    found = {c.name: experiment.outputs[:, i].copy() for i, c in enumerate(record.outputs)}
+    return found | {c.name: experiment.inputs[:, i].copy() for i, c in enumerate(record.inputs)}
+
+
+def predicted(model: Model, record: Record, horizon: int = 1) -> np.ndarray:
+    """Each output (N, ny) from outputs measured up to `horizon` samples before it; NaN where there are none."""
+    (experiment,) = record.experiments
+    start, outputs = model.form.start, model.form.outputs
+    found = np.full((len(experiment), len(outputs)), np.nan)
+    for k in range(start + horizon - 1, len(experiment)):
+        signals = signals_of(experiment, record)
+        for i in range(k - horizon + 1, k + 1):
+            baseline, learner, _ = row(model, signals, i)
+            for name, value in zip(outputs, baseline + learner, strict=True):
+                signals[name][i] = value
+            found[i] = baseline + learner if i == k else found[i]
+    return found
+
+
+def simulated(model: Model, record: Record, initial: np.ndarray) -> np.ndarray:
+    """A free run (N, ny); `initial` (start, ny) are the outputs before the first usable row."""
+    (experiment,) = record.experiments
+    start, outputs = model.form.start, model.form.outputs
+    signals = {c.name: experiment.inputs[:, i] for i, c in enumerate(record.inputs)}
+    own = np.full((len(experiment), len(outputs)), np.nan)
+    own[:start] = initial
+    signals |= {name: own[:, i] for i, name in enumerate(outputs)}
+    for k in range(start, len(experiment)):
+        baseline, learner, _ = row(model, signals, k)
+        own[k] = baseline + learner
+    own[:start] = np.nan
+    return own

@@ -1,0 +1,240 @@
+"""Records from files: rows, ranges, sampling time, and cells that are no numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from orthaug.errors import InputError
+from orthaug.readers import read_record
+from orthaug.record import Channel
+
+CONTENT = "t,u,y\n" + "".join(f"{k / 10},{k},{10 * k}\n" for k in range(10))
+
+
+def put(folder: Path, content: str = CONTENT, name: str = "run.csv") -> Path:
+    path = folder / name
+    path.write_bytes(content.encode())
+    return path
+
+
+def read(path: Path, **options):
+    return read_record(path, **{"inputs": ["u"], "outputs": ["y"], **options})
+
+
+def test_one_experiment_of_all_rows(tmp_path):
+    path = put(tmp_path)
+    record = read(path, sampling_time=0.1)
+    assert repr(record) == "Record(1 experiment, 10 samples, Ts = 0.1 s, inputs: u; outputs: y)"
+    experiment = record.experiments[0]
+    np.testing.assert_array_equal(experiment.inputs, np.arange(10.0)[:, None])
+    np.testing.assert_array_equal(experiment.outputs, 10 * np.arange(10.0)[:, None])
+    assert (experiment.source, experiment.first_row) == (str(path), 0)
+
+
+def test_the_path_may_be_text_and_the_sampling_time_one(tmp_path):
+    assert read(str(put(tmp_path))).sampling_time == 1.0
+
+
+@pytest.mark.parametrize("rows", [[2, 5], (2, 5), [np.int64(2), np.int64(5)], [[2, 5]]])
+def test_rows_are_half_open(tmp_path, rows):
+    record = read(put(tmp_path), rows=rows)
+    assert record.experiments[0].inputs[:, 0].tolist() == [2, 3, 4]
+    assert record.experiments[0].first_row == 2
+
+
+def test_several_ranges_are_experiments_of_their_own(tmp_path):
+    record = read(put(tmp_path), rows=[[0, 3], [7, 10]])
+    assert [e.inputs[:, 0].tolist() for e in record.experiments] == [[0, 1, 2], [7, 8, 9]]
+    assert [e.first_row for e in record.experiments] == [0, 7]
+
+
+def test_every_keeps_one_row_in_n_and_multiplies_the_sampling_time(tmp_path):
+    record = read(put(tmp_path), every=4, rows=[1, 10], sampling_time=0.1)
+    assert record.experiments[0].outputs[:, 0].tolist() == [10, 50, 90]
+    assert record.sampling_time == pytest.approx(0.4)
+
+
+def test_another_column_for_a_channel_in_this_file(tmp_path):
+    path = put(tmp_path, "uEst,yVal\n1,2\n3,4\n")
+    record = read_record(path, inputs=[Channel("u", column="uEst")], outputs=["y"], columns={"y": "yVal"})
+    assert record.experiments[0].outputs[:, 0].tolist() == [2, 4]
+    override = read_record(path, outputs=[Channel("y", column="uEst")], columns={"y": "yVal"})
+    assert override.experiments[0].outputs[:, 0].tolist() == [2, 4]
+
+
+def test_two_channels_of_one_column(tmp_path):
+    record = read(put(tmp_path), outputs=["y"], inputs=[Channel("a", column="u"), Channel("b", column="u", scale=2)])
+    np.testing.assert_array_equal(record.experiments[0].inputs[:3], [[0, 0], [1, 2], [2, 4]])
+
+
+def test_scale_and_offset(tmp_path):
+    record = read(put(tmp_path), outputs=[Channel("y", "m", scale=0.001, offset=-1.0)])
+    np.testing.assert_allclose(record.experiments[0].outputs[:, 0], 0.01 * np.arange(10) - 1, rtol=0, atol=1e-15)
+    assert record.outputs[0].unit == "m"
+
+
+def test_without_inputs_and_without_outputs(tmp_path):
+    path = put(tmp_path)
+    autonomous = read(path, inputs=[], rows=[[0, 4], [4, 6]], every=2)
+    assert [e.inputs.shape for e in autonomous.experiments] == [(2, 0), (1, 0)]
+    assert read(path, outputs=[]).experiments[0].outputs.shape == (10, 0)
+
+
+def test_the_time_column_gives_the_sampling_time(tmp_path):
+    path = put(tmp_path)
+    assert read(path, time="t").sampling_time == pytest.approx(0.1)
+    assert read(path, time="t", every=3).sampling_time == pytest.approx(0.3)
+    assert read(path, time="t", rows=[[0, 4], [6, 10]]).sampling_time == pytest.approx(0.1)
+
+
+def test_a_jittering_time_column_is_fine(tmp_path):
+    instants = np.arange(50) * 0.1 + np.random.default_rng(0).uniform(-0.01, 0.01, 50)
+    path = put(tmp_path, "t,u,y\n" + "".join(f"{t},1,2\n" for t in instants))
+    assert read(path, time="t").sampling_time == pytest.approx(0.1, rel=0.01)
+
+
+def test_other_file_types(tmp_path):
+    pandas = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    u, y = np.arange(4.0), np.arange(8.0).reshape(4, 2)
+    np.savez(tmp_path / "run.npz", u=u[None], Y=y)
+    record = read(tmp_path / "run.npz", outputs=[Channel("y", column="Y[1]")], rows=[1, 3])
+    assert record.experiments[0].outputs[:, 0].tolist() == [3, 5]
+    pandas.DataFrame({"u": u, "y": y[:, 0]}).to_parquet(tmp_path / "run.parquet")
+    assert read(tmp_path / "run.parquet").experiments[0].outputs[:, 0].tolist() == [0, 2, 4, 6]
+    put(tmp_path, "u\ty\n1\t2\n", "run.tsv")
+    assert len(read(tmp_path / "run.tsv")) == 1
+
+
+CELLS = ["abc", "NaN", "nan", "inf", "-inf", "NA", "null", "None", "0x10", "1 000", "True", "1e400", "--", "#N/A"]
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_a_cell_that_is_no_finite_number(tmp_path, cell):
+    path = put(tmp_path, f"u,y\n1,2\n3,4\n5,{cell}\n7,8\n")
+    found = "inf" if cell == "1e400" else cell
+    with pytest.raises(InputError, match=rf"line 4 \(row 2\), column 'y': found '{found}'; expected a finite number"):
+        read(path)
+    assert len(read(path, rows=[0, 2])) == 2
+    assert len(read(path, outputs=[])) == 4
+
+
+def test_an_empty_cell(tmp_path):
+    for cells in (",6", '"",6', "  ,6"):
+        with pytest.raises(InputError, match=r"run.csv: line 3 \(row 1\), column 'u': the cell is empty"):
+            read(put(tmp_path, f"u,y\n1,2\n{cells}\n5,6\n"))
+
+
+def test_a_blank_line_among_the_rows_is_a_row_of_empty_cells(tmp_path):
+    with pytest.raises(InputError, match=r"line 3 \(row 1\), column 'u': the cell is empty"):
+        read(put(tmp_path, "u,y\n1,2\n\n5,6\n"))
+
+
+def test_lines_are_the_file_s_own_also_behind_blank_ones(tmp_path):
+    with pytest.raises(InputError, match=r"line 6 \(row 2\), column 'y': found 'x'"):
+        read(put(tmp_path, "\r\n\r\nu,y\r\n1,2\r\n3,4\r\n5,x\r\n"))
+
+
+def test_a_decimal_comma_cell_that_is_no_number(tmp_path):
+    with pytest.raises(InputError, match=r"line 3 \(row 1\), column 'y': found '1.234,5'"):
+        read(put(tmp_path, "u;y\n1,5;2\n3;1.234,5\n"))
+
+
+def test_cells_of_binary_files_name_the_row(tmp_path):
+    np.savez(tmp_path / "run.npz", u=[1.0, 2.0], y=[np.nan, 1.0])
+    with pytest.raises(InputError, match="run.npz: row 0, column 'y': found 'nan'"):
+        read(tmp_path / "run.npz")
+
+
+def test_a_bad_cell_of_the_time_column(tmp_path):
+    with pytest.raises(InputError, match=r"line 3 \(row 1\), column 't': found 'noon'"):
+        read(put(tmp_path, "t,u,y\n0,1,2\nnoon,1,2\n2,1,2\n"), time="t")
+
+
+@pytest.mark.parametrize("content", ["u,y\n1,2\n3,4\n5,\n", "u,y,z\n1,2,\n3,4,\n5,,1\n,,1\n"])
+def test_used_columns_of_unequal_length(tmp_path, content):
+    with pytest.raises(InputError, match="run.csv: .*unequal lengths: 'u' 3, 'y' 2 rows. Give all the same length"):
+        read(put(tmp_path, content))
+    np.savez(tmp_path / "run.npz", u=np.ones(3), y=np.ones(2))
+    with pytest.raises(InputError, match="unequal lengths: 'u' 3, 'y' 2 rows"):
+        read(tmp_path / "run.npz")
+
+
+@pytest.mark.parametrize("content", ["u,y\n", "u,y", "u,y\n\n\n", "u,y\n,\n", "\nu,y\n"])
+def test_a_file_without_data_rows(tmp_path, content):
+    with pytest.raises(InputError, match="run.csv: there are no data rows"):
+        read(put(tmp_path, content))
+
+
+ROWS = [
+    ([0, 11], r"rows \[0, 11\] reaches past the end; the file has 10 data rows"),
+    ([[0, 2], [9, 12]], r"rows \[9, 12\] reaches past the end"),
+    ([10, 12], "reaches past the end"),
+    ([5, 2], r"rows \[5, 2\] is no half-open range \[start, stop\] with 0 ≤ start < stop"),
+    ([3, 3], r"rows \[3, 3\] is no half-open range"),
+    ([-3, 5], r"rows \[-3, 5\] is no half-open range"),
+    ([1, 2, 3], r"rows \[1, 2, 3\] is no half-open range"),
+    ([4], r"rows \[4\] is no half-open range"),
+    ([], r"rows \[\] is no half-open range"),
+]
+
+
+@pytest.mark.parametrize(("rows", "message"), ROWS)
+def test_refused_rows(tmp_path, rows, message):
+    with pytest.raises(InputError, match=f"run.csv: .*{message}"):
+        read(put(tmp_path), rows=rows)
+
+
+TIMES = [
+    ("0 0.1 0.2 0.5 0.6 0.7", r"line 5 \(row 3\), column 't': a step of 0.3 s .* expected evenly sampled, rising time"),
+    ("0.3 0.2 0.1 0.0", r"line 3 \(row 1\), column 't': a step of -0.1 s"),
+    ("0 0 0", "a step of 0 s"),
+    ("0 0.1 0.2 0.1 0.4 0.5", r"line 5 \(row 3\), column 't': a step of -0.1 s"),
+    ("0", "one row is too few to tell the sampling time from column 't'"),
+]
+
+
+@pytest.mark.parametrize(("instants", "message"), TIMES)
+def test_refused_times(tmp_path, instants, message):
+    path = put(tmp_path, "t,u,y\n" + "".join(f"{t},1,2\n" for t in instants.split()))
+    with pytest.raises(InputError, match=f"run.csv: .*{message}"):
+        read(path, time="t")
+
+
+def test_ranges_of_different_sampling_time(tmp_path):
+    path = put(tmp_path, "t,u,y\n" + "".join(f"{t},1,2\n" for t in (0, 0.1, 0.2, 1.0, 1.2, 1.4)))
+    with pytest.raises(InputError, match="run.csv: the sampling time in column 't' differs between row ranges"):
+        read(path, time="t", rows=[[0, 3], [3, 6]])
+
+
+REFUSED = [
+    ({"sampling_time": 0.1, "time": "t"}, "give `sampling_time` or `time`, not both"),
+    ({"sampling_time": 0.0}, "sampling time must be a positive number of seconds; got 0.0"),
+    ({"sampling_time": -1.0}, "sampling time must be a positive number"),
+    ({"time": "time"}, "no column 'time'"),
+    ({"every": 0}, "`every` must be a whole number, 1 or more; got 0"),
+    ({"every": -2}, "`every` must be a whole number"),
+    ({"every": 1.5}, "`every` must be a whole number, 1 or more; got 1.5"),
+    ({"every": True}, "`every` must be a whole number"),
+    ({"inputs": [], "outputs": []}, "no channels are asked for; name inputs, outputs or both"),
+    ({"inputs": ["y"]}, "channel 'y' is given twice; names must differ"),
+    ({"inputs": ["force"]}, "no column 'force'; the file has 't', 'u', 'y'"),
+    ({"columns": {"y": "yy"}}, "no column 'yy', did you mean 'y'"),
+    ({"inputs": ["F (N)"]}, r"'F \(N\)' cannot name a channel"),
+]
+
+
+@pytest.mark.parametrize(("options", "message"), REFUSED, ids=range(len(REFUSED)))
+def test_refused(tmp_path, options, message):
+    with pytest.raises(InputError, match=message):
+        read(put(tmp_path), **options)
+
+
+def test_refused_files(tmp_path):
+    with pytest.raises(InputError, match="absent.csv: no such file"):
+        read(tmp_path / "absent.csv")
+    with pytest.raises(InputError, match="unknown file type '.txt'"):
+        read(put(tmp_path, name="run.txt"))

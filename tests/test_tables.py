@@ -1,0 +1,285 @@
+"""Files to columns: tables as they are found, and every file that is refused."""
+
+from __future__ import annotations
+
+import gc
+import re
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from orthaug.errors import InputError
+from orthaug.tables import check_readable, has_column, pick_variable, read_table
+
+
+def put(folder: Path, name: str, content: str | bytes) -> Path:
+    """A file with exactly this content."""
+    path = folder / name
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path
+
+
+def put_npz(folder: Path, **arrays) -> Path:
+    path = folder / "run.npz"
+    np.savez(path, **arrays)
+    return path
+
+
+def values(path: Path, *columns: str) -> list[list[float]]:
+    """The named columns, each up to its last filled cell."""
+    table = read_table(path, columns)
+    return [table.columns[name][: table.filled[name]].tolist() for name in columns]
+
+
+AS_FOUND = {
+    "plain": "u,y\n1,2\n3,4\n",
+    "no line break at the end": "u,y\n1,2\n3,4",
+    "byte-order mark": b"\xef\xbb\xbfu,y\n1,2\n3,4\n",
+    "CRLF": "u,y\r\n1,2\r\n3,4\r\n",
+    "byte-order mark and CRLF": b"\xef\xbb\xbfu,y\r\n1,2\r\n3,4\r\n",
+    "trailing separators": "u,y,\n1,2,\n3,4,\n",
+    "several trailing separators": "u,y,,,\n1,2,,,\n3,4,,,\n",
+    "trailing separators below the header only": "u,y\n1,2,\n3,4,\n",
+    "blank lines at the end": "u,y\n1,2\n3,4\n\n\n",
+    "lines of separators at the end": "u,y\n1,2\n3,4\n,\n,\n",
+    "blank lines before the header": "\n\nu,y\n1,2\n3,4\n",
+    "blank CRLF lines before the header": "\r\n  \r\nu,y\r\n1,2\r\n3,4\r\n",
+    "a longer unused column": "u,y,other\n1,2,9\n3,4,9\n,,9\n,,9\n",
+    "a shorter unused column": "u,y,other\n1,2,9\n3,4,\n",
+    "text in an unused column": "u,note,y\n1,warm,2\n3,,4\n",
+    "columns in another order": "y,u\n2,1\n4,3\n",
+    "spaces around names and cells": " u , y \n 1 , 2 \n3 ,4\n",
+    "quoted cells and names": '"u","y"\n"1","2"\n"3","4"\n',
+    "semicolons": "u;y\n1;2\n3;4\n",
+    "exponents and signs": "u,y\n+1e0,0.2E1\n3.0,40e-1\n",
+}
+
+
+@pytest.mark.parametrize("content", AS_FOUND.values(), ids=AS_FOUND.keys())
+def test_csv_as_it_is_found(tmp_path, content):
+    assert values(put(tmp_path, "run.csv", content), "u", "y") == [[1.0, 3.0], [2.0, 4.0]]
+
+
+HEADERS = [
+    ("Force (N),Pos [mm]\n1,2\n", ["Force (N)", "Pos [mm]"]),
+    ("Kraft in kN ,µ\n1,2\n", ["Kraft in kN", "µ"]),
+    ('"u, filtered","y ""raw"""\n1,2\n', ["u, filtered", 'y "raw"']),
+    ('"u, filtered";y\n1;2\n', ["u, filtered", "y"]),
+    ("1,2\n1,2\n", ["1", "2"]),
+]
+
+
+@pytest.mark.parametrize(("content", "names"), HEADERS)
+def test_headers_with_spaces_units_and_quotes(tmp_path, content, names):
+    assert values(put(tmp_path, "run.csv", content), *names) == [[1.0], [2.0]]
+
+
+@pytest.mark.parametrize(
+    "content", ["u;y\n1,5;-2,25\n3;4e1\n", "u;y\n1.5;-2.25\n3;4e1\n", '"u";"y"\n1,5;"-2,25"\n3;40\n']
+)
+def test_semicolons_go_with_decimal_commas_and_points(tmp_path, content):
+    assert values(put(tmp_path, "run.csv", content), "u", "y") == [[1.5, 3.0], [-2.25, 40.0]]
+
+
+def test_tsv(tmp_path):
+    assert values(put(tmp_path, "run.tsv", "u (N)\ty\t\n1.5\t2\t\n3\t4\t\n"), "u (N)", "y") == [[1.5, 3.0], [2.0, 4.0]]
+
+
+def test_the_ending_may_be_upper_case(tmp_path):
+    assert values(put(tmp_path, "RUN.CSV", "u\n1\n"), "u") == [[1.0]]
+
+
+def test_numbers_are_read_to_the_last_digit(tmp_path):
+    rng = np.random.default_rng(0)
+    numbers = (rng.normal(size=500) * 10.0 ** rng.integers(-12, 12, 500)).tolist()
+    path = put(tmp_path, "run.csv", "y\n" + "".join(f"{number!r}\n" for number in numbers))
+    assert values(path, "y") == [numbers]
+
+
+def test_a_table_says_where_a_row_stands_and_what_a_cell_holds(tmp_path):
+    table = read_table(put(tmp_path, "run.csv", "\nu,y\n1,2\n3, n/a \n,6\n"), ("u", "y"))
+    assert table.where(1) == "line 4 (row 1)"
+    assert table.cell("y", 1) == "n/a"
+    assert table.cell("u", 2) == ""
+    assert table.filled == {"u": 2, "y": 3}
+    assert read_table(put_npz(tmp_path, y=np.ones(2)), ("y",)).where(1) == "row 1"
+
+
+def test_parquet(tmp_path):
+    pandas = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    path = tmp_path / "run.parquet"
+    pandas.DataFrame({"u": [1, 3], "pos (mm)": [2.5, 4.5], "note": ["a", "b"]}).to_parquet(path)
+    assert values(path, "u", "pos (mm)") == [[1.0, 3.0], [2.5, 4.5]]
+
+
+def test_npz_vectors_and_columns_of_a_matrix(tmp_path):
+    u = np.arange(6.0).reshape(2, 3)
+    path = put_npz(tmp_path, a=np.arange(2), b=np.array([[1.5, 2.5]]), c=np.array([[3.0], [4.0]]), U=u)
+    assert values(path, "a", "b", "c", "U[2]", "U[0]") == [[0, 1], [1.5, 2.5], [3, 4], [2, 5], [0, 3]]
+
+
+def test_a_variable_may_have_brackets_in_its_name(tmp_path):
+    assert pick_variable(tmp_path, "U[2]", {"U[2]": np.ones(3)}).tolist() == [1, 1, 1]
+
+
+def test_unused_variables_of_an_npz_do_not_matter(tmp_path):
+    """Also one that would have to be unpickled: it is not."""
+    path = put_npz(tmp_path, y=np.ones(2), note=np.array({"made": "by hand"}, dtype=object), z=np.array([1j]))
+    assert values(path, "y") == [[1.0, 1.0]]
+
+
+def test_has_column(tmp_path):
+    path = put(tmp_path, "run.csv", "u,y\n1,2\n")
+    assert has_column(path, "y")
+    assert not has_column(path, "position")
+    assert not has_column(tmp_path / "absent.csv", "y")
+
+
+REFUSED_TEXT = [
+    ("run.csv", b"", r"the file is empty \(0 bytes\)"),
+    ("run.csv", "\n\n", "holds only blank lines"),
+    ("run.csv", "\r\n  \r\n", "holds only blank lines"),
+    ("run.csv", bytes(range(256)) * 4, "not a text table; expected UTF-8 text with a header row"),
+    ("run.csv", b"u,y\n\x00\x01\xff\xfe\n", "not a text table; expected UTF-8"),
+    ("run.csv", "u,y\n1,2\n".encode("utf-16"), "not a text table; expected UTF-8"),
+    ("run.csv", "u,y,Kräfte\n1,2,3\n".encode("latin-1"), "not a text table; expected UTF-8"),
+    ("run.csv", "u,y,note\n1,2,kühl\n".encode("latin-1"), "not a text table; expected UTF-8"),
+    ("run.csv", "u,y\n1,2\n3,4,5\n", "line 3.*3 cells.*2"),
+    ("run.csv", 'u,y\n1,2\n3,"4\n5,6\n', "not a readable table.*row 2"),
+    ("run.csv", "force,position\n1,2\n", "no column 'u'; the file has 'force', 'position'"),
+    ("run.csv", "U,y\n1,2\n", "no column 'u', did you mean 'U'.; the file has 'U', 'y'"),
+    ("run.csv", "u (N),y\n1,2\n", r"no column 'u', did you mean 'u \(N\)'\?"),
+    ("run.csv", ",,\n1,2,3\n", "no column 'u'; the file has no column names"),
+    ("run.csv", "u,y,y\n1,2,3\n", "column 'y' stands 2 times; names must differ"),
+    ("run.tsv", "u,y\n1,2\n", "no column 'u'.*the file has 'u,y'"),
+    ("run.xml", "<a/>", r"unknown file type '.xml'; known are .csv, .tsv, .parquet, .npz"),
+    ("run", "u,y\n1,2\n", "unknown file type ''; known are .csv"),
+    ("run.npz", b"not a zip", "not a readable .npz archive of plain arrays"),
+    ("run.npz", b"PK\x03\x04 cut", "not a readable .npz archive of plain arrays"),
+    ("run.parquet", b"PAR1 is how it starts", "not a readable Parquet file"),
+    ("run.parquet", b"\x00" * 100, "not a readable Parquet file"),
+]
+
+
+@pytest.mark.parametrize(("name", "content", "message"), REFUSED_TEXT, ids=range(len(REFUSED_TEXT)))
+def test_refused_files(tmp_path, name, content, message):
+    path = put(tmp_path, name, content)
+    with pytest.raises(InputError, match=message) as refusal:
+        read_table(path, ("u", "y"))
+    assert str(refusal.value).startswith(f"{path}: ")
+    assert "\n" not in str(refusal.value)
+    del refusal
+    gc.collect()  # a file that was left open is reported in this test, not in a later one
+
+
+@pytest.mark.parametrize("content", ["u,y\n", "u,y", "u,y\n\n\n", "u,y\r\n,\r\n", "\nu,y\n"])
+def test_a_header_without_data_rows_holds_nothing(tmp_path, content):
+    """`read_record` says so in words; here no column may have a row, or the refusal says it already."""
+    try:
+        table = read_table(put(tmp_path, "run.csv", content), ("u", "y"))
+    except InputError as refusal:
+        assert "no data rows" in str(refusal)
+    else:
+        assert table.filled == {"u": 0, "y": 0}
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    with pytest.raises(InputError, match="absent.csv: no such file"):
+        read_table(tmp_path / "absent.csv", ("y",))
+
+
+def test_a_folder_is_no_file(tmp_path):
+    (tmp_path / "run.csv").mkdir()
+    with pytest.raises(InputError, match="run.csv: not a file"):
+        check_readable(tmp_path / "run.csv")
+    with pytest.raises(InputError, match="run.csv: not a file"):
+        read_table(tmp_path / "run.csv", ("y",))
+
+
+REFUSED_NPZ = [
+    ("v", {"vel": np.ones(3)}, r"no variable 'v', did you mean 'vel'\?; the file holds vel 3"),
+    ("y", {"a": np.ones((2, 3)), "b": 1.0}, "no variable 'y'; the file holds a 2×3, b scalar"),
+    ("y", {}, "no variable 'y'; the file holds nothing"),
+    ("y", {"y": np.ones((2, 3))}, r"'y' is no vector; write a column of a matrix as \"y\[0\]\".*y 2×3"),
+    ("y", {"y": 1.0}, "'y' is no vector"),
+    ("y", {"y": np.ones((2, 2, 2))}, "'y' is no vector"),
+    ("y[3]", {"y": np.ones((2, 3))}, r"'y\[3\]' asks for column 3 \(counted from 0\) of y"),
+    ("y[0]", {"y": np.ones(3)}, r"'y\[0\]' asks for column 0"),
+    ("x[0]", {"y": np.ones(3)}, "no variable 'x'"),
+    ("y", {"y": np.array([1j, 2])}, "'y' is complex; expected real numbers"),
+    ("y", {"y": np.array(["a", "b"])}, "column 'y' holds <U1 values; expected numbers"),
+    ("y", {"y": np.array(["2020-01-01"], dtype="datetime64[s]")}, r"column 'y' holds datetime64\[s\] values"),
+]
+
+
+@pytest.mark.parametrize(("name", "arrays", "message"), REFUSED_NPZ, ids=range(len(REFUSED_NPZ)))
+def test_refused_variables(tmp_path, name, arrays, message):
+    with pytest.raises(InputError, match=message) as refusal:
+        read_table(put_npz(tmp_path, **arrays), (name,))
+    assert str(tmp_path) in str(refusal.value)
+
+
+class Trap:
+    """Leaves a file behind when it is unpickled."""
+
+    def __init__(self, sign: Path):
+        self.sign = sign
+
+    def __reduce__(self):
+        return (Path.touch, (self.sign,))
+
+
+def test_pickled_arrays_are_refused_and_never_unpickled(tmp_path):
+    sign = tmp_path / "unpickled"
+    path = put_npz(tmp_path, y=np.array([Trap(sign), Trap(sign)], dtype=object))
+    with pytest.raises(InputError, match="not a readable .npz archive of plain arrays"):
+        read_table(path, ("y",))
+    assert not sign.exists()
+
+
+def test_a_plain_array_file_is_no_archive(tmp_path):
+    np.save(tmp_path / "run.npy", np.ones(3))
+    with pytest.raises(InputError, match="not a readable .npz archive"):
+        read_table((tmp_path / "run.npy").rename(tmp_path / "run.npz"), ("y",))
+
+
+def test_a_zip_of_something_else_is_no_archive_of_arrays(tmp_path):
+    with zipfile.ZipFile(tmp_path / "run.npz", "w") as archive:
+        archive.writestr("y", "hello")
+    with pytest.raises(InputError, match=f"{re.escape(str(tmp_path))}/run.npz: "):
+        read_table(tmp_path / "run.npz", ("y",))
+
+
+@pytest.mark.parametrize(
+    ("column", "message"),
+    [
+        (["a", "b"], "column 'y' holds .* values; expected numbers"),
+        ([[1.0], [2.0, 3.0]], "column 'y' holds object values; expected numbers"),
+        (
+            np.array(["2020-01-01", "2020-01-02"], dtype="datetime64[ns]"),
+            "column 'y' holds datetime64.*; expected numbers",
+        ),
+    ],
+)
+def test_refused_parquet_columns(tmp_path, column, message):
+    pandas = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    path = tmp_path / "run.parquet"
+    pandas.DataFrame({"y": column}).to_parquet(path)
+    with pytest.raises(InputError, match=message):
+        read_table(path, ("y",))
+    with pytest.raises(InputError, match="no column 'x'; the file has 'y'"):
+        read_table(path, ("x",))
+
+
+def test_a_cut_parquet_file(tmp_path):
+    pandas = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    path = tmp_path / "run.parquet"
+    pandas.DataFrame({"y": np.arange(100.0)}).to_parquet(path)
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(InputError, match="run.parquet: not a readable Parquet file"):
+        read_table(path, ("y",))
