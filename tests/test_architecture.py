@@ -17,8 +17,8 @@ SOURCE = Path(__file__).resolve().parents[1] / "src" / "orthaug"
 LAYERS = (
     "errors",
     "_jax",
-    "expressions",
     "_arrays",
+    "expressions",
     "record",
     "regressors",
     "baseline",
@@ -38,6 +38,7 @@ LAYERS = (
     "result",
     "estimation",
     "synthetic",
+    "variables",
     "tables",
     "readers",
     "folders",
@@ -51,8 +52,8 @@ LAYERS = (
     "",  # orthaug/__init__.py
 )
 ORDER = {name: i for i, name in enumerate(LAYERS)}
-FILES_AND_FACES = LAYERS[ORDER["tables"] :]  # from here on modules know files or the user
-NUMERICAL = LAYERS[: ORDER["tables"]]
+FILES_AND_FACES = LAYERS[ORDER["variables"] :]  # from here on modules know files or the user
+NUMERICAL = LAYERS[: ORDER["variables"]]
 NOT_NUMERICAL = ("matplotlib", "typer", "rich", "pydantic", "pandas.io")
 ONLY_IN = {"matplotlib": "plots", "typer": "cli"}
 UNSAFE_MODULES = ("pickle", "cPickle", "_pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve")

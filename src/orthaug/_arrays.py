@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterable
 from typing import Any
 
@@ -56,3 +57,10 @@ def check_choice(value: str, choices: Iterable[str], what: str) -> str:
     if value not in choices:
         raise InputError(f"{what} must be one of {', '.join(choices)}; got '{value}'.")
     return value
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """`, did you mean 'x'?` for the closest known name, or nothing."""
+    known = list(known)
+    close = [k for k in known if k.lower().startswith(name.lower())] or difflib.get_close_matches(name, known, n=1)
+    return f", did you mean '{close[0]}'?" if close else ""

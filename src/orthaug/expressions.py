@@ -8,7 +8,6 @@ whole records and with JAX inside a compiled free run.
 from __future__ import annotations
 
 import ast
-import difflib
 import keyword
 import math
 import unicodedata
@@ -18,6 +17,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
+from orthaug._arrays import nearest
 from orthaug.errors import InputError
 
 
@@ -156,7 +156,7 @@ def _check_call(node: ast.Call, text: str) -> None:
         raise InputError(f"'{text}': '{ast.unparse(node)}' is not allowed; functions are {', '.join(FUNCTIONS)}.")
     if name not in FUNCTIONS:
         raise InputError(
-            f"'{text}': unknown function '{name}'{_nearest(name, FUNCTIONS)}; known are {', '.join(FUNCTIONS)}."
+            f"'{text}': unknown function '{name}'{nearest(name, FUNCTIONS)}; known are {', '.join(FUNCTIONS)}."
         )
     wanted = "two or more arguments" if name in ("min", "max") else "one argument"
     if (len(node.args) < 2) if name in ("min", "max") else (len(node.args) != 1):
@@ -219,10 +219,5 @@ def _unknown_name(name: str, text: str, constants: Mapping[str, float]) -> str:
         return f"'{text}': k is the time index and cannot stand alone; write a channel at a lag, y[k-1]."
     if name in FUNCTIONS:
         return f"'{text}': {name} is a function; write {name}(…)."
-    hint = _nearest(name, constants) or f"; a channel needs its lag, {name}[k-1]"
+    hint = nearest(name, constants) or f"; a channel needs its lag, {name}[k-1]"
     return f"'{text}': unknown constant '{name}'{hint}."
-
-
-def _nearest(name: str, known: Any) -> str:
-    close = difflib.get_close_matches(name, list(known), n=1)
-    return f", did you mean '{close[0]}'?" if close else ""

@@ -5,13 +5,13 @@ Every error is one line that names the file, the key, what was found and what wa
 
 from __future__ import annotations
 
-import difflib
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from orthaug._arrays import nearest
 from orthaug.baseline import Baseline, Term
 from orthaug.errors import InputError
 from orthaug.record import Channel
@@ -231,9 +231,7 @@ def _first_message(error: ValidationError, content: dict[str, Any]) -> str:
     if kind == "extra_forbidden":
         *parents, name = [part for part in first["loc"] if isinstance(part, str | int)]
         known = _known_keys(parents)
-        close = difflib.get_close_matches(str(name), known, n=1)
-        hint = f"did you mean '{close[0]}'?" if close else f"known are {', '.join(known)}"
-        return f"unknown key '{key}', {hint}"
+        return f"unknown key '{key}'{nearest(str(name), known) or ', known are ' + ', '.join(known)}"
     if kind == "missing":
         return f"the key '{key}' is missing"
     if kind == "value_error":

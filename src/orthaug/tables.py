@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import csv
-import difflib
 import zipfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from orthaug._arrays import Vector
+from orthaug._arrays import Vector, nearest
 from orthaug.errors import InputError
+from orthaug.variables import ENDINGS, read_variables
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,39 +158,30 @@ def _read_parquet(path: Path, columns: Sequence[str]) -> Table:
     return _full(path, {name: _as_floats(frame[name].to_numpy(), name, path) for name in columns})
 
 
-def _read_npz(path: Path, columns: Sequence[str]) -> Table:
+def _read_excel(path: Path, columns: Sequence[str]) -> Table:
+    """The first sheet; the first row that holds anything is the header."""
+    import pandas as pd
+
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            held = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, TypeError, AttributeError, zipfile.BadZipFile, EOFError):
-        raise InputError(f"{path}: not a readable .npz archive of plain arrays.") from None
-    return _full(path, {name: pick_variable(path, name, held) for name in columns})
+        sheet = pd.read_excel(path, header=None, dtype=object)
+    except ImportError:
+        raise InputError(f"{path}: reading Excel needs openpyxl; install orthaug[excel].") from None
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: not a readable Excel file ({_short(error)}).") from None
+    rows = sheet.notna().any(axis=1).to_numpy()
+    if not rows.any():
+        raise InputError(f"{path}: the first sheet is empty.")
+    top = int(np.argmax(rows))
+    header = ["" if pd.isna(name) else str(name).strip() for name in sheet.iloc[top]]
+    _check_present(path, columns, header)
+    cells = {name: sheet.iloc[top + 1 :, header.index(name)].reset_index(drop=True) for name in columns}
+    values = {name: np.asarray(pd.to_numeric(column, errors="coerce"), dtype=float) for name, column in cells.items()}
+    filled = {name: _up_to_last(column.notna().to_numpy()) for name, column in cells.items()}
+    return Table(path, values, filled, top + 2, lambda column, row: str(cells[column].fillna("").iloc[row]))
 
 
-def pick_variable(path: Path, name: str, held: Mapping[str, Any]) -> Vector:
-    """A channel in a file of variables: a vector (1×N or N×1), or a matrix column written `"U[2]"`."""
-    variable, column = name, None
-    if name not in held and name.endswith("]") and "[" in name:
-        variable, _, index = name[:-1].rpartition("[")
-        column = int(index) if index.strip().isdigit() else None
-    shapes = {key: np.shape(value) for key, value in held.items()}
-    listing = ", ".join(f"{key} {'×'.join(map(str, shape)) or 'scalar'}" for key, shape in shapes.items()) or "nothing"
-    if variable not in held:
-        raise InputError(f"{path}: no variable '{variable}'{_nearest(variable, held)}; the file holds {listing}.")
-    array = np.asarray(held[variable])
-    if column is not None:
-        if array.ndim != 2 or column >= array.shape[1]:
-            raise InputError(
-                f"{path}: '{name}' asks for column {column} (counted from 0) of {variable}; the file holds {listing}."
-            )
-        array = array[:, column]
-    if array.ndim == 2 and 1 in array.shape:
-        array = array.ravel()
-    if array.ndim != 1:
-        raise InputError(
-            f"{path}: '{name}' is no vector; write a column of a matrix as \"{variable}[0]\". The file holds {listing}."
-        )
-    return _as_floats(array, name, path)
+def _read_variables(path: Path, columns: Sequence[str]) -> Table:
+    return _full(path, read_variables(path, columns))
 
 
 def _full(path: Path, columns: Mapping[str, Vector]) -> Table:
@@ -199,8 +190,6 @@ def _full(path: Path, columns: Mapping[str, Vector]) -> Table:
 
 
 def _as_floats(array: np.ndarray, name: str, path: Path) -> Vector:
-    if np.iscomplexobj(array):
-        raise InputError(f"{path}: '{name}' is complex; expected real numbers.")
     try:
         return np.asarray(array, dtype=float)
     except (TypeError, ValueError):
@@ -211,7 +200,8 @@ _READERS: dict[str, Callable[[Path, Sequence[str]], Table]] = {
     ".csv": _read_text,
     ".tsv": _read_text,
     ".parquet": _read_parquet,
-    ".npz": _read_npz,
+    ".xlsx": _read_excel,
+    **dict.fromkeys(ENDINGS, _read_variables),
 }
 
 
@@ -219,15 +209,9 @@ def _check_present(path: Path, columns: Sequence[str], header: Sequence[str]) ->
     for name in columns:
         if name not in header:
             known = ", ".join(f"'{h}'" for h in header if h) or "no column names"
-            raise InputError(f"{path}: no column '{name}'{_nearest(name, header)}; the file has {known}.")
+            raise InputError(f"{path}: no column '{name}'{nearest(name, header)}; the file has {known}.")
         if list(header).count(name) > 1:
             raise InputError(f"{path}: the column '{name}' stands {list(header).count(name)} times; names must differ.")
-
-
-def _nearest(name: str, known: Iterable[str]) -> str:
-    known = list(known)
-    close = [k for k in known if k.lower().startswith(name.lower())] or difflib.get_close_matches(name, known, n=1)
-    return f", did you mean '{close[0]}'?" if close else ""
 
 
 def _short(error: Exception) -> str:
