@@ -41,7 +41,7 @@ def main() -> None:
         jacobian = np.random.default_rng(1).normal(size=(rows, weights))
 
         def train(n: int, posed: Task = posed, start: object = start) -> None:
-            run = posed.run(LevenbergMarquardt(n, tolerance=0.0), start, "none", None)
+            run = posed.run(LevenbergMarquardt(n, tolerance=0.0), start)
             assert run.iterations == n, "training ended early"
 
         # the start (two passes, an eigenvalue problem) is paid once a run: take the difference of two lengths

@@ -26,7 +26,7 @@ def test_rmse(example: synthetic.Example, unit: float, seed: int, regularization
     usual = Task.of(problem, oa.MLP())
     task = Task.of(problem, oa.MLP(), usual.scaling, usual.unit * unit / OUTPUT_UNIT)
     solver = oa.LevenbergMarquardt(iterations)
-    run = task.run(solver, task.bound.init(jax.random.key(seed)), regularization, None)
+    run = task.run(solver, task.bound.init(jax.random.key(seed)), regularization=regularization)
     c = problem.projection.solve((problem.target - task.values(run.w)) * problem.weight)
     test = pose(example.test, example.baseline)
     z = task.scaling(test.feature_rows())

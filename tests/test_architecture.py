@@ -31,6 +31,7 @@ LAYERS = (
     "criteria",
     "structures",
     "solvers.levenberg_marquardt",
+    "solvers.adam_lbfgs",
     "solvers",
     "training",
     "covariance",

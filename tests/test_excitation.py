@@ -9,7 +9,9 @@ from orthaug.baseline import Baseline, Term
 from orthaug.errors import InputError, RankError
 from orthaug.excitation import excitation, identifiability, require_rank
 from orthaug.expressions import Lag
+from orthaug.problem import pose
 from orthaug.projection import Projection
+from orthaug.record import Record
 
 A, B, C, D = np.random.default_rng(5).normal(size=(4, 30))
 
@@ -106,3 +108,58 @@ def test_identifiability_leaves_out_points_without_a_value():
     assert identifiability(baseline, LAYOUT, ("y",), np.stack([A, B], axis=1)).full_rank
     fixed = Baseline.from_terms([Term("a", "1", initial=1.0, fixed=True)])
     assert identifiability(fixed, LAYOUT, ("y",), np.stack([A, B], axis=1)).full_rank
+
+
+def both(record, *texts):
+    """(identifiability, excitation) of terms a, b, c, … on a record."""
+    baseline = Baseline.from_terms([Term("abc"[i], text) for i, text in enumerate(texts)])
+    problem = pose(record, baseline, require_full_rank=False)
+    return identifiability(baseline, problem.layout, problem.outputs, problem.rows.x), problem.excitation
+
+
+DECAY = 0.5 ** np.arange(20.0)  # a free decay: y[k-2] is twice y[k-1]
+RECORDS = {
+    "random": Record.from_arrays(A[:20], B[:20]),
+    "decay": Record.from_arrays(A[:20], DECAY),
+    "two levels": Record.from_arrays(np.sign(A), B),
+    "slow": Record.from_arrays(np.repeat([0.0, 1.0], 15), np.arange(30.0)),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "texts", "identifiable", "excited"),
+    [
+        ("random", ["y[k-1]", "y[k-2]"], (), ()),
+        ("random", ["u[k]", "2*u[k]"], (("a", "b"),), (("a", "b"),)),
+        ("random", ["u[k]", "y[k-1]", "2*u[k] - y[k-1]"], (("a", "b", "c"),), (("a", "b", "c"),)),
+        ("random", ["sin(u[k])**2", "cos(u[k])**2", "1"], (("a", "b", "c"),), (("a", "b", "c"),)),
+        ("random", ["u[k] - u[k]", "u[k]"], (("a",),), (("a",),)),
+        ("decay", ["y[k-1]", "y[k-2]"], (), (("a", "b"),)),
+        ("decay", ["y[k-1]", "y[k-2]", "u[k]"], (), (("a", "b"),)),
+        ("two levels", ["u[k]", "u[k]**3"], (), (("a", "b"),)),
+        ("two levels", ["u[k]", "sign(u[k])", "y[k-1]"], (), (("a", "b"),)),
+        ("slow", ["y[k-1]", "y[k-2]", "1"], (), (("a", "b", "c"),)),
+    ],
+)
+def test_identifiability_against_excitation(name, texts, identifiable, excited):
+    """What no data could tell apart, and what only these data cannot."""
+    anywhere, here = both(RECORDS[name], *texts)
+    assert (anywhere.collinear, here.collinear) == (identifiable, excited)
+    assert anywhere.full_rank == (not identifiable) and here.full_rank == (not excited)
+    assert (anywhere.condition is None) == bool(identifiable)
+
+
+def test_identifiability_of_shared_parameters():
+    """One parameter in two outputs is found from either; two parameters that only meet as a sum are not."""
+    record = Record.from_arrays(A, np.stack([B, C], axis=1))
+    shared = Baseline.from_terms([Term("a", "u[k]", output="y1"), Term("a", "2*u[k]", output="y2")])
+    summed = Baseline.from_terms([Term(n, "u[k]", output=o) for n in "ab" for o in ("y1", "y2")])
+    for baseline, groups in ((shared, ()), (summed, (("a", "b"),))):
+        problem = pose(record, baseline, require_full_rank=False)
+        found = identifiability(baseline, problem.layout, problem.outputs, problem.rows.x)
+        assert found.collinear == problem.excitation.collinear == groups
+
+
+def test_identifiability_is_the_same_every_time():
+    anywhere = [both(RECORDS["random"], "u[k]", "u[k]**3", "y[k-1]")[0] for _ in range(2)]
+    assert anywhere[0].condition == anywhere[1].condition

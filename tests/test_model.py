@@ -211,6 +211,12 @@ def growing(factors, names):
     return estimate(Record.from_arrays(y=y, outputs=names), baseline, learner=None).model
 
 
+def test_skip_refused(first_order):
+    response = first_order.predict(one_signal(np.random.default_rng(7), 30))
+    with pytest.raises(InputError, match="`skip`"):
+        response.scores(skip=(1, 2))
+
+
 @pytest.mark.parametrize(("factors", "diverging"), [((2.0, 0.5), "p"), ((0.5, 2.0), "q"), ((1.5, 2.0), "q")])
 def test_divergence_is_named(factors, diverging):
     """Beyond 10⁶ times the largest training output, 2⁹, there is no value: step 29."""

@@ -26,7 +26,10 @@ _HOME = {
     "External": "learners",
     "Additive": "structures",
     "Orthogonal": "structures",
+    "OrthogonalPenalty": "structures",
+    "BaselinePenalty": "structures",
     "LevenbergMarquardt": "solvers",
+    "AdamLBFGS": "solvers",
     "estimate": "estimation",
     "orthogonalize": "estimation",
     "Estimate": "result",
@@ -68,11 +71,14 @@ if TYPE_CHECKING:
     from orthaug.regressors import Lags as Lags
     from orthaug.result import Estimate as Estimate
     from orthaug.result import Status as Status
+    from orthaug.solvers import AdamLBFGS as AdamLBFGS
     from orthaug.solvers import LevenbergMarquardt as LevenbergMarquardt
     from orthaug.storage import load as load
     from orthaug.storage import save as save
     from orthaug.structures import Additive as Additive
+    from orthaug.structures import BaselinePenalty as BaselinePenalty
     from orthaug.structures import Orthogonal as Orthogonal
+    from orthaug.structures import OrthogonalPenalty as OrthogonalPenalty
 
 
 def __getattr__(name: str) -> Any:

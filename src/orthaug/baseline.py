@@ -18,20 +18,23 @@ from orthaug.regressors import Layout, in_order
 
 @dataclass(frozen=True)
 class Parameter:
-    """One entry of θ: name, initial value θ⁰ and unit."""
+    """One entry of θ: name, initial value θ⁰, unit and bounds."""
 
     name: str
     initial: float = 0.0
     unit: str = ""
+    min: float = -math.inf
+    max: float = math.inf
 
 
 @dataclass(frozen=True)
 class Term:
     """`parameter * regressor`, a summand of one output; the same parameter in several terms shares θ.
 
-    `initial` and `unit` may be left out where another term of the parameter gives them, or none does (0
-    and no unit). `fixed` keeps `initial` as a known coefficient: the term is subtracted from the output
-    first and the learner is not made orthogonal to it. `output` may be left out where there is only one.
+    `initial`, `unit` and the bounds `min` and `max` on the parameter may be left out where another of its
+    terms gives them, or none does (0, no unit, no bounds). `fixed` keeps `initial` as a known coefficient:
+    the term is subtracted from the output first and the learner is not made orthogonal to it. `output` may
+    be left out where there is only one.
     """
 
     parameter: str
@@ -40,6 +43,8 @@ class Term:
     unit: str | None = None
     output: str | None = None
     fixed: bool = False
+    min: float | None = None
+    max: float | None = None
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,7 @@ class Baseline:
             if not _is_number(value):
                 raise InputError(f"the constant '{name}' must be a finite number; got {value!r}.")
         terms = _agreed(terms)
-        parameters = {t.parameter: Parameter(t.parameter, t.initial or 0.0, t.unit or "") for t in terms if not t.fixed}
+        parameters = {t.parameter: _parameter(t) for t in terms if not t.fixed}
         baseline = cls(tuple(parameters.values()), tuple(terms), tuple(sorted(constants.items())))
         _ = baseline.expressions  # report what does not parse here, not at first use
         return baseline
@@ -95,6 +100,11 @@ class Baseline:
     def initial(self) -> np.ndarray:
         """θ⁰, (nθ,)."""
         return np.array([p.initial for p in self.parameters], dtype=float)
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper bounds of θ, each (nθ,); infinite where there are none."""
+        return np.array([p.min for p in self.parameters]), np.array([p.max for p in self.parameters])
 
     @cached_property
     def expressions(self) -> tuple[Expression, ...]:
@@ -172,13 +182,17 @@ class Baseline:
         return xp.asarray(phi)
 
 
+_SHARED = ("initial", "unit", "fixed", "min", "max")  # what the terms of one parameter share
+
+
 def _agreed(terms: Sequence[Term]) -> list[Term]:
     """The terms with what one of them says about a parameter said by all of them."""
     said: dict[tuple[str, str], Any] = {}
     for term in terms:
-        if term.initial is not None and not _is_number(term.initial):
-            raise InputError(f"the initial value of '{term.parameter}' must be a finite number; got {term.initial!r}.")
-        for attribute in ("initial", "unit", "fixed"):
+        for what, value in (("initial value", term.initial), ("lower bound", term.min), ("upper bound", term.max)):
+            if value is not None and not _is_number(value):
+                raise InputError(f"the {what} of '{term.parameter}' must be a finite number; got {value!r}.")
+        for attribute in _SHARED:
             value = getattr(term, attribute)
             if value is not None and said.setdefault((term.parameter, attribute), value) != value:
                 first = said[term.parameter, attribute]
@@ -186,14 +200,16 @@ def _agreed(terms: Sequence[Term]) -> list[Term]:
     for term in terms:
         if term.fixed and (term.parameter, "initial") not in said:
             raise InputError(f"the term of '{term.parameter}' is fixed but gives no `initial`: its known coefficient.")
-    return [
-        replace(
-            term,
-            initial=float(said.get((term.parameter, "initial"), 0.0)),
-            unit=said.get((term.parameter, "unit"), ""),
-        )
-        for term in terms
-    ]
+    return [replace(term, **{a: said.get((term.parameter, a), getattr(term, a)) for a in _SHARED}) for term in terms]
+
+
+def _parameter(term: Term) -> Parameter:
+    """The parameter of a term that says all that any of its terms says."""
+    low = -math.inf if term.min is None else float(term.min)
+    high = math.inf if term.max is None else float(term.max)
+    if not low < high:
+        raise InputError(f"the bounds of '{term.parameter}' are empty or reversed: min = {low:g}, max = {high:g}.")
+    return Parameter(term.parameter, float(term.initial or 0.0), term.unit or "", low, high)
 
 
 def _is_number(value: Any) -> bool:

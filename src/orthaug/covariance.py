@@ -6,7 +6,10 @@ factor 2 of the paper's eq:cov_approx cancels against the second derivative of t
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
+import scipy.linalg
 import scipy.special
 from jaxtyping import Float
 
@@ -30,14 +33,24 @@ def noise_covariance(residual: Float[np.ndarray, "N ny"], freedom: Vector) -> Ma
     return residual.T @ residual / np.sqrt(np.outer(freedom, freedom))
 
 
-def theta_covariance(projection: Projection, weight: Vector, noise: Matrix) -> Matrix:
-    """Cov θ̂ (nθ, nθ) of θ̂ = Φ⁺Y. For one output this is the textbook s²(ΦᵀΦ)⁻¹."""
+def theta_covariance(projection: Projection, weight: Vector, noise: Matrix, fixed: Collection[int] = ()) -> Matrix:
+    """Cov θ̂ (nθ, nθ) of θ̂ = Φ⁺Y. For one output this is the textbook s²(ΦᵀΦ)⁻¹.
+
+    Entries that stand at a bound (`fixed`) have NaN; the others' covariance holds with them fixed there.
+    """
     whitened = noise * np.outer(weight, weight)
-    factor = projection.covariance_factor()
+    nt = len(projection.scale)
+    free = [i for i in range(nt) if i not in fixed]
+    basis, r = np.linalg.qr(projection.r[:, free])
+    factor = projection.scale[free, None] * scipy.linalg.solve_triangular(r, basis.T)
     if projection.q.shape[1] == 1:
-        return whitened[0, 0] * factor @ factor.T
-    middle = np.einsum("kit,ij,kjs->ts", projection.q, whitened, projection.q, optimize=True)
-    return factor @ middle @ factor.T
+        found = whitened[0, 0] * factor @ factor.T
+    else:
+        middle = np.einsum("kit,ij,kjs->ts", projection.q, whitened, projection.q, optimize=True)
+        found = factor @ middle @ factor.T
+    covariance = np.full((nt, nt), np.nan)
+    covariance[np.ix_(free, free)] = found
+    return covariance
 
 
 def interval(value: Vector, std: Vector, freedom: float, level: float = 0.95) -> Float[np.ndarray, "n 2"]:

@@ -21,9 +21,10 @@ from orthaug.problem import Problem, pose
 from orthaug.record import Record
 from orthaug.regressors import Lags, Scaling
 from orthaug.result import Estimate, Restart, Status
-from orthaug.solvers.levenberg_marquardt import CONVERGED, NO_DESCENT, NON_FINITE, LevenbergMarquardt, Run
-from orthaug.structures import Additive, Orthogonal, Structure
-from orthaug.training import Task
+from orthaug.solvers import LevenbergMarquardt
+from orthaug.solvers.levenberg_marquardt import CONVERGED, NO_DESCENT, NON_FINITE, Run
+from orthaug.structures import Fixed, Orthogonal, Split, Structure, split
+from orthaug.training import Solver, Task
 
 _CODES = {CONVERGED: "converged", NO_DESCENT: "no_descent", NON_FINITE: "non_finite"}
 
@@ -38,7 +39,7 @@ def estimate(
     lags: Lags | None = None,
     learner: Learner | None = MLP(),  # noqa: B008  (frozen)
     structure: Structure = Orthogonal(),  # noqa: B008  (frozen)
-    solver: LevenbergMarquardt = LevenbergMarquardt(),  # noqa: B008  (frozen)
+    solver: Solver = LevenbergMarquardt(),  # noqa: B008  (frozen)
     regularization: str | float = "none",
     restarts: int = 1,
     seed: int = 0,
@@ -54,8 +55,8 @@ def estimate(
         baseline: the physics.
         lags: the learner's regressor; None for the raw lags that the baseline's expressions use.
         learner: a declaration such as `MLP(hidden=(16,))`; None for physics alone.
-        structure: `Orthogonal()` or `Additive()`.
-        solver: how the learner's weights are found.
+        structure: `Orthogonal()`, `Additive()`, `OrthogonalPenalty(λ)` or `BaselinePenalty(λ)`.
+        solver: `LevenbergMarquardt(…)`, or `AdamLBFGS(…)`, the paper's pipeline from θ⁰.
         regularization: "none", "evidence" (MacKay; the weights' prior is estimated too), or a number: the
             ridge α on the weights, against squared errors in units of the baseline's RMS residual.
         restarts: runs from initial weights of seeds `seed … seed + restarts - 1`; the lowest loss is kept.
@@ -105,8 +106,9 @@ def orthogonalize(
     ny, nz = len(problem.outputs), len(problem.features.entries)
     bound = Bound(External(function, ny=ny), nz, ny)
     values = np.asarray(jax.vmap(lambda z: bound.values(jnp.zeros(0), z))(jnp.asarray(problem.feature_rows())))
-    learned = _Learned(bound, np.zeros(0), Scaling(np.zeros(nz), np.ones(nz)), np.ones(ny), values)
-    return _conclude(problem, _Given(), learned, Status("exact", 0, 0.0, np.nan))
+    scaling = Scaling(np.zeros(nz), np.ones(nz))
+    learned = _Learned(bound, np.zeros(0), scaling, np.ones(ny), values, elsewhere=True)
+    return _conclude(problem, Orthogonal(), learned, Status("exact", 0, 0.0, np.nan))
 
 
 def _refit(
@@ -114,7 +116,7 @@ def _refit(
     baseline: Baseline,
     lags: Lags | None,
     structure: Structure,
-    solver: LevenbergMarquardt,
+    solver: Solver,
     regularization: str | float,
     initial: Estimate | Model,
     progress: Progress | None,
@@ -137,12 +139,12 @@ def _train(
     starts: list[Any],
     seed: int,
     structure: Structure,
-    solver: LevenbergMarquardt,
+    solver: Solver,
     regularization: str | float,
     progress: Progress | None,
 ) -> Estimate:
     """Run from every start and conclude with the best."""
-    runs = [task.run(solver, w, regularization, _tell(progress, i, task)) for i, w in enumerate(starts)]
+    runs = [task.run(solver, w, structure, regularization, _tell(progress, i, task)) for i, w in enumerate(starts)]
     losses = np.array([task.mean_square(run.normal.loss) for run in runs])
     best = int(np.nanargmin(losses)) if np.isfinite(losses).any() else 0
     restarts = tuple(
@@ -171,6 +173,7 @@ class _Learned:
     effective: float = 0.0
     gram: Matrix | None = None
     run: Run | None = None
+    elsewhere: bool = False
 
 
 def _nothing_learned(problem: Problem) -> _Learned:
@@ -180,16 +183,6 @@ def _nothing_learned(problem: Problem) -> _Learned:
     return _Learned(None, nothing, Scaling(nothing, nothing), zeros, np.zeros_like(problem.target), 0.0, gram)
 
 
-@dataclass(frozen=True)
-class _Given:
-    """The structure of a function trained elsewhere: `c = 0`, all of it is the learner's."""
-
-    name: str = "orthogonal"
-
-    def split(self, least_squares: Vector, aux: Vector) -> tuple[Vector, Vector]:
-        return aux, aux
-
-
 def _conclude(
     problem: Problem, structure: Structure, learned: _Learned, status: Status, restarts: tuple[Restart, ...] = ()
 ) -> Estimate:
@@ -197,12 +190,17 @@ def _conclude(
     projection, weight = problem.projection, problem.weight
     whitened = learned.values * weight
     usable = status.code != "non_finite"
-    aux = projection.solve(whitened) if usable else np.zeros(len(problem.baseline.names))
-    theta, theta_aux = structure.split(projection.solve(problem.whitened_target), aux)
+    if learned.elsewhere:  # c = 0: all of the function is the learner's
+        aux = projection.solve(whitened)
+        theta, theta_aux, fixed = Split(aux, aux, {})
+    else:
+        coordinates = learned.run.coordinates if learned.run else None
+        theta, theta_aux, fixed = split(structure, problem, whitened if usable else 0.0 * whitened, coordinates)
     residual = problem.whitened_target - whitened - projection.phi @ (theta - theta_aux)
-    freedom = degrees_of_freedom(projection, learned.effective)
+    freedom = degrees_of_freedom(projection, learned.effective) + len(fixed) / len(weight)
     noise = noise_covariance(residual / weight, freedom) if usable else None
-    unique = not (isinstance(structure, Additive) and learned.bound) and not isinstance(structure, _Given)
+    unique = isinstance(structure, Orthogonal) or learned.bound is None
+    known = noise is not None and unique and not learned.elsewhere
     form = Form(problem.baseline, problem.features, problem.layout, problem.outputs, learned.bound)
     numbers = Numbers(
         theta, theta_aux, learned.weights, learned.scaling.centre, learned.scaling.halfwidth, learned.unit
@@ -223,12 +221,13 @@ def _conclude(
         status=Status(status.code, status.iterations, status.seconds, float(np.mean(residual**2))),
         restarts=restarts,
         excitation=problem.excitation,
-        covariance=theta_covariance(projection, weight, noise) if unique and noise is not None else None,
+        covariance=theta_covariance(projection, weight, noise, fixed) if known else None,  # type: ignore[arg-type]
         freedom=float(freedom.min()),
         effective_weights=learned.effective,
         defect=_defect(problem, whitened, theta_aux),
         problem=problem,
-        warnings=tuple(_warnings(problem, structure, learned, noise)),
+        at_bound={problem.baseline.names[i]: value for i, value in fixed.items()},
+        warnings=tuple(_warnings(problem, structure, learned, noise, fixed)),
     )
 
 
@@ -240,7 +239,9 @@ def _defect(problem: Problem, whitened: np.ndarray, theta_aux: Vector) -> float 
     return float(np.linalg.norm(problem.projection.coordinates(whitened - problem.projection.phi @ theta_aux)) / size)
 
 
-def _warnings(problem: Problem, structure: Structure, learned: _Learned, noise: Matrix | None) -> list[str]:
+def _warnings(
+    problem: Problem, structure: Structure, learned: _Learned, noise: Matrix | None, fixed: Fixed
+) -> list[str]:
     found = []
     condition = problem.excitation.condition
     if condition is not None and condition > ILL_CONDITIONED:
@@ -254,18 +255,24 @@ def _warnings(problem: Problem, structure: Structure, learned: _Learned, noise: 
             "the learner lies in the span of the physics (P⊥J = 0): there is nothing for it to learn that the "
             "physics does not express already. Give it another form or other inputs, or leave it out."
         )
-    if isinstance(structure, Additive) and learned.bound:
+    if learned.elsewhere:
+        found.append("no standard errors: the function was trained elsewhere.")
+    elif learned.bound and not isinstance(structure, Orthogonal):
         found.append(
-            "θ of the additive structure is not unique (it depends on the learner's initial weights), so it has no "
+            f"θ of the {structure.name} structure depends on how the learner was started or penalised, so it has no "
             "standard error; use the orthogonal structure for parameters."
         )
-    elif isinstance(structure, _Given):
-        found.append("no standard errors: the function was trained elsewhere.")
     elif noise is None:
         found.append(
             f"no standard errors: {len(problem.rows)} rows leave no degrees of freedom for "
             f"{len(problem.baseline.names)} parameters and {learned.effective:.1f} effective weights; "
             "use more data or a smaller learner."
+        )
+    if fixed:
+        names = ", ".join(f"{problem.baseline.names[i]} = {value:g}" for i, value in fixed.items())
+        found.append(
+            f"at a bound: {names}. What stands at a bound has no standard error, and those of the others hold "
+            "with it fixed there; data that contradict a bound contradict the physics or the bound."
         )
     return found
 

@@ -61,10 +61,3 @@ class Projection:
         for _ in range(2):
             values = values - self.q @ self.coordinates(values)
         return values
-
-    def covariance_factor(self) -> Float[np.ndarray, "nt nt"]:
-        """`R⁻¹` with the scaling undone: a factor L with `L Lᵀ = (ΦᵀΦ)⁻¹`."""
-        if not self.scale.size:
-            return np.zeros((0, 0))
-        inverse = scipy.linalg.solve_triangular(self.r, np.eye(len(self.r)), check_finite=False)
-        return self.scale[:, None] * inverse

@@ -89,6 +89,8 @@ class Estimate:
     defect: float | None
     """‖QᵀF̃‖ / ‖F‖ over the training rows: how much of the learner the physics could express; None without one."""
     problem: Problem = field(repr=False)
+    at_bound: Mapping[str, float] = field(default_factory=dict)
+    """Parameters that stand at a bound, with its value."""
     warnings: tuple[str, ...] = ()
 
     @property

@@ -11,15 +11,21 @@ from jaxtyping import Array, Float
 
 from orthaug._arrays import Matrix, Vector
 from orthaug._jax import jax, jnp
-from orthaug.criteria import Chunks, Hold, Overlap, Prediction
+from orthaug.criteria import Chunks, Hold, Joint, Overlap, Physics, Prediction, linearise
+from orthaug.errors import InputError
 from orthaug.gram import chunk_shape, from_chunks, in_chunks
 from orthaug.learners import Bound, Learner
 from orthaug.problem import Problem
 from orthaug.regressors import Scaling
-from orthaug.solvers.levenberg_marquardt import LevenbergMarquardt, Progress, Run
+from orthaug.solvers import AdamLBFGS, LevenbergMarquardt
+from orthaug.solvers.levenberg_marquardt import NON_FINITE, Progress, Run, effective_weights
+from orthaug.structures import Elimination, Fixed, Orthogonal, Structure, eliminate
+
+Solver = LevenbergMarquardt | AdamLBFGS
 
 OUTPUT_UNIT = 10.0
 """The learner's output unit in standard deviations of the baseline's residual: the table is in docs/design.md."""
+_ACTIVE_SETS = 10  # tries to find which bounds are active; each changes at least one entry
 _SMALLEST_RESIDUAL = 1e-10  # of an output's deviation: the physics leaves at least rounding
 
 
@@ -54,19 +60,101 @@ class Task:
         pieces = (padded, *(in_chunks(p, shape) for p in (problem.projection.q, e / rms, gain)))
         return cls(problem, bound, scaling, unit, rms, Chunks(*map(jnp.asarray, pieces)))
 
-    def run(self, solver: LevenbergMarquardt, w: Any, regularization: str | float, progress: Progress | None) -> Run:
-        """One run from the weights `w`; `regularization` as in `estimate`."""
+    def run(
+        self,
+        solver: Solver,
+        w: Any,
+        structure: Structure | None = None,
+        regularization: str | float = "none",
+        progress: Progress | None = None,
+    ) -> Run:
+        """One run from the weights `w`; the arguments as in `estimate`, `structure` None for no penalty.
+
+        Bounds that reach into training (every structure but the orthogonal, F1) are met by an active set: what
+        stands at a bound is held there, and training goes on until the same entries stand there.
+        """
+        structure = Orthogonal() if structure is None else structure
+        elimination = eliminate(structure, self.problem)
+        fixed: Fixed = {}
+        seconds = iterations = 0
+        for _ in range(_ACTIVE_SETS):
+            run = self._run_held(solver, w, structure, elimination, fixed, regularization, progress)
+            seconds, iterations = seconds + run.seconds, iterations + run.iterations
+            found = {} if isinstance(structure, Orthogonal) else elimination.active(self.coordinates(run))
+            if found == fixed or run.code == NON_FINITE:
+                break
+            w, fixed = run.w, found
+        return run._replace(seconds=seconds, iterations=iterations)
+
+    def coordinates(self, run: Run) -> Vector:
+        """QᵀF (nθ,) in whitened outputs, at the end of a run."""
+        return np.asarray(run.normal.overlap.values) * self.rms
+
+    def _run_held(
+        self,
+        solver: Solver,
+        w: Any,
+        structure: Structure,
+        elimination: Elimination,
+        fixed: Fixed,
+        regularization: str | float,
+        progress: Progress | None,
+    ) -> Run:
         nt = self.chunks.q.shape[2]
+        matrix, target = elimination.hold(fixed)
+        arguments = (self.chunks, Hold(jnp.asarray(matrix), jnp.asarray(target / self.rms)))
+        nothing = Overlap(jnp.zeros((nt, self.bound.size)), jnp.zeros(nt))
         evidence = regularization == "evidence"
-        return solver.minimise(
-            Prediction(self.bound),
-            w,
-            (self.chunks, Hold(jnp.zeros((nt, nt)), jnp.zeros(nt))),
-            Overlap(jnp.zeros((nt, self.bound.size)), jnp.zeros(nt)),
-            ridge=1.0 if evidence else 0.0 if regularization == "none" else float(regularization),
-            evidence=evidence,
-            samples=self.problem.target.size - nt,
-            progress=progress,
+        ridge = 1.0 if evidence else 0.0 if regularization == "none" else float(regularization)
+        criterion, samples = Prediction(self.bound), self.problem.target.size - nt
+        if isinstance(solver, LevenbergMarquardt):
+            return solver.minimise(
+                criterion, w, arguments, nothing, ridge=ridge, evidence=evidence, samples=samples, progress=progress
+            )
+        if evidence:
+            raise InputError("evidence regularization needs the Gauss-Newton matrix of the levenberg-marquardt solver.")
+        physics = self._physics(elimination, fixed, ridge)
+        joint = Joint(self.bound, isinstance(structure, Orthogonal))
+        found = solver.minimise(joint, w, self.chunks, physics, progress=progress)
+        normal = linearise(criterion, found.w, arguments, nothing)
+        coordinates = np.asarray(physics.start + physics.basis @ found.v) * self.rms
+        return Run(
+            found.w,
+            normal,
+            ridge,
+            float(effective_weights(normal, jnp.asarray(ridge))),
+            found.iterations,
+            found.code,
+            found.seconds,
+            coordinates,
+        )
+
+    def _physics(self, elimination: Elimination, fixed: Fixed, ridge: float) -> Physics:
+        """θ as an unknown from θ⁰ on: every free column scaled to the size of a row, fixed entries without a column."""
+        to_rows = elimination.to_coordinates / self.rms
+        initial = np.array([fixed.get(i, value) for i, value in enumerate(self.problem.baseline.initial)])
+        free = np.array([float(i not in fixed) for i in range(len(initial))])
+        rows, nt = len(self.problem.rows), len(initial)
+        scale = free * np.sqrt(rows) / np.linalg.norm(to_rows, axis=0) if nt else free
+
+        def padded(matrix: np.ndarray) -> np.ndarray:
+            return np.concatenate([matrix, np.zeros((nt - len(matrix), *matrix.shape[1:]))])
+
+        penalty = elimination.rows
+        return Physics(
+            *(
+                jnp.asarray(a, dtype=float)
+                for a in (
+                    to_rows @ initial,
+                    to_rows * scale,
+                    elimination.outputs / self.rms,
+                    padded(penalty.theta * scale) / self.rms,
+                    padded(penalty.learner),
+                    padded(penalty.target - penalty.theta @ initial) / self.rms,
+                    self.problem.target.size,
+                    ridge,
+                )
+            )
         )
 
     def mean_square(self, loss: Any) -> float:

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from orthaug._jax import jax, jnp
-from orthaug.criteria import Normal, Overlap
+from orthaug.criteria import Normal, Overlap, linearise
 
 RUNNING, CONVERGED, NO_DESCENT, NON_FINITE = range(4)
 _FIRST_DAMPING = 1e-3  # of the largest curvature
@@ -59,6 +59,8 @@ class Run(NamedTuple):
     iterations: int
     code: int
     seconds: float
+    coordinates: np.ndarray | None = None
+    """Rθ (nθ,) where the solver iterated on θ too; None where θ is eliminated."""
 
 
 Progress = Callable[[int, float], None]
@@ -79,7 +81,7 @@ class LevenbergMarquardt:
 
     def minimise(
         self,
-        linearise: Callable[..., Normal],
+        criterion: Callable[..., Normal],
         w: Float[Array, "nw"],
         arguments: tuple[Any, ...],
         overlap: Overlap,
@@ -92,7 +94,7 @@ class LevenbergMarquardt:
         """Minimise `‖r(w)‖² + α‖w‖²` from `w`.
 
         Args:
-            linearise: hashable; `(w, *arguments, overlap) -> Normal`.
+            criterion: hashable; `(w, *arguments, overlap) -> Normal`.
             overlap: a first guess of the learner's share in the physics, zeros will do.
             ridge: α in normalised units; with `evidence` where it starts.
             evidence: choose α by MacKay's re-estimation after every accepted step.
@@ -100,35 +102,35 @@ class LevenbergMarquardt:
         """
         began = time.perf_counter()
         options = Options(jnp.asarray(self.tolerance), jnp.asarray(evidence), jnp.asarray(float(samples)))
-        state = _start(linearise, w, arguments, overlap, jnp.asarray(ridge), options)
+        state = _start(criterion, w, arguments, overlap, jnp.asarray(ridge), options)
         burst = 1
         while int(state.code) == RUNNING and int(state.iteration) < self.iterations:
             tick = time.perf_counter()
             stop = min(int(state.iteration) + burst, self.iterations)
-            state = jax.block_until_ready(_advance(linearise, state, arguments, options, jnp.asarray(stop)))
+            state = jax.block_until_ready(_advance(criterion, state, arguments, options, jnp.asarray(stop)))
             spent = time.perf_counter() - tick
-            burst = int(np.clip(burst * _SECONDS_PER_BURST / max(spent, 1e-6), 1, 4 * burst))
+            burst = burst_length(burst, spent)
             if progress is not None:
                 progress(int(state.iteration), float(state.normal.loss))
         return Run(
             state.w,
             state.normal,
             float(state.ridge),
-            float(_effective_weights(state.normal, state.ridge)),
+            float(effective_weights(state.normal, state.ridge)),
             int(state.iteration),
             int(state.code),
             time.perf_counter() - began,
         )
 
 
-@partial(jax.jit, static_argnames="linearise")
-def _start(linearise: Any, w: Any, arguments: tuple[Any, ...], overlap: Overlap, ridge: Any, options: Options) -> State:
-    def refine(_: Any, normal: Normal) -> Normal:
-        return linearise(w, *arguments, normal.overlap)
+def burst_length(burst: int, spent: float) -> int:
+    """How many steps to take at a time, when `burst` of them took `spent` seconds."""
+    return int(np.clip(burst * _SECONDS_PER_BURST / max(spent, 1e-6), 1, 4 * burst))
 
-    zero = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(linearise, w, *arguments, overlap))
-    # twice: the second pass has the first one's overlap to subtract
-    normal = jax.lax.fori_loop(0, 2, refine, zero._replace(overlap=overlap))
+
+@partial(jax.jit, static_argnames="criterion")
+def _start(criterion: Any, w: Any, arguments: tuple[Any, ...], overlap: Overlap, ridge: Any, options: Options) -> State:
+    normal = linearise(criterion, w, arguments, overlap)
     curvature = jnp.max(jnp.diag(normal.hessian), initial=0.0)
     finite = jnp.isfinite(normal.loss) & jnp.all(jnp.isfinite(normal.hessian))
     nothing = curvature <= _SPANNED * _largest_column(normal)  # P⊥J = 0: the paper's Example 1
@@ -145,22 +147,22 @@ def _start(linearise: Any, w: Any, arguments: tuple[Any, ...], overlap: Overlap,
     )
 
 
-@partial(jax.jit, static_argnames="linearise")
-def _advance(linearise: Any, state: State, arguments: tuple[Any, ...], options: Options, stop: Any) -> State:
+@partial(jax.jit, static_argnames="criterion")
+def _advance(criterion: Any, state: State, arguments: tuple[Any, ...], options: Options, stop: Any) -> State:
     return jax.lax.while_loop(
         lambda s: (s.code == RUNNING) & (s.iteration < stop),
-        lambda s: _trial(linearise, s, arguments, options),
+        lambda s: _trial(criterion, s, arguments, options),
         state,
     )
 
 
-def _trial(linearise: Any, state: State, arguments: tuple[Any, ...], options: Options) -> State:
+def _trial(criterion: Any, state: State, arguments: tuple[Any, ...], options: Options) -> State:
     """One damped step: accept it, or damp more."""
     w, normal, alpha = state.w, state.normal, state.ridge
     downhill = normal.gradient - alpha * w
     shifted = normal.hessian + (alpha + state.damping) * jnp.eye(w.shape[0])
     step = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(shifted), downhill)
-    trial = linearise(w + step, *arguments, normal.overlap)
+    trial = criterion(w + step, *arguments, normal.overlap)
 
     before = normal.loss + alpha * (w @ w)
     after = trial.loss + alpha * ((w + step) @ (w + step))
@@ -198,13 +200,13 @@ def _level(normal: Normal, downhill: Any, objective: Any) -> Any:
 
 def _evidence(w: Any, normal: Normal, alpha: Any, samples: Any) -> Any:
     """MacKay's fixed point: `γ = tr(H(H + αI)⁻¹)`, `α = γ σ² / ‖w‖²` with `σ² = ‖r‖² / (N − γ)`."""
-    effective = _effective_weights(normal, alpha)
+    effective = effective_weights(normal, alpha)
     variance = normal.loss / jnp.maximum(samples - effective, 1.0)
     return jnp.clip(effective * variance / jnp.maximum(w @ w, 1e-300), 1e-12, 1e12)
 
 
 @jax.jit
-def _effective_weights(normal: Normal, alpha: Any) -> Any:
+def effective_weights(normal: Normal, alpha: Any) -> Any:
     """tr(H (H + αI)⁻¹), with directions that are rounding beside the columns of J counted as absent."""
     n = normal.hessian.shape[0]
     if n == 0:

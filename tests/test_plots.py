@@ -1,0 +1,87 @@
+"""Figures: titles, labels with units, legends, and pictures that are not blank."""
+
+from __future__ import annotations
+
+import matplotlib.image
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from orthaug import plots
+from orthaug.model import Response, Trajectory
+from orthaug.record import Channel
+
+CHANNELS = (Channel("position", "m"), Channel("angle"))
+
+
+def response(ny: int = 1, rows: int = 900, measured: bool = True, diverged: bool = False) -> Response:
+    rng = np.random.default_rng(0)
+    baseline, learner, noise = rng.normal(size=(3, rows, ny))
+    baseline[:2] = learner[:2] = np.nan
+    if diverged:
+        baseline[50:] = np.nan
+    outputs = np.nan_to_num(baseline + learner) + noise if measured else None
+    return Response((Trajectory(baseline, learner, learner, outputs, 2),), 1, CHANNELS[:ny], 0.1)
+
+
+FIGURES = {
+    "output": (plots.output_figure, 1),
+    "residual": (plots.residual_figure, 1),
+    "components": (plots.components_figure, 2),
+}
+
+
+@pytest.mark.parametrize("ny", [1, 2])
+@pytest.mark.parametrize("name", FIGURES)
+def test_every_figure(tmp_path, name, ny):
+    make, panels = FIGURES[name]
+    figure = make(response(ny), "one-step prediction, training data")
+    assert type(figure) is Figure
+    assert figure.get_suptitle() == "one-step prediction, training data"
+    assert len(figure.axes) == panels * ny
+    labels = " | ".join(axis.get_ylabel() for axis in figure.axes)
+    assert "position [m]" in labels and ("angle" in labels) == (ny == 2)
+    assert figure.axes[-1].get_xlabel() == "time [s]"
+    assert all(axis.lines and np.isfinite(axis.get_ylim()).all() for axis in figure.axes)
+    path = tmp_path / f"{name}.png"
+    plots.save(figure, path)
+    picture = matplotlib.image.imread(path)
+    assert min(picture.shape[:2]) > 300 and picture[..., :3].std() > 0.02
+    assert picture.shape[0] > picture.shape[1] / 3
+
+
+def legend(axis) -> list[str]:
+    return [text.get_text() for text in axis.get_legend().get_texts()]
+
+
+def test_legends():
+    assert legend(plots.output_figure(response(), "").axes[0]) == ["measured", "model"]
+    assert legend(plots.output_figure(response(measured=False), "").axes[0]) == ["model"]
+    upper, lower = plots.components_figure(response(), "").axes
+    assert legend(upper) == ["baseline φθ"] and legend(lower) == ["learner f − φθ_aux"]
+
+
+def test_output_shows_a_window_from_the_first_value_on():
+    (axis,) = plots.output_figure(response(), "").axes
+    time, shown = axis.lines[1].get_xdata(), response()
+    rows = slice(2, 2 + len(time))
+    assert 100 <= len(time) <= 500
+    np.testing.assert_allclose(time, 0.1 * np.arange(rows.start, rows.stop))
+    np.testing.assert_array_equal(axis.lines[0].get_ydata(), shown.trajectories[0].measured[rows, 0])
+    np.testing.assert_array_equal(axis.lines[1].get_ydata(), shown.model[rows, 0])
+
+
+def test_residual_shows_the_whole_record():
+    (axis,) = plots.residual_figure(response(), "").axes
+    assert len(axis.lines[0].get_xdata()) == 900
+    assert axis.get_ylabel() == "residual of position [m]"
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_a_run_that_diverged_is_drawn_as_far_as_it_goes(tmp_path, name):
+    plots.save(FIGURES[name][0](response(diverged=True), "diverged"), tmp_path / "figure.png")
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_a_short_record(tmp_path, name):
+    plots.save(FIGURES[name][0](response(rows=3), "one sample"), tmp_path / "figure.png")
