@@ -114,5 +114,5 @@ def test_padding_adds_nothing_of_a_learner_without_a_value_at_zero():
     u, y = np.random.default_rng(0).normal(size=(2, 37))
     task = Task.of(pose(Record.from_arrays(u, y), Baseline.from_terms([Term("a", "u[k]")])), logarithm)
     assert task.chunks.z.size > 37
-    run = task.run(LevenbergMarquardt(), jnp.ones(1), "none", None)
+    run = task.run(LevenbergMarquardt(), jnp.ones(1))
     assert run.code == CONVERGED and np.isfinite(run.normal.hessian).all()

@@ -72,7 +72,7 @@ def short(record):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"regularization": "ridge"}, "`regularization` must be none, evidence or a number; got 'ridge'"),
+        ({"regularization": "ridge"}, "`regularization` must be one of none, evidence; got 'ridge'"),
         ({"regularization": -0.1}, "`regularization` must be 0 or more; got -0.1"),
         ({"regularization": float("nan")}, "`regularization` must be 0 or more; got nan"),
         ({"regularization": float("inf")}, "`regularization` must be 0 or more; got inf"),

@@ -356,16 +356,10 @@ def test_values_that_contradict_each_other(tmp_path, old, new, message):
 
 UNBUILT = [
     ("[physics.parameters]\nm = { initial = 1.0 }\n", r"\[physics\]"),
-    ("[structure]\nkind = 'orthogonal-penalty'\n", 'structure.kind = "orthogonal-penalty"'),
-    ("[structure]\nkind = 'baseline-penalty'\n", 'structure.kind = "baseline-penalty"'),
     ("[structure.measure]\nkind = 'uniform'\n", 'structure.measure.kind = "uniform"'),
     ("[structure.measure]\nkind = 'symmetrized'\n", 'structure.measure.kind = "symmetrized"'),
     ("[structure.measure]\nkind = 'samples'\nfiles = ['grid.csv']\n", 'structure.measure.kind = "samples"'),
-    ("[training]\nsolver = 'adam-lbfgs'\n", 'training.solver = "adam-lbfgs"'),
     ("[training]\nfocus = 'simulation'\n", 'training.focus = "simulation"'),
-    ("[data.validation]\nfiles = ['run3.csv']\n", r"\[data.validation\]"),
-    ("[[baseline.terms]]\nparameter = 'b'\nregressor = 'u[k]'\nmin = 0\n", "bounds `min` and `max`"),
-    ("[[baseline.terms]]\nparameter = 'b'\nregressor = 'u[k]'\nmax = 0\n", "bounds `min` and `max`"),
 ]
 
 

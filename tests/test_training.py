@@ -35,7 +35,7 @@ def task(request):
 
 @pytest.fixture(scope="module")
 def run(task):
-    return task.run(LevenbergMarquardt(iterations=5), task.bound.init(jax.random.key(0)), "none", None)
+    return task.run(LevenbergMarquardt(iterations=5), task.bound.init(jax.random.key(0)))
 
 
 def test_features_fill_the_unit_box(task):

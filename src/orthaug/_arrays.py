@@ -64,3 +64,16 @@ def nearest(name: str, known: Iterable[str]) -> str:
     known = list(known)
     close = [k for k in known if k.lower().startswith(name.lower())] or difflib.get_close_matches(name, known, n=1)
     return f", did you mean '{close[0]}'?" if close else ""
+
+
+def check_count(value: Any, name: str, least: int = 1) -> int:
+    """Return `value` if it is a whole number of at least `least`, otherwise raise InputError."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise InputError(f"`{name}` must be a whole number, {least} or more; got {value!r}.")
+    return int(value)
+
+
+def check_type(value: Any, kinds: Any, name: str, wanted: str) -> None:
+    """Raise InputError unless `value` is an instance of `kinds` (a class itself is none)."""
+    if isinstance(value, type) or not isinstance(value, kinds):
+        raise InputError(f"`{name}` must be {wanted}; got {value!r}.")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 
+from orthaug.errors import PrecisionError
+
 if os.environ.get("JAX_ENABLE_X64", "").strip().lower() in {"0", "false", "f", "no", "n", "off"}:
-    raise ImportError(
+    raise PrecisionError(
         "orthaug computes in double precision, but the environment has "
         f"JAX_ENABLE_X64={os.environ['JAX_ENABLE_X64']}. Unset it, or set it to 1."
     )

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+import typer.core
 
 from orthaug import __version__
 from orthaug.errors import InputError, TrainingError
@@ -18,8 +19,22 @@ if TYPE_CHECKING:
     from orthaug.jobs import Fitted, Progress
     from orthaug.model import Response
 
+
+class Interrupted(Exception):
+    """Ctrl-C, with what it stopped; typer would turn a KeyboardInterrupt into a bare exit code."""
+
+
+class _Group(typer.core.TyperGroup):
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except (Interrupted, KeyboardInterrupt) as interrupt:
+            raise Interrupted(*interrupt.args) from None
+
+
 app = typer.Typer(
     name="orthaug",
+    cls=_Group,
     help="Fit physics together with a learned correction, so that the physics keeps all that physics can explain.",
     add_completion=False,
     no_args_is_help=True,
@@ -42,7 +57,7 @@ def main() -> None:
         _fail(f"error: {error}", 2)
     except TrainingError as error:
         _fail(f"training failed: {error}", 1)
-    except KeyboardInterrupt as interrupt:
+    except (Interrupted, KeyboardInterrupt) as interrupt:
         _fail(f"interrupted{''.join(f' during {text}' for text in interrupt.args)}; nothing was written", 130)
     except BrokenPipeError:
         sys.stderr.close()
@@ -51,7 +66,8 @@ def main() -> None:
         complaint = getattr(error, "format_message", None)  # typer's own, about arguments
         if complaint is None:
             raise
-        _fail(f"error: {complaint()}", getattr(error, "exit_code", 2))
+        text = " ".join(complaint().split())
+        _fail(text if text.startswith("Usage") else f"error: {text}", getattr(error, "exit_code", 2))
     sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -109,6 +125,7 @@ def fit(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False) -> None:
     folder = out or Path("orthaug-out") / spec.stem
     jobs.check_output(folder)
     job = jobs.open_job(spec)
+    jobs.check_inputs_kept(job, folder)
     _prepare_jax()
     training = job.spec.training
     with _progress(training.restarts, training.iterations, job.spec.learner.kind != "none") as progress:
@@ -139,6 +156,7 @@ def simulate(
 
     opened = runs.open_run(model, data)
     start = runs.read_initial(initial, opened)
+    runs.check_output(out)
     _prepare_jax()
     _write_response(opened.model.simulate(opened.record, initial=start), out)
 
@@ -154,6 +172,7 @@ def predict(
     from orthaug import runs
 
     opened = runs.open_run(model, data, need_outputs=True)
+    runs.check_output(out)
     _prepare_jax()
     _write_response(opened.model.predict(opened.record, horizon=horizon), out)
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Collection
 
 import numpy as np
-import scipy.linalg
 import scipy.special
 from jaxtyping import Float
 
@@ -41,8 +40,7 @@ def theta_covariance(projection: Projection, weight: Vector, noise: Matrix, fixe
     whitened = noise * np.outer(weight, weight)
     nt = len(projection.scale)
     free = [i for i in range(nt) if i not in fixed]
-    basis, r = np.linalg.qr(projection.r[:, free])
-    factor = projection.scale[free, None] * scipy.linalg.solve_triangular(r, basis.T)
+    factor = projection.covariance_factor(free)
     if projection.q.shape[1] == 1:
         found = whitened[0, 0] * factor @ factor.T
     else:

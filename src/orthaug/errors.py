@@ -11,5 +11,9 @@ class RankError(InputError):
     """The physics columns are linearly dependent on the data; names the parameters involved."""
 
 
+class PrecisionError(InputError, ImportError):
+    """The environment forbids double precision."""
+
+
 class TrainingError(ArithmeticError):
     """Training produced no finite model. The command line exits with 1."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._arrays import Matrix, Vector
+from orthaug._arrays import Matrix, Vector, check_choice, check_count, check_type
 from orthaug._jax import jax, jnp
 from orthaug.baseline import Baseline
 from orthaug.covariance import degrees_of_freedom, noise_covariance, theta_covariance
@@ -76,7 +76,8 @@ def estimate(
         >>> f"{fit.theta[0]:.3f}"
         '2.000'
     """
-    _check_arguments(regularization, restarts)
+    _check_arguments(record, baseline, lags, learner, structure, solver, regularization, initial)
+    restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
     if initial is not None:
         return _refit(record, baseline, lags, structure, solver, regularization, initial, progress)
     problem = pose(record, baseline, lags, None if learner is None else learner.inputs)
@@ -104,8 +105,9 @@ def orthogonalize(
     """
     problem = pose(record, baseline, lags)
     ny, nz = len(problem.outputs), len(problem.features.entries)
-    bound = Bound(External(function, ny=ny), nz, ny)
-    values = np.asarray(jax.vmap(lambda z: bound.values(jnp.zeros(0), z))(jnp.asarray(problem.feature_rows())))
+    external = External(function, ny=ny)
+    bound = Bound(external, nz, ny)
+    values = external.values(problem.feature_rows())
     scaling = Scaling(np.zeros(nz), np.ones(nz))
     learned = _Learned(bound, np.zeros(0), scaling, np.ones(ny), values, elsewhere=True)
     return _conclude(problem, Orthogonal(), learned, Status("exact", 0, 0.0, np.nan))
@@ -195,7 +197,9 @@ def _conclude(
         theta, theta_aux, fixed = Split(aux, aux, {})
     else:
         coordinates = learned.run.coordinates if learned.run else None
-        theta, theta_aux, fixed = split(structure, problem, whitened if usable else 0.0 * whitened, coordinates)
+        theta, theta_aux, fixed = split(
+            structure, problem, whitened if usable else np.zeros_like(whitened), coordinates
+        )
     residual = problem.whitened_target - whitened - projection.phi @ (theta - theta_aux)
     freedom = degrees_of_freedom(projection, learned.effective) + len(fixed) / len(weight)
     noise = noise_covariance(residual / weight, freedom) if usable else None
@@ -259,8 +263,8 @@ def _warnings(
         found.append("no standard errors: the function was trained elsewhere.")
     elif learned.bound and not isinstance(structure, Orthogonal):
         found.append(
-            f"θ of the {structure.name} structure depends on how the learner was started or penalised, so it has no "
-            "standard error; use the orthogonal structure for parameters."
+            f"θ of the {structure.name} structure is not unique (it depends on how the learner was started or "
+            "penalised), so it has no standard error; use the orthogonal structure for parameters."
         )
     elif noise is None:
         found.append(
@@ -287,11 +291,26 @@ def _tell(progress: Progress | None, restart: int, task: Task) -> Callable[[int,
     return lambda iteration, loss: progress(restart, iteration, task.mean_square(loss))
 
 
-def _check_arguments(regularization: str | float, restarts: int) -> None:
+def _check_arguments(
+    record: Any,
+    baseline: Any,
+    lags: Any,
+    learner: Any,
+    structure: Any,
+    solver: Any,
+    regularization: Any,
+    initial: Any,
+) -> None:
+    check_type(record, Record, "record", "a Record")
+    check_type(baseline, Baseline, "baseline", "a Baseline")
+    check_type(lags, Lags | None, "lags", "Lags(…) or None")
+    check_type(learner, Learner | None, "learner", "a learner such as MLP(), or None")
+    check_type(structure, Structure, "structure", "a structure such as Orthogonal()")
+    check_type(solver, Solver, "solver", "a solver such as LevenbergMarquardt()")
+    check_type(initial, Estimate | Model | None, "initial", "an Estimate, a Model or None")
     if isinstance(regularization, str):
-        if regularization not in ("none", "evidence"):
-            raise InputError(f"`regularization` must be none, evidence or a number; got '{regularization}'.")
+        check_choice(regularization, ("none", "evidence"), "`regularization`")
+    elif isinstance(regularization, bool) or not isinstance(regularization, int | float | np.number):
+        raise InputError(f"`regularization` must be none, evidence or a number; got {regularization!r}.")
     elif not (np.isfinite(regularization) and regularization >= 0):
         raise InputError(f"`regularization` must be 0 or more; got {regularization}.")
-    if isinstance(restarts, bool) or not isinstance(restarts, int) or restarts < 1:
-        raise InputError(f"`restarts` must be a whole number, 1 or more; got {restarts}.")

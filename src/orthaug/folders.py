@@ -40,19 +40,29 @@ def whole_folder(folder: Path, is_ours: Callable[[Path], bool]) -> Iterator[Path
     try:
         partial.chmod(0o755)
         yield partial
-        if folder.exists():
-            old = Path(tempfile.mkdtemp(prefix=f".{folder.name}-old-", dir=folder.parent))
-            folder.rename(old / folder.name)
-            partial.rename(folder)
-            shutil.rmtree(old)
-        else:
-            partial.rename(folder)
+        _put_in_place(partial, folder)
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         for parent in created:
             if parent.is_dir() and not any(parent.iterdir()):
                 parent.rmdir()
         raise
+
+
+def _put_in_place(partial: Path, folder: Path) -> None:
+    """Rename, with the folder that was there kept until the new one stands."""
+    if not folder.exists():
+        partial.rename(folder)
+        return
+    shelter = Path(tempfile.mkdtemp(prefix=f".{folder.name}-old-", dir=folder.parent))
+    old = folder.rename(shelter / folder.name)
+    try:
+        partial.rename(folder)
+    except BaseException:
+        old.rename(folder)
+        raise
+    finally:
+        shutil.rmtree(shelter, ignore_errors=True)
 
 
 def _nearest_ancestor(folder: Path) -> Path:

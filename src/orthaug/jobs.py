@@ -229,6 +229,14 @@ def check_output(folder: Path) -> None:
     check_replaceable(folder, is_result)
 
 
+def check_inputs_kept(job: Job, folder: Path) -> None:
+    """Raise InputError where the result would take the place of a file that the job reads."""
+    files = [job.path, *(job.path.parent / entry["file"] for part in job.parts for entry in part.files)]
+    for file in files:
+        if file.resolve().is_relative_to(folder.resolve()):
+            raise InputError(f"{folder}: holds {file.name}, which this fit reads; give another folder.")
+
+
 def write_result(fitted: Fitted, folder: Path) -> None:
     """result.json, model/ and figures/, whole or not at all; without a model where training failed."""
     with whole_folder(folder, is_result) as partial:

@@ -165,15 +165,27 @@ class External:
 
     def apply(self, tree: Tree, z: Float[Array, "nz"]) -> Float[Array, "ny"]:
         shape = jax.ShapeDtypeStruct((self.ny,), float)
-        return jax.pure_callback(self._call, shape, z, vmap_method="expand_dims")
+        return jax.pure_callback(self.values, shape, z, vmap_method="expand_dims")
 
-    def _call(self, z: Any) -> np.ndarray:
+    def values(self, z: Any) -> np.ndarray:
+        """The function's values (…, ny) of features (…, nz).
+
+        Raises:
+            InputError: the function returns another shape.
+        """
         z = np.asarray(z)
-        rows = z.reshape(-1, z.shape[-1])
+        every = z.reshape(-1, z.shape[-1])
+        finite = np.isfinite(every).all(axis=1)  # a run that diverged ends as NaN, not in the toolbox's own error
+        result = np.full((len(every), self.ny), np.nan)
+        if finite.any():
+            result[finite] = self._evaluate(every[finite])
+        return result.reshape(*z.shape[:-1], self.ny)
+
+    def _evaluate(self, rows: np.ndarray) -> np.ndarray:
         values = np.asarray(self.function(rows), dtype=float)
         if values.shape != (len(rows), self.ny) and (values.shape, self.ny) != ((len(rows),), 1):
             raise InputError(f"the external model returned shape {values.shape}; expected ({len(rows)}, {self.ny}).")
-        return values.reshape(*z.shape[:-1], self.ny)
+        return values.reshape(len(rows), self.ny)
 
 
 @dataclass(frozen=True)

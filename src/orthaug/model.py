@@ -167,7 +167,9 @@ class Response:
         Raises:
             InputError: no measured outputs, or no sample left to score.
         """
-        skips = (skip,) * len(self.trajectories) if isinstance(skip, int) else skip
+        skips = (skip,) * len(self.trajectories) if isinstance(skip, int | np.integer) else tuple(skip)
+        if len(skips) != len(self.trajectories):
+            raise InputError(f"`skip` has {len(skips)} numbers for {len(self.trajectories)} experiments.")
         measured, model = [], []
         for trajectory, first in zip(self.trajectories, skips, strict=True):
             if trajectory.measured is None:
@@ -272,6 +274,23 @@ class Model:
             trajectories.append(self._bounded(found, measured, len(experiment)))
         return Response(tuple(trajectories), None, self.outputs, record.sampling_time)
 
+    def check_initial(self, initial: Any) -> Matrix:
+        """Outputs before the first usable row, (rows, ny).
+
+        Raises:
+            InputError: too few rows, or not one column per output.
+        """
+        if isinstance(initial, str):
+            raise InputError(f"`initial` must be 'measured', 'zero' or an array; got '{initial}'.")
+        rows, ny = as_signal(initial, "initial"), len(self.outputs)
+        if rows.shape[1] != ny:
+            raise InputError(f"`initial` has {rows.shape[1]} columns; expected one per output, {ny}.")
+        if len(rows) < self._memory:
+            raise InputError(
+                f"`initial` has {len(rows)} rows; expected the first {self.form.start} outputs of the record."
+            )
+        return rows
+
     @property
     def _memory(self) -> int:
         """How many past outputs the model feeds back."""
@@ -312,12 +331,7 @@ class Model:
                 )
             rows = measured[:start]
         else:
-            rows = as_signal(initial, "initial")
-            if rows.shape[1] != ny:
-                raise InputError(f"`initial` has {rows.shape[1]} columns; expected one per output, {ny}.")
-            if len(rows) < memory:
-                raise InputError(f"`initial` has {len(rows)} rows; expected the first {start} outputs of the record.")
-            rows = rows[:start]
+            rows = self.check_initial(initial)[:start]
         return rows[len(rows) - memory :][::-1].copy()
 
     def _bounded(self, found: Parts, measured: Matrix | None, rows: int) -> Trajectory:

@@ -5,6 +5,7 @@ Everything here is orthogonal factorisation; `ΦᵀΦ` is never formed, let alon
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,3 +62,9 @@ class Projection:
         for _ in range(2):
             values = values - self.q @ self.coordinates(values)
         return values
+
+    def covariance_factor(self, free: Sequence[int] | None = None) -> Float[np.ndarray, "nf nt"]:
+        """A factor L with `L Lᵀ = (Φ_fᵀΦ_f)⁻¹` for the free columns, all by default; `L = Φ_f⁺Q`."""
+        chosen = list(range(len(self.scale))) if free is None else list(free)
+        basis, r = np.linalg.qr(self.r[:, chosen])
+        return self.scale[chosen, None] * scipy.linalg.solve_triangular(r, basis.T) if chosen else basis.T

@@ -47,7 +47,7 @@ def read_record(
     column_of = {c.name: (columns or {}).get(c.name, c.file_column) for group in channels for c in group}
     if sampling_time is not None and time is not None:
         raise InputError("give `sampling_time` or `time`, not both.")
-    if isinstance(every, bool) or every < 1:
+    if isinstance(every, bool) or not isinstance(every, int | np.integer) or every < 1:
         raise InputError(f"`every` must be a whole number, 1 or more; got {every}.")
     wanted: list[str] = list(dict.fromkeys([*column_of.values(), *([time] if time else [])]))
     if not wanted:

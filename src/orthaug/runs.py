@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,7 +37,7 @@ def open_run(model: Path, data: Path, *, need_outputs: bool = False) -> Run:
 
     loaded = load(model)
     held = [c for c in loaded.outputs if has_column(data, c.file_column)]
-    if need_outputs or len(held) == len(loaded.outputs):
+    if need_outputs or not loaded.inputs or len(held) == len(loaded.outputs):
         held = list(loaded.outputs)
     elif held:
         missing = [c.name for c in loaded.outputs if c not in held]
@@ -53,7 +54,13 @@ def read_initial(initial: str | None, run: Run) -> str | Any:
         if initial == "measured" and not run.record.outputs:
             raise InputError(f"{run.source}: has no measured outputs to start from; use --initial zero or a CSV.")
         return initial
+    if not Path(initial).suffix and not Path(initial).exists():
+        raise InputError(f"--initial: found '{initial}'; expected measured, zero, or a CSV file of the first outputs.")
     record = read_record(initial, outputs=run.model.outputs, sampling_time=run.model.sampling_time)
+    try:
+        run.model.check_initial(record.experiments[0].outputs)
+    except InputError as error:
+        raise InputError(f"{initial}: {error}") from None
     return record.experiments[0].outputs
 
 
@@ -64,6 +71,16 @@ def warnings(response: Response) -> list[str]:
         for t in response.trajectories
         if t.diverged
     ]
+
+
+def check_output(out: Path | None) -> None:
+    """Raise InputError early where a file could not be written."""
+    if out is None:
+        return
+    if out.is_dir() or not out.name:
+        raise InputError(f"{out}: is a folder; expected the name of a CSV file.")
+    if not out.absolute().parent.is_dir():
+        raise InputError(f"{out}: cannot be written; there is no folder {out.parent}.")
 
 
 def write_csv(response: Response, out: Path | None) -> None:
@@ -77,8 +94,7 @@ def write_csv(response: Response, out: Path | None) -> None:
         frame.to_csv(partial, index=False)
         partial.replace(out)
     except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise InputError(f"{out}: cannot be written ({error.strerror}).") from None
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
+        raise InputError(f"{out}: cannot be written ({error.strerror or error}).") from None
+    finally:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)

@@ -28,7 +28,7 @@ Range = Annotated[list[Count], Field(min_length=2, max_length=2)]
 class Section(BaseModel):
     """A table of the spec; unknown keys are errors."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
 class Part(Section):
@@ -90,8 +90,8 @@ class TermSection(Section):
     unit: str | None = None
     output: str | None = None
     fixed: bool = False
-    min: float | None = None
-    max: float | None = None
+    min: Finite | None = None
+    max: Finite | None = None
 
 
 class BaselineSection(Section):
@@ -185,8 +185,7 @@ def load_spec(path: Path) -> Spec:
     """
     check_readable(path)
     try:
-        with path.open("rb") as file:
-            content = tomllib.load(file)
+        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path}: broken TOML: {' '.join(str(error).split())}.") from None
     except UnicodeDecodeError:
@@ -204,17 +203,11 @@ def load_spec(path: Path) -> Spec:
 
 def _refuse_unbuilt(spec: Spec) -> None:
     """Parts of the contract that this version does not build yet."""
-    training = spec.training
+    measure, focus = spec.structure.measure.kind, spec.training.focus
     unbuilt = {
         "[physics]": spec.physics is not None,
-        "[data.validation]": spec.data.validation is not None,
-        f'structure.kind = "{spec.structure.kind}"': spec.structure.kind.endswith("penalty"),
-        f'structure.measure.kind = "{spec.structure.measure.kind}"': spec.structure.measure.kind != "training",
-        f'training.solver = "{training.solver}"': training.solver != "levenberg-marquardt",
-        f'training.focus = "{training.focus}"': training.focus != "prediction",
-        "baseline.terms: bounds `min` and `max`": any(
-            t.min is not None or t.max is not None for t in spec.baseline.terms
-        ),
+        f'structure.measure.kind = "{measure}"': spec.structure.kind == "orthogonal" and measure != "training",
+        f'training.focus = "{focus}"': focus != "prediction",
     }
     for what, used in unbuilt.items():
         if used:
@@ -224,8 +217,9 @@ def _refuse_unbuilt(spec: Spec) -> None:
 def _first_message(error: ValidationError, content: dict[str, Any]) -> str:
     """The first error as `key: found …; expected …`."""
     errors = error.errors()
-    # of a union every branch complains: the deepest complaint is about what was meant
-    first = errors[0]
+    # of a union every branch complains: what was meant is the branch whose type fits, there the deepest complaint
+    fitting = [e for e in errors if not e["type"].endswith("_type")]
+    first = max(fitting or errors[:1], key=lambda e: len(e["loc"]))
     key = _key(first["loc"], content)
     kind, found = first["type"], first["input"]
     if kind == "extra_forbidden":
@@ -241,10 +235,14 @@ def _first_message(error: ValidationError, content: dict[str, Any]) -> str:
             else first["msg"].removeprefix("Value error, ")
         )
     same_key = [e["msg"] for e in errors if _key(e["loc"], content) == key]
-    expected = " or ".join(
-        dict.fromkeys(m.removeprefix("Input should be ").replace("a valid ", "a ") for m in same_key)
-    )
+    expected = " or ".join(dict.fromkeys(_plain(m) for m in same_key))
     return f"'{key}': found {found!r}; expected {expected}"
+
+
+def _plain(message: str) -> str:
+    """Pydantic's words in those of TOML."""
+    message = message.removeprefix("Input should be ").replace("a valid ", "a ").replace("a integer", "an integer")
+    return "a table" if "dictionary" in message else message
 
 
 def _key(location: tuple[Any, ...], content: Any) -> str:

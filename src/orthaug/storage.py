@@ -147,6 +147,9 @@ def _rebuild(
         elif learner is None:
             raise InputError(f"{path}: the learner was a Python callable; give it again, load(…, learner=…).")
         bound = Bound(learner, kept["nz"], kept["ny"])  # type: ignore[arg-type]
+        if bound.size != len(arrays["numbers.weights"]):
+            found = len(arrays["numbers.weights"])
+            raise InputError(f"{path}: the learner has {bound.size} weights, the saved one {found}; give the same one.")
     features = Features(tuple(Expression(e["text"], tuple(e["constants"].items())) for e in declared["features"]))
     outputs, inputs_ = (tuple(Channel(**c) for c in declared[kind]) for kind in ("outputs", "inputs"))
     form = Form(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -82,6 +83,7 @@ def _read_text(path: Path, columns: Sequence[str]) -> Table:
         raise InputError(f"{path}: not a text table; expected UTF-8 text with a header row.") from None
     _check_present(path, columns, header)
     place = {name: str(header.index(name)) for name in columns}
+    beyond = str(len(header))  # a column that must stay empty: cells behind the last header
     decimal = "," if separator == ";" else "."
 
     def read(**options: Any) -> pd.DataFrame:
@@ -89,29 +91,35 @@ def _read_text(path: Path, columns: Sequence[str]) -> Table:
             path,
             sep=separator,
             header=None,
-            names=[str(i) for i in range(len(header))],
-            usecols=list(place.values()),
+            names=[str(i) for i in range(len(header) + 1)],
             index_col=False,
             skiprows=header_line,
             skip_blank_lines=False,
             keep_default_na=False,
             encoding="utf-8-sig",
+            low_memory=False,
             **options,
-        )
+        )[[*place.values(), beyond]]
 
     try:
-        frame = read(dtype=np.float64, na_values=[""], decimal=decimal)
+        frame = read(dtype=dict.fromkeys((*place.values(), beyond), np.float64), na_values=[""], decimal=decimal)
         texts, held = None, frame.notna()
-    except pd.errors.EmptyDataError:
-        raise InputError(f"{path}: there are no data rows below the header.") from None
     except ValueError:  # something is no number: read again as text, to be able to name it
         try:
             texts = read(dtype=str).fillna("").apply(lambda column: column.str.strip())
         except ValueError as error:
-            raise InputError(f"{path}: not a readable table ({' '.join(str(error).split())}).") from None
+            if "found 0" in str(error) or isinstance(error, pd.errors.EmptyDataError):
+                raise InputError(f"{path}: there are no data rows below the header.") from None
+            raise InputError(f"{path}: not a readable table ({_short(error)}).") from None
         frame = texts.apply(lambda column: pd.to_numeric(column.str.replace(decimal, "."), errors="coerce"))
         held = texts != ""
 
+    extra = np.flatnonzero(np.asarray(held[beyond]))
+    if extra.size:
+        raise InputError(
+            f"{path}: line {header_line + 1 + extra[0]} has {len(header) + 1} cells under {len(header)} headers; "
+            "is a separator or a decimal comma wrong?"
+        )
     values = {name: np.asarray(frame[place[name]], dtype=float) for name in columns}
 
     def cell(column: str, row: int) -> str:
@@ -135,7 +143,8 @@ def _header(path: Path) -> tuple[list[str], int, str]:
     if "\0" in line:
         raise csv.Error("NUL byte")
     tab = path.suffix.lower() == ".tsv"
-    separator = "\t" if tab else ";" if ";" in line and "," not in line else ","
+    bare = re.sub(r'"[^"]*"', "", line)  # separators inside quotes do not count
+    separator = "\t" if tab else ";" if ";" in bare and "," not in bare else ","
     return [name.strip() for name in next(csv.reader([line], delimiter=separator))], number, separator
 
 
@@ -191,6 +200,8 @@ def _full(path: Path, columns: Mapping[str, Vector]) -> Table:
 
 def _as_floats(array: np.ndarray, name: str, path: Path) -> Vector:
     try:
+        if array.dtype.kind in "mM":
+            raise TypeError
         return np.asarray(array, dtype=float)
     except (TypeError, ValueError):
         raise InputError(f"{path}: column '{name}' holds {array.dtype} values; expected numbers.") from None

@@ -34,7 +34,7 @@ def read_variables(path: Path, names: Sequence[str]) -> dict[str, Vector]:
     except InputError:
         raise
     except _CORRUPT as error:
-        reason = " ".join(str(error).split())[:120]
+        reason = "no archive of plain arrays" if path.suffix.lower() == ".npz" else " ".join(str(error).split())[:120]
         raise InputError(f"{path}: cannot be read as {path.suffix.lower()} ({reason}); is it cut or corrupt?") from None
 
 
@@ -42,7 +42,7 @@ _CORRUPT = (OSError, ValueError, TypeError, KeyError, IndexError, AttributeError
 
 
 def _from_npz(path: Path, names: Sequence[str]) -> dict[str, Vector]:
-    with np.load(path, allow_pickle=False) as archive:
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
         held = {}
         for name in archive.files:
             try:

@@ -6,6 +6,7 @@ compiled loop; SciPy's L-BFGS-B, called back from Python, took 3 to 6 times long
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 from functools import partial
@@ -14,8 +15,10 @@ from typing import Any, NamedTuple
 import optax
 from jaxtyping import Array, Float
 
+from orthaug._arrays import check_count
 from orthaug._jax import jax, jnp
 from orthaug.criteria import Chunks, Joint, Physics
+from orthaug.errors import InputError
 from orthaug.solvers.levenberg_marquardt import CONVERGED, NON_FINITE, RUNNING, Progress, burst_length
 
 _MEMORY = 20  # pairs that L-BFGS keeps
@@ -53,6 +56,12 @@ class AdamLBFGS:
     adam_iterations: int = 500
     lbfgs_iterations: int = 1000
     learning_rate: float = 1e-3
+
+    def __post_init__(self) -> None:
+        check_count(self.adam_iterations, "adam_iterations", least=0)
+        check_count(self.lbfgs_iterations, "lbfgs_iterations", least=0)
+        if not (math.isfinite(self.learning_rate) and self.learning_rate > 0):
+            raise InputError(f"`learning_rate` must be positive; got {self.learning_rate}.")
 
     @property
     def iterations(self) -> int:

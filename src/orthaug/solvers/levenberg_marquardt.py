@@ -16,8 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from orthaug._arrays import check_count
 from orthaug._jax import jax, jnp
 from orthaug.criteria import Normal, Overlap, linearise
+from orthaug.errors import InputError
 
 RUNNING, CONVERGED, NO_DESCENT, NON_FINITE = range(4)
 _FIRST_DAMPING = 1e-3  # of the largest curvature
@@ -78,6 +80,11 @@ class LevenbergMarquardt:
 
     iterations: int = 300
     tolerance: float = 1e-8
+
+    def __post_init__(self) -> None:
+        check_count(self.iterations, "iterations", least=0)
+        if not (np.isfinite(self.tolerance) and self.tolerance >= 0):
+            raise InputError(f"`tolerance` must be 0 or more; got {self.tolerance}.")
 
     def minimise(
         self,
