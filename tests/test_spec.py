@@ -128,7 +128,7 @@ def test_a_full_spec(tmp_path):
 
 
 def test_the_physics_of_a_full_spec(tmp_path):
-    baseline = load_spec(put(tmp_path, FULL)).physics_terms()
+    baseline = load_spec(put(tmp_path, FULL)).declared_baseline()
     assert baseline.parameters == (Parameter("theta1", 0.61, "1"), Parameter("offset"))
     assert baseline.constants == (("g", 9.81),)
     assert [term.output for term in baseline.terms] == ["position", "angle", "angle"]
@@ -381,4 +381,4 @@ EXPRESSIONS = [
 def test_expressions_are_read_when_the_physics_is_asked_for(tmp_path, text, message):
     spec = load_spec(put(tmp_path, edited(LEAST, '"y[k-1]"', f'"{text}"')))
     with pytest.raises(InputError, match=message):
-        spec.physics_terms()
+        spec.declared_baseline()

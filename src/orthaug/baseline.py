@@ -75,7 +75,10 @@ class Baseline:
         constants = dict(constants or {})
         for name, value in constants.items():
             if not is_name(name):
-                raise InputError(f"'{name}' cannot name a constant; {', '.join(sorted(RESERVED))} are taken.")
+                raise InputError(
+                    f"'{name}' cannot name a constant; use letters, digits and underscores, not starting with a digit, "
+                    f"and no keyword; {', '.join(sorted(RESERVED))} are taken."
+                )
             if not _is_number(value):
                 raise InputError(f"the constant '{name}' must be a finite number; got {value!r}.")
         terms = _agreed(terms)
@@ -124,6 +127,9 @@ class Baseline:
 
     def check_channels(self, outputs: Sequence[str], inputs: Sequence[str]) -> None:
         """Raise InputError for a term that uses an unknown channel, an output at lag 0 or an unknown output."""
+        for name, _ in self.constants:
+            if name in (*outputs, *inputs):
+                raise InputError(f"'{name}' is a constant and a channel; give one of them another name.")
         for term, expression in zip(self.terms, self.expressions, strict=True):
             try:
                 in_order(expression.lags, outputs, inputs)
@@ -189,6 +195,8 @@ def _agreed(terms: Sequence[Term]) -> list[Term]:
     """The terms with what one of them says about a parameter said by all of them."""
     said: dict[tuple[str, str], Any] = {}
     for term in terms:
+        if not term.parameter.strip() or not term.parameter.isprintable():
+            raise InputError(f"{term.parameter!r} cannot name a parameter; use visible characters on one line.")
         for what, value in (("initial value", term.initial), ("lower bound", term.min), ("upper bound", term.max)):
             if value is not None and not _is_number(value):
                 raise InputError(f"the {what} of '{term.parameter}' must be a finite number; got {value!r}.")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -46,6 +48,10 @@ ModelPath = Annotated[Path, typer.Argument(metavar="MODEL", help="Result folder 
 DataPath = Annotated[Path, typer.Argument(metavar="DATA", help="Data file with the model's channels.")]
 OutFolder = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Result folder.")]
 OutFile = Annotated[Path | None, typer.Option("--out", metavar="FILE", help="CSV file; standard output without it.")]
+Initial = Annotated[
+    str | None,
+    typer.Option("--initial", metavar="measured|zero|INIT", help="Outputs before the first step; INIT is a CSV."),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the summary.")]
 
 
@@ -88,7 +94,7 @@ def _options(
 
 @app.command()
 def demo(out: OutFolder = None) -> None:
-    """Fit the paper's mass-spring-damper, additive and orthogonal, and compare with the true parameters."""
+    """Fit the paper's example with two structures, compare with the truth."""
     from orthaug.jobs import check_output
 
     folder = out or Path("orthaug-out/demo")
@@ -104,7 +110,7 @@ def demo(out: OutFolder = None) -> None:
 
 @app.command()
 def check(spec: SpecPath, as_json: AsJson = False) -> None:
-    """Report excitation, identifiability and bias of data and physics; trains nothing."""
+    """Report excitation and identifiability; trains nothing."""
     from orthaug import jobs
     from orthaug.excitation import require_rank
 
@@ -127,8 +133,7 @@ def fit(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False) -> None:
     job = jobs.open_job(spec)
     jobs.check_inputs_kept(job, folder)
     _prepare_jax()
-    training = job.spec.training
-    with _progress(training.restarts, training.iterations, job.spec.learner.kind != "none") as progress:
+    with _progress(job.run_count, job.iterations, job.spec.learner.kind != "none") as progress:
         fitted = jobs.fit_job(job, progress)
     jobs.write_result(fitted, folder)
     if as_json:
@@ -142,21 +147,43 @@ def fit(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False) -> None:
 
 
 @app.command()
+def compare(
+    spec: SpecPath,
+    out: OutFolder = None,
+    model: Annotated[
+        list[Path] | None, typer.Option("--model", metavar="MODEL", help="A saved model to put beside; any number.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Physics alone and every structure on the same data and seeds, one table."""
+    from orthaug import jobs
+
+    folder = out or Path("orthaug-out") / spec.stem
+    jobs.check_output(folder)
+    job = jobs.open_job(spec)
+    jobs.check_inputs_kept(job, folder)
+    _prepare_jax()
+    from orthaug import compare as comparing
+
+    with _progress(job.run_count * len(comparing.KINDS), job.iterations) as progress:
+        found = comparing.compare(job, model or (), progress)
+    comparing.write(found, folder)
+    typer.echo(_json(found.result) if as_json else f"{comparing.text(found)}\n\nwritten to {folder}")
+
+
+@app.command()
 def simulate(
     model: ModelPath,
     data: DataPath,
     out: OutFile = None,
-    initial: Annotated[
-        str | None,
-        typer.Option("--initial", metavar="measured|zero|INIT", help="Outputs before the first step; INIT is a CSV."),
-    ] = None,
+    initial: Initial = None,
 ) -> None:
     """Free run of a saved model on a data file."""
     from orthaug import runs
 
     opened = runs.open_run(model, data)
     start = runs.read_initial(initial, opened)
-    runs.check_output(out)
+    runs.check_output(out, data, Path(initial or data))
     _prepare_jax()
     _write_response(opened.model.simulate(opened.record, initial=start), out)
 
@@ -167,14 +194,16 @@ def predict(
     data: DataPath,
     horizon: Annotated[int, typer.Option("--horizon", metavar="H", help="Steps ahead.")] = 1,
     out: OutFile = None,
+    initial: Initial = None,
 ) -> None:
-    """h-step-ahead prediction of a saved model on a data file."""
+    """Predict each row from outputs measured up to H samples before it."""
     from orthaug import runs
 
     opened = runs.open_run(model, data, need_outputs=True)
-    runs.check_output(out)
+    record = runs.with_initial(opened, runs.read_initial(initial, opened))
+    runs.check_output(out, data, Path(initial or data))
     _prepare_jax()
-    _write_response(opened.model.predict(opened.record, horizon=horizon), out)
+    _write_response(opened.model.predict(record, horizon=horizon), out)
 
 
 def _unbuilt(name: str) -> None:
@@ -183,7 +212,7 @@ def _unbuilt(name: str) -> None:
         raise InputError(f"`orthaug {name}` is not built yet in this version.")
 
 
-for _name in ("compare", "split", "design", "export", "reproduce"):
+for _name in ("split", "design", "export", "reproduce"):
     _unbuilt(_name)
 
 
@@ -210,18 +239,44 @@ def _progress(runs: int, iterations: int, wanted: bool = True) -> Iterator[Progr
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     reached = "the start of training"
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with (
+        _deferred_interrupt() as interrupted,
+        Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar,
+    ):
         task = bar.add_task("compiling", total=runs * iterations)
+        done: dict[int, int] = {}
 
         def tell(run: int, iteration: int, loss: float) -> None:
             nonlocal reached
+            done[run] = iteration
             reached = f"run {run + 1} of {runs}, iteration {iteration}, loss {loss:.3g}"
-            bar.update(task, completed=run * iterations + iteration, description=reached)
+            bar.update(task, completed=sum(done.values()), description=reached)
+            if interrupted.is_set():
+                raise KeyboardInterrupt(reached)
 
         try:
             yield tell
         except KeyboardInterrupt:
             raise KeyboardInterrupt(reached) from None
+        if interrupted.is_set():
+            raise KeyboardInterrupt("the scoring of the model")
+
+
+@contextmanager
+def _deferred_interrupt() -> Iterator[threading.Event]:
+    """Ctrl-C sets the event, so that it never lands inside compiled code; a second one interrupts at once."""
+    event = threading.Event()
+
+    def note(signum: int, frame: object) -> None:
+        if event.is_set():
+            raise KeyboardInterrupt
+        event.set()
+
+    previous = signal.signal(signal.SIGINT, note)
+    try:
+        yield event
+    finally:
+        signal.signal(signal.SIGINT, previous)
 
 
 def _write_response(response: Response, out: Path | None) -> None:

@@ -7,6 +7,10 @@ class InputError(ValueError):
     """Bad input: names what was found and what was expected. The command line exits with 2."""
 
 
+class MissingColumnError(InputError):
+    """A data file lacks a column or variable that is asked for."""
+
+
 class RankError(InputError):
     """The physics columns are linearly dependent on the data; names the parameters involved."""
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from orthaug._arrays import Matrix, Vector, check_choice, check_count, check_type
 from orthaug._jax import jax, jnp
@@ -17,17 +18,25 @@ from orthaug.errors import InputError
 from orthaug.excitation import ILL_CONDITIONED
 from orthaug.learners import MLP, Bound, External, Learner
 from orthaug.model import Form, Model, Numbers
+from orthaug.parallel import spread
 from orthaug.problem import Problem, pose
 from orthaug.record import Record
 from orthaug.regressors import Lags, Scaling
 from orthaug.result import Estimate, Restart, Status
 from orthaug.solvers import LevenbergMarquardt
-from orthaug.solvers.levenberg_marquardt import CONVERGED, NO_DESCENT, NON_FINITE, Run
+from orthaug.solvers.levenberg_marquardt import CONVERGED, NO_DESCENT, NON_FINITE, RUNNING, SPANNED, Run
 from orthaug.structures import Fixed, Orthogonal, Split, Structure, split
 from orthaug.training import Solver, Task
 
-_CODES = {CONVERGED: "converged", NO_DESCENT: "no_descent", NON_FINITE: "non_finite"}
+_CODES = {
+    RUNNING: "iteration_limit",
+    CONVERGED: "converged",
+    SPANNED: "converged",
+    NO_DESCENT: "no_descent",
+    NON_FINITE: "non_finite",
+}
 
+Regularization = str | float
 Progress = Callable[[int, int, float], None]
 """Called now and then with the number of the restart, the iteration and the loss."""
 
@@ -40,10 +49,11 @@ def estimate(
     learner: Learner | None = MLP(),  # noqa: B008  (frozen)
     structure: Structure = Orthogonal(),  # noqa: B008  (frozen)
     solver: Solver = LevenbergMarquardt(),  # noqa: B008  (frozen)
-    regularization: str | float = "none",
+    regularization: Regularization | Sequence[Regularization] = "none",
     restarts: int = 1,
     seed: int = 0,
     initial: Estimate | Model | None = None,
+    validation: Record | None = None,
     progress: Progress | None = None,
 ) -> Estimate:
     """Fit `y_k = φ(x_k)θ + learner(x_k) + e_k` by one-step prediction error (eq:cost_fun).
@@ -58,10 +68,14 @@ def estimate(
         structure: `Orthogonal()`, `Additive()`, `OrthogonalPenalty(λ)` or `BaselinePenalty(λ)`.
         solver: `LevenbergMarquardt(…)`, or `AdamLBFGS(…)`, the paper's pipeline from θ⁰.
         regularization: "none", "evidence" (MacKay; the weights' prior is estimated too), or a number: the
-            ridge α on the weights, against squared errors in units of the baseline's RMS residual.
-        restarts: runs from initial weights of seeds `seed … seed + restarts - 1`; the lowest loss is kept.
+            ridge α on the weights, against squared errors in units of the baseline's RMS residual. Several, if
+            `validation` is there to choose.
+        restarts: runs from initial weights of seeds `seed … seed + restarts - 1`, spread over the cores; the lowest
+            training loss is kept, or with `validation` the lowest one-step error there.
         seed: of the initial weights.
-        initial: warm start from an earlier estimate or model: its learner, features, scaling and weights.
+        initial: warm start from an earlier estimate or model: its learner, features, scaling and weights take
+            the place of `learner`, `restarts` and `seed`.
+        validation: a record that chooses between restarts and regularizations; it is never fitted.
         progress: called about twice a second with (restart, iteration, loss).
 
     Raises:
@@ -76,16 +90,21 @@ def estimate(
         >>> f"{fit.theta[0]:.3f}"
         '2.000'
     """
-    _check_arguments(record, baseline, lags, learner, structure, solver, regularization, initial)
+    _check_arguments(record, baseline, lags, learner, structure, solver, initial, validation)
+    choices = _regularizations(regularization, validation)
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
+    if seed + restarts >= 2**63:
+        raise InputError(f"`seed` must be below 2**63; got {seed}.")
     if initial is not None:
-        return _refit(record, baseline, lags, structure, solver, regularization, initial, progress)
+        task, w = _warm_start(record, baseline, lags, initial)
+        return _train(task, [_Start(0, w, choice) for choice in choices], structure, solver, validation, progress)
     problem = pose(record, baseline, lags, None if learner is None else learner.inputs)
     if learner is None:
         return _conclude(problem, structure, _nothing_learned(problem), Status("exact", 0, 0.0, np.nan))
     task = Task.of(problem, learner)
-    starts = [task.bound.init(jax.random.key(seed + i)) for i in range(restarts)]
-    return _train(task, starts, seed, structure, solver, regularization, progress)
+    weights = {s: task.bound.init(jax.random.key(s)) for s in range(seed, seed + restarts)}
+    starts = [_Start(s, w, choice) for choice in choices for s, w in weights.items()]
+    return _train(task, starts, structure, solver, validation, progress)
 
 
 def orthogonalize(
@@ -113,17 +132,10 @@ def orthogonalize(
     return _conclude(problem, Orthogonal(), learned, Status("exact", 0, 0.0, np.nan))
 
 
-def _refit(
-    record: Record,
-    baseline: Baseline,
-    lags: Lags | None,
-    structure: Structure,
-    solver: Solver,
-    regularization: str | float,
-    initial: Estimate | Model,
-    progress: Progress | None,
-) -> Estimate:
-    """Go on from an earlier model's weights, in its scaling."""
+def _warm_start(
+    record: Record, baseline: Baseline, lags: Lags | None, initial: Estimate | Model
+) -> tuple[Task, Float[Array, "nw"]]:
+    """The task of going on from an earlier model's weights, in its scaling."""
     model = initial.model if isinstance(initial, Estimate) else initial
     bound, numbers = model.form.bound, model.numbers
     if bound is None:
@@ -132,35 +144,83 @@ def _refit(
     if len(problem.outputs) != bound.ny:
         raise InputError(f"`initial` has {bound.ny} outputs, the record {len(problem.outputs)}; fit anew.")
     scaling = Scaling(np.asarray(numbers.centre), np.asarray(numbers.halfwidth))
-    task = Task.of(problem, bound.learner, scaling, np.asarray(numbers.gain))
-    return _train(task, [jnp.asarray(numbers.weights)], 0, structure, solver, regularization, progress)
+    return Task.of(problem, bound.learner, scaling, np.asarray(numbers.gain)), jnp.asarray(numbers.weights)
+
+
+@dataclass(frozen=True, eq=False)
+class _Start:
+    """One run to be made: its seed, initial weights and regularization."""
+
+    seed: int
+    weights: Any
+    regularization: Regularization
 
 
 def _train(
     task: Task,
-    starts: list[Any],
-    seed: int,
+    starts: Sequence[_Start],
     structure: Structure,
     solver: Solver,
-    regularization: str | float,
+    validation: Record | None,
     progress: Progress | None,
 ) -> Estimate:
-    """Run from every start and conclude with the best."""
-    runs = [task.run(solver, w, structure, regularization, _tell(progress, i, task)) for i, w in enumerate(starts)]
-    losses = np.array([task.mean_square(run.normal.loss) for run in runs])
-    best = int(np.nanargmin(losses)) if np.isfinite(losses).any() else 0
+    """Run from every start and conclude with the best, by training loss or by one-step validation error."""
+
+    def one(numbered: tuple[int, _Start], check: Callable[[], None]) -> Run:
+        i, start = numbered
+
+        def tell(iteration: int, loss: float) -> None:
+            check()
+            if progress is not None:
+                progress(i, iteration, task.mean_square(loss))
+
+        return task.run(solver, start.weights, structure, start.regularization, tell)
+
+    runs = spread(one, list(enumerate(starts)))
+    losses = [task.mean_square(run.normal.loss) for run in runs]
+    concluded, errors = {}, [math.nan] * len(runs)
+    if validation is not None:
+        concluded = {i: _trained(task, structure, run) for i, run in enumerate(runs)}
+        errors = [_validation_error(fit, validation) for fit in concluded.values()]
+    ranking = np.array(losses if validation is None else errors)
+    best = int(np.nanargmin(ranking)) if np.isfinite(ranking).any() else 0
+    fit = concluded[best] if validation is not None else _trained(task, structure, runs[best])
     restarts = tuple(
-        Restart(seed + i, float(loss) if np.isfinite(loss) else None, run.iterations, _code(run), i == best)
-        for i, (run, loss) in enumerate(zip(runs, losses, strict=True))
+        Restart(
+            seed=start.seed,
+            loss=_finite(losses[i]),
+            iterations=run.iterations,
+            code=_code(run),
+            chosen=i == best,
+            regularization=start.regularization,
+            validation=_finite(errors[i]),
+        )
+        for i, (start, run) in enumerate(zip(starts, runs, strict=True))
     )
-    run = runs[best]
+    seconds = sum(run.seconds for run in runs)
+    return replace(fit, restarts=restarts, status=replace(fit.status, seconds=seconds))
+
+
+def _trained(task: Task, structure: Structure, run: Run) -> Estimate:
+    """The estimate that a run leads to."""
     values = task.values(run.w)
     code = _code(run) if np.isfinite(values).all() else "non_finite"
     learned = _Learned(
         task.bound, np.asarray(run.w), task.scaling, task.unit, values, run.effective, task.gram(run), run
     )
-    status = Status(code, run.iterations, sum(r.seconds for r in runs), np.nan)
-    return _conclude(task.problem, structure, learned, status, restarts)
+    return _conclude(task.problem, structure, learned, Status(code, run.iterations, run.seconds, np.nan))
+
+
+def _validation_error(fit: Estimate, validation: Record) -> float:
+    """Mean squared one-step error with each output in its training standard deviation; NaN without a model."""
+    if not fit.status.ok:
+        return math.nan
+    rmse = fit.model.predict(validation).scores().rmse
+    return float(np.mean((rmse * fit.problem.weight) ** 2))
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,6 +277,7 @@ def _conclude(
             outputs=record.outputs,
             inputs=record.inputs,
             sampling_time=record.sampling_time,
+            time_column=record.time_column,
             structure=structure.name,
             largest_output=np.max([np.abs(e.outputs).max(axis=0) for e in record.experiments], axis=0),
             gram=learned.gram,
@@ -253,8 +314,7 @@ def _warnings(
             f"the physics is ill-conditioned on the data (condition {condition:.1e} of the scaled columns): "
             "θ is determined, but small changes of the data move it far."
         )
-    run = learned.run
-    if run is not None and run.code == CONVERGED and run.iterations == 0:
+    if learned.run is not None and learned.run.code == SPANNED:
         found.append(
             "the learner lies in the span of the physics (P⊥J = 0): there is nothing for it to learn that the "
             "physics does not express already. Give it another form or other inputs, or leave it out."
@@ -282,13 +342,7 @@ def _warnings(
 
 
 def _code(run: Run) -> str:
-    return _CODES.get(run.code, "iteration_limit")
-
-
-def _tell(progress: Progress | None, restart: int, task: Task) -> Callable[[int, float], None] | None:
-    if progress is None:
-        return None
-    return lambda iteration, loss: progress(restart, iteration, task.mean_square(loss))
+    return _CODES[run.code]
 
 
 def _check_arguments(
@@ -298,8 +352,8 @@ def _check_arguments(
     learner: Any,
     structure: Any,
     solver: Any,
-    regularization: Any,
     initial: Any,
+    validation: Any,
 ) -> None:
     check_type(record, Record, "record", "a Record")
     check_type(baseline, Baseline, "baseline", "a Baseline")
@@ -308,9 +362,21 @@ def _check_arguments(
     check_type(structure, Structure, "structure", "a structure such as Orthogonal()")
     check_type(solver, Solver, "solver", "a solver such as LevenbergMarquardt()")
     check_type(initial, Estimate | Model | None, "initial", "an Estimate, a Model or None")
-    if isinstance(regularization, str):
-        check_choice(regularization, ("none", "evidence"), "`regularization`")
-    elif isinstance(regularization, bool) or not isinstance(regularization, int | float | np.number):
-        raise InputError(f"`regularization` must be none, evidence or a number; got {regularization!r}.")
-    elif not (np.isfinite(regularization) and regularization >= 0):
-        raise InputError(f"`regularization` must be 0 or more; got {regularization}.")
+    check_type(validation, Record | None, "validation", "a Record or None")
+
+
+def _regularizations(given: Any, validation: Record | None) -> tuple[Regularization, ...]:
+    """The regularizations to try, each checked."""
+    choices = tuple(given) if isinstance(given, list | tuple) else (given,)
+    if len(choices) > 1 and validation is None:
+        raise InputError("several regularizations need `validation` to choose between them.")
+    for choice in choices:
+        if isinstance(choice, str):
+            check_choice(choice, ("none", "evidence"), "`regularization`")
+        elif isinstance(choice, bool) or not isinstance(choice, int | float | np.number):
+            raise InputError(f"`regularization` must be none, evidence or a number; got {choice!r}.")
+        elif not (np.isfinite(choice) and choice >= 0):
+            raise InputError(f"`regularization` must be 0 or more; got {choice}.")
+    if not choices:
+        raise InputError("`regularization` is empty; give none, evidence or a number.")
+    return choices

@@ -33,6 +33,7 @@ class Lag(NamedTuple):
 
 FUNCTIONS = ("sin", "cos", "tan", "exp", "log", "sqrt", "abs", "sign", "tanh", "min", "max")
 RESERVED = frozenset((*FUNCTIONS, "k"))
+LARGEST_LAG = 100_000  # more is a mistake, and would fill the memory
 _MAX_LENGTH = 500  # characters; a longer expression is a mistake, and messages stay readable
 _BINARY = {
     ast.Add: lambda a, b: a + b,
@@ -101,6 +102,8 @@ def parse(text: str, constants: Mapping[str, float] | None = None) -> Expression
     text = " ".join(text.split())
     if not text:
         raise InputError("An expression is empty; write for example y[k-1], or 1 for an offset.")
+    if "#" in text:
+        raise InputError(f"'{text[:_MAX_LENGTH]}': '#' is not allowed in an expression; allowed are {_ALLOWED}.")
     if len(text) > _MAX_LENGTH:
         raise InputError(f"An expression has {len(text)} characters; at most {_MAX_LENGTH} are read.")
     try:
@@ -181,8 +184,8 @@ def _lag(node: ast.Subscript, text: str) -> Lag:
     ):
         if isinstance(index.op, ast.Add) and index.right.value > 0:
             raise InputError(f"'{text}': '{piece}' looks ahead; a regressor uses {name}[k] or earlier samples.")
-        if index.right.value > 1_000_000:
-            raise InputError(f"'{text}': '{piece}' reaches too far back; lags up to 1000000 are read.")
+        if index.right.value > LARGEST_LAG:
+            raise InputError(f"'{text}': '{piece}' reaches too far back; lags up to {LARGEST_LAG} are read.")
         return Lag(name, index.right.value)
     raise InputError(f"'{text}': the index of '{piece}' must be k or k-1, k-2, … with a whole number.")
 

@@ -13,7 +13,11 @@ from orthaug.errors import InputError
 
 def check_replaceable(folder: Path, is_ours: Callable[[Path], bool]) -> None:
     """Raise InputError unless `folder` can be written: it is absent, empty or ours, in a place that can be written."""
-    if folder.exists() or folder.is_symlink():
+    try:
+        there = folder.exists() or folder.is_symlink()
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror}).") from None
+    if there:
         if not folder.is_dir():
             raise InputError(f"{folder}: not a folder; give another name.")
         if any(folder.iterdir()) and not is_ours(folder):

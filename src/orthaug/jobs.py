@@ -6,21 +6,24 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from orthaug import __version__
 from orthaug.errors import InputError
 from orthaug.excitation import Excitation, identifiability
 from orthaug.folders import check_replaceable, whole_folder
-from orthaug.problem import Problem, pose
+from orthaug.problem import Problem, check_defined, pose
 from orthaug.readers import read_record
-from orthaug.record import Record
+from orthaug.record import Record, same_step
 from orthaug.spec import Part, Spec, load_spec
+from orthaug.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty, Structure
 
 if TYPE_CHECKING:
-    from orthaug.model import Model
+    from orthaug.model import Model, Response
     from orthaug.result import Estimate
 
 SCHEMA = 1
@@ -44,13 +47,27 @@ class Job:
     path: Path
     spec: Spec
     train: LoadedPart
+    validation: LoadedPart | None
     tests: tuple[LoadedPart, ...]
     problem: Problem
     warnings: tuple[str, ...]
 
     @property
+    def run_count(self) -> int:
+        """How many runs a fit makes: restarts times regularizations."""
+        choices = self.spec.training.regularizations(self.validation is not None)
+        return self.spec.training.restarts * (len(choices) if isinstance(choices, tuple) else 1)
+
+    @property
+    def iterations(self) -> int:
+        """Steps of a run at most."""
+        training = self.spec.training
+        gradient = training.adam_iterations + training.lbfgs_iterations
+        return training.iterations if training.solver == "levenberg-marquardt" else gradient
+
+    @property
     def parts(self) -> tuple[LoadedPart, ...]:
-        return (self.train, *self.tests)
+        return (self.train, *([self.validation] if self.validation else []), *self.tests)
 
 
 def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
@@ -61,34 +78,57 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
     """
     spec = load_spec(path)
     try:
-        baseline, learner_inputs = spec.physics_terms(), spec.learner_inputs()
-        train = _load(spec, spec.data.train, path.parent, "train")
-        tests = tuple(_load(spec, part, path.parent, f"tests.{name}") for name, part in spec.data.tests.items())
-        lags = spec.lag_orders() if spec.learner.kind != "none" else None
+        baseline, learner_inputs = spec.declared_baseline(), spec.learner_inputs()
+        spec.channels(spec.data.inputs + spec.data.outputs)
+        structure_of(spec).penalty(baseline.names, baseline.initial, 1.0)
+        baseline.check_channels(spec.data.outputs, spec.data.inputs)
+    except InputError as error:
+        raise type(error)(f"{path}: {error}") from None
+    train = _load(path, spec, spec.data.train, "train")
+    validation = _load(path, spec, spec.data.validation, "validation") if spec.data.validation else None
+    tests = tuple(_load(path, spec, part, f"tests.{name}") for name, part in spec.data.tests.items())
+    lags = spec.lag_orders() if spec.learner.kind != "none" else None
+    try:
         problem = pose(train.record, baseline, lags, learner_inputs, require_full_rank=require_full_rank)
         problem.feature_rows()
-        for part in (train, *tests):
+        job = Job(path, spec, train, validation, tests, problem, ())
+        for part in job.parts:
             _check_scorable(part, problem.rows.start, train.record.sampling_time)
+            check_defined(problem, part.record)
     except InputError as error:
-        message = str(error)
-        raise type(error)(message if message.startswith(str(path.parent)) else f"{path}: {message}") from None
-    parts = {"train": spec.data.train, **{f"tests.{k}": v for k, v in spec.data.tests.items()}}
-    warnings = tuple(
-        f"{name}: one row in {part.every} is kept without a filter; content above the new Nyquist frequency folds back."
-        for name, part in parts.items()
-        if part.every > 1
+        raise type(error)(f"{path}: {error}") from None
+    declared = {"train": spec.data.train, "validation": spec.data.validation}
+    declared |= {f"tests.{name}": part for name, part in spec.data.tests.items()}
+    return replace(
+        job, warnings=tuple(_thinned(name, part.every) for name, part in declared.items() if part and part.every > 1)
     )
-    return Job(path, spec, train, tests, problem, warnings)
 
 
-def _load(spec: Spec, part: Part, folder: Path, name: str) -> LoadedPart:
+def _thinned(name: str, every: int) -> str:
+    return f"{name}: one row in {every} is kept without a filter; content above the new Nyquist frequency folds back."
+
+
+def structure_of(spec: Spec, kind: str | None = None) -> Structure:
+    """The structure that a spec declares, or another kind with its weight."""
+    weight = spec.structure.weight
+    known = {
+        "additive": Additive(),
+        "orthogonal": Orthogonal(),
+        "orthogonal-penalty": OrthogonalPenalty(weight),
+        "baseline-penalty": BaselinePenalty(weight),
+    }
+    return known[kind or spec.structure.kind]
+
+
+def _load(path: Path, spec: Spec, part: Part, name: str) -> LoadedPart:
+    """Read a part's files; messages begin with the file that is at fault."""
     unknown = [channel for channel in part.columns if channel not in (*spec.data.inputs, *spec.data.outputs)]
     if unknown:
-        raise InputError(f"'data.{name}.columns': '{unknown[0]}' is neither an input nor an output.")
+        raise InputError(f"{path}: 'data.{name}.columns': '{unknown[0]}' is neither an input nor an output.")
     records, files = [], []
     for file in part.files:
         record = read_record(
-            folder / file,
+            path.parent / file,
             inputs=spec.channels(spec.data.inputs),
             outputs=spec.channels(spec.data.outputs),
             sampling_time=spec.data.sampling_time,
@@ -98,13 +138,13 @@ def _load(spec: Spec, part: Part, folder: Path, name: str) -> LoadedPart:
             columns=part.columns,
         )
         records.append(record)
-        digest = hashlib.sha256((folder / file).read_bytes()).hexdigest()
+        digest = hashlib.sha256((path.parent / file).read_bytes()).hexdigest()
         files.append({"file": file, "sha256": digest, "rows": len(record)})
     return LoadedPart(name, Record.join(records), part.skip, tuple(files))
 
 
 def _check_scorable(part: LoadedPart, start: int, sampling_time: float) -> None:
-    if abs(part.record.sampling_time - sampling_time) > 1e-3 * sampling_time:
+    if not same_step(part.record.sampling_time, sampling_time):
         raise InputError(
             f"data.{part.name}: sampled every {part.record.sampling_time:g} s, the training data every "
             f"{sampling_time:g} s; one model has one sampling time."
@@ -125,7 +165,7 @@ def check_report(job: Job) -> dict[str, Any]:
     return {
         "schema": SCHEMA,
         "orthaug": __version__,
-        "data": _data(job),
+        "data": data_of(job),
         "parameters": list(problem.baseline.names),
         "regressor": [str(lag) for lag in problem.layout],
         "rows": len(problem.rows),
@@ -141,27 +181,31 @@ def check_report(job: Job) -> dict[str, Any]:
     }
 
 
-def run_fit(job: Job, progress: Progress | None = None) -> Estimate:
-    """Train as the spec says."""
+def run_fit(job: Job, progress: Progress | None = None, *, kind: str | None = None, alone: bool = False) -> Estimate:
+    """Train as the spec says; with another `kind` of structure, or the physics `alone`."""
     from orthaug.estimation import estimate
     from orthaug.learners import MLP
-    from orthaug.solvers import LevenbergMarquardt
-    from orthaug.structures import Additive, Orthogonal
+    from orthaug.solvers import AdamLBFGS, LevenbergMarquardt
 
     spec, training = job.spec, job.spec.training
     learner = None
-    if spec.learner.kind == "mlp":
+    if spec.learner.kind == "mlp" and not alone:
         learner = MLP(tuple(spec.learner.hidden), spec.learner.activation, spec.learner_inputs())
+    if training.solver == "adam-lbfgs":
+        solver = AdamLBFGS(training.adam_iterations, training.lbfgs_iterations, training.learning_rate)
+    else:
+        solver = LevenbergMarquardt(training.iterations)
     return estimate(
         job.train.record,
         job.problem.baseline,
         lags=spec.lag_orders() if learner is not None else None,
         learner=learner,
-        structure={"additive": Additive(), "orthogonal": Orthogonal()}[spec.structure.kind],
-        solver=LevenbergMarquardt(training.iterations),
-        regularization=training.regularization,
+        structure=Orthogonal() if alone else structure_of(spec, kind),
+        solver=solver,
+        regularization=training.regularizations(job.validation is not None),
         restarts=training.restarts,
         seed=training.seed,
+        validation=job.validation.record if job.validation else None,
         progress=progress,
     )
 
@@ -173,23 +217,25 @@ class Fitted:
     job: Job
     fit: Estimate
     result: dict[str, Any]
+    responses: tuple[Response, Response] | None
+    """One-step prediction and free run of the last part."""
 
 
-def fit_job(job: Job, progress: Progress | None = None) -> Fitted:
-    """Train, score every part, and put the result together."""
-    fit = run_fit(job, progress)
+def fit_job(job: Job, progress: Progress | None = None, *, kind: str | None = None, alone: bool = False) -> Fitted:
+    """Train, score every part, and put the result together; the arguments as in `run_fit`."""
+    fit = run_fit(job, progress, kind=kind, alone=alone)
     warnings = [*job.warnings, *fit.warnings]
-    scores = {}
+    scores, responses = {}, None
     if fit.status.ok:
         for part in job.parts:
-            scores[part.name] = _scores(fit.model, part, warnings)
+            scores[part.name], responses = score_part(fit.model, part, warnings)
     spec = job.spec.model_dump(mode="json", exclude_unset=True)
     status = fit.status
     result = {
         "schema": SCHEMA,
         "orthaug": __version__,
         "spec": spec,
-        "data": _data(job),
+        "data": data_of(job),
         "status": {
             "code": status.code,
             "message": status.message,
@@ -197,9 +243,7 @@ def fit_job(job: Job, progress: Progress | None = None) -> Fitted:
             "seconds": status.seconds,
             "loss": status.loss,
         },
-        "restarts": [
-            {"seed": r.seed, "loss": r.loss, "iterations": r.iterations, "chosen": r.chosen} for r in fit.restarts
-        ],
+        "restarts": [asdict(restart) for restart in fit.restarts],
         "parameters": _parameters(fit),
         "physical_parameters": None,
         "structure": fit.model.structure,
@@ -212,7 +256,7 @@ def fit_job(job: Job, progress: Progress | None = None) -> Fitted:
         "validation": None,
         "warnings": warnings,
     }
-    return Fitted(job, fit, plain(result))
+    return Fitted(job, fit, plain(result), responses)
 
 
 def is_result(folder: Path) -> bool:
@@ -254,15 +298,17 @@ def fill_result(fitted: Fitted, folder: Path) -> None:
     (folder / "model").mkdir()
     storage.write(fitted.fit.model, folder / "model")
     (folder / "figures").mkdir()
-    part = fitted.job.parts[-1]
-    one_step, free = fitted.fit.model.predict(part.record), fitted.fit.model.simulate(part.record)
-    where = f"{part.name}, {fitted.fit.model.structure}"
-    for name, figure in (
-        ("prediction", plots.output_figure(one_step, f"one-step prediction ({where})")),
-        ("simulation", plots.output_figure(free, f"free run ({where})")),
-        ("residual", plots.residual_figure(one_step, f"one-step residual ({where})")),
-        ("components", plots.components_figure(one_step, f"parts of the one-step prediction ({where})")),
-    ):
+    assert fitted.responses is not None
+    one_step, free = fitted.responses
+    where = f"{fitted.job.parts[-1].name}, {fitted.fit.model.structure}"
+    drawn = {
+        "prediction": plots.output_figure(one_step, f"one-step prediction, {where}"),
+        "simulation": plots.output_figure(free, f"free run, {where}"),
+        "residual": plots.residual_figure(one_step, f"one-step residual, {where}"),
+    }
+    if fitted.fit.model.form.bound is not None:
+        drawn["components"] = plots.components_figure(one_step, f"parts of the one-step prediction, {where}")
+    for name, figure in drawn.items():
         plots.save(figure, folder / "figures" / f"{name}.png")
 
 
@@ -277,31 +323,34 @@ def plain(value: Any) -> Any:
     return value
 
 
-def _scores(model: Model, part: LoadedPart, warnings: list[str]) -> dict[str, Any]:
-    """Scores of a part; what does not exist is None, with a sentence in `warnings`."""
+def score_part(model: Model, part: LoadedPart, warnings: list[str]) -> tuple[dict[str, Any], tuple[Response, Response]]:
+    """Scores of a part and the responses they come from; what does not exist is None, with a sentence in `warnings`."""
+    responses = model.predict(part.record), model.simulate(part.record)
     found = {}
-    for kind, response in (("prediction", model.predict(part.record)), ("simulation", model.simulate(part.record))):
+    for kind, response in zip(("prediction", "simulation"), responses, strict=True):
+        runaway = next((t.diverged for t in response.trajectories if t.diverged), None)
         scored = response.scores(part.skip)
         found[kind] = scored.as_dict()
-        runaway = next((t.diverged for t in response.trajectories if t.diverged), None)
         if runaway is not None:
             step, output = runaway
             found[kind] = {"rmse": None, "nrmse": None, "fit": None}
             warnings.append(
                 f"{part.name}: the free run diverged in output '{output}' at step {step}; no simulation scores."
             )
-        elif found[kind]["rmse"] is None or None in found[kind]["rmse"]:
-            warnings.append(f"{part.name}: the {kind} has values that are not finite; no scores.")
-        elif found[kind]["nrmse"] is None or None in found[kind]["nrmse"]:
+        elif np.isnan(scored.rmse).any():
+            warnings.append(f"{part.name}: the {kind} is not finite on some rows; no scores.")
+        elif np.isnan(scored.nrmse).any():
             warnings.append(
-                f"{part.name}: an output is constant over the scored samples, so its NRMSE and FIT do not exist."
+                f"{part.name}: an output is constant over the scored samples; no NRMSE and FIT of its {kind}."
             )
-    return found
+    return found, responses
 
 
-def _data(job: Job) -> dict[str, Any]:
+def data_of(job: Job) -> dict[str, Any]:
+    """The files of each part, as result.json lists them."""
     return {
         "train": list(job.train.files),
+        **({"validation": list(job.validation.files)} if job.validation else {}),
         **({"tests": {part.name.removeprefix("tests."): list(part.files) for part in job.tests}} if job.tests else {}),
     }
 

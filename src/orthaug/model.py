@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,7 +16,7 @@ from orthaug.baseline import Baseline
 from orthaug.errors import InputError
 from orthaug.learners import Bound
 from orthaug.metrics import Scores, scores
-from orthaug.record import Channel, Experiment, Record
+from orthaug.record import Channel, Experiment, Record, same_step
 from orthaug.regressors import Features, Layout, lag_matrix, largest_lag
 
 if TYPE_CHECKING:
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 AnyArray = Array | np.ndarray
 
 _BATCH = 4096  # rows per compiled call; records of any length share the program
+_WINDOW_CELLS = 8_000_000  # input cells of a batch of multi-step predictions
 _RUNAWAY = 1e6  # times the largest training output: a free run beyond this has diverged
 
 
@@ -131,6 +132,7 @@ class Trajectory:
     learner_before: Matrix
     measured: Matrix | None
     start: int
+    start_time: float = 0.0
     diverged: tuple[int, str] | None = None
 
     @property
@@ -186,7 +188,9 @@ class Response:
         import pandas as pd
 
         trajectory = self.trajectories[experiment]
-        columns: dict[str, Any] = {"time": np.arange(len(trajectory.model)) * self.sampling_time}
+        columns: dict[str, Any] = {
+            "time": trajectory.start_time + np.arange(len(trajectory.model)) * self.sampling_time
+        }
         for i, channel in enumerate(self.outputs):
             if trajectory.measured is not None:
                 columns[channel.name] = trajectory.measured[:, i]
@@ -211,6 +215,7 @@ class Model:
     sampling_time: float
     structure: str
     largest_output: Vector
+    time_column: str | None = None
     gram: Matrix | None = None
     noise: Matrix | None = None
 
@@ -250,7 +255,7 @@ class Model:
                 found = _in_batches(lambda rows: _predict_rows(self.form, self.numbers, rows), (x,))
             else:
                 found = self._predict_ahead(experiment, record, int(horizon))
-            trajectories.append(_trajectory(found, experiment.outputs, len(experiment), first))
+            trajectories.append(_trajectory(found, experiment, experiment.outputs, first))
         return Response(tuple(trajectories), int(horizon), self.outputs, record.sampling_time)
 
     def simulate(self, record: Record, initial: str | Any = "measured") -> Response:
@@ -271,7 +276,7 @@ class Model:
             measured = experiment.outputs if record.outputs else None
             past = self._initial(initial, measured)
             found = self._run(past, experiment, record)
-            trajectories.append(self._bounded(found, measured, len(experiment)))
+            trajectories.append(self._bounded(found, experiment, measured))
         return Response(tuple(trajectories), None, self.outputs, record.sampling_time)
 
     def check_initial(self, initial: Any) -> Matrix:
@@ -317,7 +322,9 @@ class Model:
         windows = np.lib.stride_tricks.sliding_window_view(inputs, horizon, axis=0).swapaxes(1, 2)
         outputs = experiment.outputs[: len(experiment) - horizon]
         past = np.stack([outputs[start - i - 1 : len(outputs) - i] for i in range(self._memory)], axis=1)
-        return _in_batches(lambda p, u: _ahead(self.form, self.numbers, p, u, horizon), (past[: len(windows)], windows))
+        largest = max(1, _WINDOW_CELLS // max(1, windows[0].size))  # windows overlap: they are copied batch by batch
+        rows = (past[: len(windows)], windows)
+        return _in_batches(lambda p, u: _ahead(self.form, self.numbers, p, u, horizon), rows, largest)
 
     def _initial(self, initial: Any, measured: Matrix | None) -> Matrix:
         """The last `_memory` outputs before the first usable row, newest first."""
@@ -334,9 +341,9 @@ class Model:
             rows = self.check_initial(initial)[:start]
         return rows[len(rows) - memory :][::-1].copy()
 
-    def _bounded(self, found: Parts, measured: Matrix | None, rows: int) -> Trajectory:
+    def _bounded(self, found: Parts, experiment: Experiment, measured: Matrix | None) -> Trajectory:
         """A free run cut where it left all bounds."""
-        trajectory = _trajectory(found, measured, rows, self.form.start)
+        trajectory = _trajectory(found, experiment, measured, self.form.start)
         with np.errstate(all="ignore"):
             wild = ~(np.abs(trajectory.model[self.form.start :]) <= _RUNAWAY * self.largest_output)
         if not wild.any():
@@ -344,8 +351,8 @@ class Model:
         step = int(np.argmax(wild.any(axis=1)))
         output = self.outputs[int(np.argmax(wild[step]))].name
         cut = Parts(*(np.where(np.arange(len(part))[:, None] < step, part, np.nan) for part in found))
-        bounded = _trajectory(cut, measured, rows, self.form.start)
-        return Trajectory(**{**bounded.__dict__, "diverged": (step + self.form.start, output)})
+        bounded = _trajectory(cut, experiment, measured, self.form.start)
+        return replace(bounded, diverged=(step + self.form.start, output))
 
     def _check_rows(self, experiment: Experiment, first: int) -> None:
         if len(experiment) <= first:
@@ -358,7 +365,7 @@ class Model:
         Raises:
             InputError: a channel is missing, or the sampling time differs by more than 0.1 %.
         """
-        if not np.isclose(record.sampling_time, self.sampling_time, rtol=1e-3):
+        if not same_step(record.sampling_time, self.sampling_time):
             raise InputError(
                 f"the record is sampled every {record.sampling_time:g} s, the model every {self.sampling_time:g} s; "
                 "resample the record."
@@ -373,7 +380,7 @@ class Model:
                 raise InputError(f"the record lacks the {kind[:-1]} {', '.join(missing)} of the model; it has {found}.")
         order = {kind: [names[kind].index(c.name) for c in channels] for kind, channels in wanted.items()}
         experiments = tuple(
-            Experiment(e.inputs[:, order["inputs"]], e.outputs[:, order["outputs"]], e.source, e.first_row)
+            replace(e, inputs=e.inputs[:, order["inputs"]], outputs=e.outputs[:, order["outputs"]])
             for e in record.experiments
         )
         return Record(self.inputs, wanted["outputs"], record.sampling_time, experiments)
@@ -384,10 +391,10 @@ def _bucket(steps: int) -> int:
     return max(256, 1 << (steps - 1).bit_length())
 
 
-def _in_batches(function: Callable[..., Parts], rows: tuple[np.ndarray, ...]) -> Parts:
+def _in_batches(function: Callable[..., Parts], rows: tuple[np.ndarray, ...], largest: int = _BATCH) -> Parts:
     """`function` over batches of rows, padded to one shape, its results concatenated."""
     count = len(rows[0])
-    size = min(_BATCH, _bucket(count))
+    size = min(_BATCH, largest, _bucket(count))
     pieces = []
     for begin in range(0, count, size):
         batch = [array[begin : begin + size] for array in rows]
@@ -398,10 +405,12 @@ def _in_batches(function: Callable[..., Parts], rows: tuple[np.ndarray, ...]) ->
     return Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True)))
 
 
-def _trajectory(found: Parts, measured: Matrix | None, rows: int, first: int) -> Trajectory:
+def _trajectory(found: Parts, experiment: Experiment, measured: Matrix | None, first: int) -> Trajectory:
     def whole(values: Any) -> Matrix:
-        padded = np.full((rows, values.shape[1]), np.nan)
+        padded = np.full((len(experiment), values.shape[1]), np.nan)
         padded[first:] = values
         return padded
 
-    return Trajectory(whole(found.baseline), whole(found.learner), whole(found.raw), measured, first)
+    return Trajectory(
+        whole(found.baseline), whole(found.learner), whole(found.raw), measured, first, experiment.start_time
+    )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -10,30 +12,35 @@ from matplotlib.figure import Figure
 from orthaug.model import Response
 
 # Okabe-Ito: told apart by every reader
-_BLACK, _BLUE, _ORANGE, _GREEN = "#000000", "#0072B2", "#E69F00", "#009E73"
+_BLACK, _GREY, _BLUE, _ORANGE, _GREEN = "#000000", "#B8B8B8", "#0072B2", "#E69F00", "#009E73"
 _WINDOW = 250  # samples of a long record that are shown, so that single swings can be seen
 _SIZE = (7.0, 2.4)  # inches per panel
 
 
 def output_figure(response: Response, title: str) -> Figure:
-    """Measured output against the model, a window from the first value on, one panel per output."""
-    figure, axes = _panels(response, title)
-    time, rows = _window(response)
+    """Measured output against the model, and below it their difference, from the first value on."""
     trajectory = response.trajectories[0]
-    for i, (axis, channel) in enumerate(zip(axes, response.outputs, strict=True)):
+    time, rows = _window(response)
+    figure, axes = _panels(response, f"{title}: {_extent(response, rows)}", heights=(2, 1))
+    for i, channel in enumerate(response.outputs):
+        upper, lower = axes[2 * i], axes[2 * i + 1]
         if trajectory.measured is not None:
-            axis.plot(time, trajectory.measured[rows, i], color=_BLACK, linewidth=1.8, label="measured")
-        axis.plot(time, trajectory.model[rows, i], color=_ORANGE, linewidth=1.1, label="model")
-        axis.set_ylabel(channel.label)
-        _legend(axis)
+            upper.plot(time, trajectory.measured[rows, i], color=_GREY, linewidth=2.6, label="measured")
+            error = trajectory.measured[rows, i] - trajectory.model[rows, i]
+            lower.plot(time, error, color=_BLUE, linewidth=0.9)
+        upper.plot(time, trajectory.model[rows, i], color=_BLACK, linewidth=0.9, label="model")
+        upper.set_ylabel(channel.label)
+        lower.set_ylabel("difference" + (f" [{channel.unit}]" if channel.unit else ""))
+        _legend(upper)
     axes[-1].set_xlabel("time [s]")
+    figure.align_ylabels()
     return figure
 
 
 def residual_figure(response: Response, title: str) -> Figure:
     """Measured minus model over the whole record, one panel per output."""
-    figure, axes = _panels(response, title)
     trajectory = response.trajectories[0]
+    figure, axes = _panels(response, f"{title}: {_extent(response, slice(trajectory.start, len(trajectory.model)))}")
     assert trajectory.measured is not None
     time = np.arange(len(trajectory.model)) * response.sampling_time
     for i, (axis, channel) in enumerate(zip(axes, response.outputs, strict=True)):
@@ -46,19 +53,69 @@ def residual_figure(response: Response, title: str) -> Figure:
 
 
 def components_figure(response: Response, title: str) -> Figure:
-    """The baseline's and the learner's part of the model's output, over the same window; two panels per output."""
-    figure, axes = _panels(response, title, per_output=2)
+    """The baseline's and the learner's part of the model's output, each on its own scale; two panels per output."""
     time, rows = _window(response)
     trajectory = response.trajectories[0]
+    figure, axes = _panels(response, f"{title}: {_extent(response, rows)}", heights=(1, 1))
     for i, channel in enumerate(response.outputs):
-        upper, lower = axes[2 * i], axes[2 * i + 1]
-        upper.plot(time, trajectory.baseline[rows, i], color=_BLUE, linewidth=1.2, label="baseline φθ")
-        lower.plot(time, trajectory.learner[rows, i], color=_GREEN, linewidth=1.2, label="learner f − φθ_aux")
-        for axis in (upper, lower):
-            axis.set_ylabel(channel.label)
+        unit = f" [{channel.unit}]" if channel.unit else ""
+        for axis, values, color, part, formula in (
+            (axes[2 * i], trajectory.baseline, _BLUE, "baseline", r"$\varphi\,\theta$"),
+            (axes[2 * i + 1], trajectory.learner, _GREEN, "learner", r"$f - \varphi\,\theta_{\mathrm{aux}}$"),
+        ):
+            axis.plot(
+                time, values[rows, i], color=color, linewidth=1.1, label=f"{part} part of {channel.name}, {formula}"
+            )
+            axis.set_ylabel(part + unit)
             _legend(axis)
     axes[-1].set_xlabel("time [s]")
+    figure.align_ylabels()
     return figure
+
+
+def comparison_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Scores and parameters of several ways of modelling, from the rows of a comparison.
+
+    Upper panel: free-run and one-step NRMSE on the last part. Below, a panel per parameter with 95 % intervals.
+    """
+    names = [Path(row["name"]).name for row in rows]
+    parameters = [parameter["name"] for parameter in rows[0]["parameters"]]
+    figure = Figure(figsize=(_SIZE[0], 2.2 + 1.3 * len(parameters)), layout="constrained")
+    axes = figure.subplots(1 + len(parameters), 1, sharex=True, squeeze=False)[:, 0]
+    place = np.arange(len(rows))
+    for kind, marker, color in (("prediction", "o", _BLUE), ("simulation", "s", _ORANGE)):
+        label = "one step" if kind == "prediction" else "free run"
+        axes[0].plot(place, [_mean_nrmse(row, kind) for row in rows], marker, color=color, label=label)
+    part = list(rows[0]["scores"])[-1] if rows[0]["scores"] else ""
+    axes[0].set_yscale("log")
+    axes[0].set_ylabel(f"NRMSE, {part}")
+    _legend(axes[0])
+    for axis, name in zip(axes[1:], parameters, strict=True):
+        for i, row in enumerate(rows):
+            entry = next((p for p in row["parameters"] if p["name"] == name), None)
+            if entry is None or entry["value"] is None:
+                continue
+            reach = (
+                [[0.0], [0.0]] if entry["ci95"] is None else np.abs(np.array(entry["ci95"]) - entry["value"])[:, None]
+            )
+            axis.errorbar([i], [entry["value"]], yerr=reach, fmt="o", color=_GREEN, capsize=4)
+        unit = rows[0]["parameters"][parameters.index(name)]["unit"]
+        axis.set_ylabel(f"{name} [{unit}]" if unit else name)
+    for axis in axes:
+        axis.grid(alpha=0.25)
+        axis.spines[["top", "right"]].set_visible(False)
+    axes[-1].set_xticks(place, names, rotation=15, ha="right")
+    axes[-1].set_xlim(-0.5, len(rows) - 0.5)
+    figure.align_ylabels()
+    return figure
+
+
+def _mean_nrmse(row: Mapping[str, Any], kind: str) -> float:
+    """RMS over outputs of the last part's NRMSE; NaN where there is none."""
+    if not row["scores"]:
+        return float("nan")
+    found = list(row["scores"].values())[-1][kind]["nrmse"]
+    return float("nan") if found is None or None in found else float(np.sqrt(np.mean(np.square(found))))
 
 
 def save(figure: Figure, path: Path) -> None:
@@ -66,15 +123,23 @@ def save(figure: Figure, path: Path) -> None:
     figure.savefig(path, dpi=160)
 
 
-def _panels(response: Response, title: str, per_output: int = 1) -> tuple[Figure, list]:
-    count = per_output * len(response.outputs)
-    figure = Figure(figsize=(_SIZE[0], _SIZE[1] * count + 0.5), layout="constrained")
-    axes = list(figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0])
+def _panels(response: Response, title: str, heights: tuple[int, ...] = (1,)) -> tuple[Figure, list]:
+    """Stacked axes, `len(heights)` per output."""
+    ratios = heights * len(response.outputs)
+    figure = Figure(figsize=(_SIZE[0], 0.5 + _SIZE[1] * sum(ratios) / max(heights)), layout="constrained")
+    axes = list(figure.subplots(len(ratios), 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0])
     for axis in axes:
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)
     figure.suptitle(title, fontsize=10)
     return figure, axes
+
+
+def _extent(response: Response, rows: slice) -> str:
+    """What of the record is drawn."""
+    whole = len(response.trajectories[0].model)
+    text = f"samples {rows.start} to {rows.stop - 1} of {whole}"
+    return text + (f", first of {len(response.trajectories)} experiments" if len(response.trajectories) > 1 else "")
 
 
 def _window(response: Response) -> tuple[np.ndarray, slice]:

@@ -19,6 +19,8 @@ from orthaug.projection import Projection
 from orthaug.record import Record
 from orthaug.regressors import Features, Lags, Layout, Rows, in_order, stack_rows
 
+_LARGEST = 1e120  # standard deviation of an output whose squares still add up
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
@@ -52,11 +54,7 @@ class Problem:
         Raises:
             InputError: a feature that is not finite on some row.
         """
-        with np.errstate(all="ignore"):
-            z = np.asarray(self.features.evaluate(self.rows.x, self.layout, np))
-        for j, entry in enumerate(self.features.entries):
-            _check_finite(z[:, j], f"the learner input {entry}", self.rows, self.record)
-        return z
+        return _feature_rows(self.features, self.rows, self.layout, self.record)
 
 
 def pose(
@@ -91,14 +89,36 @@ def pose(
         target = rows.y - known
         deviation = target.std(axis=0)
     _check_physics(phi, known, baseline, rows, record)
-    if not np.all(np.isfinite(deviation)) or not np.all(np.isfinite(deviation**2 * len(rows))):
-        raise InputError("the outputs are too large for double precision arithmetic; scale them (`scale` in the spec).")
+    moving = deviation[deviation > 0]
+    if not np.all(np.isfinite(deviation)) or np.any(deviation > _LARGEST) or np.any(moving < 1 / _LARGEST):
+        raise InputError(
+            f"the outputs move by {np.max(deviation):.3g}, too large or too small for double precision arithmetic; "
+            "scale them (`scale` of the channel)."
+        )
     weight = 1.0 / np.where(deviation > 0, deviation, 1.0)
     projection = Projection.factor(phi * weight[:, None])
     found = excitation(projection.r, baseline.names)
     if require_full_rank:
         require_rank(found, rows.y.size)
     return Problem(record, baseline, features, layout, rows, target, weight, projection, found)
+
+
+def check_defined(problem: Problem, record: Record) -> None:
+    """Raise InputError where physics or learner inputs are not finite on another record's measured rows."""
+    rows = stack_rows(record, problem.layout)
+    with np.errstate(all="ignore"):
+        phi = np.asarray(problem.baseline.phi(rows.x, problem.layout, problem.outputs, np))
+        known = np.asarray(problem.baseline.known(rows.x, problem.layout, problem.outputs, np))
+    _check_physics(phi, known, problem.baseline, rows, record)
+    _feature_rows(problem.features, rows, problem.layout, record)
+
+
+def _feature_rows(features: Features, rows: Rows, layout: Layout, record: Record) -> Matrix:
+    with np.errstate(all="ignore"):
+        z = np.asarray(features.evaluate(rows.x, layout, np))
+    for j, entry in enumerate(features.entries):
+        _check_finite(z[:, j], f"the learner input {entry}", rows, record)
+    return z
 
 
 def _layout(
@@ -158,6 +178,5 @@ def _check_finite(values: np.ndarray, what: str, rows: Rows, record: Record) -> 
     for experiment in record.experiments:
         usable = len(experiment) - rows.start
         if row < usable:
-            where = f"{experiment.source}: row" if experiment.source else "row"
-            raise InputError(f"{where} {experiment.first_row + row + rows.start}: {what} is not finite there.")
+            raise InputError(f"{experiment.where(row + rows.start)}: {what} is not finite there.")
         row -= usable

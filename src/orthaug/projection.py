@@ -36,7 +36,9 @@ class Projection:
             return cls(phi, phi, np.zeros((0, 0)), np.zeros(0))
         stacked = phi.reshape(rows * ny, nt)
         largest = np.abs(stacked).max(axis=0, initial=0.0)
-        scale = np.where(largest > 0, 2.0 ** -np.round(np.log2(np.where(largest > 0, largest, 1.0))), 1.0)
+        scale = np.where(
+            largest > 0, 2.0 ** np.clip(-np.round(np.log2(np.where(largest > 0, largest, 1.0))), -1000, 1000), 1.0
+        )
         q, r = scipy.linalg.qr(  # pyright: ignore[reportAssignmentType]  (its stubs do not know `mode`)
             stacked * scale, mode="economic", overwrite_a=True, check_finite=False
         )

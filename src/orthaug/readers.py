@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from orthaug.errors import InputError
-from orthaug.record import Channel, Experiment, Record
+from orthaug.record import Channel, Experiment, Record, same_step
 from orthaug.tables import Table, read_table
 
 RowRange = tuple[int, int] | list[int]
@@ -64,13 +64,17 @@ def read_record(
             else np.empty((len(range(start, stop, every)), 0))
             for group in channels
         ]
-        experiments.append(Experiment(signals[0], signals[1], str(path), start))
+        began = float(table.columns[time][start]) if time else 0.0
+        experiments.append(Experiment(signals[0], signals[1], str(path), start, every, table.first_line, began))
         if time:
             steps.append(_uniform_step(table, time, start, stop))
     step = steps[0] if time else (1.0 if sampling_time is None else sampling_time)
-    if any(not np.isclose(s, step, rtol=1e-3) for s in steps):
-        raise InputError(f"{path}: the sampling time in column '{time}' differs between row ranges: {steps} s.")
-    return Record(tuple(channels[0]), tuple(channels[1]), step * every, tuple(experiments))
+    for other in steps:
+        if not same_step(other, step):
+            raise InputError(
+                f"{path}: column '{time}' steps by {step:g} s in one row range and by {other:g} s in another."
+            )
+    return Record(tuple(channels[0]), tuple(channels[1]), step * every, tuple(experiments), time)
 
 
 def _trim(table: Table) -> Table:
@@ -96,6 +100,12 @@ def _ranges(rows: RowRange | Sequence[RowRange] | None, total: int, path: Path) 
             raise InputError(f"{path}: rows {list(pair)} is no half-open range [start, stop] with 0 ≤ start < stop.")
         if pair[1] > total:
             raise InputError(f"{path}: rows {list(pair)} reaches past the end; the file has {total} data rows.")
+    ordered = sorted((int(start), int(stop)) for start, stop in pairs)
+    for before, after in zip(ordered, ordered[1:], strict=False):
+        if after[0] < before[1]:
+            raise InputError(
+                f"{path}: the row ranges {list(before)} and {list(after)} overlap; samples would count twice."
+            )
     return [(int(start), int(stop)) for start, stop in pairs]
 
 

@@ -12,6 +12,13 @@ from orthaug._arrays import Matrix, as_signal, check_unique
 from orthaug.errors import InputError
 from orthaug.expressions import RESERVED, is_name
 
+_LONGEST_STEP = 1e12  # s; a longer one overflows somewhere in a time axis
+
+
+def same_step(one: float, other: float) -> bool:
+    """Whether two sampling times are the same to 0.1 %, as logged time columns are."""
+    return bool(np.isclose(one, other, rtol=1e-3, atol=0.0))
+
 
 @dataclass(frozen=True)
 class Channel:
@@ -51,20 +58,30 @@ class Channel:
 class Experiment:
     """One uninterrupted run: `inputs` (N, nu) and `outputs` (N, ny), row k taken at the same instant.
 
-    `source` and `first_row` say where it came from, for messages.
+    `source`, `first_row`, `stride` and `first_line` (the file's line of its row 0) say where a row came from, for
+    messages; `start_time` [s] is the instant of the first row.
     """
 
     inputs: Matrix
     outputs: Matrix
     source: str = ""
     first_row: int = 0
+    stride: int = 1
+    first_line: int | None = None
+    start_time: float = 0.0
 
     def __len__(self) -> int:
         return len(self.inputs)
 
+    def where(self, row: int) -> str:
+        """`run.csv: line 17 (row 15)` for a row of this experiment, as much of it as is known."""
+        row = self.first_row + self.stride * row
+        place = f"row {row}" if self.first_line is None else f"line {self.first_line + row} (row {row})"
+        return f"{self.source}: {place}" if self.source else place
+
     def rows(self, start: int | None, stop: int | None) -> Experiment:
         """The half-open range of rows `[start, stop)` as an experiment of its own."""
-        first = self.first_row + range(len(self))[start:stop].start
+        first = self.first_row + self.stride * range(len(self))[start:stop].start
         return replace(self, inputs=self.inputs[start:stop], outputs=self.outputs[start:stop], first_row=first)
 
 
@@ -88,11 +105,21 @@ class Record:
     outputs: tuple[Channel, ...]
     sampling_time: float
     experiments: tuple[Experiment, ...]
+    time_column: str | None = None
 
     def __post_init__(self) -> None:
         check_unique((channel.name for channel in self.inputs + self.outputs), "channel")
-        if not (np.isfinite(self.sampling_time) and self.sampling_time > 0):
-            raise InputError(f"the sampling time must be a positive number of seconds; got {self.sampling_time}.")
+        derived = [f"{c.name}_{part}" for c in self.outputs for part in ("model", "baseline", "learner")]
+        for channel in self.outputs:
+            if channel.name in ("time", *derived):
+                raise InputError(
+                    f"an output cannot be called '{channel.name}': tables of results have a column of that name."
+                )
+        if not 0 < self.sampling_time <= _LONGEST_STEP:
+            raise InputError(
+                f"the sampling time must be a positive number of seconds, at most {_LONGEST_STEP:g}; "
+                f"got {self.sampling_time}."
+            )
         if not self.experiments:
             raise InputError("a record needs at least one experiment; got none.")
 
@@ -148,10 +175,10 @@ class Record:
         for other in records[1:]:
             if (other.inputs, other.outputs) != (first.inputs, first.outputs):
                 raise InputError(f"records with other channels cannot be joined: {first!r} and {other!r}.")
-            if not np.isclose(other.sampling_time, first.sampling_time, rtol=1e-6):
+            if not same_step(other.sampling_time, first.sampling_time):
                 raise InputError(
-                    "records of different sampling time cannot be joined: "
-                    f"{first.sampling_time} s and {other.sampling_time} s."
+                    f"{other.experiments[0].source or 'a record'}: sampled every {other.sampling_time:g} s, "
+                    f"{first.experiments[0].source or 'another'} every {first.sampling_time:g} s; resample one of them."
                 )
         return replace(first, experiments=tuple(e for record in records for e in record.experiments))
 

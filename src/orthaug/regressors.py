@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from orthaug._arrays import Matrix
 from orthaug.errors import InputError
-from orthaug.expressions import Expression, Lag
+from orthaug.expressions import LARGEST_LAG, Expression, Lag
 from orthaug.record import Experiment, Record
 
 Layout = tuple[Lag, ...]
@@ -57,6 +57,8 @@ def _per_channel(value: int | Sequence[int], names: Sequence[str], key: str, kin
         )
     if any(isinstance(v, bool) or not isinstance(v, int | np.integer) or v < 0 for v in values):
         raise InputError(f"`{key}` must be whole numbers, 0 or more; got {value}.")
+    if any(v > LARGEST_LAG for v in values):
+        raise InputError(f"`{key}` must be at most {LARGEST_LAG}; got {value}.")
     return [int(v) for v in values]
 
 

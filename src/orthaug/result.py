@@ -71,6 +71,9 @@ class Restart:
     iterations: int
     code: str
     chosen: bool
+    regularization: str | float = "none"
+    validation: float | None = None
+    """Mean squared one-step error on the validation record, where there is one."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from orthaug.errors import InputError
 from orthaug.readers import read_record
@@ -42,7 +44,8 @@ def open_run(model: Path, data: Path, *, need_outputs: bool = False) -> Run:
     elif held:
         missing = [c.name for c in loaded.outputs if c not in held]
         raise InputError(f"{data}: has some of the model's outputs but not {', '.join(missing)}; give all or none.")
-    record = read_record(data, inputs=loaded.inputs, outputs=held, sampling_time=loaded.sampling_time)
+    step = None if loaded.time_column else loaded.sampling_time
+    record = read_record(data, inputs=loaded.inputs, outputs=held, sampling_time=step, time=loaded.time_column)
     return Run(loaded, record, data)
 
 
@@ -64,6 +67,17 @@ def read_initial(initial: str | None, run: Run) -> str | Any:
     return record.experiments[0].outputs
 
 
+def with_initial(run: Run, initial: str | Any) -> Record:
+    """The record with the outputs of its first rows replaced, for predictions that start from others."""
+    if isinstance(initial, str) and initial == "measured":
+        return run.record
+    start, experiment = run.model.form.start, run.record.experiments[0]
+    outputs = experiment.outputs.copy()
+    rows = np.zeros((start, outputs.shape[1])) if isinstance(initial, str) else initial[:start]
+    outputs[start - len(rows) : start] = rows
+    return replace(run.record, experiments=(replace(experiment, outputs=outputs),))
+
+
 def warnings(response: Response) -> list[str]:
     """What the reader of a response must know."""
     return [
@@ -73,10 +87,12 @@ def warnings(response: Response) -> list[str]:
     ]
 
 
-def check_output(out: Path | None) -> None:
-    """Raise InputError early where a file could not be written."""
+def check_output(out: Path | None, *read: Path) -> None:
+    """Raise InputError early where a file could not be written, or is one of those that are read."""
     if out is None:
         return
+    if any(file.exists() and out.exists() and out.samefile(file) for file in read):
+        raise InputError(f"{out}: is read by this run; give another name.")
     if out.is_dir() or not out.name:
         raise InputError(f"{out}: is a folder; expected the name of a CSV file.")
     if not out.absolute().parent.is_dir():

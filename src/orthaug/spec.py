@@ -5,6 +5,7 @@ Every error is one line that names the file, the key, what was found and what wa
 
 from __future__ import annotations
 
+import json
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -22,6 +23,7 @@ Count = Annotated[int, Field(ge=0, strict=True)]
 Positive = Annotated[int, Field(ge=1, strict=True)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Orders = Count | list[Count]
+Regularization = Literal["none", "evidence"] | Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Range = Annotated[list[Count], Field(min_length=2, max_length=2)]
 
 
@@ -54,7 +56,7 @@ class Data(Section):
     """Channels, sampling time and parts."""
 
     sampling_time: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
-    time: str | None = None
+    time: Annotated[str, Field(min_length=1)] | None = None
     inputs: list[str] = []
     outputs: Annotated[list[str], Field(min_length=1)]
     train: Part
@@ -140,8 +142,14 @@ class TrainingSection(Section):
     segment: Count = 512
     washout: Count = 40
     restarts: Positive = 1
-    seed: Count = 0
-    regularization: Literal["none", "evidence"] | Annotated[float, Field(ge=0, allow_inf_nan=False)] = "none"
+    seed: Annotated[int, Field(ge=0, lt=2**63, strict=True)] = 0
+    regularization: Regularization | Annotated[list[Regularization], Field(min_length=1)] | None = None
+
+    def regularizations(self, validated: bool) -> str | float | tuple[str | float, ...]:
+        """What to try: by default none, or with a validation part to choose by, none and evidence."""
+        if self.regularization is None:
+            return ("none", "evidence") if validated and self.solver == "levenberg-marquardt" else "none"
+        return tuple(self.regularization) if isinstance(self.regularization, list) else self.regularization
 
 
 class Spec(Section):
@@ -155,6 +163,14 @@ class Spec(Section):
     structure: StructureSection = StructureSection()
     training: TrainingSection = TrainingSection()
 
+    @model_validator(mode="after")
+    def _choices_need_validation(self) -> Spec:
+        if isinstance(self.training.regularization, list) and self.data.validation is None:
+            raise ValueError("`training.regularization` is a list; expected [data.validation] to choose by")
+        if self.training.solver == "adam-lbfgs" and "evidence" in _as_list(self.training.regularization):
+            raise ValueError("`training.regularization` = evidence; expected solver levenberg-marquardt with it")
+        return self
+
     def channels(self, names: list[str]) -> tuple[Channel, ...]:
         """The named channels with unit, column, scale and offset."""
         given = self.data.channels
@@ -166,7 +182,7 @@ class Spec(Section):
             return None
         return Lags(*(tuple(v) if isinstance(v, list) else v for v in (self.lags.na, self.lags.nb, self.lags.nk)))
 
-    def physics_terms(self) -> Baseline:
+    def declared_baseline(self) -> Baseline:
         """The baseline as declared."""
         terms = [Term(t.parameter, str(t.regressor), t.initial, t.unit, t.output, t.fixed) for t in self.baseline.terms]
         return Baseline.from_terms(terms, self.baseline.constants)
@@ -174,6 +190,10 @@ class Spec(Section):
     def learner_inputs(self) -> tuple[str, ...] | None:
         """What the learner sees; None for all lags."""
         return tuple(self.learner.inputs) if self.learner.inputs is not None and self.learner.kind != "none" else None
+
+
+def _as_list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]
 
 
 def load_spec(path: Path) -> Spec:
@@ -236,11 +256,21 @@ def _first_message(error: ValidationError, content: dict[str, Any]) -> str:
         )
     same_key = [e["msg"] for e in errors if _key(e["loc"], content) == key]
     expected = " or ".join(dict.fromkeys(_plain(m) for m in same_key))
-    return f"'{key}': found {found!r}; expected {expected}"
+    return f"'{key}': found {_shown(found)}; expected {expected}"
+
+
+def _shown(value: Any) -> str:
+    """A value as the file writes it, cut where it is long."""
+    text = json.dumps(value, default=str, ensure_ascii=False)
+    return text if len(text) <= 80 else text[:77] + "…"
 
 
 def _plain(message: str) -> str:
     """Pydantic's words in those of TOML."""
+    if "at least 1 item" in message or "at least 1 character" in message:
+        return "at least one entry" if "item" in message else "some text"
+    if "after validation" in message:
+        return "two numbers, [start, stop]"
     message = message.removeprefix("Input should be ").replace("a valid ", "a ").replace("a integer", "an integer")
     return "a table" if "dictionary" in message else message
 

@@ -77,9 +77,9 @@ def load(folder: str | Path, *, baseline: Baseline | None = None, learner: Learn
     path = folder / _DECLARATION
     try:
         declared = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError):
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError):
         raise InputError(f"{path}: the file is cut or altered (no JSON); fit again, or copy it again.") from None
-    if not isinstance(declared, dict) or not isinstance(declared.get("format"), int):
+    if not isinstance(declared, dict) or type(declared.get("format")) is not int or declared["format"] < 1:
         raise InputError(f"{path}: not a model of orthaug.")
     if declared["format"] > FORMAT:
         raise InputError(
@@ -95,7 +95,10 @@ def load(folder: str | Path, *, baseline: Baseline | None = None, learner: Learn
         arrays = load_arrays(packed)
     except SafetensorError as error:
         raise InputError(f"{folder / _ARRAYS}: cannot be read ({error}).") from None
-    return _rebuild(declared, arrays, baseline, learner, path)
+    try:
+        return _rebuild(declared, arrays, baseline, learner, path)
+    except (KeyError, TypeError, AttributeError, IndexError) as error:
+        raise InputError(f"{path}: not a model of this version (missing or misplaced: {error}).") from None
 
 
 def _declare(model: Model) -> dict[str, Any]:
@@ -111,6 +114,7 @@ def _declare(model: Model) -> dict[str, Any]:
         "orthaug": __version__,
         "structure": model.structure,
         "sampling_time": model.sampling_time,
+        "time_column": model.time_column,
         "outputs": [asdict(channel) for channel in model.outputs],
         "inputs": [asdict(channel) for channel in model.inputs],
         "layout": [list(lag) for lag in form.layout],
@@ -160,7 +164,8 @@ def _rebuild(
         numbers=Numbers(**{name: arrays[f"numbers.{name}"] for name in Numbers._fields}),
         outputs=outputs,
         inputs=inputs_,
-        sampling_time=declared["sampling_time"],
+        sampling_time=float(declared["sampling_time"]),
+        time_column=declared["time_column"],
         structure=declared["structure"],
         largest_output=arrays["largest_output"],
         gram=arrays.get("gram"),

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._arrays import Vector, nearest
-from orthaug.errors import InputError
+from orthaug.errors import InputError, MissingColumnError
 from orthaug.variables import ENDINGS, read_variables
 
 
@@ -42,29 +42,33 @@ def read_table(path: Path, columns: Sequence[str]) -> Table:
     Raises:
         InputError: no such file, an unknown ending, content that does not fit it, or missing columns.
     """
+    check_readable(path)
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise InputError(f"{path}: unknown file type '{path.suffix}'; known are {', '.join(_READERS)}.")
-    check_readable(path)
     return reader(path, columns)
 
 
 def has_column(path: Path, name: str) -> bool:
-    """Whether the file has a column (or variable) of that name."""
+    """Whether the file has a column (or variable) of that name.
+
+    Raises:
+        InputError: a file that cannot be read, or holds the column twice.
+    """
     try:
         read_table(path, (name,))
-    except InputError:
+    except MissingColumnError:
         return False
     return True
 
 
 def check_readable(path: Path) -> None:
     """Raise InputError unless `path` is a file with something in it."""
-    if not path.exists():
-        raise InputError(f"{path}: no such file.")
-    if not path.is_file():
-        raise InputError(f"{path}: not a file.")
     try:
+        if not path.exists():
+            raise InputError(f"{path}: no such file.")
+        if not path.is_file():
+            raise InputError(f"{path}: not a file.")
         with path.open("rb") as file:
             empty = not file.read(1)
     except OSError as error:
@@ -200,7 +204,7 @@ def _full(path: Path, columns: Mapping[str, Vector]) -> Table:
 
 def _as_floats(array: np.ndarray, name: str, path: Path) -> Vector:
     try:
-        if array.dtype.kind in "mM":
+        if array.dtype.kind not in "fiub":
             raise TypeError
         return np.asarray(array, dtype=float)
     except (TypeError, ValueError):
@@ -220,7 +224,7 @@ def _check_present(path: Path, columns: Sequence[str], header: Sequence[str]) ->
     for name in columns:
         if name not in header:
             known = ", ".join(f"'{h}'" for h in header if h) or "no column names"
-            raise InputError(f"{path}: no column '{name}'{nearest(name, header)}; the file has {known}.")
+            raise MissingColumnError(f"{path}: no column '{name}'{nearest(name, header)}; the file has {known}.")
         if list(header).count(name) > 1:
             raise InputError(f"{path}: the column '{name}' stands {list(header).count(name)} times; names must differ.")
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._arrays import Vector, nearest
-from orthaug.errors import InputError
+from orthaug.errors import InputError, MissingColumnError
 
 
 @dataclass(frozen=True)
@@ -124,12 +124,14 @@ def _pick(path: Path, name: str, held: Mapping[str, Held]) -> Vector:
     variable, column = name, None
     if name not in held and name.endswith("]") and "[" in name:
         variable, _, index = name[:-1].rpartition("[")
-        if not index.strip().isdigit():
+        if not index.strip().isdecimal():
             raise InputError(f"{path}: '{name}': a column of a matrix is written \"{variable}[0]\", counted from 0.")
         column = int(index)
     listing = ", ".join(f"{key} ({value.what})" for key, value in held.items()) or "nothing"
     if variable not in held:
-        raise InputError(f"{path}: no variable '{variable}'{nearest(variable, held)}; the file holds {listing}.")
+        raise MissingColumnError(
+            f"{path}: no variable '{variable}'{nearest(variable, held)}; the file holds {listing}."
+        )
     read = held[variable].read
     if read is None:
         raise InputError(f"{path}: '{variable}' is {held[variable].what}, no numbers; the file holds {listing}.")

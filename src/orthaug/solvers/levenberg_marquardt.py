@@ -21,10 +21,11 @@ from orthaug._jax import jax, jnp
 from orthaug.criteria import Normal, Overlap, linearise
 from orthaug.errors import InputError
 
-RUNNING, CONVERGED, NO_DESCENT, NON_FINITE = range(4)
+RUNNING, CONVERGED, NO_DESCENT, NON_FINITE, SPANNED = range(5)
+"""Codes of a run; RUNNING at the end means that the limit of iterations was reached, SPANNED that P⊥J = 0."""
 _FIRST_DAMPING = 1e-3  # of the largest curvature
 _LARGEST_DAMPING = 1e12  # of the largest curvature: no step is short enough to descend
-_SPANNED = 1e-22  # of ‖J‖²: what rounding leaves of a Jacobian in the span of the physics
+_NOTHING_LEFT = 1e-22  # of ‖J‖²: what rounding leaves of a Jacobian in the span of the physics
 _SECONDS_PER_BURST = 0.5  # how often progress is told and Ctrl-C is heard
 
 
@@ -140,7 +141,7 @@ def _start(criterion: Any, w: Any, arguments: tuple[Any, ...], overlap: Overlap,
     normal = linearise(criterion, w, arguments, overlap)
     curvature = jnp.max(jnp.diag(normal.hessian), initial=0.0)
     finite = jnp.isfinite(normal.loss) & jnp.all(jnp.isfinite(normal.hessian))
-    nothing = curvature <= _SPANNED * _largest_column(normal)  # P⊥J = 0: the paper's Example 1
+    nothing = curvature <= _NOTHING_LEFT * _largest_column(normal)  # P⊥J = 0: the paper's Example 1
     return State(
         w=w,
         normal=normal,
@@ -150,7 +151,7 @@ def _start(criterion: Any, w: Any, arguments: tuple[Any, ...], overlap: Overlap,
         iteration=jnp.asarray(0),
         accepted=jnp.asarray(0),
         small=jnp.asarray(0),
-        code=jnp.where(finite, jnp.where(nothing, CONVERGED, RUNNING), NON_FINITE),
+        code=jnp.where(finite, jnp.where(nothing, SPANNED, RUNNING), NON_FINITE),
     )
 
 
