@@ -87,18 +87,19 @@ def comparison_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
         label = "one step" if kind == "prediction" else "free run"
         axes[0].plot(place, [_mean_nrmse(row, kind) for row in rows], marker, color=color, label=label)
     part = list(rows[0]["scores"])[-1] if rows[0]["scores"] else ""
-    axes[0].set_yscale("log")
-    axes[0].set_ylabel(f"NRMSE, {part}")
+    axes[0].set_title(f"NRMSE on {part}, and parameters with their 95 % intervals (hollow: none)", fontsize=10, pad=20)
+    axes[0].set_ylabel("NRMSE")
+    axes[0].set_ylim(bottom=0)
     _legend(axes[0])
     for axis, name in zip(axes[1:], parameters, strict=True):
         for i, row in enumerate(rows):
             entry = next((p for p in row["parameters"] if p["name"] == name), None)
             if entry is None or entry["value"] is None:
                 continue
-            reach = (
-                [[0.0], [0.0]] if entry["ci95"] is None else np.abs(np.array(entry["ci95"]) - entry["value"])[:, None]
-            )
-            axis.errorbar([i], [entry["value"]], yerr=reach, fmt="o", color=_GREEN, capsize=4)
+            interval = entry["ci95"] if entry["ci95"] and None not in entry["ci95"] else None
+            if interval:
+                axis.plot([i, i], interval, "_-", color=_GREEN, markersize=14)
+            axis.plot([i], [entry["value"]], "o", color=_GREEN, markerfacecolor=_GREEN if interval else "white")
         unit = rows[0]["parameters"][parameters.index(name)]["unit"]
         axis.set_ylabel(f"{name} [{unit}]" if unit else name)
     for axis in axes:

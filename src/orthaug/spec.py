@@ -261,7 +261,7 @@ def _first_message(error: ValidationError, content: dict[str, Any]) -> str:
 
 def _shown(value: Any) -> str:
     """A value as the file writes it, cut where it is long."""
-    text = json.dumps(value, default=str, ensure_ascii=False)
+    text = json.dumps(value, default=str, ensure_ascii=False).replace("Infinity", "inf").replace("NaN", "nan")
     return text if len(text) <= 80 else text[:77] + "…"
 
 

@@ -1,0 +1,69 @@
+"""The paper's pipeline (Adam, then L-BFGS) against Levenberg-Marquardt to the same training loss, both warm.
+
+Same normalised problem, same start, same process. Run: python benchmarks/solvers.py
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from machine import alternate, describe
+
+from orthaug import MLP, AdamLBFGS, LevenbergMarquardt, Orthogonal, synthetic
+from orthaug._jax import jax
+from orthaug.problem import pose
+from orthaug.training import Task
+
+SEEDS = range(3)
+CASES = (
+    ("static, set 1, no noise", synthetic.static(1), AdamLBFGS(500, 1000)),
+    ("static, set 1, 30 dB", synthetic.static(1, noise=True), AdamLBFGS(500, 1000)),
+    ("mass-spring-damper", synthetic.mass_spring_damper(), AdamLBFGS(2500, 500)),
+)
+
+
+def iterations_to(task: Task, w: object, loss: float) -> int | None:
+    """The fewest Levenberg-Marquardt iterations that end at or below a loss."""
+    low, high = 0, 1
+    while task.run(LevenbergMarquardt(high, tolerance=0.0), w).normal.loss > loss:
+        low, high = high, 2 * high
+        if high > 4096:
+            return None
+    while high - low > 1:
+        middle = (low + high) // 2
+        if task.run(LevenbergMarquardt(middle, tolerance=0.0), w).normal.loss > loss:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+def main() -> None:
+    print(describe())
+    print(
+        "| example | seed | adam-lbfgs | its loss | LM to that loss | iterations | ratio |\n|---|---|---|---|---|---|---|"
+    )
+    for name, example, pipeline in CASES:
+        task = Task.of(pose(example.train, example.baseline), MLP())
+        ratios = []
+        for seed in SEEDS:
+            w = task.bound.init(jax.random.key(seed))
+            target = float(task.run(pipeline, w, Orthogonal()).normal.loss)
+            count = iterations_to(task, w, target)
+            if count is None:
+                print(f"| {name} | {seed} | LM does not reach the loss within 4096 iterations | | | | |")
+                continue
+            slow, fast = alternate(
+                lambda t=task, w=w, p=pipeline: t.run(p, w, Orthogonal()),
+                lambda t=task, w=w, n=count: t.run(LevenbergMarquardt(n, tolerance=0.0), w),
+                3,
+            )
+            ratios.append(slow / fast)
+            mean_square = task.mean_square(target)
+            print(
+                f"| {name} | {seed} | {slow:.3f} s | {mean_square:.4g} | {1e3 * fast:.1f} ms | {count} | {slow / fast:.0f} |"
+            )
+        print(f"| {name} | median | | | | | {np.median(ratios):.0f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
