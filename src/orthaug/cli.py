@@ -72,8 +72,9 @@ def main() -> None:
         complaint = getattr(error, "format_message", None)  # typer's own, about arguments
         if complaint is None:
             raise
-        text = " ".join(complaint().split())
-        _fail(text if text.startswith("Usage") else f"error: {text}", getattr(error, "exit_code", 2))
+        text = complaint()
+        line = text if text.startswith("Usage") else f"error: {' '.join(text.split())}"
+        _fail(line, getattr(error, "exit_code", 2))
     sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -94,7 +95,7 @@ def _options(
 
 @app.command()
 def demo(out: OutFolder = None) -> None:
-    """Fit the paper's example with two structures, compare with the truth."""
+    """Fit the paper's example and compare with the truth."""
     from orthaug.jobs import check_output
 
     folder = out or Path("orthaug-out/demo")
@@ -155,7 +156,7 @@ def compare(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Physics alone and every structure on the same data and seeds, one table."""
+    """Physics alone and every structure, one table."""
     from orthaug import jobs
 
     folder = out or Path("orthaug-out") / spec.stem
@@ -196,7 +197,7 @@ def predict(
     out: OutFile = None,
     initial: Initial = None,
 ) -> None:
-    """Predict each row from outputs measured up to H samples before it."""
+    """H-step-ahead prediction of a saved model."""
     from orthaug import runs
 
     opened = runs.open_run(model, data, need_outputs=True)
