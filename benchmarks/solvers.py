@@ -39,9 +39,8 @@ def iterations_to(task: Task, w: object, loss: float) -> int | None:
 
 def main() -> None:
     print(describe())
-    print(
-        "| example | seed | adam-lbfgs | its loss | LM to that loss | iterations | ratio |\n|---|---|---|---|---|---|---|"
-    )
+    print("| example | seed | adam-lbfgs | its loss | LM to that loss | iterations | ratio |")
+    print("|---|---|---|---|---|---|---|")
     for name, example, pipeline in CASES:
         task = Task.of(pose(example.train, example.baseline), MLP())
         ratios = []
@@ -58,10 +57,8 @@ def main() -> None:
                 3,
             )
             ratios.append(slow / fast)
-            mean_square = task.mean_square(target)
-            print(
-                f"| {name} | {seed} | {slow:.3f} s | {mean_square:.4g} | {1e3 * fast:.1f} ms | {count} | {slow / fast:.0f} |"
-            )
+            loss, ratio = task.mean_square(target), slow / fast
+            print(f"| {name} | {seed} | {slow:.3f} s | {loss:.4g} | {1e3 * fast:.1f} ms | {count} | {ratio:.0f} |")
         print(f"| {name} | median | | | | | {np.median(ratios):.0f} |", flush=True)
 
 

@@ -151,7 +151,7 @@ def test_version():
 def test_help_lists_the_commands():
     done = run("--help")
     assert (done.code, done.err) == (0, "")
-    for command in ("demo", "check", "fit", "simulate", "predict"):
+    for command in ("demo", "check", "fit", "compare", "simulate", "predict"):
         assert f"\n  {command} " in done.out
 
 
@@ -162,7 +162,7 @@ def test_without_a_command_the_help_page_is_no_error_message():
     assert "error:" not in done.err
 
 
-@pytest.mark.parametrize("command", ["demo", "check", "fit", "simulate", "predict"])
+@pytest.mark.parametrize("command", ["demo", "check", "fit", "compare", "simulate", "predict"])
 def test_every_command_has_help(command):
     done = run(command, "--help")
     assert (done.code, done.err) == (0, "")
@@ -633,13 +633,16 @@ BAD = {  # what is put in the place of files ("" replaces a piece of the spec), 
     "lags for other channels": ({"": ('kind = "none"', "[lags]\nna = [1, 1]")}, ["`na` has 2 numbers", "1 outputs"]),
     "unknown key": ({"": ("skip = 5", "skipp = 5")}, ["plant.toml", "data.tests.steps.skipp", "did you mean 'skip'"]),
     "missing key": ({"": ('outputs = ["y"]', "")}, ["plant.toml", "'data.outputs' is missing"]),
-    "wrong value": ({"": ("skip = 5", 'skip = "5 s"')}, ["plant.toml", "'data.tests.steps.skip'", "'5 s'", "integer"]),
+    "wrong value": ({"": ("skip = 5", 'skip = "5 s"')}, ["plant.toml", "'data.tests.steps.skip'", '"5 s"', "integer"]),
     "broken TOML": ({"": ("[data]", "[data")}, ["plant.toml", "broken TOML", "line 2"]),
-    "channel twice": ({"": ('inputs = ["u"]', 'inputs = ["y"]')}, ["plant.toml", "channel 'y' is given twice"]),
+    "channel twice": ({"": ('inputs = ["u"]', 'inputs = ["u", "y"]')}, ["plant.toml", "channel 'y' is given twice"]),
     "channel with a strange name": ({"": ('inputs = ["u"]', 'inputs = ["u 1"]')}, ["plant.toml", "'u 1' cannot name"]),
     "scale of zero": ({"": ('unit = "m"', "scale = 0")}, ["plant.toml", "channel 'y'", "`scale` must be finite"]),
     "rank-deficient": ({"": ("u[k-1]", "2*y[k-1]")}, ["plant.toml", "rank-deficient", "a, c are linearly dependent"]),
-    "term without a value": ({"": ("u[k-1]", "log(u[k-1])")}, ["run.csv: row", "the regressor of c", "not finite"]),
+    "term without a value": (
+        {"": ("u[k-1]", "log(u[k-1])")},
+        ["run.csv: line 5 (row 3)", "the regressor of c", "not finite"],
+    ),
     "rows beyond the end": ({"": ('["run.csv"]', '["run.csv"], rows = [0, 500]')}, ["run.csv", "[0, 500]", "120 data"]),
     "test part too short": ({"steps.csv": "u,y\n1,2\n1,3\n"}, ["steps.csv", "data.tests.steps", "2 rows, too few"]),
     "skip longer than the part": ({"": ("skip = 5", "skip = 60")}, ["steps.csv", "60 rows, too few", "first 60"]),
@@ -691,7 +694,9 @@ ARGUMENTS = [
     (["fit", "plant.toml", "more"], ["unexpected extra argument", "more"]),
     (["fit", "plant.toml", "--out"], ["--out", "requires an argument"]),
     (["fot"], ["No such command 'fot'", "fit"]),
-    (["compare", "plant.toml", "--out", "x"], ["compare", "not built yet"]),
+    (["compare", "absent.toml"], ["absent.toml", "no such file"]),
+    (["compare", "plant.toml", "--out", "theirs"], ["theirs", "not an orthaug result"]),
+    (["compare", "plant.toml", "--out", "x", "--model", "theirs"], ["theirs", "no saved model there"]),
     (["split", "out", "run.csv", "--measure", "uniform"], ["split", "not built yet"]),
     (["design", "plant.toml"], ["design", "not built yet"]),
     (["export", "out", "--to", "c"], ["export", "not built yet"]),

@@ -68,7 +68,7 @@ def case(request):
     """A model that was fitted shortly, and a new record of 40 rows."""
     make, baseline, lags, learner = CASES[request.param]
     rng = np.random.default_rng(1)
-    fit = estimate(make(rng, 80), baseline, lags=lags, learner=learner, solver=FEW)
+    fit = estimate(make(rng, 80), baseline, lags=lags, learner=learner, solver=FEW, regularization=1.0)
     return fit.model, make(rng, 40)
 
 

@@ -25,7 +25,7 @@ def response(ny: int = 1, rows: int = 900, measured: bool = True, diverged: bool
 
 
 FIGURES = {
-    "output": (plots.output_figure, 1),
+    "output": (plots.output_figure, 2),
     "residual": (plots.residual_figure, 1),
     "components": (plots.components_figure, 2),
 }
@@ -37,10 +37,14 @@ def test_every_figure(tmp_path, name, ny):
     make, panels = FIGURES[name]
     figure = make(response(ny), "one-step prediction, training data")
     assert type(figure) is Figure
-    assert figure.get_suptitle() == "one-step prediction, training data"
+    drawn = "samples 2 to 899 of 900" if name == "residual" else "samples 2 to 251 of 900"
+    assert figure.get_suptitle() == f"one-step prediction, training data: {drawn}"
     assert len(figure.axes) == panels * ny
     labels = " | ".join(axis.get_ylabel() for axis in figure.axes)
-    assert "position [m]" in labels and ("angle" in labels) == (ny == 2)
+    if name == "components":
+        assert labels == " | ".join(["baseline [m]", "learner [m]", "baseline", "learner"][: 2 * ny])
+    else:
+        assert "position [m]" in labels and ("angle" in labels) == (ny == 2)
     assert figure.axes[-1].get_xlabel() == "time [s]"
     assert all(axis.lines and np.isfinite(axis.get_ylim()).all() for axis in figure.axes)
     path = tmp_path / f"{name}.png"
@@ -58,17 +62,21 @@ def test_legends():
     assert legend(plots.output_figure(response(), "").axes[0]) == ["measured", "model"]
     assert legend(plots.output_figure(response(measured=False), "").axes[0]) == ["model"]
     upper, lower = plots.components_figure(response(), "").axes
-    assert legend(upper) == ["baseline φθ"] and legend(lower) == ["learner f − φθ_aux"]
+    assert legend(upper) == [r"baseline part of position, $\varphi\,\theta$"]
+    assert legend(lower) == [r"learner part of position, $f - \varphi\,\theta_{\mathrm{aux}}$"]
 
 
 def test_output_shows_a_window_from_the_first_value_on():
-    (axis,) = plots.output_figure(response(), "").axes
+    axis, lower = plots.output_figure(response(), "").axes
     time, shown = axis.lines[1].get_xdata(), response()
     rows = slice(2, 2 + len(time))
     assert 100 <= len(time) <= 500
     np.testing.assert_allclose(time, 0.1 * np.arange(rows.start, rows.stop))
     np.testing.assert_array_equal(axis.lines[0].get_ydata(), shown.trajectories[0].measured[rows, 0])
     np.testing.assert_array_equal(axis.lines[1].get_ydata(), shown.model[rows, 0])
+    difference = shown.trajectories[0].measured[rows, 0] - shown.model[rows, 0]
+    np.testing.assert_array_equal(lower.lines[0].get_ydata(), difference)
+    assert lower.get_ylabel() == "difference [m]"
 
 
 def test_residual_shows_the_whole_record():

@@ -106,7 +106,10 @@ REFUSED = [
         r"the learner inputs use u\[k-1\], which `lags` does not contain",
     ),
     (RECORD, SQUARE, {"lags": Lags(na=1)}, r"baseline function returned shape \(1, 2\) .* expected .*\(1, 1\)"),
-    (Record.from_arrays(U, Y * 1e160), physics("u[k]"), {}, "the outputs are too large for double precision"),
+    (Record.from_arrays(U, Y * 1e160), physics("u[k]"), {}, "the outputs move by .*, too large or too small"),
+    (Record.from_arrays(U, Y * 1e130), physics("u[k]"), {}, "the outputs move by .*e.130, too large .* scale them"),
+    (Record.from_arrays(U, Y * 1e-130), physics("u[k]"), {}, "the outputs move by .*e-1[23]., too large or too small"),
+    (Record.from_arrays(U, Y * 1e-300), physics("u[k]"), {}, "the outputs move by .*, too large or too small"),
 ]  # fmt: skip
 
 

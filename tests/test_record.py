@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from orthaug.errors import InputError
-from orthaug.record import Channel, Experiment, Record
+from orthaug.record import Channel, Experiment, Record, same_step
 
 STEPS = np.arange(6.0)
 
@@ -71,7 +71,7 @@ def test_join_refuses_what_does_not_fit():
     record = Record.from_arrays(y=STEPS)
     with pytest.raises(InputError, match=r"other channels cannot be joined: .*outputs: y\).*outputs: z\)"):
         Record.join([record, Record.from_arrays(y=STEPS, outputs=["z"])])
-    with pytest.raises(InputError, match=r"different sampling time cannot be joined: 1.0 s and 2.0 s"):
+    with pytest.raises(InputError, match="a record: sampled every 2 s, another every 1 s; resample one of them"):
         Record.join([record, Record.from_arrays(y=STEPS, sampling_time=2.0)])
     with pytest.raises(InputError, match="at least one"):
         Record.join([])
@@ -93,9 +93,20 @@ REFUSED = [
     ({"y": [1j, 2.0]}, "`y` is complex; expected real numbers"),
     ({"y": np.zeros((2, 2, 2))}, r"`y` has 3 axes; expected \(samples,\) or \(samples, channels\)"),
     ({"y": 1.0}, "`y` has 0 axes"),
-    ({"y": STEPS, "sampling_time": 0.0}, "sampling time must be a positive number of seconds; got 0.0"),
+    (
+        {"y": STEPS, "sampling_time": 0.0},
+        r"sampling time must be a positive number of seconds, at most 1e\+12; got 0.0",
+    ),
     ({"y": STEPS, "sampling_time": -1.0}, "sampling time must be a positive number"),
     ({"y": STEPS, "sampling_time": float("nan")}, "sampling time must be a positive number"),
+    ({"y": STEPS, "sampling_time": 1.1e12}, r"at most 1e\+12; got 1.1e\+?12|got 1100000000000.0"),
+    ({"y": STEPS, "outputs": ["time"]}, "an output cannot be called 'time': results have a column"),
+    (
+        {"y": np.stack([STEPS, STEPS], 1), "outputs": ["X", "X_model"]},
+        "an output cannot be called 'X_model': results have a column of that name",
+    ),
+    ({"y": np.stack([STEPS, STEPS], 1), "outputs": ["X_learner", "X"]}, "an output cannot be called 'X_learner'"),
+    ({"y": np.stack([STEPS, STEPS], 1), "outputs": ["X_baseline", "X"]}, "an output cannot be called 'X_baseline'"),
     ({"y": STEPS, "outputs": ["a", "b"]}, "2 names for 1 channels of `y`; give one name for each column"),
     ({"u": STEPS, "y": STEPS, "inputs": ["a"], "outputs": ["a"]}, "channel 'a' is given twice; names must differ"),
     ({"y": STEPS, "outputs": ["position (mm)"]}, r"'position \(mm\)' cannot name a channel; use letters"),
@@ -122,3 +133,29 @@ def test_a_record_needs_an_experiment():
 
 def test_experiment_length():
     assert len(Experiment(np.zeros((3, 0)), np.zeros((3, 1)))) == 3
+
+
+def test_sampling_times_are_compared_to_a_thousandth():
+    assert same_step(0.1, 0.10009) and same_step(1e-6, 1.0009e-6)
+    assert not same_step(0.1, 0.1002) and not same_step(1e-9, 1.1e-9)
+    joined = Record.join([Record.from_arrays(y=STEPS, sampling_time=t) for t in (0.1, 0.10005)])
+    assert (joined.sampling_time, len(joined.experiments)) == (0.1, 2)
+    with pytest.raises(InputError, match="b.csv: sampled every 0.1002 s, a.csv every 0.1 s; resample one of them"):
+        Record.join(
+            Record.from_arrays(y=STEPS, sampling_time=t, source=s) for t, s in ((0.1, "a.csv"), (0.1002, "b.csv"))
+        )
+
+
+def test_names_that_only_look_like_columns_of_results_are_fine():
+    """`y_model` beside no output `y`, and inputs, whose columns results do not repeat."""
+    record = Record.from_arrays(u=STEPS, y=STEPS, inputs=["time"], outputs=["y_model"])
+    assert [c.name for c in record.channels] == ["y_model", "time"]
+
+
+def test_where_a_row_came_from():
+    nothing, full = np.zeros((9, 0)), np.arange(9.0)[:, None]
+    assert Experiment(nothing, full).where(3) == "row 3"
+    assert Experiment(nothing, full, "run.csv", first_row=10).where(3) == "run.csv: row 13"
+    assert Experiment(nothing, full, "run.csv", 10, 4, 2).where(3) == "run.csv: line 24 (row 22)"
+    part = Experiment(nothing, full, "run.csv", 10, 4, 2).rows(2, None)
+    assert (part.first_row, part.where(1)) == (18, "run.csv: line 24 (row 22)")

@@ -135,7 +135,24 @@ def test_has_column(tmp_path):
     path = put(tmp_path, "run.csv", "u,y\n1,2\n")
     assert has_column(path, "y")
     assert not has_column(path, "position")
-    assert not has_column(tmp_path / "absent.csv", "y")
+    assert not has_column(put_npz(tmp_path, U=np.ones((3, 2))), "y")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("run.csv", "", "0 bytes"),
+        ("run.csv", "y,y\n1,2\n", "the column 'y' stands 2 times; names must differ"),
+        ("run.npz", "y", "cannot be read as .npz"),
+        ("run.txt", "y\n1\n", "unknown file type '.txt'"),
+    ],
+)
+def test_has_column_of_a_file_that_cannot_be_read(tmp_path, name, content, message):
+    """A file that cannot be read is no file without the column."""
+    with pytest.raises(InputError, match=f"{name}: .*{message}"):
+        has_column(put(tmp_path, name, content), "y")
+    with pytest.raises(InputError, match="absent.csv: no such file"):
+        has_column(tmp_path / "absent.csv", "y")
 
 
 REFUSED_TEXT = [

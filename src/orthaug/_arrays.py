@@ -73,6 +73,16 @@ def check_count(value: Any, name: str, least: int = 1) -> int:
     return int(value)
 
 
+def check_number(value: Any, name: str, *, positive: bool = False) -> float:
+    """Return `value` if it is a finite number, 0 or more (above 0 if `positive`), otherwise raise InputError."""
+    number = not isinstance(value, bool) and isinstance(value, int | float | np.number) and bool(np.isfinite(value))
+    if not number or value < 0 or (positive and value == 0):
+        raise InputError(
+            f"`{name}` must be {'a positive number' if positive else 'a number, 0 or more'}; got {value!r}."
+        )
+    return float(value)
+
+
 def check_type(value: Any, kinds: Any, name: str, wanted: str) -> None:
     """Raise InputError unless `value` is an instance of `kinds` (a class itself is none)."""
     if isinstance(value, type) or not isinstance(value, kinds):

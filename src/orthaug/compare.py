@@ -15,6 +15,7 @@ from orthaug.errors import InputError
 from orthaug.folders import whole_folder
 from orthaug.jobs import SCHEMA, Fitted, Job, Progress, data_of, fit_job, is_result, plain, score_part, structure_of
 from orthaug.model import Model
+from orthaug.record import same_step
 
 ALONE = "physics alone"
 KINDS = (ALONE, "additive", "orthogonal", "orthogonal-penalty", "baseline-penalty")
@@ -108,7 +109,16 @@ def text(found: Comparison) -> str:
 
 def _matching(path: Path, job: Job) -> Model:
     model = storage.load(path)
-    wanted = [c.name for c in job.problem.record.outputs]
+    record = job.problem.record
+    lacking = [c.name for c in model.inputs if c.name not in [own.name for own in record.inputs]]
+    if lacking:
+        found = ", ".join(c.name for c in record.inputs) or "none"
+        raise InputError(f"{path}: uses the input {', '.join(lacking)}; the spec has {found}.")
+    if not same_step(model.sampling_time, record.sampling_time):
+        raise InputError(
+            f"{path}: sampled every {model.sampling_time:g} s, the spec's data every {record.sampling_time:g} s."
+        )
+    wanted = [c.name for c in record.outputs]
     if [c.name for c in model.outputs] != wanted:
         raise InputError(
             f"{path}: its outputs are {', '.join(c.name for c in model.outputs)}; expected {', '.join(wanted)}."

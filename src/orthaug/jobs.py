@@ -18,7 +18,7 @@ from orthaug.excitation import Excitation, identifiability
 from orthaug.folders import check_replaceable, whole_folder
 from orthaug.problem import Problem, check_defined, pose
 from orthaug.readers import read_record
-from orthaug.record import Record, same_step
+from orthaug.record import Record, check_channels, same_step
 from orthaug.spec import Part, Spec, load_spec
 from orthaug.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty, Structure
 
@@ -38,6 +38,11 @@ class LoadedPart:
     record: Record
     skip: int
     files: tuple[dict[str, Any], ...]
+
+    def scored(self, start: int) -> Record:
+        """The record without rows that are neither scored nor lags of what is, for a first usable row `start`."""
+        kept = tuple(e.rows(max(0, self.skip - start), None) for e in self.record.experiments)
+        return replace(self.record, experiments=kept)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +84,7 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
     spec = load_spec(path)
     try:
         baseline, learner_inputs = spec.declared_baseline(), spec.learner_inputs()
-        spec.channels(spec.data.inputs + spec.data.outputs)
+        check_channels(spec.channels(spec.data.inputs), spec.channels(spec.data.outputs))
         structure_of(spec).penalty(baseline.names, baseline.initial, 1.0)
         baseline.check_channels(spec.data.outputs, spec.data.inputs)
     except InputError as error:
@@ -205,7 +210,7 @@ def run_fit(job: Job, progress: Progress | None = None, *, kind: str | None = No
         regularization=training.regularizations(job.validation is not None),
         restarts=training.restarts,
         seed=training.seed,
-        validation=job.validation.record if job.validation else None,
+        validation=job.validation.scored(job.problem.rows.start) if job.validation else None,
         progress=progress,
     )
 
@@ -368,7 +373,7 @@ def _parameters(fit: Estimate) -> list[dict[str, Any]]:
             "initial": p.initial,
             "value": float(fit.theta[i]) if fit.status.ok else None,
             "std": None if std is None else float(std[i]),
-            "ci95": None if ci is None else [float(v) for v in ci[i]],
+            "ci95": None if ci is None or np.isnan(ci[i]).any() else [float(v) for v in ci[i]],
         }
         for i, p in enumerate(fit.problem.baseline.parameters)
     ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from typing import TypeVar
 
 Item = TypeVar("Item")
@@ -29,11 +29,14 @@ def spread(function: Callable[[Item, Callable[[], None]], Result], items: Sequen
             raise Stopped
 
     workers = min(len(items), os.cpu_count() or 1)
-    if workers == 1:
+    if workers <= 1:
         return [function(item, check) for item in items]
     with ThreadPoolExecutor(workers) as pool:
         futures = [pool.submit(function, item, check) for item in items]
         try:
+            done, _ = wait(futures, return_when=FIRST_EXCEPTION)
+            for future in done:
+                future.result()
             return [future.result() for future in futures]
         except BaseException:
             stop.set()

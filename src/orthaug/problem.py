@@ -19,7 +19,7 @@ from orthaug.projection import Projection
 from orthaug.record import Record
 from orthaug.regressors import Features, Lags, Layout, Rows, in_order, stack_rows
 
-_LARGEST = 1e120  # standard deviation of an output whose squares still add up
+_LARGEST = 1e120  # size of outputs and regressors whose squares still add up; 1 / _LARGEST is the smallest
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +89,11 @@ def pose(
         target = rows.y - known
         deviation = target.std(axis=0)
     _check_physics(phi, known, baseline, rows, record)
-    moving = deviation[deviation > 0]
-    if not np.all(np.isfinite(deviation)) or np.any(deviation > _LARGEST) or np.any(moving < 1 / _LARGEST):
+    moves = np.ptp(target, axis=0) > 0
+    if not np.all(np.isfinite(deviation)) or np.any(moves & ((deviation > _LARGEST) | (deviation < 1 / _LARGEST))):
         raise InputError(
-            f"the outputs move by {np.max(deviation):.3g}, too large or too small for double precision arithmetic; "
-            "scale them (`scale` of the channel)."
+            f"the outputs move by {np.max(np.ptp(target, axis=0)):.3g}, too large or too small for double precision "
+            "arithmetic; scale them (`scale` of the channel)."
         )
     weight = 1.0 / np.where(deviation > 0, deviation, 1.0)
     projection = Projection.factor(phi * weight[:, None])
@@ -167,6 +167,12 @@ def _check_physics(phi: np.ndarray, known: np.ndarray, baseline: Baseline, rows:
     for j, name in enumerate(baseline.names):
         texts = ", ".join(t.regressor for t in baseline.terms if t.parameter == name) or "the baseline function"
         _check_finite(phi[:, :, j], f"the regressor of {name} ({texts})", rows, record)
+        size = np.abs(phi[:, :, j]).max()
+        if size > _LARGEST or 0 < size < 1 / _LARGEST:
+            raise InputError(
+                f"the regressor of {name} ({texts}) is of size {size:.3g}, beyond double precision arithmetic; "
+                "scale its channels (`scale`)."
+            )
     _check_finite(known, "the sum of the fixed terms", rows, record)
 
 

@@ -54,6 +54,15 @@ class Channel:
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
 
+def check_channels(inputs: Sequence[Channel], outputs: Sequence[Channel]) -> None:
+    """Raise InputError for a name that stands twice, or an output whose name tables of results need."""
+    check_unique((channel.name for channel in (*inputs, *outputs)), "channel")
+    derived = [f"{c.name}_{part}" for c in outputs for part in ("model", "baseline", "learner")]
+    for channel in outputs:
+        if channel.name in ("time", *derived):
+            raise InputError(f"an output cannot be called '{channel.name}': results have a column of that name.")
+
+
 @dataclass(frozen=True, eq=False)
 class Experiment:
     """One uninterrupted run: `inputs` (N, nu) and `outputs` (N, ny), row k taken at the same instant.
@@ -108,13 +117,7 @@ class Record:
     time_column: str | None = None
 
     def __post_init__(self) -> None:
-        check_unique((channel.name for channel in self.inputs + self.outputs), "channel")
-        derived = [f"{c.name}_{part}" for c in self.outputs for part in ("model", "baseline", "learner")]
-        for channel in self.outputs:
-            if channel.name in ("time", *derived):
-                raise InputError(
-                    f"an output cannot be called '{channel.name}': tables of results have a column of that name."
-                )
+        check_channels(self.inputs, self.outputs)
         if not 0 < self.sampling_time <= _LONGEST_STEP:
             raise InputError(
                 f"the sampling time must be a positive number of seconds, at most {_LONGEST_STEP:g}; "

@@ -57,7 +57,7 @@ def read_initial(initial: str | None, run: Run) -> str | Any:
         if initial == "measured" and not run.record.outputs:
             raise InputError(f"{run.source}: has no measured outputs to start from; use --initial zero or a CSV.")
         return initial
-    if not Path(initial).suffix and not Path(initial).exists():
+    if not Path(initial).suffix and "/" not in initial:
         raise InputError(f"--initial: found '{initial}'; expected measured, zero, or a CSV file of the first outputs.")
     record = read_record(initial, outputs=run.model.outputs, sampling_time=run.model.sampling_time)
     try:
@@ -91,12 +91,15 @@ def check_output(out: Path | None, *read: Path) -> None:
     """Raise InputError early where a file could not be written, or is one of those that are read."""
     if out is None:
         return
-    if any(file.exists() and out.exists() and out.samefile(file) for file in read):
-        raise InputError(f"{out}: is read by this run; give another name.")
-    if out.is_dir() or not out.name:
-        raise InputError(f"{out}: is a folder; expected the name of a CSV file.")
-    if not out.absolute().parent.is_dir():
-        raise InputError(f"{out}: cannot be written; there is no folder {out.parent}.")
+    try:
+        if any(file.exists() and out.exists() and out.samefile(file) for file in read):
+            raise InputError(f"{out}: is read by this run; give another name.")
+        if out.is_dir() or not out.name:
+            raise InputError(f"{out}: is a folder; expected the name of a CSV file.")
+        if not out.absolute().parent.is_dir():
+            raise InputError(f"{out}: cannot be written; there is no folder {out.parent}.")
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror}).") from None
 
 
 def write_csv(response: Response, out: Path | None) -> None:

@@ -164,6 +164,14 @@ class Spec(Section):
     training: TrainingSection = TrainingSection()
 
     @model_validator(mode="after")
+    def _seeds_fit(self) -> Spec:
+        if self.training.seed + self.training.restarts >= 2**63:
+            raise ValueError(
+                f"`training.seed`: found {self.training.seed}; expected seeds below 2**63 for all restarts"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _choices_need_validation(self) -> Spec:
         if isinstance(self.training.regularization, list) and self.data.validation is None:
             raise ValueError("`training.regularization` is a list; expected [data.validation] to choose by")
@@ -184,7 +192,10 @@ class Spec(Section):
 
     def declared_baseline(self) -> Baseline:
         """The baseline as declared."""
-        terms = [Term(t.parameter, str(t.regressor), t.initial, t.unit, t.output, t.fixed) for t in self.baseline.terms]
+        terms = [
+            Term(t.parameter, str(t.regressor), t.initial, t.unit, t.output, t.fixed, t.min, t.max)
+            for t in self.baseline.terms
+        ]
         return Baseline.from_terms(terms, self.baseline.constants)
 
     def learner_inputs(self) -> tuple[str, ...] | None:

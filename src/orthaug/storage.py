@@ -70,9 +70,13 @@ def load(folder: str | Path, *, baseline: Baseline | None = None, learner: Learn
         InputError: no model there; a file that is cut, altered, or from a newer version.
     """
     folder = Path(folder)
-    if not (folder / _DECLARATION).exists() and (folder / "model" / _DECLARATION).exists():
-        folder = folder / "model"
-    if not (folder / _DECLARATION).is_file() or not (folder / _ARRAYS).is_file():
+    try:
+        if not (folder / _DECLARATION).exists() and (folder / "model" / _DECLARATION).exists():
+            folder = folder / "model"
+        there = (folder / _DECLARATION).is_file() and (folder / _ARRAYS).is_file()
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read ({error.strerror}).") from None
+    if not there:
         raise InputError(f"{folder}: no saved model there; expected {_DECLARATION} and {_ARRAYS}.")
     path = folder / _DECLARATION
     try:

@@ -124,6 +124,11 @@ class Elimination:
     upper: Vector
 
     @property
+    def bounded(self) -> bool:
+        """Whether any entry of θ has a bound."""
+        return bool(np.isfinite(self.lower).any() or np.isfinite(self.upper).any())
+
+    @property
     def _theta(self) -> Matrix:
         return np.concatenate([self.to_coordinates, self.rows.theta])
 
@@ -166,7 +171,7 @@ class Elimination:
 
     def active(self, f: Vector) -> Fixed:
         """Which entries of θ stand at which bound, for the learner's coordinates f."""
-        if not np.isfinite(self.lower).any() and not np.isfinite(self.upper).any():
+        if not self.bounded:
             return {}
         matrix, right = self._theta, self._target - self._learner @ f
         scale = np.linalg.norm(matrix, axis=0)
@@ -213,7 +218,7 @@ def split(
     Args:
         coordinates: Rθ (nθ,) where a solver iterated on it; None to solve for θ.
     """
-    projection = problem.projection
+    projection, baseline = problem.projection, problem.baseline
     orthogonal = isinstance(structure, Orthogonal)
     aux = projection.solve(values)
     elimination = eliminate(structure, problem)
@@ -221,6 +226,9 @@ def split(
     fixed = elimination.active(f)
     if coordinates is not None and not orthogonal:
         theta = projection.from_coordinates(coordinates)
+        if elimination.bounded:  # the iterate need not satisfy what only its end satisfies
+            fixed = fixed | {i: v for i, v in enumerate(np.clip(theta, *baseline.bounds)) if v != theta[i]}
+            theta = np.array([fixed.get(i, value) for i, value in enumerate(theta)])
     elif fixed or len(elimination.rows.target):
         theta = elimination.theta(f, fixed)
     else:  # refined least squares, as exact as double precision allows

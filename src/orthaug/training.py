@@ -113,8 +113,9 @@ class Task:
             )
         if evidence:
             raise InputError("evidence regularization needs the Gauss-Newton matrix of the levenberg-marquardt solver.")
-        physics = self._physics(elimination, fixed, ridge)
-        joint = Joint(self.bound, isinstance(structure, Orthogonal))
+        orthogonal = isinstance(structure, Orthogonal)
+        physics = self._physics(elimination, fixed, ridge, solved=orthogonal)
+        joint = Joint(self.bound, orthogonal)
         found = solver.minimise(joint, w, self.chunks, physics, progress=progress)
         normal = linearise(criterion, found.w, arguments, nothing)
         coordinates = np.asarray(physics.start + physics.basis @ found.v) * self.rms
@@ -129,10 +130,14 @@ class Task:
             coordinates,
         )
 
-    def _physics(self, elimination: Elimination, fixed: Fixed, ridge: float) -> Physics:
-        """θ as an unknown from θ⁰ on: every free column scaled to the size of a row, fixed entries without a column."""
+    def _physics(self, elimination: Elimination, fixed: Fixed, ridge: float, *, solved: bool) -> Physics:
+        """θ as an unknown from θ⁰ on: every free column scaled to the size of a row, fixed entries without a column.
+
+        Where θ is `solved` (F1), it stands at its end and has no columns: the learner's path does not depend on it.
+        """
         to_rows = elimination.to_coordinates / self.rms
-        initial = np.array([fixed.get(i, value) for i, value in enumerate(self.problem.baseline.initial)])
+        initial = np.clip(self.problem.baseline.initial, elimination.lower, elimination.upper)
+        initial = np.array([fixed.get(i, value) for i, value in enumerate(initial)])
         free = np.array([float(i not in fixed) for i in range(len(initial))])
         rows, nt = len(self.problem.rows), len(initial)
         scale = free * np.sqrt(rows) / np.linalg.norm(to_rows, axis=0) if nt else free
@@ -145,8 +150,8 @@ class Task:
             *(
                 jnp.asarray(a, dtype=float)
                 for a in (
-                    to_rows @ initial,
-                    to_rows * scale,
+                    elimination.outputs / self.rms if solved else to_rows @ initial,
+                    to_rows * (0.0 if solved else scale),
                     elimination.outputs / self.rms,
                     padded(penalty.theta * scale) / self.rms,
                     padded(penalty.learner),

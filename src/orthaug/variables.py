@@ -86,8 +86,9 @@ def _from_hdf5(path: Path, names: Sequence[str]) -> dict[str, Vector]:
     def note(name: str, item: Any) -> None:
         if isinstance(item, h5py.Group):
             if not name.startswith("#"):
-                held[name] = Held("a struct" if matlab else "a group", None)
-        elif not name.startswith("#"):
+                sparse = "MATLAB_sparse" in item.attrs
+                held[name] = Held("a sparse matrix" if sparse else "a struct" if matlab else "a group", None)
+        elif not name.startswith("#") and "MATLAB_sparse" not in item.parent.attrs:
             kind = item.attrs.get("MATLAB_class", b"")
             if kind in (b"char", b"cell", "char", "cell"):
                 held[name] = Held("text" if kind in (b"char", "char") else "a cell", None)

@@ -6,7 +6,6 @@ compiled loop; SciPy's L-BFGS-B, called back from Python, took 3 to 6 times long
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import dataclass
 from functools import partial
@@ -15,10 +14,9 @@ from typing import Any, NamedTuple
 import optax
 from jaxtyping import Array, Float
 
-from orthaug._arrays import check_count
+from orthaug._arrays import check_count, check_number
 from orthaug._jax import jax, jnp
 from orthaug.criteria import Chunks, Joint, Physics
-from orthaug.errors import InputError
 from orthaug.solvers.levenberg_marquardt import CONVERGED, NON_FINITE, RUNNING, Progress, burst_length
 
 _MEMORY = 20  # pairs that L-BFGS keeps
@@ -60,8 +58,7 @@ class AdamLBFGS:
     def __post_init__(self) -> None:
         check_count(self.adam_iterations, "adam_iterations", least=0)
         check_count(self.lbfgs_iterations, "lbfgs_iterations", least=0)
-        if not (math.isfinite(self.learning_rate) and self.learning_rate > 0):
-            raise InputError(f"`learning_rate` must be positive; got {self.learning_rate}.")
+        check_number(self.learning_rate, "learning_rate", positive=True)
 
     @property
     def iterations(self) -> int:
@@ -80,7 +77,8 @@ class AdamLBFGS:
         """Minimise the joint criterion from θ⁰ and `w`; the loss told to `progress` is a mean square."""
         began = time.perf_counter()
         unknowns = (jnp.zeros_like(physics.start), w)
-        done, state = 0, _State(unknowns, None, jnp.asarray(jnp.inf), jnp.asarray(0), jnp.asarray(0))
+        loss = _value(criterion, unknowns, chunks, physics)
+        done, state = 0, _State(unknowns, None, loss, jnp.asarray(0), jnp.asarray(0))
         phases = (
             (self.adam_iterations, optax.adam(self.learning_rate)),
             (self.lbfgs_iterations, optax.lbfgs(memory_size=_MEMORY)),
@@ -88,7 +86,7 @@ class AdamLBFGS:
         for limit, optimizer in phases:
             state = _State(state.unknowns, optimizer.init(state.unknowns), state.loss, jnp.asarray(0), jnp.asarray(0))
             burst, second = 1, optimizer is phases[1][1]
-            while int(state.iteration) < limit and int(state.small) < 5:
+            while int(state.iteration) < limit and bool(_going(state)):
                 tick = time.perf_counter()
                 stop = jnp.asarray(min(int(state.iteration) + burst, limit))
                 advance = _lbfgs if second else _adam
@@ -103,6 +101,16 @@ class AdamLBFGS:
         return GradientRun(v, w, done, code, time.perf_counter() - began)
 
 
+def _going(state: _State) -> Any:
+    """Whether another step makes sense: the loss is finite and still falls."""
+    return jnp.isfinite(state.loss) & (state.small < 5)
+
+
+@partial(jax.jit, static_argnames="criterion")
+def _value(criterion: Joint, unknowns: Any, chunks: Chunks, physics: Physics) -> Any:
+    return criterion(unknowns, chunks, physics)
+
+
 @partial(jax.jit, static_argnames="criterion")
 def _adam(criterion: Joint, state: _State, chunks: Chunks, physics: Physics, rate: Any, stop: Any) -> _State:
     optimizer = optax.adam(rate)
@@ -113,7 +121,7 @@ def _adam(criterion: Joint, state: _State, chunks: Chunks, physics: Physics, rat
         unknowns: Any = optax.apply_updates(s.unknowns, update)
         return _State(unknowns, inner, loss, s.iteration + 1, s.small)
 
-    return jax.lax.while_loop(lambda s: s.iteration < stop, step, state)
+    return jax.lax.while_loop(lambda s: (s.iteration < stop) & _going(s), step, state)
 
 
 @partial(jax.jit, static_argnames="criterion")
@@ -133,4 +141,4 @@ def _lbfgs(criterion: Joint, state: _State, chunks: Chunks, physics: Physics, ra
         small = jnp.where(loss - found <= _SMALL * loss, s.small + 1, 0)
         return _State(unknowns, inner, found, s.iteration + 1, small)
 
-    return jax.lax.while_loop(lambda s: (s.iteration < stop) & (s.small < 5), step, state)
+    return jax.lax.while_loop(lambda s: (s.iteration < stop) & _going(s), step, state)

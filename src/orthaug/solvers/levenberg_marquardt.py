@@ -16,10 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from orthaug._arrays import check_count
+from orthaug._arrays import check_count, check_number
 from orthaug._jax import jax, jnp
 from orthaug.criteria import Normal, Overlap, linearise
-from orthaug.errors import InputError
 
 RUNNING, CONVERGED, NO_DESCENT, NON_FINITE, SPANNED = range(5)
 """Codes of a run; RUNNING at the end means that the limit of iterations was reached, SPANNED that P⊥J = 0."""
@@ -86,8 +85,7 @@ class LevenbergMarquardt:
 
     def __post_init__(self) -> None:
         check_count(self.iterations, "iterations", least=0)
-        if not (np.isfinite(self.tolerance) and self.tolerance >= 0):
-            raise InputError(f"`tolerance` must be 0 or more; got {self.tolerance}.")
+        check_number(self.tolerance, "tolerance")
 
     def minimise(
         self,

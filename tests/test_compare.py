@@ -1,0 +1,159 @@
+"""`orthaug compare`: every structure on the same data and seeds, beside models that were saved earlier."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from test_cli import MLP, SPEC, listing, make_project, one_line, run, signals, write_csv
+
+NETWORK = SPEC.replace('kind = "none"\n', MLP)
+STARTED = NETWORK.replace('"b"', '"b"\ninitial = -0.1').replace('"c"', '"c"\ninitial = 0.4')
+
+
+@pytest.fixture
+def project(tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return make_project(tmp_path, STARTED)
+
+
+def test_every_structure(project):
+    assert run("fit", project, "--out", "fit").code == 0
+    done = run("compare", project, "--out", "out", "--model", "fit", "--json")
+    assert (done.code, done.err) == (0, "")
+    result = json.loads(done.out)
+    assert result == json.loads(Path("out/result.json").read_text(encoding="utf-8"))
+    rows = {row["name"]: row for row in result["comparison"]}
+    kinds = ["physics alone", "additive", "orthogonal", "orthogonal-penalty", "baseline-penalty"]
+    assert list(rows) == [*kinds, "fit"]
+    assert (result["left_out"], result["chosen"]) == ({}, None)
+    values = {name: [p["value"] for p in row["parameters"]] for name, row in rows.items()}
+    assert values["orthogonal"] == pytest.approx(values["physics alone"], rel=1e-10)
+    assert values["fit"] == values["orthogonal"]
+    assert values["additive"] != pytest.approx(values["orthogonal"], rel=1e-3)
+    assert rows["orthogonal"]["orthogonality_defect"] <= 1e-12
+    assert rows["physics alone"]["weights"] == 0 < rows["additive"]["weights"]
+    assert rows["fit"]["scores"] == rows["orthogonal"]["scores"]
+    assert set(rows["additive"]["scores"]) == {"train", "tests.steps"}
+    assert Path("out/figures/comparison.png").read_bytes().startswith(b"\x89PNG")
+    saved = [path.name for path in Path("out/models").iterdir()]
+    assert sorted(saved) == sorted(kind.replace(" ", "-") for kind in kinds)
+    done = run("simulate", "out/models/additive", "steps.csv")
+    assert (done.code, done.err) == (0, "")
+
+
+def test_the_table(project):
+    project.write_text(NETWORK)  # θ⁰ = 0 of two parameters: nothing to hold them to
+    done = run("compare", project)
+    assert (done.code, done.err) == (0, "")
+    for words in ("physics alone", "orthogonal-penalty", "tests.steps", "free-run NRMSE", "left out: baseline-penalty"):
+        assert words in done.out
+    assert (project.parent / "orthaug-out" / "plant" / "result.json").is_file()
+
+
+def test_with_a_validation_part_the_lowest_error_there_is_marked(project):
+    u, y = signals(80, 3)
+    write_csv(Path("valid.csv"), u=u, y=y)
+    project.write_text(
+        STARTED.replace("[data.channels.y]", '[data.validation]\nfiles = ["valid.csv"]\n[data.channels.y]')
+    )
+    result = json.loads(run("compare", project, "--json").out)
+    errors = {r["name"]: r["scores"]["validation"]["prediction"]["rmse"][0] for r in result["comparison"]}
+    assert result["chosen"] == min(errors, key=errors.__getitem__)
+
+
+def test_without_a_learner_there_is_only_the_physics(project):
+    project.write_text(SPEC)
+    result = json.loads(run("compare", project, "--json").out)
+    assert [row["name"] for row in result["comparison"]] == ["physics alone"]
+
+
+def test_a_saved_model_of_other_outputs_is_refused(project):
+    assert run("fit", project, "--out", "fit").code == 0
+    for name in ("run", "steps"):
+        u, y = signals(120, 1)
+        write_csv(Path(f"{name}.csv"), u=u, z=y)
+    project.write_text(STARTED.replace('["y"]', '["z"]').replace("y[k", "z[k").replace("channels.y", "channels.z"))
+    before = listing(Path())
+    done = run("compare", project, "--model", "fit")
+    assert (done.code, done.out) == (2, "")
+    assert one_line(done.err, "fit: its outputs are y; expected z")
+    assert listing(Path()) == before
+
+
+# --- the rows are what the single fits are, and everything written can be used
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
+    """A folder whose comparison, with a validation part, lies in `out`; tests leave it as it is."""
+    folder = tmp_path_factory.mktemp("compared")
+    spec = make_project(folder, STARTED.replace("[data.tests", '[data.validation]\nfiles = ["valid.csv"]\n[data.tests'))
+    u, y = signals(80, 3)
+    write_csv(folder / "valid.csv", u=u, y=y)
+    done = run("compare", spec, "--out", folder / "out")
+    assert (done.code, done.err) == (0, "")
+    return folder
+
+
+def rows_of(folder: Path) -> dict:
+    result = json.loads((folder / "out" / "result.json").read_text(encoding="utf-8"))
+    return {row["name"]: row for row in result["comparison"]}
+
+
+@pytest.mark.parametrize("kind", ["orthogonal", "additive", "orthogonal-penalty", "baseline-penalty"])
+def test_a_row_is_what_the_single_fit_gives(compared, tmp_path, kind):
+    spec = (compared / "plant.toml").read_text(encoding="utf-8")
+    (compared / f"{kind}.toml").write_text(spec + f'[structure]\nkind = "{kind}"\n', encoding="utf-8")
+    assert run("fit", compared / f"{kind}.toml", "--out", tmp_path / "fit").code == 0
+    single = json.loads((tmp_path / "fit" / "result.json").read_text(encoding="utf-8"))
+    row = rows_of(compared)[kind]
+    for key in ("parameters", "scores", "orthogonality_defect", "warnings"):
+        assert row[key] == single[key]
+    assert row["status"] == single["status"]["code"]
+
+
+def test_every_part_is_scored_in_every_row(compared):
+    for row in rows_of(compared).values():
+        assert set(row["scores"]) == {"train", "validation", "tests.steps"}
+        for scores in row["scores"].values():
+            assert scores["prediction"]["rmse"][0] > 0 and scores["simulation"]["rmse"][0] > 0
+
+
+def test_the_chosen_row_has_the_lowest_validation_error(compared):
+    errors = {n: row["scores"]["validation"]["prediction"]["nrmse"][0] for n, row in rows_of(compared).items()}
+    result = json.loads((compared / "out" / "result.json").read_text(encoding="utf-8"))
+    assert result["chosen"] == min(errors, key=errors.__getitem__)
+
+
+def test_the_models_can_join_the_next_comparison(compared, tmp_path):
+    models = [compared / "out" / "models" / name for name in ("physics-alone", "additive")]
+    joined = [word for model in models for word in ("--model", model)]
+    assert run("compare", compared / "plant.toml", "--out", tmp_path / "out", *joined).code == 0
+    rows, before = rows_of(tmp_path), rows_of(compared)
+    for model, name in zip(models, ("physics alone", "additive"), strict=True):
+        row = rows[str(model)]
+        assert row["status"] == "saved" and row["scores"] == before[name]["scores"]
+        assert [p["value"] for p in row["parameters"]] == [p["value"] for p in before[name]["parameters"]]
+        assert all(p["std"] is None for p in row["parameters"])
+
+
+@pytest.mark.parametrize("model", ["nowhere", "run.csv", "empty"])
+def test_what_is_no_saved_model_is_refused(compared, tmp_path, model):
+    (compared / "empty").mkdir(exist_ok=True)
+    done = run("compare", compared / "plant.toml", "--out", tmp_path / "out", "--model", compared / model)
+    assert done.code == 2 and model in done.err and done.err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_saved_model_of_other_inputs_is_refused_before_training(compared, tmp_path):
+    spec = STARTED.replace('"u"', '"force"').replace("u[k-1]", "force[k-1]")
+    other = make_project(
+        tmp_path, spec.replace("[data.channels.y]", '[data.channels.force]\ncolumn = "u"\n[data.channels.y]')
+    )
+    model = compared / "out" / "models" / "additive"
+    done = run("compare", other, "--out", tmp_path / "out", "--model", model)
+    assert done.code == 2 and done.err.count("\n") == 1
+    assert str(model) in done.err and "force" in done.err
+    assert not (tmp_path / "out").exists()
