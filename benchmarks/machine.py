@@ -26,13 +26,21 @@ def describe() -> str:
     return f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}, {versions}, {datetime.date.today()}"
 
 
+def median_seconds(call: Callable[[], object], repeats: int) -> float:
+    """Median seconds of a call, after one warm call."""
+    call()
+    return float(np.median([_seconds(call) for _ in range(repeats)]))
+
+
 def alternate(first: Callable[[], object], second: Callable[[], object], repeats: int) -> tuple[float, float]:
     """Median seconds of two calls taken in turn, so that both see the same machine; one warm call before."""
-    times: tuple[list[float], list[float]] = ([], [])
     first(), second()
-    for _ in range(repeats):
-        for call, spent in zip((first, second), times, strict=True):
-            began = time.perf_counter()
-            call()
-            spent.append(time.perf_counter() - began)
-    return float(np.median(times[0])), float(np.median(times[1]))
+    pairs = [(_seconds(first), _seconds(second)) for _ in range(repeats)]
+    one, two = np.median(pairs, axis=0)
+    return float(one), float(two)
+
+
+def _seconds(call: Callable[[], object]) -> float:
+    began = time.perf_counter()
+    call()
+    return time.perf_counter() - began

@@ -10,6 +10,7 @@ from machine import alternate, describe
 
 from orthaug import MLP, AdamLBFGS, LevenbergMarquardt, Orthogonal, synthetic
 from orthaug._jax import jax
+from orthaug.parallel import one_blas_thread
 from orthaug.problem import pose
 from orthaug.training import Task
 
@@ -39,6 +40,12 @@ def iterations_to(task: Task, w: object, loss: float) -> int | None:
 
 def main() -> None:
     print(describe())
+    with one_blas_thread():  # as `estimate` trains
+        table()
+
+
+def table() -> None:
+    """Measure every case."""
     print("| example | seed | adam-lbfgs | its loss | LM to that loss | iterations | ratio |")
     print("|---|---|---|---|---|---|---|")
     for name, example, pipeline in CASES:

@@ -85,13 +85,13 @@ class Prediction:
     def _blocks(self, w: Float[Array, "nw"], chunk: Chunks, before: Overlap) -> Float[Array, "n n"]:
         """Gram matrix of the columns `[Q r J]` of one chunk, each column a row of `columns`."""
         values, jacobian = self.bound.jacobian(w, chunk.z, chunk.gain)
-        q = jnp.moveaxis(chunk.q, 1, 0)  # (nt, ny, m)
-        residual = chunk.e - values
-        for i in range(q.shape[0]):  # unrolled, so that it fuses with the derivative
+        nt, cells = chunk.q.shape[1], chunk.e.size  # outputs and rows as one axis of ny·m cells
+        q = jnp.moveaxis(chunk.q, 1, 0).reshape(nt, cells)
+        residual, jacobian = (chunk.e - values).reshape(cells), jacobian.reshape(-1, cells)
+        for i in range(nt):  # unrolled, so that it fuses with the derivative
             residual = residual + before.values[i] * q[i]
-            jacobian = jacobian - before.jacobian[i][:, None, None] * q[i]
-        columns = jnp.concatenate([q, residual[None], jacobian])
-        return gram(columns.reshape(columns.shape[0], -1))
+            jacobian = jacobian - before.jacobian[i][:, None] * q[i]
+        return gram(jnp.concatenate([q, residual[None], jacobian]))
 
 
 @partial(jax.jit, static_argnames="criterion")

@@ -4,12 +4,26 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from typing import TypeVar
+
+from threadpoolctl import threadpool_limits
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """BLAS on one thread: its others would wait actively after every call, for longer than a pass over 10⁵ rows takes.
+
+    The Cholesky factors of a step are LAPACK's, everything else is XLA's own threads; sharing the cores
+    with waiting ones cost 45 % (benchmarks/lm_iteration.py).
+    """
+    with threadpool_limits(limits=1, user_api="blas"):
+        yield
 
 
 class Stopped(Exception):
@@ -30,8 +44,9 @@ def spread(function: Callable[[Item, Callable[[], None]], Result], items: Sequen
 
     workers = min(len(items), os.cpu_count() or 1)
     if workers <= 1:
-        return [function(item, check) for item in items]
-    with ThreadPoolExecutor(workers) as pool:
+        with one_blas_thread():
+            return [function(item, check) for item in items]
+    with one_blas_thread(), ThreadPoolExecutor(workers) as pool:
         futures = [pool.submit(function, item, check) for item in items]
         try:
             done, _ = wait(futures, return_when=FIRST_EXCEPTION)
