@@ -25,7 +25,7 @@ from orthaug.regressors import Lags, Scaling
 from orthaug.result import Estimate, Restart, Status
 from orthaug.solvers import LevenbergMarquardt
 from orthaug.solvers.levenberg_marquardt import CONVERGED, NO_DESCENT, NON_FINITE, RUNNING, SPANNED, Run
-from orthaug.structures import Fixed, Orthogonal, Split, Structure, split
+from orthaug.structures import BaselinePenalty, Fixed, Orthogonal, Split, Structure, split
 from orthaug.training import Solver, Task
 
 _CODES = {
@@ -245,9 +245,7 @@ def _nothing_learned(problem: Problem) -> _Learned:
     return _Learned(None, nothing, Scaling(nothing, nothing), zeros, np.zeros_like(problem.target), 0.0, gram)
 
 
-def _conclude(
-    problem: Problem, structure: Structure, learned: _Learned, status: Status, restarts: tuple[Restart, ...] = ()
-) -> Estimate:
+def _conclude(problem: Problem, structure: Structure, learned: _Learned, status: Status) -> Estimate:
     """Solve θ, split it from the learner, and attach statistics."""
     projection, weight = problem.projection, problem.weight
     whitened = learned.values * weight
@@ -263,8 +261,7 @@ def _conclude(
     residual = problem.whitened_target - whitened - projection.phi @ (theta - theta_aux)
     freedom = degrees_of_freedom(projection, learned.effective) + len(fixed) / len(weight)
     noise = noise_covariance(residual / weight, freedom) if usable else None
-    unique = isinstance(structure, Orthogonal) or learned.bound is None
-    known = noise is not None and unique and not learned.elsewhere
+    known = noise is not None and _unique(structure, learned) and not learned.elsewhere
     form = Form(problem.baseline, problem.features, problem.layout, problem.outputs, learned.bound)
     numbers = Numbers(
         theta, theta_aux, learned.weights, learned.scaling.centre, learned.scaling.halfwidth, learned.unit
@@ -284,7 +281,7 @@ def _conclude(
             noise=noise,
         ),
         status=Status(status.code, status.iterations, status.seconds, float(np.mean(residual**2))),
-        restarts=restarts,
+        restarts=(),
         excitation=problem.excitation,
         covariance=theta_covariance(projection, weight, noise, fixed) if known else None,  # type: ignore[arg-type]
         freedom=float(freedom.min()),
@@ -294,6 +291,11 @@ def _conclude(
         at_bound={problem.baseline.names[i]: value for i, value in fixed.items()},
         warnings=tuple(_warnings(problem, structure, learned, noise, fixed)),
     )
+
+
+def _unique(structure: Structure, learned: _Learned) -> bool:
+    """Whether the data alone determine θ."""
+    return isinstance(structure, Orthogonal) or (learned.bound is None and not isinstance(structure, BaselinePenalty))
 
 
 def _defect(problem: Problem, whitened: np.ndarray, theta_aux: Vector) -> float | None:
@@ -321,10 +323,10 @@ def _warnings(
         )
     if learned.elsewhere:
         found.append("no standard errors: the function was trained elsewhere.")
-    elif learned.bound and not isinstance(structure, Orthogonal):
+    elif not _unique(structure, learned):
         found.append(
-            f"θ of the {structure.name} structure is not unique (it depends on how the learner was started or "
-            "penalised), so it has no standard error; use the orthogonal structure for parameters."
+            f"θ of the {structure.name} structure is not unique (it depends on the learner's start or on the "
+            "penalty), so it has no standard error; use the orthogonal structure for parameters."
         )
     elif noise is None:
         found.append(
