@@ -13,6 +13,7 @@ from orthaug.model import Response
 
 # Okabe-Ito: told apart by every reader
 _BLACK, _GREY, _BLUE, _ORANGE, _GREEN = "#000000", "#B8B8B8", "#0072B2", "#E69F00", "#009E73"
+_KINDS = ("prediction", "simulation")
 _WINDOW = 250  # samples of a long record that are shown, so that single swings can be seen
 _SIZE = (7.0, 2.4)  # inches per panel
 
@@ -83,13 +84,13 @@ def comparison_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
     figure = Figure(figsize=(_SIZE[0], 2.2 + 1.3 * len(parameters)), layout="constrained")
     axes = figure.subplots(1 + len(parameters), 1, sharex=True, squeeze=False)[:, 0]
     place = np.arange(len(rows))
-    for kind, marker, color in (("prediction", "o", _BLUE), ("simulation", "s", _ORANGE)):
+    for kind, marker, color in zip(_KINDS, "os", (_BLUE, _ORANGE), strict=True):
         label = "one step" if kind == "prediction" else "free run"
         axes[0].plot(place, [_mean_nrmse(row, kind) for row in rows], marker, color=color, label=label)
     part = list(rows[0]["scores"])[-1] if rows[0]["scores"] else ""
     axes[0].set_title(f"NRMSE on {part}, and parameters with their 95 % intervals (hollow: none)", fontsize=10, pad=20)
     axes[0].set_ylabel("NRMSE")
-    axes[0].set_ylim(bottom=0)
+    axes[0].set_ylim(0, 1.15 * np.nanmax([0.0, *(_mean_nrmse(row, kind) for row in rows for kind in _KINDS)]) or 1.0)
     _legend(axes[0])
     for axis, name in zip(axes[1:], parameters, strict=True):
         for i, row in enumerate(rows):
@@ -103,6 +104,7 @@ def comparison_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
         unit = rows[0]["parameters"][parameters.index(name)]["unit"]
         axis.set_ylabel(f"{name} [{unit}]" if unit else name)
     for axis in axes:
+        axis.margins(y=0.15)
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)
     axes[-1].set_xticks(place, names, rotation=15, ha="right")
