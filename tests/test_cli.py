@@ -478,7 +478,9 @@ def test_ctrl_c_during_training_leaves_nothing(project, monkeypatch, before):
     kept = {path: path.read_bytes() for path in project.parent.rglob("*") if path.is_file()}
     done = run("fit", project, "--out", "deep/out")
     assert (done.code, done.out) == (130, "")
-    assert one_line(done.err, "interrupted", "run 1 of 2", "iteration 3", "nothing was written")
+    assert one_line(
+        done.err, "interrupted", " of 2", "iteration 3", "nothing was written"
+    )  # whichever thread was first
     assert {path: path.read_bytes() for path in project.parent.rglob("*") if path.is_file()} == kept
     assert before or not Path("deep").exists()
 
