@@ -13,6 +13,8 @@ from orthaug.problem import pose
 from orthaug.record import Record
 from orthaug.regressors import Lags, Scaling
 from orthaug.solvers import LevenbergMarquardt
+from orthaug.structures import Orthogonal, OrthogonalPenalty
+from orthaug.synthetic import mass_spring_damper
 from orthaug.training import OUTPUT_UNIT, Task
 
 TERMS = [Term("a", "y1[k-1]", output="y1"), Term("b", "u[k]", output="y2"), Term("a", "u[k-1]", output="y2")]
@@ -99,3 +101,12 @@ def test_mean_square_is_that_of_the_projected_residual(task, run):
     rest = problem.whitened_target.ravel() - np.asarray(whitened(task, run.w))
     rest = rest - phi @ np.linalg.lstsq(phi, rest, rcond=None)[0]
     assert task.mean_square(run.normal.loss) == pytest.approx(np.mean(rest**2), rel=1e-9)
+
+
+def test_gram_has_no_rows_of_a_penalty():
+    example = mass_spring_damper()
+    task = Task.of(pose(example.train.rows(0, 400), example.baseline), MLP(hidden=(3,)))
+    w = task.bound.init(jax.random.key(0))
+    free, held = (task.run(LevenbergMarquardt(0), w, s) for s in (Orthogonal(), OrthogonalPenalty(100.0)))
+    assert held.held and not free.held
+    np.testing.assert_allclose(task.gram(held), task.gram(free), rtol=1e-9, atol=1e-9)

@@ -84,7 +84,8 @@ class Task:
             if found == fixed or run.code == NON_FINITE:
                 break
             w, fixed = run.w, found
-        return run._replace(seconds=seconds, iterations=iterations)
+        held = bool(elimination.hold(fixed)[0].any())
+        return run._replace(seconds=seconds, iterations=iterations, held=held)
 
     def coordinates(self, run: Run) -> Vector:
         """QᵀF (nθ,) in whitened outputs, at the end of a run."""
@@ -172,10 +173,15 @@ class Task:
         return from_chunks(chunks, len(self.problem.rows)) * self.unit
 
     def gram(self, run: Run) -> Matrix:
-        """Gram matrix of `[Φ J]` in whitened outputs, from the run's last pass."""
-        projection, overlap = self.problem.projection, np.asarray(run.normal.overlap.jacobian) * self.rms
+        """Gram matrix of `[Φ J]` in whitened outputs, from the run's last pass; a held run's has rows of its own."""
+        projection, normal = self.problem.projection, run.normal
+        if run.held:
+            nt = len(normal.overlap.values)
+            free = Hold(jnp.zeros((nt, nt)), jnp.zeros(nt))
+            normal = linearise(Prediction(self.bound), run.w, (self.chunks, free), normal.overlap)
+        overlap = np.asarray(normal.overlap.jacobian) * self.rms
         to_phi = projection.r / projection.scale
-        inner = np.asarray(run.normal.hessian) * self.rms**2 + overlap.T @ overlap
+        inner = np.asarray(normal.hessian) * self.rms**2 + overlap.T @ overlap
         cross = to_phi.T @ overlap
         return np.block([[to_phi.T @ to_phi, cross], [cross.T, inner]])
 

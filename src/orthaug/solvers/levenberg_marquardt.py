@@ -22,9 +22,7 @@ from orthaug.criteria import Normal, Overlap, linearise
 
 RUNNING, CONVERGED, NO_DESCENT, NON_FINITE, SPANNED = range(5)
 """Codes of a run; RUNNING at the end means that the limit of iterations was reached, SPANNED that P⊥J = 0."""
-_FIRST_DAMPING = (
-    1e-5  # of the largest curvature; 1e-3 took 15 % more iterations on the paper's examples, 1e-8 got stuck
-)
+_FIRST_DAMPING = 1e-5  # of the largest curvature; docs/design.md has the comparison
 _LARGEST_DAMPING = 1e12  # of the largest curvature: no step is short enough to descend
 _NOTHING_LEFT = 1e-22  # of ‖J‖²: what rounding leaves of a Jacobian in the span of the physics
 _SECONDS_PER_BURST = 0.5  # how often progress is told and Ctrl-C is heard
@@ -65,6 +63,8 @@ class Run(NamedTuple):
     seconds: float
     coordinates: np.ndarray | None = None
     """Rθ (nθ,) where the solver iterated on θ too; None where θ is eliminated."""
+    held: bool = False
+    """Whether a penalty or a bound held the learner, so that `normal` has its rows too."""
 
 
 Progress = Callable[[int, float], None]
