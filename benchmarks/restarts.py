@@ -12,7 +12,7 @@ from machine import alternate, describe
 
 from orthaug import MLP, LevenbergMarquardt, synthetic
 from orthaug._jax import jax, jnp
-from orthaug.criteria import Hold, Overlap, Prediction
+from orthaug.criteria import Hold, Overlap, OneStep
 from orthaug.problem import pose
 from orthaug.solvers.levenberg_marquardt import Options, _advance, _start
 from orthaug.training import Task
@@ -34,7 +34,7 @@ def main() -> None:
         arguments = (task.chunks, Hold(jnp.zeros((nt, nt)), jnp.zeros(nt)))
         overlap = Overlap(jnp.zeros((nt, task.bound.size)), jnp.zeros(nt))
         options = Options(jnp.asarray(0.0), jnp.asarray(False), jnp.asarray(1.0))
-        criterion = Prediction(task.bound)
+        criterion = OneStep(task.bound)
 
         @jax.jit
         def batched(ws: object, criterion=criterion, arguments=arguments, overlap=overlap, options=options) -> object:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from orthaug._jax import jax, jnp
-from orthaug.criteria import Chunks, Hold, Overlap, Prediction
+from orthaug.criteria import Chunks, Hold, OneStep, Overlap
 from orthaug.gram import chunk_shape, in_chunks
 from orthaug.learners import Bound, Learner
 
@@ -15,7 +15,7 @@ from orthaug.learners import Bound, Learner
 class Problem(NamedTuple):
     """A prediction problem whose rows are chosen directly, not read from a record."""
 
-    criterion: Prediction
+    criterion: OneStep
     z: np.ndarray
     """Features (N, nz)."""
     q: np.ndarray
@@ -56,7 +56,7 @@ def problem(
     shape = chunk_shape(rows, limit)
     chunks = Chunks(*(jnp.asarray(in_chunks(values, shape)) for values in (z, q, e, gain)))
     hold = Hold(jnp.zeros((nt, nt)), jnp.zeros(nt))
-    return Problem(Prediction(Bound(learner, z.shape[1], ny)), z, q, e, gain, chunks, hold)
+    return Problem(OneStep(Bound(learner, z.shape[1], ny)), z, q, e, gain, chunks, hold)
 
 
 def linear_columns(given: Problem) -> np.ndarray:

@@ -51,6 +51,28 @@ def theta_covariance(projection: Projection, weight: Vector, noise: Matrix, fixe
     return covariance
 
 
+def theta_block(information: Matrix, ridge: float, nt: int, fixed: Collection[int] = ()) -> Matrix:
+    """Cov θ̂ (nθ, nθ) per unit of noise variance, from the information `[S_θ S_w]ᵀ[S_θ S_w]` of θ and weights.
+
+    The weights are eliminated: `(H_θθ − H_θw (H_ww + αI)⁺ H_wθ)⁻¹`. Directions of the weights that the data do not see
+    count as absent. NaN for entries at a bound (`fixed`), and for all where θ is not determined beside the weights.
+    """
+    free = [i for i in range(nt) if i not in fixed]
+    covariance = np.full((nt, nt), np.nan)
+    unit = 1 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+    scaled = information * np.outer(unit, unit)
+    inner = scaled[nt:, nt:] + ridge * np.diag(unit[nt:] ** 2)
+    values, vectors = np.linalg.eigh(inner)
+    kept = values > len(information) * np.finfo(float).eps * values.max(initial=0.0)
+    across = scaled[np.ix_(free, range(nt, len(information)))] @ vectors[:, kept]
+    remaining = scaled[np.ix_(free, free)] - (across / values[kept]) @ across.T
+    values, vectors = np.linalg.eigh(remaining)
+    if free and values.min() > len(information) * np.finfo(float).eps:
+        found = (vectors / values) @ vectors.T
+        covariance[np.ix_(free, free)] = found * np.outer(unit[free], unit[free])
+    return covariance
+
+
 def interval(value: Vector, std: Vector, freedom: float, level: float = 0.95) -> Float[np.ndarray, "n 2"]:
     """Student-t interval of each entry, (n, 2)."""
     reach = scipy.special.stdtrit(max(freedom, 1.0), 0.5 + level / 2) * std

@@ -13,9 +13,47 @@ from typing import Any, NamedTuple
 
 from jaxtyping import Array, Float
 
+from orthaug._arrays import check_count
 from orthaug._jax import jax, jnp
+from orthaug.errors import InputError
 from orthaug.gram import gram, row_sum
 from orthaug.learners import Bound
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Declaration: the error of the prediction `horizon` steps ahead; 1 is the paper's criterion (eq:cost_fun)."""
+
+    horizon: int = 1
+
+    def __post_init__(self) -> None:
+        check_count(self.horizon, "horizon")
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """Declaration: the error of a free run over segments that start from measured lags.
+
+    Args:
+        segment: steps of a segment; 0 for whole experiments.
+        washout: leading steps of a segment that are not scored, until the measured start is forgotten.
+        start_iterations: one-step iterations that training starts from.
+    """
+
+    segment: int = 512
+    washout: int = 40
+    start_iterations: int = 20
+
+    def __post_init__(self) -> None:
+        for name in ("segment", "washout", "start_iterations"):
+            check_count(getattr(self, name), name, least=0)
+        if self.segment and self.washout >= self.segment:
+            raise InputError(
+                f"`washout` must be shorter than `segment`; got {self.washout} and {self.segment}: nothing is scored."
+            )
+
+
+Criterion = Prediction | Simulation
 
 
 class Chunks(NamedTuple):
@@ -57,7 +95,7 @@ class Normal(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Prediction:
+class OneStep:
     """One-step prediction error with θ eliminated (F1): `‖P⊥(Y − F)‖²` plus the structure's `Hold`.
 
     θ minimises the rest exactly for any w, so it is not an unknown here. The Gram matrix of `[Q r J]`

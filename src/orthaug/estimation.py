@@ -14,19 +14,22 @@ from orthaug._arrays import Matrix, Vector, check_choice, check_count, check_typ
 from orthaug._jax import jax, jnp
 from orthaug.baseline import Baseline
 from orthaug.covariance import degrees_of_freedom, noise_covariance, theta_covariance
+from orthaug.criteria import Criterion, Prediction, Simulation
 from orthaug.errors import InputError
 from orthaug.excitation import ILL_CONDITIONED
 from orthaug.learners import MLP, Bound, External, Learner
-from orthaug.model import Form, Model, Numbers
+from orthaug.model import Model
 from orthaug.parallel import spread
+from orthaug.predictor import Form, Numbers
 from orthaug.problem import Problem, pose
 from orthaug.record import Record
 from orthaug.regressors import Lags, Scaling
 from orthaug.result import Estimate, Restart, Status
+from orthaug.simulation import FreeRun
 from orthaug.solvers import LevenbergMarquardt
-from orthaug.solvers.levenberg_marquardt import CONVERGED, NO_DESCENT, NON_FINITE, RUNNING, SPANNED, Run
+from orthaug.solvers.levenberg_marquardt import CONVERGED, NO_DESCENT, NON_FINITE, RUNNING, SPANNED
 from orthaug.structures import BaselinePenalty, Fixed, Orthogonal, Split, Structure, split
-from orthaug.training import Solver, Task
+from orthaug.training import FreeStatistics, Learned, Solver, Task
 
 _CODES = {
     RUNNING: "iteration_limit",
@@ -48,6 +51,7 @@ def estimate(
     lags: Lags | None = None,
     learner: Learner | None = MLP(),  # noqa: B008  (frozen)
     structure: Structure = Orthogonal(),  # noqa: B008  (frozen)
+    criterion: Criterion = Prediction(),  # noqa: B008  (frozen)
     solver: Solver = LevenbergMarquardt(),  # noqa: B008  (frozen)
     regularization: Regularization | Sequence[Regularization] = "none",
     restarts: int = 1,
@@ -56,7 +60,7 @@ def estimate(
     validation: Record | None = None,
     progress: Progress | None = None,
 ) -> Estimate:
-    """Fit `y_k = φ(x_k)θ + learner(x_k) + e_k` by one-step prediction error (eq:cost_fun).
+    """Fit `y_k = φ(x_k)θ + learner(x_k) + e_k` by prediction error (eq:cost_fun) or by the error of a free run.
 
     θ is solved, never iterated (F1): with the orthogonal structure it is `Φ⁺Y` whatever the learner does.
 
@@ -66,12 +70,14 @@ def estimate(
         lags: the learner's regressor; None for the raw lags that the baseline's expressions use.
         learner: a declaration such as `MLP(hidden=(16,))`; None for physics alone.
         structure: `Orthogonal()`, `Additive()`, `OrthogonalPenalty(λ)` or `BaselinePenalty(λ)`.
+        criterion: `Prediction(horizon)`, 1 step by default, or `Simulation(segment, washout)`, the free run: then θ is
+            trained with the weights and split off at the end (F2).
         solver: `LevenbergMarquardt(…)`, or `AdamLBFGS(…)`, the paper's pipeline from θ⁰.
         regularization: "none", "evidence" (MacKay; the weights' prior is estimated too), or a number: the
             ridge α on the weights, against squared errors in units of the baseline's RMS residual. Several, if
             `validation` is there to choose.
         restarts: runs from initial weights of seeds `seed … seed + restarts - 1`, spread over the cores; the lowest
-            training loss is kept, or with `validation` the lowest one-step error there.
+            training loss is kept, or with `validation` the lowest error there, one-step or of the free run as trained.
         seed: of the initial weights.
         initial: warm start from an earlier estimate or model: its learner, features, scaling and weights take
             the place of `learner`, `restarts` and `seed`.
@@ -90,21 +96,35 @@ def estimate(
         >>> f"{fit.theta[0]:.3f}"
         '2.000'
     """
-    _check_arguments(record, baseline, lags, learner, structure, solver, initial, validation)
+    _check_arguments(record, baseline, lags, learner, structure, criterion, solver, initial, validation)
+    flown = _free_run_of(criterion)
     choices = _regularizations(regularization, validation)
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
     if seed + restarts >= 2**63:
         raise InputError(f"`seed` must be below 2**63; got {seed}.")
     if initial is not None:
         task, w = _warm_start(record, baseline, lags, initial)
-        return _train(task, [_Start(0, w, choice) for choice in choices], structure, solver, validation, progress)
+        starts = [_Start(0, w, choice) for choice in choices]
+        place = FreeRun.of(task.problem, task, flown) if flown else task
+        return _train(place, starts, structure, solver, validation, progress)
     problem = pose(record, baseline, lags, None if learner is None else learner.inputs)
-    if learner is None:
+    if learner is None and flown is None:
         return _conclude(problem, structure, _nothing_learned(problem), Status("exact", 0, 0.0, np.nan))
+    if learner is None:
+        place = FreeRun.of(problem, None, flown)
+        return _train(place, [_Start(seed, np.zeros(0), "none")], structure, solver, validation, progress)
     task = Task.of(problem, learner)
     weights = {s: task.bound.init(jax.random.key(s)) for s in range(seed, seed + restarts)}
     starts = [_Start(s, w, choice) for choice in choices for s, w in weights.items()]
-    return _train(task, starts, structure, solver, validation, progress)
+    place = FreeRun.of(problem, task, flown) if flown else task
+    return _train(place, starts, structure, solver, validation, progress)
+
+
+def _free_run_of(criterion: Criterion) -> Simulation | None:
+    """The free run that a criterion trains on; h steps ahead are segments of h steps whose last one is scored."""
+    if isinstance(criterion, Simulation):
+        return criterion
+    return Simulation(criterion.horizon, criterion.horizon - 1) if criterion.horizon > 1 else None
 
 
 def orthogonalize(
@@ -128,7 +148,7 @@ def orthogonalize(
     bound = Bound(external, nz, ny)
     values = external.values(problem.feature_rows())
     scaling = Scaling(np.zeros(nz), np.ones(nz))
-    learned = _Learned(bound, np.zeros(0), scaling, np.ones(ny), values, elsewhere=True)
+    learned = Learned(bound, np.zeros(0), scaling, np.ones(ny), values, elsewhere=True)
     return _conclude(problem, Orthogonal(), learned, Status("exact", 0, 0.0, np.nan))
 
 
@@ -157,40 +177,40 @@ class _Start:
 
 
 def _train(
-    task: Task,
+    task: Task | FreeRun,
     starts: Sequence[_Start],
     structure: Structure,
     solver: Solver,
     validation: Record | None,
     progress: Progress | None,
 ) -> Estimate:
-    """Run from every start and conclude with the best, by training loss or by one-step validation error."""
+    """Run from every start and conclude with the best, by training loss or by the criterion's validation error."""
 
-    def one(numbered: tuple[int, _Start], check: Callable[[], None]) -> Run:
+    def one(numbered: tuple[int, _Start], check: Callable[[], None]) -> Any:
         i, start = numbered
 
         def tell(iteration: int, loss: float) -> None:
             check()
             if progress is not None:
-                progress(i, iteration, task.mean_square(loss))
+                progress(i, iteration, loss)
 
-        return task.run(solver, start.weights, structure, start.regularization, tell)
+        return task.run(solver, start.weights, structure, start.regularization, tell)  # type: ignore[arg-type]
 
     runs = spread(one, list(enumerate(starts)))
-    losses = [task.mean_square(run.normal.loss) for run in runs]
+    losses = [task.loss(run) for run in runs]
     concluded, errors = {}, [math.nan] * len(runs)
     if validation is not None:
-        concluded = {i: _trained(task, structure, run) for i, run in enumerate(runs)}
-        errors = [_validation_error(fit, validation) for fit in concluded.values()]
+        concluded = {i: _concluded(task, structure, run) for i, run in enumerate(runs)}
+        errors = [_validation_error(fit, validation, isinstance(task, FreeRun)) for fit in concluded.values()]
     ranking = np.array(losses if validation is None else errors)
     best = int(np.nanargmin(ranking)) if np.isfinite(ranking).any() else 0
-    fit = concluded[best] if validation is not None else _trained(task, structure, runs[best])
+    fit = concluded[best] if validation is not None else _concluded(task, structure, runs[best])
     restarts = tuple(
         Restart(
             seed=start.seed,
             loss=_finite(losses[i]),
             iterations=run.iterations,
-            code=_code(run),
+            code=_CODES[run.code],
             chosen=i == best,
             regularization=start.regularization,
             validation=_finite(errors[i]),
@@ -201,21 +221,19 @@ def _train(
     return replace(fit, restarts=restarts, status=replace(fit.status, seconds=seconds))
 
 
-def _trained(task: Task, structure: Structure, run: Run) -> Estimate:
+def _concluded(task: Task | FreeRun, structure: Structure, run: Any) -> Estimate:
     """The estimate that a run leads to."""
-    values = task.values(run.w)
-    code = _code(run) if np.isfinite(values).all() else "non_finite"
-    learned = _Learned(
-        task.bound, np.asarray(run.w), task.scaling, task.unit, values, run.effective, task.gram(run), run
-    )
+    learned = task.learned(run)
+    code = _CODES[run.code] if np.isfinite(learned.values).all() else "non_finite"
     return _conclude(task.problem, structure, learned, Status(code, run.iterations, run.seconds, np.nan))
 
 
-def _validation_error(fit: Estimate, validation: Record) -> float:
-    """Mean squared one-step error with each output in its training standard deviation; NaN without a model."""
+def _validation_error(fit: Estimate, validation: Record, free_run: bool) -> float:
+    """Mean squared error with each output in its training standard deviation; NaN without a model or a value."""
     if not fit.status.ok:
         return math.nan
-    rmse = fit.model.predict(validation).scores().rmse
+    response = fit.model.simulate(validation) if free_run else fit.model.predict(validation)
+    rmse = response.scores().rmse
     return float(np.mean((rmse * fit.problem.weight) ** 2))
 
 
@@ -223,29 +241,14 @@ def _finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-@dataclass(frozen=True, eq=False)
-class _Learned:
-    """What training left: the learner with its weights, and its values F (N, ny) at the training rows."""
-
-    bound: Bound | None
-    weights: Vector
-    scaling: Scaling
-    unit: Vector
-    values: Float[np.ndarray, "N ny"]
-    effective: float = 0.0
-    gram: Matrix | None = None
-    run: Run | None = None
-    elsewhere: bool = False
-
-
-def _nothing_learned(problem: Problem) -> _Learned:
+def _nothing_learned(problem: Problem) -> Learned:
     nothing, zeros = np.zeros(0), np.zeros(len(problem.outputs))
     phi = problem.projection.phi
     gram = np.tensordot(phi, phi, axes=([0, 1], [0, 1]))
-    return _Learned(None, nothing, Scaling(nothing, nothing), zeros, np.zeros_like(problem.target), 0.0, gram)
+    return Learned(None, nothing, Scaling(nothing, nothing), zeros, np.zeros_like(problem.target), 0.0, gram)
 
 
-def _conclude(problem: Problem, structure: Structure, learned: _Learned, status: Status) -> Estimate:
+def _conclude(problem: Problem, structure: Structure, learned: Learned, status: Status) -> Estimate:
     """Solve θ, split it from the learner, and attach statistics."""
     projection, weight = problem.projection, problem.weight
     whitened = learned.values * weight
@@ -254,13 +257,11 @@ def _conclude(problem: Problem, structure: Structure, learned: _Learned, status:
         aux = projection.solve(whitened)
         theta, theta_aux, fixed = Split(aux, aux, {})
     else:
-        coordinates = learned.run.coordinates if learned.run else None
-        theta, theta_aux, fixed = split(
-            structure, problem, whitened if usable else np.zeros_like(whitened), coordinates
-        )
-    residual = problem.whitened_target - whitened - projection.phi @ (theta - theta_aux)
-    freedom = degrees_of_freedom(projection, learned.effective) + len(fixed) / len(weight)
-    noise = noise_covariance(residual / weight, freedom) if usable else None
+        there = whitened if usable else np.zeros_like(whitened)
+        held = learned.free.fixed if learned.free else None
+        theta, theta_aux, fixed = split(structure, problem, there, learned.coefficients, held)
+    found = learned.free or _one_step_statistics(problem, learned, theta - theta_aux, fixed)
+    noise = found.noise if usable else None
     known = noise is not None and _unique(structure, learned) and not learned.elsewhere
     form = Form(problem.baseline, problem.features, problem.layout, problem.outputs, learned.bound)
     numbers = Numbers(
@@ -280,11 +281,11 @@ def _conclude(problem: Problem, structure: Structure, learned: _Learned, status:
             gram=learned.gram,
             noise=noise,
         ),
-        status=Status(status.code, status.iterations, status.seconds, float(np.mean(residual**2))),
+        status=Status(status.code, status.iterations, status.seconds, found.mean_square),
         restarts=(),
         excitation=problem.excitation,
-        covariance=theta_covariance(projection, weight, noise, fixed) if known else None,  # type: ignore[arg-type]
-        freedom=float(freedom.min()),
+        covariance=found.covariance if known else None,
+        freedom=found.freedom,
         effective_weights=learned.effective,
         defect=_defect(problem, whitened, theta_aux),
         problem=problem,
@@ -293,7 +294,17 @@ def _conclude(problem: Problem, structure: Structure, learned: _Learned, status:
     )
 
 
-def _unique(structure: Structure, learned: _Learned) -> bool:
+def _one_step_statistics(problem: Problem, learned: Learned, c: Vector, fixed: Fixed) -> FreeStatistics:
+    """The statistics of the one-step residual, in the form of those of a free run."""
+    projection, weight = problem.projection, problem.weight
+    residual = problem.whitened_target - learned.values * weight - projection.phi @ c
+    freedom = degrees_of_freedom(projection, learned.effective) + len(fixed) / len(weight)
+    noise = noise_covariance(residual / weight, freedom) if np.isfinite(residual).all() else None
+    covariance = None if noise is None else theta_covariance(projection, weight, noise, fixed)
+    return FreeStatistics(noise, covariance, float(freedom.min()), float(np.mean(residual**2)), fixed)
+
+
+def _unique(structure: Structure, learned: Learned) -> bool:
     """Whether the data alone determine θ."""
     return isinstance(structure, Orthogonal) or (learned.bound is None and not isinstance(structure, BaselinePenalty))
 
@@ -307,7 +318,7 @@ def _defect(problem: Problem, whitened: np.ndarray, theta_aux: Vector) -> float 
 
 
 def _warnings(
-    problem: Problem, structure: Structure, learned: _Learned, noise: Matrix | None, fixed: Fixed
+    problem: Problem, structure: Structure, learned: Learned, noise: Matrix | None, fixed: Fixed
 ) -> list[str]:
     found = []
     condition = problem.excitation.condition
@@ -316,7 +327,7 @@ def _warnings(
             f"the physics is ill-conditioned on the data (condition {condition:.1e} of the scaled columns): "
             "θ is determined, but small changes of the data move it far."
         )
-    if learned.run is not None and learned.run.code == SPANNED:
+    if learned.code == SPANNED:
         found.append(
             "the learner lies in the span of the physics (P⊥J = 0): there is nothing for it to learn that the "
             "physics does not express already. Give it another form or other inputs, or leave it out."
@@ -343,16 +354,13 @@ def _warnings(
     return found
 
 
-def _code(run: Run) -> str:
-    return _CODES[run.code]
-
-
 def _check_arguments(
     record: Any,
     baseline: Any,
     lags: Any,
     learner: Any,
     structure: Any,
+    criterion: Any,
     solver: Any,
     initial: Any,
     validation: Any,
@@ -362,6 +370,7 @@ def _check_arguments(
     check_type(lags, Lags | None, "lags", "Lags(…) or None")
     check_type(learner, Learner | None, "learner", "a learner such as MLP(), or None")
     check_type(structure, Structure, "structure", "a structure such as Orthogonal()")
+    check_type(criterion, Criterion, "criterion", "Prediction(…) or Simulation(…)")
     check_type(solver, Solver, "solver", "a solver such as LevenbergMarquardt()")
     check_type(initial, Estimate | Model | None, "initial", "an Estimate, a Model or None")
     check_type(validation, Record | None, "validation", "a Record or None")

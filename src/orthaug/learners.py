@@ -237,9 +237,9 @@ class Bound:
             offset += size
         return pieces
 
-    def values(self, w: Float[Array | np.ndarray, "nw"], z: Float[Array, "nz"]) -> Float[Array, "ny"]:
-        """f(z; w) for one row."""
-        return self.from_leaves(self.leaves(w), z)
+    def values(self, w: Float[Array | np.ndarray, "nw"] | list[Any], z: Float[Array, "nz"]) -> Float[Array, "ny"]:
+        """f(z; w) for one row, of the weights as one vector or as leaves."""
+        return self.from_leaves(w if isinstance(w, list) else self.leaves(w), z)
 
     def from_leaves(self, leaves: list[Any], z: Float[Array, "nz"]) -> Float[Array, "ny"]:
         """f(z; w) for one row, of the weight arrays."""

@@ -5,76 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Array, Float
 
 from orthaug._arrays import Matrix, Vector, as_signal
 from orthaug._jax import jax, jnp
-from orthaug.baseline import Baseline
 from orthaug.errors import InputError
-from orthaug.learners import Bound
 from orthaug.metrics import Scores, scores
+from orthaug.predictor import Form, Numbers, Parts, parts, push, regressor
 from orthaug.record import Channel, Experiment, Record, same_step
-from orthaug.regressors import Features, Layout, lag_matrix, largest_lag
+from orthaug.regressors import lag_matrix
 
 if TYPE_CHECKING:
     import pandas as pd
 
-AnyArray = Array | np.ndarray
-
 _BATCH = 4096  # rows per compiled call; records of any length share the program
 _WINDOW_CELLS = 8_000_000  # input cells of a batch of multi-step predictions
 _RUNAWAY = 1e6  # times the largest training output: a free run beyond this has diverged
-
-
-@dataclass(frozen=True)
-class Form:
-    """What a model computes, without its numbers: hashable, so compiled programs are reused."""
-
-    baseline: Baseline
-    features: Features
-    layout: Layout
-    outputs: tuple[str, ...]
-    bound: Bound | None
-
-    @property
-    def start(self) -> int:
-        """The first row of an experiment that can be predicted."""
-        return largest_lag(self.layout)
-
-
-class Numbers(NamedTuple):
-    """The numbers of a model."""
-
-    theta: Float[AnyArray, "nt"]
-    theta_aux: Float[AnyArray, "nt"]
-    weights: Float[AnyArray, "nw"]
-    centre: Float[AnyArray, "nz"]
-    halfwidth: Float[AnyArray, "nz"]
-    gain: Float[AnyArray, "ny"]
-    """Unit of the learner's output, in the outputs' units."""
-
-
-class Parts(NamedTuple):
-    """The prediction of a row in parts: `baseline` = φθ + fixed terms, `learner` = f − φθ_aux, `raw` = f."""
-
-    baseline: Any
-    learner: Any
-    raw: Any
-
-
-def parts(form: Form, numbers: Numbers, x: Float[Array, "nx"]) -> Parts:
-    """The prediction at one regressor x (nx,), each part (ny,) (eq:orth_param)."""
-    phi = form.baseline.phi(x, form.layout, form.outputs, jnp)
-    known = form.baseline.known(x, form.layout, form.outputs, jnp)
-    if form.bound is None:
-        raw = jnp.zeros(len(form.outputs))
-    else:
-        z = (form.features.evaluate(x, form.layout, jnp) - numbers.centre) / numbers.halfwidth
-        raw = numbers.gain * form.bound.values(numbers.weights, z)
-    return Parts(known + phi @ numbers.theta, raw - phi @ numbers.theta_aux, raw)
 
 
 @partial(jax.jit, static_argnames="form")
@@ -87,8 +36,8 @@ def _free_run(form: Form, numbers: Numbers, past: Float[Array, "na ny"], inputs:
     """One scan over the rows; `past` holds the outputs before the first one, newest first."""
 
     def step(past: Any, row: Any) -> tuple[Any, Parts]:
-        found = parts(form, numbers, _regressor(form, past, row))
-        return _push(past, found.baseline + found.learner), found
+        found = parts(form, numbers, regressor(form, past, row))
+        return push(past, found.baseline + found.learner), found
 
     return jax.lax.scan(step, past, inputs)[1]
 
@@ -98,25 +47,14 @@ def _ahead(
     form: Form, numbers: Numbers, past: Float[Array, "m na ny"], inputs: Float[Array, "m T nu"], horizon: Any
 ) -> Parts:
     """The last of `horizon` free-run steps from each of m starts."""
-    one = jax.vmap(lambda p, row: parts(form, numbers, _regressor(form, p, row)))
+    one = jax.vmap(lambda p, row: parts(form, numbers, regressor(form, p, row)))
 
     def step(i: Any, carry: tuple[Any, Parts]) -> tuple[Any, Parts]:
         found = one(carry[0], inputs[:, i])
-        return jax.vmap(_push)(carry[0], found.baseline + found.learner), found
+        return jax.vmap(push)(carry[0], found.baseline + found.learner), found
 
     nothing = jnp.zeros((past.shape[0], len(form.outputs)))
     return jax.lax.fori_loop(0, horizon, step, (past, Parts(nothing, nothing, nothing)))[1]
-
-
-def _regressor(form: Form, past: Any, inputs: Any) -> Any:
-    """x of the outputs' past (na, ny), newest first, and the row of lagged inputs."""
-    lags = [(lag.lag - 1, form.outputs.index(lag.channel)) for lag in form.layout if lag.channel in form.outputs]
-    back, channel = np.array(lags, dtype=int).reshape(-1, 2).T
-    return jnp.concatenate([past[back, channel], inputs])
-
-
-def _push(past: Any, y: Any) -> Any:
-    return jnp.concatenate([y[None], past[:-1]]) if past.shape[0] else past
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,7 +188,7 @@ class Model:
         for experiment in record.experiments:
             first = self.form.start + horizon - 1
             self._check_rows(experiment, first)
-            if horizon == 1 or not self._memory:
+            if horizon == 1 or not self.form.memory:
                 x = lag_matrix(experiment, self.form.layout, record, first)
                 found = _in_batches(lambda rows: _predict_rows(self.form, self.numbers, rows), (x,))
             else:
@@ -290,24 +228,15 @@ class Model:
         rows, ny = as_signal(initial, "initial"), len(self.outputs)
         if rows.shape[1] != ny:
             raise InputError(f"`initial` has {rows.shape[1]} columns; expected one per output, {ny}.")
-        if len(rows) < self._memory:
+        if len(rows) < self.form.memory:
             raise InputError(
                 f"`initial` has {len(rows)} rows; expected the first {self.form.start} outputs of the record."
             )
         return rows
 
-    @property
-    def _memory(self) -> int:
-        """How many past outputs the model feeds back."""
-        return max((lag.lag for lag in self.form.layout if lag.channel in self.form.outputs), default=0)
-
-    def _input_rows(self, experiment: Experiment, record: Record, start: int) -> Matrix:
-        layout = tuple(lag for lag in self.form.layout if lag.channel not in self.form.outputs)
-        return lag_matrix(experiment, layout, record, start)
-
     def _run(self, past: Matrix, experiment: Experiment, record: Record) -> Parts:
-        inputs = self._input_rows(experiment, record, self.form.start)
-        if not self._memory:
+        inputs = lag_matrix(experiment, self.form.input_layout, record, self.form.start)
+        if not self.form.memory:
             x = lag_matrix(experiment, self.form.layout, record, self.form.start)
             return _in_batches(lambda rows: _predict_rows(self.form, self.numbers, rows), (x,))
         steps = len(inputs)
@@ -318,17 +247,17 @@ class Model:
 
     def _predict_ahead(self, experiment: Experiment, record: Record, horizon: int) -> Parts:
         start = self.form.start
-        inputs = self._input_rows(experiment, record, start)
+        inputs = lag_matrix(experiment, self.form.input_layout, record, start)
         windows = np.lib.stride_tricks.sliding_window_view(inputs, horizon, axis=0).swapaxes(1, 2)
         outputs = experiment.outputs[: len(experiment) - horizon]
-        past = np.stack([outputs[start - i - 1 : len(outputs) - i] for i in range(self._memory)], axis=1)
+        past = np.stack([outputs[start - i - 1 : len(outputs) - i] for i in range(self.form.memory)], axis=1)
         largest = max(1, _WINDOW_CELLS // max(1, windows[0].size))  # windows overlap: they are copied batch by batch
         rows = (past[: len(windows)], windows)
         return _in_batches(lambda p, u: _ahead(self.form, self.numbers, p, u, horizon), rows, largest)
 
     def _initial(self, initial: Any, measured: Matrix | None) -> Matrix:
         """The last `_memory` outputs before the first usable row, newest first."""
-        start, memory, ny = self.form.start, self._memory, len(self.outputs)
+        start, memory, ny = self.form.start, self.form.memory, len(self.outputs)
         if isinstance(initial, str) and initial == "zero":
             return np.zeros((memory, ny))
         if isinstance(initial, str) and initial == "measured":

@@ -53,11 +53,11 @@ class Projection:
         theta = self.from_coordinates(self.coordinates(values))
         return theta + self.from_coordinates(self.coordinates(values - self.phi @ theta))
 
-    def from_coordinates(self, coordinates: Vector) -> Vector:
-        """θ of coordinates in the basis Q: `R⁻¹q`."""
+    def from_coordinates(self, coordinates: Float[np.ndarray, "nt *m"]) -> Float[np.ndarray, "nt *m"]:
+        """θ of coordinates in the basis Q: `R⁻¹q`, one vector or several as columns."""
         if not coordinates.size:
             return coordinates
-        return self.scale * scipy.linalg.solve_triangular(self.r, coordinates, check_finite=False)
+        return (self.scale * scipy.linalg.solve_triangular(self.r, coordinates, check_finite=False).T).T
 
     def orthogonal_part(self, values: Float[np.ndarray, "N ny"]) -> Float[np.ndarray, "N ny"]:
         """P⊥v = v − QQᵀv, projected twice so that what is left is orthogonal to rounding."""

@@ -22,7 +22,8 @@ from orthaug.errors import InputError
 from orthaug.expressions import Expression, Lag
 from orthaug.folders import whole_folder
 from orthaug.learners import MLP, Bound, Learner
-from orthaug.model import Form, Model, Numbers
+from orthaug.model import Model
+from orthaug.predictor import Form, Numbers
 from orthaug.record import Channel
 from orthaug.regressors import Features
 

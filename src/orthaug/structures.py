@@ -211,25 +211,30 @@ class Split(NamedTuple):
 
 
 def split(
-    structure: Structure, problem: Problem, values: Float[np.ndarray, "N ny"], coordinates: Vector | None = None
+    structure: Structure,
+    problem: Problem,
+    values: Float[np.ndarray, "N ny"],
+    coefficients: Vector | None = None,
+    fixed: Fixed | None = None,
 ) -> Split:
     """θ for the learner's whitened values F (N, ny), and its share θ_aux that the structure moves to θ.
 
     Args:
-        coordinates: Rθ (nθ,) where a solver iterated on it; None to solve for θ.
+        coefficients: c = θ − θ_aux (nθ,) where training found it; None to solve for θ.
+        fixed: what stands at a bound, where training found that.
     """
     projection, baseline = problem.projection, problem.baseline
     orthogonal = isinstance(structure, Orthogonal)
     aux = projection.solve(values)
     elimination = eliminate(structure, problem)
     f = np.zeros(len(aux)) if orthogonal else projection.coordinates(values)
-    fixed = elimination.active(f)
-    if coordinates is not None and not orthogonal:
-        theta = projection.from_coordinates(coordinates)
-        if elimination.bounded:  # the iterate need not satisfy what only its end satisfies
-            fixed = fixed | {i: v for i, v in enumerate(np.clip(theta, *baseline.bounds)) if v != theta[i]}
-            theta = np.array([fixed.get(i, value) for i, value in enumerate(theta)])
-    elif fixed or len(elimination.rows.target):
+    if coefficients is not None:
+        theta = coefficients + (aux if orthogonal else 0.0)
+        if fixed is None:  # an iterate need not satisfy what only its end satisfies
+            inside = np.clip(theta, *baseline.bounds)
+            fixed = elimination.active(f) | {i: value for i, value in enumerate(inside) if value != theta[i]}
+        theta = np.array([fixed.get(i, value) for i, value in enumerate(theta)])
+    elif (fixed := elimination.active(f)) or len(elimination.rows.target):
         theta = elimination.theta(f, fixed)
     else:  # refined least squares, as exact as double precision allows
         theta = projection.solve(problem.whitened_target) - (0.0 if orthogonal else aux)

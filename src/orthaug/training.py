@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float
 
 from orthaug._arrays import Matrix, Vector
 from orthaug._jax import jax, jnp
-from orthaug.criteria import Chunks, Hold, Joint, Overlap, Physics, Prediction, linearise
+from orthaug.criteria import Chunks, Hold, Joint, OneStep, Overlap, Physics, linearise
 from orthaug.errors import InputError
 from orthaug.gram import chunk_shape, from_chunks, in_chunks
 from orthaug.learners import Bound, Learner
@@ -27,6 +27,39 @@ OUTPUT_UNIT = 10.0
 """The learner's output unit in standard deviations of the baseline's residual: the table is in docs/design.md."""
 _ACTIVE_SETS = 10  # tries to find which bounds are active; each changes at least one entry
 _SMALLEST_RESIDUAL = 1e-10  # of an output's deviation: the physics leaves at least rounding
+
+
+class FreeStatistics(NamedTuple):
+    """What a training on the free run knows about its own errors."""
+
+    noise: Matrix | None
+    """Covariance (ny, ny) of the errors of the free run, in the outputs' units."""
+    covariance: Matrix | None
+    """Cov θ̂ (nθ, nθ) from the sensitivities."""
+    freedom: float
+    mean_square: float
+    fixed: Fixed
+
+
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """What training left, whatever the criterion: the learner's weights, and its values F (N, ny) at the rows."""
+
+    bound: Bound | None
+    weights: Vector
+    scaling: Scaling
+    unit: Vector
+    values: Float[np.ndarray, "N ny"]
+    effective: float = 0.0
+    gram: Matrix | None = None
+    code: int | None = None
+    iterations: int = 0
+    seconds: float = 0.0
+    coefficients: Vector | None = None
+    """c = θ − θ_aux (nθ,) where it was an unknown of training; None where θ is solved."""
+    free: FreeStatistics | None = None
+    elsewhere: bool = False
+    """Whether it is a function from another toolbox."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +140,7 @@ class Task:
         nothing = Overlap(jnp.zeros((nt, self.bound.size)), jnp.zeros(nt))
         evidence = regularization == "evidence"
         ridge = 1.0 if evidence else 0.0 if regularization == "none" else float(regularization)
-        criterion, samples = Prediction(self.bound), self.problem.target.size - nt
+        criterion, samples = OneStep(self.bound), self.problem.target.size - nt
         if isinstance(solver, LevenbergMarquardt):
             return solver.minimise(
                 criterion, w, arguments, nothing, ridge=ridge, evidence=evidence, samples=samples, progress=progress
@@ -120,6 +153,7 @@ class Task:
         found = solver.minimise(joint, w, self.chunks, physics, progress=progress)
         normal = linearise(criterion, found.w, arguments, nothing)
         coordinates = np.asarray(physics.start + physics.basis @ found.v) * self.rms
+        coefficients = None if orthogonal else self.problem.projection.from_coordinates(coordinates)
         return Run(
             found.w,
             normal,
@@ -128,7 +162,7 @@ class Task:
             found.iterations,
             found.code,
             found.seconds,
-            coordinates,
+            coefficients,
         )
 
     def _physics(self, elimination: Elimination, fixed: Fixed, ridge: float, *, solved: bool) -> Physics:
@@ -163,9 +197,33 @@ class Task:
             )
         )
 
+    def loss(self, run: Run) -> float:
+        """Mean of squared errors of a run, with each output in its standard deviation."""
+        return self.mean_square(run.normal.loss)
+
     def mean_square(self, loss: Any) -> float:
         """The criterion's `‖r‖²` as the mean of squared errors with each output in its standard deviation."""
         return float(loss) * self.rms**2 / self.problem.target.size
+
+    def learned(self, run: Run) -> Learned:
+        """What a run left."""
+        return Learned(
+            bound=self.bound,
+            weights=np.asarray(run.w),
+            scaling=self.scaling,
+            unit=self.unit,
+            values=self.values(run.w),
+            effective=run.effective,
+            gram=self.gram(run),
+            code=run.code,
+            iterations=run.iterations,
+            seconds=run.seconds,
+            coefficients=run.coefficients,
+        )
+
+    def overlap(self, w: Any) -> Matrix:
+        """QᵀJ (nθ, nw) at the training rows, in whitened outputs."""
+        return np.asarray(_share(OneStep(self.bound), w, self.chunks).jacobian) * self.rms
 
     def values(self, w: Any) -> Float[np.ndarray, "N ny"]:
         """f at the training rows, in the outputs' units."""
@@ -178,12 +236,19 @@ class Task:
         if run.held:
             nt = len(normal.overlap.values)
             free = Hold(jnp.zeros((nt, nt)), jnp.zeros(nt))
-            normal = linearise(Prediction(self.bound), run.w, (self.chunks, free), normal.overlap)
+            normal = linearise(OneStep(self.bound), run.w, (self.chunks, free), normal.overlap)
         overlap = np.asarray(normal.overlap.jacobian) * self.rms
         to_phi = projection.r / projection.scale
         inner = np.asarray(normal.hessian) * self.rms**2 + overlap.T @ overlap
         cross = to_phi.T @ overlap
         return np.block([[to_phi.T @ to_phi, cross], [cross.T, inner]])
+
+
+@partial(jax.jit, static_argnames="criterion")
+def _share(criterion: OneStep, w: Float[Array, "nw"], chunks: Chunks) -> Overlap:
+    nt = chunks.q.shape[2]
+    nothing = Overlap(jnp.zeros((nt, w.shape[0])), jnp.zeros(nt))
+    return criterion(w, chunks, Hold(jnp.zeros((nt, nt)), jnp.zeros(nt)), nothing).overlap
 
 
 @partial(jax.jit, static_argnames="bound")

@@ -61,8 +61,8 @@ class Run(NamedTuple):
     iterations: int
     code: int
     seconds: float
-    coordinates: np.ndarray | None = None
-    """Rθ (nθ,) where the solver iterated on θ too; None where θ is eliminated."""
+    coefficients: np.ndarray | None = None
+    """θ (nθ,) where the solver iterated on it too; None where it is eliminated."""
     held: bool = False
     """Whether a penalty or a bound held the learner, so that `normal` has its rows too."""
 

@@ -1,0 +1,91 @@
+"""The one-step predictor g(x) = φ(x)θ + f(x) − φ(x)θ_aux, and how a free run feeds it its own outputs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from orthaug._jax import jnp
+from orthaug.baseline import Baseline
+from orthaug.learners import Bound
+from orthaug.regressors import Features, Layout, largest_lag
+
+AnyArray = Array | np.ndarray
+
+
+@dataclass(frozen=True)
+class Form:
+    """What a model computes, without its numbers: hashable, so compiled programs are reused."""
+
+    baseline: Baseline
+    features: Features
+    layout: Layout
+    outputs: tuple[str, ...]
+    bound: Bound | None
+
+    @property
+    def start(self) -> int:
+        """The first row of an experiment that can be predicted."""
+        return largest_lag(self.layout)
+
+    @property
+    def fed_back(self) -> tuple[tuple[int, int], ...]:
+        """(lag, number of the output) of every past output in the regressor, in its order."""
+        return tuple((lag.lag, self.outputs.index(lag.channel)) for lag in self.layout if lag.channel in self.outputs)
+
+    @property
+    def memory(self) -> int:
+        """How many past outputs a free run keeps."""
+        return max((lag for lag, _ in self.fed_back), default=0)
+
+    @property
+    def input_layout(self) -> Layout:
+        """The lagged inputs of the regressor, in its order."""
+        return tuple(lag for lag in self.layout if lag.channel not in self.outputs)
+
+
+class Numbers(NamedTuple):
+    """The numbers of a model."""
+
+    theta: Float[AnyArray, "nt"]
+    theta_aux: Float[AnyArray, "nt"]
+    weights: Any
+    """One vector (nw,), or its leaves."""
+    centre: Float[AnyArray, "nz"]
+    halfwidth: Float[AnyArray, "nz"]
+    gain: Float[AnyArray, "ny"]
+    """Unit of the learner's output, in the outputs' units."""
+
+
+class Parts(NamedTuple):
+    """The prediction of a row in parts: `baseline` = φθ + fixed terms, `learner` = f − φθ_aux, `raw` = f."""
+
+    baseline: Any
+    learner: Any
+    raw: Any
+
+
+def parts(form: Form, numbers: Numbers, x: Float[Array, "nx"]) -> Parts:
+    """The prediction at one regressor x (nx,), each part (ny,) (eq:orth_param)."""
+    phi = form.baseline.phi(x, form.layout, form.outputs, jnp)
+    known = form.baseline.known(x, form.layout, form.outputs, jnp)
+    if form.bound is None:
+        raw = jnp.zeros(len(form.outputs))
+    else:
+        z = (form.features.evaluate(x, form.layout, jnp) - numbers.centre) / numbers.halfwidth
+        raw = numbers.gain * form.bound.values(numbers.weights, z)
+    return Parts(known + phi @ numbers.theta, raw - phi @ numbers.theta_aux, raw)
+
+
+def regressor(form: Form, past: Any, inputs: Any) -> Any:
+    """x of the outputs' past (na, ny), newest first, and the row of lagged inputs."""
+    lag, output = np.array(form.fed_back, dtype=int).reshape(-1, 2).T
+    return jnp.concatenate([past[lag - 1, output], inputs])
+
+
+def push(past: Any, y: Any) -> Any:
+    """The past (na, ny) one step later, when y (ny,) is its newest entry."""
+    return jnp.concatenate([y[None], past[:-1]]) if past.shape[0] else past

@@ -1,0 +1,309 @@
+"""Training on the free run: θ and the weights together, from a one-step solution (the criterion `Simulation`).
+
+Here θ is an unknown beside the weights (F1 does not hold). Without bounds or penalties the unknown is `c = θ − θ_aux`,
+and θ is split off at the end under the measure of the *measured* regressors (F2), which keeps the orthogonal structure
+exact. Where θ has bounds, it is the unknown itself and `c = θ − Φ⁺F(w)` follows, so that the split cannot leave them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from orthaug._arrays import Matrix, Vector
+from orthaug._jax import jnp
+from orthaug.covariance import noise_covariance, theta_block
+from orthaug.criteria import Simulation
+from orthaug.predictor import Form, Numbers
+from orthaug.problem import Problem
+from orthaug.regressors import Scaling
+from orthaug.segments import Segments, lay_segments, respond, sensitivity_gram
+from orthaug.solvers import LevenbergMarquardt
+from orthaug.solvers.levenberg_marquardt import NON_FINITE, Progress, Run
+from orthaug.solvers.output_error import Outcome, independent_share, minimise
+from orthaug.structures import Elimination, Orthogonal, Structure, eliminate
+from orthaug.training import FreeStatistics, Learned, Task
+
+
+@dataclass(frozen=True, eq=False)
+class FreeRun:
+    """A problem laid out in segments, with the learner of a one-step task or none."""
+
+    problem: Problem
+    task: Task | None
+    form: Form
+    segments: Segments
+    rms: float
+    criterion: Simulation
+
+    @classmethod
+    def of(cls, problem: Problem, task: Task | None, criterion: Simulation) -> FreeRun:
+        bound = None if task is None else task.bound
+        form = Form(problem.baseline, problem.features, problem.layout, problem.outputs, bound)
+        segments = lay_segments(problem.record, form, criterion.segment, criterion.washout)
+        residual = problem.projection.orthogonal_part(problem.whitened_target)
+        rms = task.rms if task is not None else max(float(np.sqrt(np.mean(residual**2))), 1e-10)
+        return cls(problem, task, form, segments, rms, criterion)
+
+    def numbers(self, c: Vector, w: Any) -> Numbers:
+        """The model's numbers before the split."""
+        return Numbers(c, np.zeros_like(c), np.asarray(w), self.scaling.centre, self.scaling.halfwidth, self.unit)
+
+    def errors(self, c: Vector, w: Any) -> list[Matrix]:
+        """Scored errors of every segment, (steps, ny) in the outputs' units."""
+        with np.errstate(all="ignore"):
+            error = np.asarray(self.segments.target) - np.asarray(respond(self.form, self.numbers(c, w), self.segments))
+        scored = np.asarray(self.segments.scored)
+        chunks, _, _, width = error.shape
+        each = (error[i, scored[i, :, j], :, j] for i in range(chunks) for j in range(width))
+        return [piece for piece in each if len(piece)]
+
+    def run(
+        self,
+        solver: LevenbergMarquardt,
+        w: Any,
+        structure: Structure,
+        regularization: str | float = "none",
+        progress: Progress | None = None,
+    ) -> Flight:
+        """One run from the weights `w`: a short one-step training, then the free run; the arguments as in `estimate`.
+
+        Training goes on from whichever flies better, the weights after the one-step training or those before it:
+        a good one-step predictor may run away.
+        """
+        objective = Objective.of(self, structure)
+        places, begun, seconds = [objective.start(np.asarray(w), None)], 0, 0.0
+        evidence = regularization == "evidence"
+        ridge = 1.0 if evidence else 0.0 if regularization == "none" else float(regularization)
+        if self.task is not None and self.criterion.start_iterations:
+            short = LevenbergMarquardt(self.criterion.start_iterations, solver.tolerance)
+            first = self.task.run(short, w, structure, regularization, progress)
+            begun, seconds = first.iterations, first.seconds
+            places.append(objective.start(np.asarray(first.w), first))
+            ridge = first.ridge
+        losses = np.array([objective.loss(p) for p in places])
+        best = int(np.argmin(np.where(np.isfinite(losses), losses, np.inf)))
+
+        def tell(iteration: int, loss: float) -> None:
+            if progress is not None:
+                progress(begun + iteration, loss)
+
+        found = objective.minimise(places[best], solver, ridge, evidence, tell)
+        theta, c, w = objective.place(found.p)
+        square, iterations, seconds = objective.mean_square(), begun + found.iterations, seconds + found.seconds
+        return Flight(w, theta, c, objective, found, found.code, square, iterations, seconds)
+
+    def loss(self, flight: Flight) -> float:
+        """Mean of squared errors with each output in its standard deviation."""
+        return flight.mean_square
+
+    def learned(self, flight: Flight) -> Learned:
+        """What a run left, with the statistics of its errors."""
+        return Learned(
+            bound=self.form.bound,
+            weights=np.asarray(flight.w),
+            scaling=self.scaling,
+            unit=self.unit,
+            values=np.zeros_like(self.problem.target) if self.task is None else self.task.values(flight.w),
+            effective=flight.found.effective,
+            gram=flight.objective.gram(flight.found),
+            code=flight.code,
+            iterations=flight.iterations,
+            seconds=flight.seconds,
+            coefficients=flight.c,
+            free=flight.objective.statistics(flight.found),
+        )
+
+    @property
+    def scaling(self) -> Scaling:
+        return Scaling(np.zeros(0), np.zeros(0)) if self.task is None else self.task.scaling
+
+    @property
+    def unit(self) -> Vector:
+        return np.zeros(len(self.problem.outputs)) if self.task is None else self.task.unit
+
+
+class Flight(NamedTuple):
+    """A finished run on the free-run criterion."""
+
+    w: Vector
+    theta: Vector
+    c: Vector
+    objective: Objective
+    found: Outcome
+    code: int
+    mean_square: float
+    iterations: int
+    seconds: float
+
+
+@dataclass(eq=False)
+class Objective:
+    """`‖r‖²` of the free run and of the structure's rows, as a function of p = (θ, w).
+
+    `weight` (ny, ny) multiplies the errors of a step; `follows` says that c follows θ, `c = θ − Φ⁺F(w)`.
+    """
+
+    free_run: FreeRun
+    elimination: Elimination
+    orthogonal: bool
+    weight: Matrix
+    errors: list[Matrix] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, free_run: FreeRun, structure: Structure) -> Objective:
+        weight = np.diag(free_run.problem.weight) / free_run.rms
+        return cls(free_run, eliminate(structure, free_run.problem), isinstance(structure, Orthogonal), weight)
+
+    @property
+    def follows(self) -> bool:
+        return self.orthogonal and self.elimination.bounded and self.free_run.task is not None
+
+    def start(self, w: Vector, run: Run | None) -> Vector:
+        """p of the one-step θ for the weights w."""
+        problem, task = self.free_run.problem, self.free_run.task
+        values = np.zeros_like(problem.target) if task is None else task.values(w) * problem.weight
+        f = problem.projection.coordinates(values)
+        if self.orthogonal:
+            theta = self.elimination.theta(0 * f, self.elimination.active(0 * f))
+            theta = theta if self.follows else theta - problem.projection.from_coordinates(f)
+        else:
+            theta = self.elimination.theta(f, self.elimination.active(f))
+        return np.concatenate([theta, w])
+
+    def place(self, p: Vector) -> tuple[Vector, Vector, Vector]:
+        """(unknown θ, c, w) of p; without bounds on an orthogonal θ the unknown is c itself."""
+        nt = len(self.free_run.problem.baseline.names)
+        theta, w = p[:nt], p[nt:]
+        c = theta - self.free_run.problem.projection.from_coordinates(self._share(w)) if self.follows else theta
+        return theta, c, w
+
+    def loss(self, p: Vector) -> float:
+        """‖r‖² with the structure's rows; infinite where a free run diverges."""
+        theta, c, w = self.place(p)
+        self.errors = self.free_run.errors(c, w)
+        with np.errstate(all="ignore"):
+            total = sum(float(np.sum((error @ self.weight.T) ** 2)) for error in self.errors)
+        rows = self.elimination.rows
+        if len(rows.target):
+            miss = rows.target - rows.theta @ theta - rows.learner @ self._share(w)
+            total += float(miss @ miss) / self.free_run.rms**2
+        return total if np.isfinite(total) else np.inf
+
+    def normal(self, p: Vector) -> tuple[Matrix, Vector]:
+        """JᵀJ and Jᵀr at the p of the last `loss`."""
+        theta, c, w = self.place(p)
+        columns = self._gram(c, w)
+        hessian, gradient = columns[:-1, :-1], columns[:-1, -1]
+        rows, rms, nt = self.elimination.rows, self.free_run.rms, len(theta)
+        if self.follows:
+            change = self._change(w)
+            hessian, gradient = change.T @ hessian @ change, change.T @ gradient
+        if len(rows.target):
+            slope = np.column_stack([rows.theta, rows.learner @ self._share_slope(w)]) / rms
+            miss = (rows.target - rows.theta @ theta - rows.learner @ self._share(w)) / rms
+            hessian, gradient = hessian + slope.T @ slope, gradient + slope.T @ miss
+        assert hessian.shape[0] == nt + len(w)
+        return hessian, gradient
+
+    def samples(self) -> tuple[float, float]:
+        """Number of residuals less the physics' own parameters, and the share of them that is independent."""
+        ny = len(self.free_run.problem.outputs)
+        shares = [independent_share([e[:, i] for e in self.errors]) for i in range(ny)]
+        return self._count * ny - len(self.free_run.problem.baseline.names), float(np.mean(shares))
+
+    def minimise(self, p: Vector, solver: LevenbergMarquardt, ridge: float, evidence: bool, tell: Progress) -> Outcome:
+        """From p to the end; several outputs are weighted by their errors' covariance in a second leg."""
+        nt, ny = len(self.free_run.problem.baseline.names), len(self.free_run.problem.outputs)
+        bounded = not self.orthogonal or self.follows or self.free_run.task is None
+        options: dict[str, Any] = {
+            "physics": nt,
+            "tolerance": solver.tolerance,
+            "evidence": evidence,
+            "bounds": (self.elimination.lower, self.elimination.upper) if bounded else None,
+        }
+        first = solver.iterations if ny == 1 else solver.iterations // 2
+        found = minimise(self, p, iterations=first, ridge=ridge, progress=tell, **options)
+        if ny > 1 and found.code != NON_FINITE:
+            self.loss(found.p)
+            noise = self._noise(found)
+            if noise is not None:
+                self.weight = np.linalg.inv(np.linalg.cholesky(noise))
+                done = found.iterations
+                again = minimise(
+                    self,
+                    found.p,
+                    iterations=solver.iterations - done,
+                    ridge=found.ridge,
+                    progress=lambda i, loss: tell(done + i, loss),
+                    **options,
+                )
+                found = again._replace(iterations=done + again.iterations, seconds=found.seconds + again.seconds)
+        self.loss(found.p)  # the errors of the end, not of the last trial
+        return found
+
+    def mean_square(self) -> float:
+        """Mean of the squared errors of the last `loss`, each output in its standard deviation."""
+        return float(np.mean(np.concatenate(self.errors) ** 2 * self.free_run.problem.weight**2))
+
+    def gram(self, found: Outcome) -> Matrix:
+        """Gram matrix of the sensitivities ∂ŷ/∂(c, w) in whitened outputs, (nθ + nw)²."""
+        _, c, w = self.place(found.p)
+        weight = np.diag(self.free_run.problem.weight)
+        return np.asarray(self._sensitivities(c, w, weight))[:-1, :-1]
+
+    def statistics(self, found: Outcome) -> FreeStatistics:
+        """Noise covariance of the free run, Cov θ̂ from its sensitivities, and the mean square of its errors."""
+        theta, c, w = self.place(found.p)
+        nt = len(theta)
+        freedom = self._count - (nt + found.effective) / len(self.weight)
+        noise = self._noise(found)
+        sides = (self.elimination.lower, self.elimination.upper)
+        at_bound = {i: float(value) for i, value in enumerate(theta) if value in (sides[0][i], sides[1][i])}
+        covariance = None
+        if noise is not None:
+            information = self._gram(c, w)[:-1, :-1]
+            if self.orthogonal and self.free_run.task is not None:
+                change = self._change(w)
+                information = change.T @ information @ change
+            white = self.weight @ noise @ self.weight.T
+            scale = float(np.trace(white)) / len(white)
+            covariance = theta_block(information, found.ridge, nt, tuple(at_bound)) * scale
+        return FreeStatistics(noise, covariance, freedom, self.mean_square(), at_bound)
+
+    @property
+    def _count(self) -> int:
+        return sum(len(error) for error in self.errors)
+
+    def _noise(self, found: Outcome) -> Matrix | None:
+        errors = np.concatenate(self.errors)
+        ny = errors.shape[1]
+        used = (len(self.free_run.problem.baseline.names) + found.effective) / ny
+        return noise_covariance(errors, np.full(ny, len(errors) - used))
+
+    def _gram(self, c: Vector, w: Vector) -> Matrix:
+        return np.asarray(self._sensitivities(c, w, self.weight))
+
+    def _sensitivities(self, c: Vector, w: Vector, weight: Matrix) -> Any:
+        run = self.free_run
+        return sensitivity_gram(run.form, run.numbers(c, w), run.segments, jnp.asarray(weight))
+
+    def _share(self, w: Vector) -> Vector:
+        """QᵀF (nθ,) at the measured regressors, in whitened outputs."""
+        task, problem = self.free_run.task, self.free_run.problem
+        if task is None:
+            return np.zeros(len(problem.baseline.names))
+        return problem.projection.coordinates(task.values(w) * problem.weight)
+
+    def _share_slope(self, w: Vector) -> Matrix:
+        """QᵀJ (nθ, nw) at the measured regressors, in whitened outputs."""
+        task, nt = self.free_run.task, len(self.free_run.problem.baseline.names)
+        return np.zeros((nt, 0)) if task is None else task.overlap(w)
+
+    def _change(self, w: Vector) -> Matrix:
+        """∂(c, w)/∂(θ, w) for `c = θ − Φ⁺F(w)`."""
+        slope = self.free_run.problem.projection.from_coordinates(self._share_slope(w))
+        nt, nw = slope.shape
+        return np.block([[np.eye(nt), -slope], [np.zeros((nw, nt)), np.eye(nw)]])
