@@ -21,14 +21,14 @@ from orthaug.excitation import excitation, require_rank
 from orthaug.projection import Projection
 from orthaug.suspects import Suspect
 
-NEGLIGIBLE = 1e-12  # rows whose ‖φᵀδ‖ is below this share of the largest: only weights of 1e12 could use them
+NEGLIGIBLE = 1e-12  # rows whose ‖φᵀδ‖ is below this share of the largest ‖φ‖‖δ‖: only weights of 1e12 could use them
 SMALLEST_COSINE = 1e-6  # between Φa and Δ; below it the optimum of the linear program counts as zero
 VIOLATION = 1e-9  # of (φᵀa)δ, rows and a of unit length; the linear program itself is solved to 1e-10
 WORKING_SET = 1000  # rows of the first linear program, and the most that are added at a time
 MOST_ROUNDS = 50
 IN_SPAN = 1e-10  # ‖P⊥Δ‖/‖Δ‖ below which Δ counts as physics
 
-Verdict = Literal["unremovable", "removable", "undecided", "absent"]
+Verdict = Literal["unremovable", "removable", "undecided", "orthogonal"]
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Certificate:
 
     By Stiemke's lemma exactly one of the two holds: positive weights on all points with `Σ μ_k φ_kᵀδ_k = 0`
     (`removable`), or a direction a with `(φ_kᵀa)δ_k ≥ 0` on all points and `> 0` on some (`unremovable`).
-    `undecided` is a numerical failure, `absent` a suspect that is zero on all points.
+    `undecided` is a numerical failure; `orthogonal` means that `φ_kᵀδ_k` is zero on every point.
 
     `direction` (nt,) is a in the units of θ, `Φa` of root mean square 1; `shares` (nt,) is the same with the
     columns of Φ scaled to root mean square 1 and the largest entry 1, to read. `cosine` is that between Φa and Δ,
@@ -79,8 +79,8 @@ class SuspectedBias:
         found = self.certificate
         if found is None:
             return ""
-        if found.verdict == "absent":
-            return f"{self.suspect.name} is zero on all points: it biases nothing there."
+        if found.verdict == "orthogonal":
+            return f"{self.suspect.name}: φᵀδ is zero on all of these points, so that it biases nothing there."
         if found.verdict == "removable":
             return f"{self.suspect.name}: some weighting of these points leaves θ unbiased."
         if found.verdict == "undecided":
@@ -221,9 +221,10 @@ def find_certificate(projection: Projection, delta: Float[np.ndarray, "N ny"]) -
     delta = delta / size if size > 0 else delta  # squares of the smallest numbers would be lost
     products = np.einsum("kon,ko->kn", projection.q, delta)
     lengths = np.linalg.norm(products, axis=1)
-    kept = lengths > NEGLIGIBLE * lengths.max(initial=0.0)
+    largest = (np.linalg.norm(projection.q, axis=2) * np.abs(delta)).max(initial=0.0)
+    kept = lengths > NEGLIGIBLE * largest
     if not kept.any():
-        return Certificate("absent")
+        return Certificate("orthogonal")
     rows = products[kept] / lengths[kept, None]
     objective = products.sum(axis=0) / np.linalg.norm(delta)
     chosen = np.unique(np.linspace(0, len(rows) - 1, min(WORKING_SET, len(rows))).astype(int))

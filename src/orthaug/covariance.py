@@ -59,7 +59,8 @@ def theta_block(information: Matrix, ridge: float, nt: int, fixed: Collection[in
     """
     free = [i for i in range(nt) if i not in fixed]
     covariance = np.full((nt, nt), np.nan)
-    unit = 1 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+    size = np.sqrt(np.maximum(np.diag(information), 0.0))
+    unit = 1 / np.where(size > 1e-150, size, 1.0)
     scaled = information * np.outer(unit, unit)
     inner = scaled[nt:, nt:] + ridge * np.diag(unit[nt:] ** 2)
     values, vectors = np.linalg.eigh(inner)

@@ -1,9 +1,9 @@
 """The free-run criterion: error of the model's own outputs over segments, with its sensitivities.
 
-A segment starts from measured lags and then lives on its own outputs; its first steps, the washout, are not
-scored. With `G_k = ∂g/∂(c, w)` and `A_{k,i} = ∂g/∂ŷ_{k−i}` the sensitivities of the free run obey
-`S_k = G_k + Σ_i A_{k,i} S_{k−i}`. One scan carries outputs, sensitivities and the Gram matrix of `[S r]` together,
-so that nothing of size N × n_w ever exists.
+A segment starts from its past, the outputs before its first step, and then lives on its own outputs; its first steps,
+the washout, are not scored. With `G_k = ∂g/∂(c, w)` and `A_{k,i} = ∂g/∂ŷ_{k−i}` the sensitivities of the free run obey
+`S_k = G_k + Σ_i A_{k,i} S_{k−i}`, and those in the past the same without G. One scan carries outputs, sensitivities and
+the Gram matrix of `[S r]` together, so that nothing of size N × n_w ever exists.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from orthaug._jax import jax, jnp
-from orthaug.gram import gram, row_sum
+from orthaug.gram import gram
 from orthaug.predictor import Form, Numbers, parts, push, regressor
 from orthaug.record import Record
 from orthaug.regressors import lag_matrix
@@ -74,18 +74,17 @@ def _segment(outputs: Any, inputs: Any, begin: int, steps: int, washout: int, fo
 
 
 @partial(jax.jit, static_argnames="form")
-def respond(form: Form, numbers: Numbers, segments: Segments) -> Float[Array, "k T ny m"]:
-    """Free run of every segment."""
+def respond(
+    form: Form, numbers: Numbers, segments: Segments, past: Float[Array, "k na ny m"]
+) -> Float[Array, "k T ny m"]:
+    """Free run of every segment from its past."""
     one = jax.vmap(partial(_step, form, numbers), in_axes=-1, out_axes=-1)
 
-    def run(chunk: Segments) -> Any:
-        def step(past: Any, inputs: Any) -> tuple[Any, Any]:
-            value = one(past, inputs)
-            return push(past, value), value
+    def step(past: Any, inputs: Any) -> tuple[Any, Any]:
+        value = one(past, inputs)
+        return push(past, value), value
 
-        return jax.lax.scan(step, chunk.past, chunk.inputs)[1]
-
-    return jax.lax.map(run, segments)
+    return jax.lax.map(lambda chunk: jax.lax.scan(step, *chunk)[1], (past, segments.inputs))
 
 
 def _step(form: Form, numbers: Numbers, past: Any, inputs: Any) -> Any:
@@ -93,36 +92,50 @@ def _step(form: Form, numbers: Numbers, past: Any, inputs: Any) -> Any:
     return found.baseline + found.learner
 
 
+class Sensitivity(NamedTuple):
+    """Gram matrices over the scored steps; columns are the pasts' entries (n0), then c and w (n), then the error."""
+
+    shared: Float[Array, "n+1 n+1"]
+    """Of `[S_c S_w r]`, over all segments."""
+    own: Float[Array, "k n0 n0+n+1 m"]
+    """Of the past's sensitivities with all columns, of every segment by itself."""
+
+
 @partial(jax.jit, static_argnames="form")
-def sensitivity_gram(
-    form: Form, numbers: Numbers, segments: Segments, weight: Float[Array, "ny ny"]
-) -> Float[Array, "n n"]:
-    """Gram matrix of the columns `[S r]` over all scored steps, rows multiplied by `weight`; S is ∂ŷ/∂(c, w)."""
+def sensitivity(
+    form: Form,
+    numbers: Numbers,
+    segments: Segments,
+    past: Float[Array, "k na ny m"],
+    weight: Float[Array, "ny ny"],
+) -> Sensitivity:
+    """Gram matrices of the sensitivities `∂ŷ/∂(past, c, w)` and the error, rows multiplied by `weight`."""
     explicit = jax.vmap(partial(_derivatives, form, numbers), in_axes=-1, out_axes=-1)
+    _, na, ny, width = segments.past.shape
+    n0, n = na * ny, len(form.baseline.names) + (form.bound.size if form.bound else 0)
+    first = jnp.broadcast_to(jnp.eye(n0, n0 + n).reshape(na, ny, n0 + n, 1), (na, ny, n0 + n, width))
 
-    def one_chunk(chunk: Segments) -> Any:
-        def step(carry: tuple[Any, ...], row: tuple[Any, ...]) -> tuple[Any, None]:
-            past, slopes, total = carry
-            inputs, target, scored = row
-            value, slope, feedback = explicit(past, inputs)  # (ny, m), (ny, n, m), (ny, lags, m)
-            for i, (lag, output) in enumerate(form.fed_back):
-                slope = slope + feedback[:, i, None] * slopes[lag - 1][output]
-            columns = jnp.concatenate([slope, (target - value)[:, None]], axis=1)
-            columns = jnp.where(scored, columns, 0.0)
-            columns = jnp.einsum("oi,inm->onm", weight, columns) if len(columns) > 1 else weight[0, 0] * columns
-            total = total + sum(gram(one) for one in columns)
-            return (push(past, value), (slope, *slopes[:-1]), total), None
+    def step(carry: tuple[Any, ...], row: tuple[Any, ...]) -> tuple[Any, None]:
+        past, slopes, shared, own = carry
+        inputs, target, scored = row
+        value, slope, feedback = explicit(past, inputs)  # (ny, m), (ny, n, m), (ny, lags, m)
+        slope = jnp.pad(slope, ((0, 0), (n0, 0), (0, 0)))
+        for i, (lag, output) in enumerate(form.fed_back):
+            slope = slope + feedback[:, i, None] * slopes[lag - 1][output]
+        columns = jnp.where(scored, jnp.concatenate([slope, (target - value)[:, None]], axis=1), 0.0)
+        columns = jnp.einsum("oi,inm->onm", weight, columns) if ny > 1 else weight[0, 0] * columns
+        shared = shared + sum(gram(one[n0:]) for one in columns)
+        own = own + sum(one[:n0, None] * one[None] for one in columns)
+        return (push(past, value), (slope, *slopes[:-1]) if na else slopes, shared, own), None
 
-        size = (len(form.outputs), _unknowns(form), chunk.past.shape[-1])
-        slopes = tuple(jnp.zeros(size) for _ in range(max(1, form.memory)))
-        start = (chunk.past, slopes, jnp.zeros((size[1] + 1, size[1] + 1)))
-        return jax.lax.scan(step, start, (chunk.inputs, chunk.target, chunk.scored))[0][2]
+    def one_chunk(total: Any, chunk: tuple[Any, ...]) -> tuple[Any, Any]:
+        past, inputs, target, scored = chunk
+        start = (past, tuple(first), jnp.zeros((n + 1, n + 1)), jnp.zeros((n0, n0 + n + 1, width)))
+        _, _, shared, own = jax.lax.scan(step, start, (inputs, target, scored))[0]
+        return total + shared, own
 
-    return row_sum(one_chunk, segments)
-
-
-def _unknowns(form: Form) -> int:
-    return len(form.baseline.names) + (form.bound.size if form.bound else 0)
+    rows = (past, segments.inputs, segments.target, segments.scored)
+    return Sensitivity(*jax.lax.scan(one_chunk, jnp.zeros((n + 1, n + 1)), rows))
 
 
 def _derivatives(form: Form, numbers: Numbers, past: Any, inputs: Any) -> tuple[Any, Any, Any]:

@@ -16,10 +16,11 @@ from orthaug._arrays import Matrix, Vector
 from orthaug._jax import jnp
 from orthaug.covariance import noise_covariance, theta_block
 from orthaug.criteria import Simulation
+from orthaug.pasts import Pasts
 from orthaug.predictor import Form, Numbers
 from orthaug.problem import Problem
 from orthaug.regressors import Scaling
-from orthaug.segments import Segments, lay_segments, respond, sensitivity_gram
+from orthaug.segments import Segments, Sensitivity, lay_segments, respond, sensitivity
 from orthaug.solvers import LevenbergMarquardt
 from orthaug.solvers.levenberg_marquardt import NON_FINITE, Progress, Run
 from orthaug.solvers.output_error import Outcome, independent_share, minimise
@@ -51,10 +52,11 @@ class FreeRun:
         """The model's numbers before the split."""
         return Numbers(c, np.zeros_like(c), np.asarray(w), self.scaling.centre, self.scaling.halfwidth, self.unit)
 
-    def errors(self, c: Vector, w: Any) -> list[Matrix]:
-        """Scored errors of every segment, (steps, ny) in the outputs' units."""
+    def errors(self, c: Vector, w: Any, past: Any) -> list[Matrix]:
+        """Scored errors of every segment from its past, (steps, ny) in the outputs' units."""
+        run = np.asarray(respond(self.form, self.numbers(c, w), self.segments, jnp.asarray(past)))
         with np.errstate(all="ignore"):
-            error = np.asarray(self.segments.target) - np.asarray(respond(self.form, self.numbers(c, w), self.segments))
+            error = np.asarray(self.segments.target) - run
         scored = np.asarray(self.segments.scored)
         chunks, _, _, width = error.shape
         each = (error[i, scored[i, :, j], :, j] for i in range(chunks) for j in range(width))
@@ -150,12 +152,20 @@ class Objective:
     elimination: Elimination
     orthogonal: bool
     weight: Matrix
+    pasts: Pasts
     errors: list[Matrix] = field(default_factory=list)
+    """Of the last `loss`."""
+    _flown: tuple[float, Any] = (np.inf, None)
+    """Loss and pasts of the last `loss`."""
+    _anchor: tuple[float, Vector] | None = None
+    """Loss and (c, w) of the last `normal`."""
 
     @classmethod
     def of(cls, free_run: FreeRun, structure: Structure) -> Objective:
         weight = np.diag(free_run.problem.weight) / free_run.rms
-        return cls(free_run, eliminate(structure, free_run.problem), isinstance(structure, Orthogonal), weight)
+        past = np.asarray(free_run.segments.past)
+        elimination = eliminate(structure, free_run.problem)
+        return cls(free_run, elimination, isinstance(structure, Orthogonal), weight, Pasts(past, past))
 
     @property
     def follows(self) -> bool:
@@ -181,23 +191,38 @@ class Objective:
         return theta, c, w
 
     def loss(self, p: Vector) -> float:
-        """‖r‖² with the structure's rows; infinite where a free run diverges."""
+        """‖r‖² with the structure's rows; infinite where a free run diverges.
+
+        The pasts follow p to first order; where that does not lower the loss, they stay.
+        """
         theta, c, w = self.place(p)
-        self.errors = self.free_run.errors(c, w)
-        with np.errstate(all="ignore"):
-            total = sum(float(np.sum((error @ self.weight.T) ** 2)) for error in self.errors)
+        tried = [self.pasts.values]
+        if self._anchor is not None and self.pasts.values.size:
+            tried.insert(0, self.pasts.after(np.concatenate([c, w]) - self._anchor[1]))
+        flights = []
+        for past in tried:
+            errors = self.free_run.errors(c, w, past)
+            with np.errstate(all="ignore"):
+                total = sum(float(np.sum((error @ self.weight.T) ** 2)) for error in errors)
+            total += self.pasts.loss(past, self.weight)
+            flights.append((total if np.isfinite(total) else np.inf, past, errors))
+            if self._anchor is None or total < self._anchor[0]:
+                break
+        best, past, self.errors = min(flights, key=lambda flight: flight[0])
+        self._flown = best, past
         rows = self.elimination.rows
         if len(rows.target):
             miss = rows.target - rows.theta @ theta - rows.learner @ self._share(w)
-            total += float(miss @ miss) / self.free_run.rms**2
-        return total if np.isfinite(total) else np.inf
+            best += float(miss @ miss) / self.free_run.rms**2
+        return best
 
     def normal(self, p: Vector) -> tuple[Matrix, Vector]:
         """JᵀJ and Jᵀr at the p of the last `loss`."""
         theta, c, w = self.place(p)
-        columns = self._gram(c, w)
-        hessian, gradient = columns[:-1, :-1], columns[:-1, -1]
-        rows, rms, nt = self.elimination.rows, self.free_run.rms, len(theta)
+        total, self.pasts.values = self._flown
+        self._anchor = total, np.concatenate([c, w])
+        hessian, gradient = self._linearise(c, w)
+        rows, rms = self.elimination.rows, self.free_run.rms
         if self.follows:
             change = self._change(w)
             hessian, gradient = change.T @ hessian @ change, change.T @ gradient
@@ -205,7 +230,6 @@ class Objective:
             slope = np.column_stack([rows.theta, rows.learner @ self._share_slope(w)]) / rms
             miss = (rows.target - rows.theta @ theta - rows.learner @ self._share(w)) / rms
             hessian, gradient = hessian + slope.T @ slope, gradient + slope.T @ miss
-        assert hessian.shape[0] == nt + len(w)
         return hessian, gradient
 
     def samples(self) -> tuple[float, float]:
@@ -227,10 +251,10 @@ class Objective:
         first = solver.iterations if ny == 1 else solver.iterations // 2
         found = minimise(self, p, iterations=first, ridge=ridge, progress=tell, **options)
         if ny > 1 and found.code != NON_FINITE:
-            self.loss(found.p)
+            self._settle(found.p)
             noise = self._noise(found)
             if noise is not None:
-                self.weight = np.linalg.inv(np.linalg.cholesky(noise))
+                self.weight, self._anchor = np.linalg.inv(np.linalg.cholesky(noise)), None
                 done = found.iterations
                 again = minimise(
                     self,
@@ -241,8 +265,13 @@ class Objective:
                     **options,
                 )
                 found = again._replace(iterations=done + again.iterations, seconds=found.seconds + again.seconds)
-        self.loss(found.p)  # the errors of the end, not of the last trial
+        self._settle(found.p)
         return found
+
+    def _settle(self, p: Vector) -> None:
+        """The errors of p itself, where the last trial was another."""
+        _, c, w = self.place(p)
+        self.errors = self.free_run.errors(c, w, self.pasts.values)
 
     def mean_square(self) -> float:
         """Mean of the squared errors of the last `loss`, each output in its standard deviation."""
@@ -252,7 +281,7 @@ class Objective:
         """Gram matrix of the sensitivities ∂ŷ/∂(c, w) in whitened outputs, (nθ + nw)²."""
         _, c, w = self.place(found.p)
         weight = np.diag(self.free_run.problem.weight)
-        return np.asarray(self._sensitivities(c, w, weight))[:-1, :-1]
+        return self.pasts.eliminate(self._sensitivity(c, w, weight), weight)[0]
 
     def statistics(self, found: Outcome) -> FreeStatistics:
         """Noise covariance of the free run, Cov θ̂ from its sensitivities, and the mean square of its errors."""
@@ -264,7 +293,7 @@ class Objective:
         at_bound = {i: float(value) for i, value in enumerate(theta) if value in (sides[0][i], sides[1][i])}
         covariance = None
         if noise is not None:
-            information = self._gram(c, w)[:-1, :-1]
+            information, _ = self._linearise(c, w)
             if self.orthogonal and self.free_run.task is not None:
                 change = self._change(w)
                 information = change.T @ information @ change
@@ -283,12 +312,13 @@ class Objective:
         used = (len(self.free_run.problem.baseline.names) + found.effective) / ny
         return noise_covariance(errors, np.full(ny, len(errors) - used))
 
-    def _gram(self, c: Vector, w: Vector) -> Matrix:
-        return np.asarray(self._sensitivities(c, w, self.weight))
+    def _linearise(self, c: Vector, w: Vector) -> tuple[Matrix, Vector]:
+        return self.pasts.eliminate(self._sensitivity(c, w, self.weight), self.weight)
 
-    def _sensitivities(self, c: Vector, w: Vector, weight: Matrix) -> Any:
+    def _sensitivity(self, c: Vector, w: Vector, weight: Matrix) -> Sensitivity:
         run = self.free_run
-        return sensitivity_gram(run.form, run.numbers(c, w), run.segments, jnp.asarray(weight))
+        past = jnp.asarray(self.pasts.values)
+        return sensitivity(run.form, run.numbers(c, w), run.segments, past, jnp.asarray(weight))
 
     def _share(self, w: Vector) -> Vector:
         """QᵀF (nθ,) at the measured regressors, in whitened outputs."""

@@ -66,15 +66,14 @@ class Suspect:
     expression: str
     output: str | None = None
     coefficient: float | None = None
-    constants: tuple[tuple[str, float], ...] = ()
+    constants: Mapping[str, float] | tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.strip() or not self.name.isprintable():
             raise InputError(f"{self.name!r} cannot name a suspect; use visible characters on one line.")
         if self.output is not None and not isinstance(self.output, str):
             raise InputError(f"suspect '{self.name}': `output` must be the name of a channel; got {self.output!r}.")
-        given = self.constants.items() if isinstance(self.constants, Mapping) else self.constants
-        constants = _checked_constants(dict(given), self.name)
+        constants = _checked_constants(dict(self.constants), self.name)
         if self.coefficient is not None and not _is_number(self.coefficient):
             raise InputError(f"suspect '{self.name}': `coefficient` must be a finite number; got {self.coefficient!r}.")
         object.__setattr__(self, "constants", constants)
@@ -139,8 +138,9 @@ class Suspect:
         w = "" if width is None else repr(check_number(width, "width", positive=True))
         arguments = ", ".join(part for part in (on, w) if part)
         label = on if kind == "expression" else f"{kind}({arguments})" if arguments else kind
-        pairs = tuple((constants or {}).items())
-        return cls(label if name is None else name, _KINDS[kind].text(on or "", w), output, coefficient, pairs)  # type: ignore[arg-type]
+        return cls(
+            label if name is None else name, _KINDS[kind].text(on or "", w), output, coefficient, constants or ()
+        )  # type: ignore[arg-type]
 
     @property
     def parsed(self) -> Expression:

@@ -18,6 +18,7 @@ from orthaug.solvers.levenberg_marquardt import CONVERGED, NO_DESCENT, NON_FINIT
 
 _FIRST_DAMPING = 1e-3
 _LARGEST_DAMPING = 1e16
+_NO_CORRELATION = 0.05  # below it a correlation of the errors does not count
 _SMALLEST_CURVATURE = 1e-14  # of the largest: what a direction that does nothing is damped with
 
 
@@ -165,7 +166,7 @@ def _evidence(objective: Objective, p: Vector, hessian: Matrix, loss: float, rid
 
 
 def independent_share(residuals: list[Vector]) -> float:
-    """1 / (1 + 2 Σ ρ_i²): Bartlett's effective share of a coloured sequence beside regressors of the same colour.
+    """1 / (1 + 2 Σ ρ_i), the inverse autocorrelation time, summed up to the first correlation that is noise.
 
     Args:
         residuals: one stretch (T,) or several; lags never reach across them.
@@ -174,13 +175,11 @@ def independent_share(residuals: list[Vector]) -> float:
     if longest < 3:
         return 1.0
     size = 1 << (2 * longest - 1).bit_length()
-    spectrum = np.zeros(size // 2 + 1)
-    for residual in residuals:
-        spectrum += np.abs(np.fft.rfft(residual, size)) ** 2
+    spectrum = sum(np.abs(np.fft.rfft(residual, size)) ** 2 for residual in residuals)
     covariance = np.fft.irfft(spectrum, size)[:longest]
     if not covariance[0] > 0:
         return 1.0
-    rho = covariance / covariance[0]
-    noise = 1 / np.sqrt(sum(len(r) for r in residuals))
-    tail = np.flatnonzero(np.abs(rho[1:]) < 2 * noise)
-    return float(1 / (1 + 2 * np.sum(rho[1 : (tail[0] + 1 if tail.size else longest)] ** 2)))
+    rho = covariance[1:] / covariance[0]
+    noise = max(_NO_CORRELATION, 2 / np.sqrt(sum(len(r) for r in residuals)))
+    end = int(np.argmax(np.append(rho < noise, True)))
+    return float(1 / (1 + 2 * np.sum(rho[:end])))

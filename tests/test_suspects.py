@@ -1,0 +1,166 @@
+"""Suspected terms: what each kind computes, and every refusal in its words."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from orthaug.errors import InputError
+from orthaug.expressions import Lag, parse
+from orthaug.suspects import KINDS, Suspect, data_width, suspect_columns
+from orthaug.synthetic import MassSpringDamper
+
+LAYOUT = (Lag("y", 1), Lag("y", 2), Lag("u", 1))
+X = np.random.default_rng(1).normal(size=(50, 3)) * [0.005, 0.005, 100.0]
+X[0] = 0.0
+TS = {"Ts": 0.01}
+VELOCITY = "(y[k-1] - y[k-2])/Ts"
+V = (X[:, 0] - X[:, 1]) / 0.01
+
+FORMS = {
+    "coulomb": lambda v, w: np.sign(v),
+    "stribeck": lambda v, w: np.sign(v) * np.exp(-np.abs(v) / w),
+    "stribeck_gauss": lambda v, w: np.sign(v) * np.exp(-((v / w) ** 2)),
+    "quadratic_drag": lambda v, w: v * np.abs(v),
+    "cubic": lambda v, w: v**3,
+    "dead_zone": lambda v, w: v - np.clip(v, -w, w),
+    "saturation": lambda v, w: np.clip(v, -w, w),
+    "expression": lambda v, w: v,
+}
+WIDE = ("stribeck", "stribeck_gauss", "dead_zone", "saturation")
+
+
+def of(kind, **more):
+    """A suspect on the velocity, with a width where its kind has one."""
+    return Suspect.of(kind, VELOCITY, constants=TS, **({"width": 0.3} if kind in WIDE else {}), **more)
+
+
+@pytest.mark.parametrize("kind", FORMS)
+def test_values_of_every_kind(kind):
+    suspect = of(kind)
+    assert parse(suspect.expression, TS).lags == suspect.lags == LAYOUT[:2]
+    values = suspect.values(X, LAYOUT, ["y"])
+    assert values.shape == (50, 1)
+    np.testing.assert_allclose(values[:, 0], FORMS[kind](V, 0.3), rtol=1e-13, atol=1e-15)
+
+
+def test_every_kind_is_tested():
+    assert set(KINDS) == {*FORMS, "offset"}
+
+
+def test_offset():
+    suspect = Suspect.of("offset")
+    assert (suspect.name, suspect.expression, suspect.lags) == ("offset", "1", ())
+    np.testing.assert_array_equal(suspect.values(X, LAYOUT, ["y"]), np.ones((50, 1)))
+
+
+def test_the_papers_friction_is_coulomb_and_stribeck():
+    system = MassSpringDamper()
+    coulomb = Suspect.of("coulomb", VELOCITY, constants=TS).values(X, LAYOUT, ["y"])[:, 0]
+    stribeck = Suspect.of("stribeck", VELOCITY, width=system.stribeck, constants=TS).values(X, LAYOUT, ["y"])[:, 0]
+    total = system.coulomb * coulomb + (system.static - system.coulomb) * stribeck
+    np.testing.assert_allclose(total, system.friction(V), rtol=1e-12)
+
+
+def test_names():
+    assert Suspect.of("coulomb", " v[k-1]\n").name == "coulomb(v[k-1])"
+    assert Suspect.of("saturation", "u[k-1]", width=1e-5).name == "saturation(u[k-1], 1e-05)"
+    assert Suspect.of("expression", "u[k-1]**2").name == "u[k-1]**2"
+    assert Suspect.of("coulomb", "v[k-1]", name="bearing").name == "bearing"
+
+
+def test_width_may_be_a_numpy_number():
+    assert Suspect.of("saturation", "u[k-1]", width=np.float64(0.5)).expression == "max(min(u[k-1], 0.5), -0.5)"
+
+
+def test_constants_are_sorted_pairs_and_suspects_hashable():
+    one = Suspect("a", "c*u[k-1]*b", constants={"c": 1, "b": 2})
+    assert one.constants == (("b", 2.0), ("c", 1.0))
+    assert hash(one) == hash(Suspect("a", "c*u[k-1]*b", constants=(("b", 2.0), ("c", 1.0))))
+
+
+def test_columns_stand_in_their_output():
+    suspects = [Suspect.of("cubic", "y[k-1]", output="z"), Suspect.of("offset", output="y")]
+    columns = suspect_columns(suspects, X, LAYOUT, ["y", "z"])
+    assert columns.shape == (2, 50, 2)
+    np.testing.assert_allclose(columns[0], np.stack([0 * X[:, 0], X[:, 0] ** 3], axis=1))
+    np.testing.assert_array_equal(columns[1], [[1.0, 0.0]] * 50)
+    assert suspect_columns([], X, LAYOUT, ["y"]).shape == (0, 50, 1)
+
+
+def test_data_width_is_the_median_of_what_moves():
+    assert data_width(VELOCITY, X, LAYOUT, TS) == pytest.approx(np.median(np.abs(V[1:])))
+    inside = np.abs(V[1:]) < data_width(VELOCITY, X, LAYOUT, TS)
+    assert abs(inside.mean() - 0.5) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            {"kind": "columb", "on": "v[k-1]"},
+            r"unknown kind of suspect 'columb', did you mean 'coulomb'\?; known are coul",
+        ),
+        ({"kind": "", "on": "v[k-1]"}, r"unknown kind of suspect ''"),
+        ({"kind": "cubic"}, r"a suspect of kind cubic needs `on`, an expression such as v\[k-1\]"),
+        ({"kind": "offset", "on": "v[k-1]"}, r"an offset .* takes no `on`; got 'v\[k-1\]'"),
+        ({"kind": "stribeck", "on": "v[k-1]"}, r"stribeck needs `width`, in the unit of v\[k-1\]; data_width suggests"),
+        ({"kind": "cubic", "on": "v[k-1]", "width": 1.0}, "kind cubic takes no `width`; got 1.0"),
+        ({"kind": "dead_zone", "on": "v[k-1]", "width": 0.0}, "`width` must be a positive number; got 0.0"),
+        ({"kind": "dead_zone", "on": "v[k-1]", "width": float("nan")}, "`width` must be a positive number; got nan"),
+        ({"kind": "cubic", "on": "v"}, r"unknown constant 'v'; a channel needs its lag, v\[k-1\]"),
+        ({"kind": "coulomb", "on": "v[k-1]) + (1"}, "is not an expression"),
+        ({"kind": "cubic", "on": VELOCITY}, "unknown constant 'Ts'"),
+        ({"kind": "cubic", "on": "v[k-1]", "name": " "}, "' ' cannot name a suspect; use visible characters"),
+        ({"kind": "cubic", "on": "v[k-1]", "output": 1}, "`output` must be the name of a channel; got 1"),
+        (
+            {"kind": "cubic", "on": "v[k-1]", "coefficient": float("inf")},
+            "`coefficient` must be a finite number; got inf",
+        ),
+        ({"kind": "cubic", "on": "v[k-1]", "coefficient": "1"}, "`coefficient` must be a finite number; got '1'"),
+        ({"kind": "cubic", "on": "v[k-1]", "constants": {"sin": 1.0}}, "'sin' cannot name a constant"),
+        (
+            {"kind": "cubic", "on": "v[k-1]", "constants": {"c": float("nan")}},
+            "constant 'c' must be a finite number; got n",
+        ),
+    ],
+)
+def test_refusals(arguments, message):
+    with pytest.raises(InputError, match=message) as caught:
+        Suspect.of(**arguments)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_expression_that_does_not_parse_names_its_suspect():
+    with pytest.raises(InputError, match="suspect 'drag': 'u.k': 'u.k' is not allowed in an expression"):
+        Suspect("drag", "u.k")
+
+
+@pytest.mark.parametrize(
+    ("suspect", "outputs", "message"),
+    [
+        (
+            Suspect("a", "w[k-1] + u[k-3]"),
+            ["y"],
+            r"'a' reads w\[k-1\], u\[k-3\], which the regressor does not hold; it ho",
+        ),
+        (Suspect("a", "1"), ["y", "z"], "suspect 'a': `output` is missing; one of y, z"),
+        (Suspect("a", "1", output="zz"), ["y", "zet"], "suspect 'a': unknown output 'zz'; known are y, zet"),
+        (Suspect("a", "log(y[k-1])"), ["y"], r"suspect 'a' = log\(y\[k-1\]\) is not finite at row 0 of the regressor"),
+    ],
+)
+def test_refusals_on_data(suspect, outputs, message):
+    with pytest.raises(InputError, match=message):
+        suspect.values(X, LAYOUT, outputs)
+
+
+def test_two_suspects_of_one_name():
+    with pytest.raises(InputError, match="suspect 'offset' is given twice"):
+        suspect_columns([Suspect.of("offset")] * 2, X, LAYOUT, ["y"])
+
+
+def test_no_width_from_data_that_do_not_move():
+    with pytest.raises(InputError, match=r"'u\[k-1\]' is zero on all rows; the data give no width"):
+        data_width("u[k-1]", 0 * X, LAYOUT)
+    with pytest.raises(InputError, match=r"'1/u\[k-1\]' is not finite at row 0"):
+        data_width("1/u[k-1]", X, LAYOUT)
