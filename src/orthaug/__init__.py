@@ -28,6 +28,8 @@ _HOME = {
     "Orthogonal": "structures",
     "OrthogonalPenalty": "structures",
     "BaselinePenalty": "structures",
+    "Prediction": "criteria",
+    "Simulation": "criteria",
     "LevenbergMarquardt": "solvers",
     "AdamLBFGS": "solvers",
     "estimate": "estimation",
@@ -50,6 +52,8 @@ if TYPE_CHECKING:
     from orthaug.baseline import Baseline as Baseline
     from orthaug.baseline import Parameter as Parameter
     from orthaug.baseline import Term as Term
+    from orthaug.criteria import Prediction as Prediction
+    from orthaug.criteria import Simulation as Simulation
     from orthaug.errors import InputError as InputError
     from orthaug.errors import RankError as RankError
     from orthaug.errors import TrainingError as TrainingError

@@ -34,9 +34,12 @@ class Prediction:
 class Simulation:
     """Declaration: the error of a free run over segments that start from measured lags.
 
+    With a washout, or over whole experiments, the outputs before a segment are taken for as noisy as all others: they
+    are unknowns too (`Pasts`). Segments without a washout start exactly from what was measured.
+
     Args:
         segment: steps of a segment; 0 for whole experiments.
-        washout: leading steps of a segment that are not scored, until the measured start is forgotten.
+        washout: leading steps of a segment that are not scored, until its start is forgotten.
         start_iterations: one-step iterations that training starts from.
     """
 
@@ -51,6 +54,11 @@ class Simulation:
             raise InputError(
                 f"`washout` must be shorter than `segment`; got {self.washout} and {self.segment}: nothing is scored."
             )
+
+    @property
+    def estimates_pasts(self) -> bool:
+        """Whether the outputs before a segment are unknowns."""
+        return self.washout > 0 or self.segment == 0
 
 
 Criterion = Prediction | Simulation

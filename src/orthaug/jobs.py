@@ -16,9 +16,10 @@ from orthaug import __version__
 from orthaug.errors import InputError
 from orthaug.excitation import Excitation, identifiability
 from orthaug.folders import check_replaceable, whole_folder
-from orthaug.problem import Problem, check_defined, pose
+from orthaug.problem import Problem, check_defined, pose, regressor_of
 from orthaug.readers import read_record
 from orthaug.record import Record, check_channels, same_step
+from orthaug.regressors import largest_lag
 from orthaug.spec import Part, Spec, load_spec
 from orthaug.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty, Structure
 
@@ -32,16 +33,37 @@ Progress = Callable[[int, int, float], None]
 
 @dataclass(frozen=True, eq=False)
 class LoadedPart:
-    """A part of the data: its record, and how many leading samples of each experiment are not scored."""
+    """A part of the data: its record, and how many leading samples of each recording are not scored."""
 
     name: str
     record: Record
     skip: int
     files: tuple[dict[str, Any], ...]
+    gaps: str = ""
+    """What was left out around missing samples, in words."""
+
+    def without_short(self, first: int) -> LoadedPart:
+        """Without stretches between missing samples that are too short for a row after the first `first`."""
+        record = self.record.without_short(first)
+        if not record.missing:
+            return self
+        usable = sum(max(0, len(experiment) - first) for experiment in record.experiments)
+        gaps = (
+            f"{self.name}: {record.missing} rows have missing cells and are left out with all windows that touch them; "
+            f"{usable} usable rows remain, in {len(record.experiments)} stretches."
+        )
+        return replace(self, record=record, gaps=gaps)
+
+    @property
+    def skips(self) -> tuple[int, ...]:
+        """How many leading samples of each experiment are not scored."""
+        return tuple(max(0, self.skip - experiment.offset) for experiment in self.record.experiments)
 
     def scored(self, start: int) -> Record:
         """The record without rows that are neither scored nor lags of what is, for a first usable row `start`."""
-        kept = tuple(e.rows(max(0, self.skip - start), None) for e in self.record.experiments)
+        kept = tuple(
+            e.rows(max(0, skip - start), None) for e, skip in zip(self.record.experiments, self.skips, strict=True)
+        )
         return replace(self.record, experiments=kept)
 
 
@@ -67,8 +89,10 @@ class Job:
     def iterations(self) -> int:
         """Steps of a run at most."""
         training = self.spec.training
-        gradient = training.adam_iterations + training.lbfgs_iterations
-        return training.iterations if training.solver == "levenberg-marquardt" else gradient
+        if training.solver == "adam-lbfgs":
+            return training.adam_iterations + training.lbfgs_iterations
+        free_run = training.focus == "simulation" or training.horizon > 1
+        return training.iterations + (training.start_iterations if free_run else 0)
 
     @property
     def parts(self) -> tuple[LoadedPart, ...]:
@@ -94,9 +118,11 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
     tests = tuple(_load(path, spec, part, f"tests.{name}") for name, part in spec.data.tests.items())
     lags = spec.lag_orders() if spec.learner.kind != "none" else None
     try:
+        layout, _ = regressor_of(baseline, lags, learner_inputs, tuple(spec.data.outputs), tuple(spec.data.inputs))
+        train, validation, *tests = (p and p.without_short(largest_lag(layout)) for p in (train, validation, *tests))
         problem = pose(train.record, baseline, lags, learner_inputs, require_full_rank=require_full_rank)
         problem.feature_rows()
-        job = Job(path, spec, train, validation, tests, problem, ())
+        job = Job(path, spec, train, validation, tuple(tests), problem, ())
         for part in job.parts:
             _check_scorable(part, problem.rows.start, train.record.sampling_time)
             check_defined(problem, part.record)
@@ -104,9 +130,9 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
         raise type(error)(f"{path}: {error}") from None
     declared = {"train": spec.data.train, "validation": spec.data.validation}
     declared |= {f"tests.{name}": part for name, part in spec.data.tests.items()}
-    return replace(
-        job, warnings=tuple(_thinned(name, part.every) for name, part in declared.items() if part and part.every > 1)
-    )
+    warnings = [_thinned(name, part.every) for name, part in declared.items() if part and part.every > 1]
+    warnings += [part.gaps for part in job.parts if part.gaps]
+    return replace(job, warnings=tuple(warnings))
 
 
 def _thinned(name: str, every: int) -> str:
@@ -141,6 +167,7 @@ def _load(path: Path, spec: Spec, part: Part, name: str) -> LoadedPart:
             rows=part.rows,  # type: ignore[arg-type]  (lists of two, checked by the spec)
             every=part.every,
             columns=part.columns,
+            missing=spec.data.missing,
         )
         records.append(record)
         digest = hashlib.sha256((path.parent / file).read_bytes()).hexdigest()
@@ -154,8 +181,8 @@ def _check_scorable(part: LoadedPart, start: int, sampling_time: float) -> None:
             f"data.{part.name}: sampled every {part.record.sampling_time:g} s, the training data every "
             f"{sampling_time:g} s; one model has one sampling time."
         )
-    first = max(start, part.skip)
-    for experiment in part.record.experiments:
+    for experiment, skip in zip(part.record.experiments, part.skips, strict=True):
+        first = max(start, skip)
         if len(experiment) <= first:
             raise InputError(
                 f"{experiment.source}: data.{part.name} has {len(experiment)} rows, too few; the first {first} are "
@@ -188,6 +215,7 @@ def check_report(job: Job) -> dict[str, Any]:
 
 def run_fit(job: Job, progress: Progress | None = None, *, kind: str | None = None, alone: bool = False) -> Estimate:
     """Train as the spec says; with another `kind` of structure, or the physics `alone`."""
+    from orthaug.criteria import Prediction, Simulation
     from orthaug.estimation import estimate
     from orthaug.learners import MLP
     from orthaug.solvers import AdamLBFGS, LevenbergMarquardt
@@ -206,6 +234,9 @@ def run_fit(job: Job, progress: Progress | None = None, *, kind: str | None = No
         lags=spec.lag_orders() if learner is not None else None,
         learner=learner,
         structure=Orthogonal() if alone else structure_of(spec, kind),
+        criterion=Simulation(training.segment, training.washout, training.start_iterations)
+        if training.focus == "simulation"
+        else Prediction(training.horizon),
         solver=solver,
         regularization=training.regularizations(job.validation is not None),
         restarts=training.restarts,
@@ -334,7 +365,7 @@ def score_part(model: Model, part: LoadedPart, warnings: list[str]) -> tuple[dic
     found = {}
     for kind, response in zip(("prediction", "simulation"), responses, strict=True):
         runaway = next((t.diverged for t in response.trajectories if t.diverged), None)
-        scored = response.scores(part.skip)
+        scored = response.scores(part.skips)
         found[kind] = scored.as_dict()
         if runaway is not None:
             step, output = runaway

@@ -18,10 +18,11 @@ from orthaug.segments import Sensitivity
 
 @dataclass(eq=False)
 class Pasts:
-    """The pasts of all segments, (k, na, ny, m): `measured`, and `values` as estimated so far."""
+    """The pasts of all segments, (k, na, ny, m): `measured`, and `values` as estimated so far where they are `free`."""
 
     measured: Float[np.ndarray, "k na ny m"]
     values: Float[np.ndarray, "k na ny m"]
+    free: bool
     offset: np.ndarray | None = field(default=None)
     slope: np.ndarray | None = field(default=None)
 
@@ -32,7 +33,10 @@ class Pasts:
 
     def eliminate(self, found: Sensitivity, weight: Matrix) -> tuple[Matrix, Vector]:
         """Normal matrix and right-hand side of (c, w) with the pasts at their best, which `after` then follows."""
-        shared, own = np.asarray(found.shared), np.moveaxis(np.asarray(found.own), -1, 1)  # own: (k, m, n0, n0+n+1)
+        shared = np.asarray(found.shared)
+        if not self.free:
+            return shared[:-1, :-1], shared[:-1, -1]
+        own = np.moveaxis(np.asarray(found.own), -1, 1)  # (k, m, n0, n0+n+1)
         na, ny = self.measured.shape[1:3]
         n0 = na * ny
         prior = np.kron(np.eye(na), weight.T @ weight)

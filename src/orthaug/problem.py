@@ -80,7 +80,7 @@ def pose(
     if not outputs:
         raise InputError("the record has no outputs; there is nothing to fit.")
     baseline.check_channels(outputs, inputs)
-    layout, features = _layout(baseline, lags, learner_inputs, outputs, inputs)
+    layout, features = regressor_of(baseline, lags, learner_inputs, outputs, inputs)
     rows = stack_rows(record, layout)
     _check_moving(record, layout)
     with np.errstate(all="ignore"):
@@ -121,14 +121,18 @@ def _feature_rows(features: Features, rows: Rows, layout: Layout, record: Record
     return z
 
 
-def _layout(
+def regressor_of(
     baseline: Baseline,
     lags: Lags | None,
     learner_inputs: tuple[str, ...] | None,
     outputs: tuple[str, ...],
     inputs: tuple[str, ...],
 ) -> tuple[Layout, Features]:
-    """The regressor of the whole model, and what the learner sees of it."""
+    """The regressor of the whole model, and what the learner sees of it.
+
+    Raises:
+        InputError: unknown channels, outputs at lag 0, learner inputs that cannot be read.
+    """
     chosen = in_order(baseline.lags, outputs, inputs) if lags is None else lags.layout(outputs, inputs)
     features = Features.of(chosen)
     if learner_inputs is not None:

@@ -11,11 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
+from orthaug._arrays import check_choice
 from orthaug.errors import InputError
 from orthaug.record import Channel, Experiment, Record, same_step
 from orthaug.tables import Table, read_table
 
 RowRange = tuple[int, int] | list[int]
+_MISSING = ("", "nan", "na", "n/a", "null", "none")  # how files write a sample that is not there
 
 
 def read_record(
@@ -28,6 +30,7 @@ def read_record(
     rows: RowRange | Sequence[RowRange] | None = None,
     every: int = 1,
     columns: Mapping[str, str] | None = None,
+    missing: str = "error",
 ) -> Record:
     """Read one file; several row ranges are experiments of their own.
 
@@ -38,6 +41,8 @@ def read_record(
         rows: half-open range `(start, stop)` of data rows, or several; None for all.
         every: keep each n-th row (no filter); the sampling time is multiplied.
         columns: this file's column for a channel, `{"position": "yVal"}`.
+        missing: "error", or "skip" to leave out rows with empty or NaN cells: what lies between them is an experiment
+            of its own, so that no lag reaches across a gap.
 
     Raises:
         InputError: no such file, wrong type, missing columns, cells that are empty or no finite numbers.
@@ -54,27 +59,32 @@ def read_record(
         raise InputError("no channels are asked for; name inputs, outputs or both.")
     table = _trim(read_table(path, wanted))
     total = len(next(iter(table.columns.values())))
-    experiments, steps = [], []
-    for start, stop in _ranges(rows, total, path):
-        _check_cells(table, wanted, start, stop)
-        pick = slice(start, stop, every)
-        signals = [
-            np.stack([c.scale * table.columns[column_of[c.name]][pick] + c.offset for c in group], axis=-1)
-            if group
-            else np.empty((len(range(start, stop, every)), 0))
-            for group in channels
-        ]
-        began = float(table.columns[time][start]) if time else 0.0
-        experiments.append(Experiment(signals[0], signals[1], str(path), start, every, table.first_line, began))
-        if time:
-            steps.append(_uniform_step(table, time, start, stop))
+    experiments, steps, recorded = [], [], 0
+    for begin, end in _ranges(rows, total, path):
+        recorded += len(range(begin, end, every))
+        for start, stop in _stretches(table, wanted, begin, end, every, missing):
+            pick = slice(start, stop, every)
+            signals = [
+                np.stack([c.scale * table.columns[column_of[c.name]][pick] + c.offset for c in group], axis=-1)
+                if group
+                else np.empty((len(range(start, stop, every)), 0))
+                for group in channels
+            ]
+            began = float(table.columns[time][start]) if time else 0.0
+            place = (str(path), start, every, table.first_line, began, (start - begin) // every)
+            experiments.append(Experiment(signals[0], signals[1], *place))
+            if time and (stop - start > 1 or missing == "error"):
+                steps.append(_uniform_step(table, time, start, stop))
+    if time and not steps:
+        raise InputError(f"{path}: no two rows without missing cells follow each other; the sampling time is unknown.")
     step = steps[0] if time else (1.0 if sampling_time is None else sampling_time)
     for other in steps:
         if not same_step(other, step):
             raise InputError(
                 f"{path}: column '{time}' steps by {step:g} s in one row range and by {other:g} s in another."
             )
-    return Record(tuple(channels[0]), tuple(channels[1]), step * every, tuple(experiments), time)
+    left_out = recorded - sum(len(experiment) for experiment in experiments)
+    return Record(tuple(channels[0]), tuple(channels[1]), step * every, tuple(experiments), time, left_out)
 
 
 def _trim(table: Table) -> Table:
@@ -107,6 +117,26 @@ def _ranges(rows: RowRange | Sequence[RowRange] | None, total: int, path: Path) 
                 f"{path}: the row ranges {list(before)} and {list(after)} overlap; samples would count twice."
             )
     return [(int(start), int(stop)) for start, stop in pairs]
+
+
+def _stretches(
+    table: Table, columns: Sequence[str], begin: int, end: int, every: int, missing: str
+) -> list[tuple[int, int]]:
+    """Half-open row ranges without missing cells; the whole range where missing cells are errors."""
+    check_choice(missing, ("error", "skip"), "`missing`")
+    if missing == "error":
+        _check_cells(table, columns, begin, end)
+        return [(begin, end)]
+    kept = np.arange(begin, end, every)
+    there = np.all([np.isfinite(table.columns[name][kept]) for name in columns], axis=0)
+    for row in kept[~there]:
+        for name in columns:
+            if not np.isfinite(table.columns[name][row]) and table.cell(name, row).strip().lower() not in _MISSING:
+                _check_cells(table, [name], row, row + 1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int)))
+    if not len(edges):
+        raise InputError(f"{table.path}: every row from {begin} to {end - 1} has a missing cell; nothing is left.")
+    return [(int(kept[a]), int(kept[b - 1]) + 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def _check_cells(table: Table, columns: Sequence[str], start: int, stop: int) -> None:

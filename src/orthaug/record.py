@@ -68,7 +68,8 @@ class Experiment:
     """One uninterrupted run: `inputs` (N, nu) and `outputs` (N, ny), row k taken at the same instant.
 
     `source`, `first_row`, `stride` and `first_line` (the file's line of its row 0) say where a row came from, for
-    messages; `start_time` [s] is the instant of the first row.
+    messages; `start_time` [s] is the instant of the first row. A stretch between missing samples begins `offset` rows
+    into the recording it is a part of.
     """
 
     inputs: Matrix
@@ -78,6 +79,7 @@ class Experiment:
     stride: int = 1
     first_line: int | None = None
     start_time: float = 0.0
+    offset: int = 0
 
     def __len__(self) -> int:
         return len(self.inputs)
@@ -115,6 +117,8 @@ class Record:
     sampling_time: float
     experiments: tuple[Experiment, ...]
     time_column: str | None = None
+    missing: int = 0
+    """Rows that were left out because a sample was missing."""
 
     def __post_init__(self) -> None:
         check_channels(self.inputs, self.outputs)
@@ -183,7 +187,8 @@ class Record:
                     f"{other.experiments[0].source or 'a record'}: sampled every {other.sampling_time:g} s, "
                     f"{first.experiments[0].source or 'another'} every {first.sampling_time:g} s; resample one of them."
                 )
-        return replace(first, experiments=tuple(e for record in records for e in record.experiments))
+        experiments = tuple(e for record in records for e in record.experiments)
+        return replace(first, experiments=experiments, missing=sum(record.missing for record in records))
 
     def __len__(self) -> int:
         return sum(len(experiment) for experiment in self.experiments)
@@ -212,6 +217,11 @@ class Record:
             raise InputError(f"`fraction` must lie between 0 and 1; got {fraction}.")
         cut = round(fraction * len(self._only("split")))
         return self.rows(None, cut), self.rows(cut, None)
+
+    def without_short(self, first: int) -> Record:
+        """Without stretches between missing samples that end before row `first`, as long as one is left."""
+        long = tuple(e for e in self.experiments if len(e) > first)
+        return replace(self, experiments=long) if self.missing and long else self
 
     def _only(self, verb: str) -> Experiment:
         if len(self.experiments) != 1:

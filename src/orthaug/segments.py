@@ -56,6 +56,7 @@ def lay_segments(record: Record, form: Form, segment: int, washout: int) -> Segm
     count = len(pieces)
     chunks = -(-count // _CHUNK)
     width = -(-count // chunks)
+    width += -width % 8 if width > 8 else 0  # about as many segments run by the same program
     nothing = Segments(*(np.zeros_like(part) for part in pieces[0]))
     pieces += [nothing] * (chunks * width - count)
     stacked = (np.stack(part, axis=-1) for part in zip(*pieces, strict=True))

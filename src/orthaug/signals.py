@@ -165,7 +165,7 @@ def square(samples: int, *, amplitude: float, period: int) -> Vector:
     return binary_pattern(samples, [1, 0], amplitude=amplitude, hold=period // 2)
 
 
-def binary_pattern(samples: int, pattern: Sequence[int] | Vector, *, amplitude: float, hold: int = 1) -> Vector:
+def binary_pattern(samples: int, pattern: Sequence[int] | np.ndarray, *, amplitude: float, hold: int = 1) -> Vector:
     """A pattern of 0 and 1 as ∓amplitude, each held for `hold` samples, repeated until there are N.
 
     Raises:

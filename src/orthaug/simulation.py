@@ -7,10 +7,11 @@ exact. Where θ has bounds, it is the unknown itself and `c = θ − Φ⁺F(w)` 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from orthaug._arrays import Matrix, Vector
 from orthaug._jax import jnp
@@ -27,6 +28,9 @@ from orthaug.solvers.output_error import Outcome, independent_share, minimise
 from orthaug.structures import Elimination, Orthogonal, Structure, eliminate
 from orthaug.training import FreeStatistics, Learned, Task
 
+_RUNAWAY = 1e6  # mean square in deviations of the output: a free run beyond it has diverged
+_SHORTEST = 4  # steps of a segment
+
 
 @dataclass(frozen=True, eq=False)
 class FreeRun:
@@ -36,6 +40,8 @@ class FreeRun:
     task: Task | None
     form: Form
     segments: Segments
+    whole: Segments
+    """The whole experiments, over which runs are compared."""
     rms: float
     criterion: Simulation
 
@@ -46,21 +52,19 @@ class FreeRun:
         segments = lay_segments(problem.record, form, criterion.segment, criterion.washout)
         residual = problem.projection.orthogonal_part(problem.whitened_target)
         rms = task.rms if task is not None else max(float(np.sqrt(np.mean(residual**2))), 1e-10)
-        return cls(problem, task, form, segments, rms, criterion)
+        whole = segments if not criterion.segment else lay_segments(problem.record, form, 0, criterion.washout)
+        return cls(problem, task, form, segments, whole, rms, criterion)
 
     def numbers(self, c: Vector, w: Any) -> Numbers:
         """The model's numbers before the split."""
         return Numbers(c, np.zeros_like(c), np.asarray(w), self.scaling.centre, self.scaling.halfwidth, self.unit)
 
-    def errors(self, c: Vector, w: Any, past: Any) -> list[Matrix]:
-        """Scored errors of every segment from its past, (steps, ny) in the outputs' units."""
-        run = np.asarray(respond(self.form, self.numbers(c, w), self.segments, jnp.asarray(past)))
+    def errors(self, c: Vector, w: Any, past: Any, segments: Segments | None = None) -> Float[np.ndarray, "k T ny m"]:
+        """Errors of every segment from its past, in the outputs' units; 0 where they are not scored."""
+        segments = self.segments if segments is None else segments
+        run = np.asarray(respond(self.form, self.numbers(c, w), segments, jnp.asarray(past)))
         with np.errstate(all="ignore"):
-            error = np.asarray(self.segments.target) - run
-        scored = np.asarray(self.segments.scored)
-        chunks, _, _, width = error.shape
-        each = (error[i, scored[i, :, j], :, j] for i in range(chunks) for j in range(width))
-        return [piece for piece in each if len(piece)]
+            return np.where(np.asarray(segments.scored)[:, :, None], np.asarray(segments.target) - run, 0.0)
 
     def run(
         self,
@@ -85,21 +89,36 @@ class FreeRun:
             begun, seconds = first.iterations, first.seconds
             places.append(objective.start(np.asarray(first.w), first))
             ridge = first.ridge
-        losses = np.array([objective.loss(p) for p in places])
-        best = int(np.argmin(np.where(np.isfinite(losses), losses, np.inf)))
+        losses = [objective.loss(p) for p in places]
+        if not np.isfinite(losses).any() and self.segments.scored.shape[1] > _SHORTEST:
+            shorter = self._shorter().run(solver, w, structure, regularization, progress)
+            places, losses = [shorter.found.p], [objective.loss(shorter.found.p)]
+            begun, seconds = shorter.iterations, shorter.seconds
 
         def tell(iteration: int, loss: float) -> None:
             if progress is not None:
-                progress(begun + iteration, loss)
+                progress(begun + iteration, loss * self.rms**2 / (self.segments.count * len(self.form.outputs)))
 
-        found = objective.minimise(places[best], solver, ridge, evidence, tell)
-        theta, c, w = objective.place(found.p)
-        square, iterations, seconds = objective.mean_square(), begun + found.iterations, seconds + found.seconds
-        return Flight(w, theta, c, objective, found, found.code, square, iterations, seconds)
+        found = objective.minimise(places[int(np.argmin(losses))], solver, ridge, evidence, tell)
+        _, c, w = objective.place(found.p)
+        iterations, seconds = begun + found.iterations, seconds + found.seconds
+        return Flight(w, c, objective, found, found.code, self._mean_square(c, w), iterations, seconds)
+
+    def _shorter(self) -> FreeRun:
+        """The same over segments of a quarter of the length, from which training reaches where longer ones run away."""
+        segment = max(_SHORTEST, self.segments.scored.shape[1] // 4)
+        shorter = replace(self.criterion, segment=segment, washout=min(self.criterion.washout, segment // 2))
+        return FreeRun.of(self.problem, self.task, shorter)
 
     def loss(self, flight: Flight) -> float:
-        """Mean of squared errors with each output in its standard deviation."""
+        """Mean of squared errors over whole experiments, in deviations of the outputs; NaN where it diverges."""
         return flight.mean_square
+
+    def _mean_square(self, c: Vector, w: Vector) -> float:
+        with np.errstate(all="ignore"):
+            errors = self.errors(c, w, self.whole.past, self.whole) * self.problem.weight[:, None]
+            found = float(np.sum(errors**2)) / (self.whole.count * len(self.form.outputs))
+        return found if found < _RUNAWAY else np.nan
 
     def learned(self, flight: Flight) -> Learned:
         """What a run left, with the statistics of its errors."""
@@ -115,7 +134,7 @@ class FreeRun:
             iterations=flight.iterations,
             seconds=flight.seconds,
             coefficients=flight.c,
-            free=flight.objective.statistics(flight.found),
+            free=flight.objective.statistics(flight),
         )
 
     @property
@@ -127,11 +146,12 @@ class FreeRun:
         return np.zeros(len(self.problem.outputs)) if self.task is None else self.task.unit
 
 
+
+
 class Flight(NamedTuple):
     """A finished run on the free-run criterion."""
 
     w: Vector
-    theta: Vector
     c: Vector
     objective: Objective
     found: Outcome
@@ -153,8 +173,8 @@ class Objective:
     orthogonal: bool
     weight: Matrix
     pasts: Pasts
-    errors: list[Matrix] = field(default_factory=list)
-    """Of the last `loss`."""
+    errors: Any = None
+    """Of the last `loss`, (k, T, ny, m)."""
     _flown: tuple[float, Any] = (np.inf, None)
     """Loss and pasts of the last `loss`."""
     _anchor: tuple[float, Vector] | None = None
@@ -164,8 +184,9 @@ class Objective:
     def of(cls, free_run: FreeRun, structure: Structure) -> Objective:
         weight = np.diag(free_run.problem.weight) / free_run.rms
         past = np.asarray(free_run.segments.past)
+        free = past.size > 0 and free_run.criterion.estimates_pasts
         elimination = eliminate(structure, free_run.problem)
-        return cls(free_run, elimination, isinstance(structure, Orthogonal), weight, Pasts(past, past))
+        return cls(free_run, elimination, isinstance(structure, Orthogonal), weight, Pasts(past, past, free))
 
     @property
     def follows(self) -> bool:
@@ -197,15 +218,15 @@ class Objective:
         """
         theta, c, w = self.place(p)
         tried = [self.pasts.values]
-        if self._anchor is not None and self.pasts.values.size:
+        if self._anchor is not None and self.pasts.free:
             tried.insert(0, self.pasts.after(np.concatenate([c, w]) - self._anchor[1]))
         flights = []
         for past in tried:
             errors = self.free_run.errors(c, w, past)
             with np.errstate(all="ignore"):
-                total = sum(float(np.sum((error @ self.weight.T) ** 2)) for error in errors)
-            total += self.pasts.loss(past, self.weight)
-            flights.append((total if np.isfinite(total) else np.inf, past, errors))
+                total = float(np.sum(np.einsum("oi,ktim->ktom", self.weight, errors) ** 2))
+                total += self.pasts.loss(past, self.weight)
+            flights.append((total if total < self._largest else np.inf, past, errors))
             if self._anchor is None or total < self._anchor[0]:
                 break
         best, past, self.errors = min(flights, key=lambda flight: flight[0])
@@ -234,9 +255,16 @@ class Objective:
 
     def samples(self) -> tuple[float, float]:
         """Number of residuals less the physics' own parameters, and the share of them that is independent."""
-        ny = len(self.free_run.problem.outputs)
-        shares = [independent_share([e[:, i] for e in self.errors]) for i in range(ny)]
-        return self._count * ny - len(self.free_run.problem.baseline.names), float(np.mean(shares))
+        nt, ny = len(self.free_run.problem.baseline.names), len(self.weight)
+        moved = np.moveaxis(self.errors, 1, -1).swapaxes(1, 2)  # (k, m, ny, T)
+        shares = [independent_share(moved[:, :, i].reshape(-1, moved.shape[-1])) for i in range(ny)]
+        return self.free_run.segments.count * ny - nt, float(np.mean(shares))
+
+    @property
+    def _largest(self) -> float:
+        """A loss beyond which a free run has diverged."""
+        problem, count = self.free_run.problem, self.free_run.segments.count
+        return _RUNAWAY * count * float(np.sum((self.weight / problem.weight) ** 2))
 
     def minimise(self, p: Vector, solver: LevenbergMarquardt, ridge: float, evidence: bool, tell: Progress) -> Outcome:
         """From p to the end; several outputs are weighted by their errors' covariance in a second leg."""
@@ -273,21 +301,18 @@ class Objective:
         _, c, w = self.place(p)
         self.errors = self.free_run.errors(c, w, self.pasts.values)
 
-    def mean_square(self) -> float:
-        """Mean of the squared errors of the last `loss`, each output in its standard deviation."""
-        return float(np.mean(np.concatenate(self.errors) ** 2 * self.free_run.problem.weight**2))
-
     def gram(self, found: Outcome) -> Matrix:
         """Gram matrix of the sensitivities ∂ŷ/∂(c, w) in whitened outputs, (nθ + nw)²."""
         _, c, w = self.place(found.p)
         weight = np.diag(self.free_run.problem.weight)
         return self.pasts.eliminate(self._sensitivity(c, w, weight), weight)[0]
 
-    def statistics(self, found: Outcome) -> FreeStatistics:
-        """Noise covariance of the free run, Cov θ̂ from its sensitivities, and the mean square of its errors."""
+    def statistics(self, flight: Flight) -> FreeStatistics:
+        """Noise covariance of the free run and Cov θ̂ from its sensitivities."""
+        found = flight.found
         theta, c, w = self.place(found.p)
         nt = len(theta)
-        freedom = self._count - (nt + found.effective) / len(self.weight)
+        freedom = self.free_run.segments.count - (nt + found.effective) / len(self.weight)
         noise = self._noise(found)
         sides = (self.elimination.lower, self.elimination.upper)
         at_bound = {i: float(value) for i, value in enumerate(theta) if value in (sides[0][i], sides[1][i])}
@@ -300,17 +325,13 @@ class Objective:
             white = self.weight @ noise @ self.weight.T
             scale = float(np.trace(white)) / len(white)
             covariance = theta_block(information, found.ridge, nt, tuple(at_bound)) * scale
-        return FreeStatistics(noise, covariance, freedom, self.mean_square(), at_bound)
-
-    @property
-    def _count(self) -> int:
-        return sum(len(error) for error in self.errors)
+        return FreeStatistics(noise, covariance, freedom, flight.mean_square, at_bound)
 
     def _noise(self, found: Outcome) -> Matrix | None:
-        errors = np.concatenate(self.errors)
-        ny = errors.shape[1]
+        ny, count = len(self.weight), self.free_run.segments.count
         used = (len(self.free_run.problem.baseline.names) + found.effective) / ny
-        return noise_covariance(errors, np.full(ny, len(errors) - used))
+        errors = np.moveaxis(self.errors, 2, -1).reshape(-1, ny)
+        return noise_covariance(errors, np.full(ny, count - used)) if np.isfinite(errors).all() else None
 
     def _linearise(self, c: Vector, w: Vector) -> tuple[Matrix, Vector]:
         return self.pasts.eliminate(self._sensitivity(c, w, self.weight), self.weight)

@@ -59,6 +59,7 @@ class Data(Section):
     time: Annotated[str, Field(min_length=1)] | None = None
     inputs: list[str] = []
     outputs: Annotated[list[str], Field(min_length=1)]
+    missing: Literal["error", "skip"] = "error"
     train: Part
     validation: Part | None = None
     tests: dict[str, Part] = {}
@@ -139,8 +140,10 @@ class TrainingSection(Section):
     lbfgs_iterations: Count = 1000
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1e-3
     focus: Literal["prediction", "simulation"] = "prediction"
+    horizon: Positive = 1
     segment: Count = 512
     washout: Count = 40
+    start_iterations: Count = 20
     restarts: Positive = 1
     seed: Annotated[int, Field(ge=0, lt=2**63, strict=True)] = 0
     regularization: Regularization | Annotated[list[Regularization], Field(min_length=1)] | None = None
@@ -169,6 +172,17 @@ class Spec(Section):
             raise ValueError(
                 f"`training.seed`: found {self.training.seed}; expected seeds below 2**63 for all restarts"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _free_run_scores_something(self) -> Spec:
+        training = self.training
+        if training.focus == "simulation" and 0 < training.segment <= training.washout:
+            raise ValueError(
+                f"`training.washout`: found {training.washout}; expected less than the segment, {training.segment}"
+            )
+        if (training.focus == "simulation" or training.horizon > 1) and training.solver == "adam-lbfgs":
+            raise ValueError("`training.solver` = adam-lbfgs trains one step ahead; expected levenberg-marquardt here")
         return self
 
     @model_validator(mode="after")
@@ -234,11 +248,10 @@ def load_spec(path: Path) -> Spec:
 
 def _refuse_unbuilt(spec: Spec) -> None:
     """Parts of the contract that this version does not build yet."""
-    measure, focus = spec.structure.measure.kind, spec.training.focus
+    measure = spec.structure.measure.kind
     unbuilt = {
         "[physics]": spec.physics is not None,
         f'structure.measure.kind = "{measure}"': spec.structure.kind == "orthogonal" and measure != "training",
-        f'training.focus = "{focus}"': focus != "prediction",
     }
     for what, used in unbuilt.items():
         if used:

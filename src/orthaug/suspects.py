@@ -136,11 +136,10 @@ class Suspect:
         if width is not None and not _KINDS[kind].width:
             raise InputError(f"a suspect of kind {kind} takes no `width`; got {width!r}.")
         w = "" if width is None else repr(check_number(width, "width", positive=True))
+        text = _KINDS[kind].text(on or "", w)
         arguments = ", ".join(part for part in (on, w) if part)
-        label = on if kind == "expression" else f"{kind}({arguments})" if arguments else kind
-        return cls(
-            label if name is None else name, _KINDS[kind].text(on or "", w), output, coefficient, constants or ()
-        )  # type: ignore[arg-type]
+        label = text if kind == "expression" else f"{kind}({arguments})" if arguments else kind
+        return cls(label if name is None else name, text, output, coefficient, constants or ())
 
     @property
     def parsed(self) -> Expression:

@@ -107,11 +107,16 @@ class Task:
         stands at a bound is held there, and training goes on until the same entries stand there.
         """
         structure = Orthogonal() if structure is None else structure
+
+        def tell(iteration: int, loss: float) -> None:
+            if progress is not None:
+                progress(iteration, self.mean_square(loss))
+
         elimination = eliminate(structure, self.problem)
         fixed: Fixed = {}
         seconds = iterations = 0
         for _ in range(_ACTIVE_SETS):
-            run = self._run_held(solver, w, structure, elimination, fixed, regularization, progress)
+            run = self._run_held(solver, w, structure, elimination, fixed, regularization, tell)
             seconds, iterations = seconds + run.seconds, iterations + run.iterations
             found = {} if isinstance(structure, Orthogonal) else elimination.active(self.coordinates(run))
             if found == fixed or run.code == NON_FINITE:

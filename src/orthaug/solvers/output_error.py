@@ -165,21 +165,21 @@ def _evidence(objective: Objective, p: Vector, hessian: Matrix, loss: float, rid
     return float(np.clip(effective * variance / (share * max(size, 1e-300)), 1e-12, 1e12))
 
 
-def independent_share(residuals: list[Vector]) -> float:
+def independent_share(residuals: Matrix) -> float:
     """1 / (1 + 2 Σ ρ_i), the inverse autocorrelation time, summed up to the first correlation that is noise.
 
     Args:
-        residuals: one stretch (T,) or several; lags never reach across them.
+        residuals: stretches (s, T), 0 where there is no residual; lags never reach from one into the next.
     """
-    longest = max((len(r) for r in residuals), default=0)
+    longest = residuals.shape[1]
     if longest < 3:
         return 1.0
     size = 1 << (2 * longest - 1).bit_length()
-    spectrum = sum(np.abs(np.fft.rfft(residual, size)) ** 2 for residual in residuals)
+    spectrum = np.sum(np.abs(np.fft.rfft(residuals, size, axis=1)) ** 2, axis=0)
     covariance = np.fft.irfft(spectrum, size)[:longest]
     if not covariance[0] > 0:
         return 1.0
     rho = covariance[1:] / covariance[0]
-    noise = max(_NO_CORRELATION, 2 / np.sqrt(sum(len(r) for r in residuals)))
+    noise = max(_NO_CORRELATION, 2 / np.sqrt(np.count_nonzero(residuals)))
     end = int(np.argmax(np.append(rho < noise, True)))
     return float(1 / (1 + 2 * np.sum(rho[:end])))
