@@ -18,8 +18,9 @@ from orthaug import __version__
 from orthaug.errors import InputError, TrainingError
 
 if TYPE_CHECKING:
-    from orthaug.jobs import Fitted, Progress
+    from orthaug.jobs import Progress
     from orthaug.model import Response
+    from orthaug.outcome import Fitted
 
 
 class Interrupted(Exception):
@@ -96,7 +97,7 @@ def _options(
 @app.command()
 def demo(out: OutFolder = None) -> None:
     """Fit the paper's example and compare with the truth."""
-    from orthaug.jobs import check_output
+    from orthaug.outcome import check_output
 
     folder = out or Path("orthaug-out/demo")
     check_output(folder)
@@ -112,11 +113,11 @@ def demo(out: OutFolder = None) -> None:
 @app.command()
 def check(spec: SpecPath, as_json: AsJson = False) -> None:
     """Report excitation and identifiability; trains nothing."""
-    from orthaug import jobs
+    from orthaug import jobs, outcome
     from orthaug.excitation import require_rank
 
     job = jobs.open_job(spec, require_full_rank=False)
-    report = jobs.plain(jobs.check_report(job))
+    report = outcome.plain(outcome.check_report(job))
     typer.echo(_json(report) if as_json else _check_text(report))
     try:
         require_rank(job.problem.excitation, job.problem.rows.y.size)
@@ -127,16 +128,16 @@ def check(spec: SpecPath, as_json: AsJson = False) -> None:
 @app.command()
 def fit(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False) -> None:
     """Fit a spec, print a summary and write the result folder."""
-    from orthaug import jobs
+    from orthaug import jobs, outcome
 
     folder = out or Path("orthaug-out") / spec.stem
-    jobs.check_output(folder)
+    outcome.check_output(folder)
     job = jobs.open_job(spec)
-    jobs.check_inputs_kept(job, folder)
+    outcome.check_inputs_kept(job, folder)
     _prepare_jax()
     with _progress(job.run_count, job.iterations, job.spec.learner.kind != "none") as progress:
-        fitted = jobs.fit_job(job, progress)
-    jobs.write_result(fitted, folder)
+        fitted = outcome.fit_job(job, progress)
+    outcome.write_result(fitted, folder)
     if as_json:
         typer.echo(_json(fitted.result))
     else:
@@ -157,12 +158,12 @@ def compare(
     as_json: AsJson = False,
 ) -> None:
     """Physics alone and every structure, one table."""
-    from orthaug import jobs
+    from orthaug import jobs, outcome
 
     folder = out or Path("orthaug-out") / spec.stem
-    jobs.check_output(folder)
+    outcome.check_output(folder)
     job = jobs.open_job(spec)
-    jobs.check_inputs_kept(job, folder)
+    outcome.check_inputs_kept(job, folder)
     _prepare_jax()
     from orthaug import compare as comparing
 

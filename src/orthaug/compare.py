@@ -13,9 +13,22 @@ import numpy as np
 from orthaug import __version__, plots, storage
 from orthaug.errors import InputError
 from orthaug.folders import whole_folder
-from orthaug.jobs import SCHEMA, Fitted, Job, Progress, data_of, fit_job, is_result, plain, score_part, structure_of
+from orthaug.jobs import Job, Progress, structure_of
 from orthaug.model import Model
+from orthaug.outcome import (
+    DEFAULT_BLOCKS,
+    SCHEMA,
+    Fitted,
+    cross_validated,
+    data_of,
+    fit_job,
+    is_result,
+    judge_fit,
+    plain,
+    score_part,
+)
 from orthaug.record import same_step
+from orthaug.validation import Verdict, dominance
 
 ALONE = "physics alone"
 KINDS = (ALONE, "additive", "orthogonal", "orthogonal-penalty", "baseline-penalty")
@@ -47,8 +60,10 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress | None = No
         except InputError as error:
             left_out[kind] = str(error)
             continue
-        fitted[kind] = fit_job(job, _offset(progress, number, job), kind=kind, alone=kind == ALONE)
-    rows = [_row(kind, one) for kind, one in fitted.items()]
+        told = _offset(progress, number, job)
+        fitted[kind] = fit_job(job, told, kind=kind, alone=kind == ALONE, judged=False)
+    verdicts = _verdicts(job, fitted)
+    rows = [_row(kind, one, verdicts.get(kind)) for kind, one in fitted.items()]
     rows += [_saved_row(name, model, job) for name, model in models.items()]
     chosen = _chosen(rows) if job.validation else None
     result = {
@@ -62,6 +77,18 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress | None = No
         "warnings": list(job.warnings),
     }
     return Comparison(job, fitted, plain(result))
+
+
+def _verdicts(job: Job, fitted: dict[str, Fitted]) -> dict[str, Verdict]:
+    """Whether the learner earns its place in each structure, by blocked cross-validation and the held-out parts."""
+    alone = fitted[ALONE].fit
+    kinds = [kind for kind, one in fitted.items() if kind != ALONE and one.fit.status.ok]
+    if not kinds or not alone.status.ok:
+        return {}
+    blocks = DEFAULT_BLOCKS if job.spec.validation.blocks is None else job.spec.validation.blocks
+    trials = cross_validated(job, blocks, kinds) if blocks else {kind: [] for kind in kinds}
+    found = {kind: judge_fit(job, fitted[kind].fit, trials[kind], alone.model) for kind in kinds}
+    return {kind: verdict for kind, verdict in found.items() if verdict is not None}
 
 
 def write(found: Comparison, folder: Path) -> None:
@@ -82,7 +109,7 @@ def text(found: Comparison) -> str:
     """Two tables: parameters with standard errors, and scores on every part."""
     rows = found.result["comparison"]
     names = [parameter["name"] for parameter in rows[0]["parameters"]]
-    first = [["structure", *names, "‖QᵀF̃‖/‖F‖", "weights", "time [s]"]]
+    first = [["structure", *names, "‖QᵀF̃‖/‖F‖", "‖F̃‖/‖Φθ̂‖", "weights", "time [s]"]]
     for row in rows:
         defect = row["orthogonality_defect"]
         first.append(
@@ -90,6 +117,7 @@ def text(found: Comparison) -> str:
                 row["name"] + (" *" if row["name"] == found.result["chosen"] else ""),
                 *(_value(parameter) for parameter in row["parameters"]),
                 "–" if defect is None else f"{defect:.1e}",
+                "–" if row["learner_to_physics"] is None else f"{row['learner_to_physics']:.2g}",
                 str(row["weights"]),
                 "–" if row["seconds"] is None else f"{row['seconds']:.2f}",
             ]
@@ -102,9 +130,15 @@ def text(found: Comparison) -> str:
     lines = [*_table(first), "", *_table(second)]
     if found.result["chosen"]:
         lines += ["", "* lowest one-step error on the validation part"]
+    for key in ("residuals", "validation"):
+        told = [f"{row['name']}: {row[key]['text']}" for row in rows if row[key] is not None]
+        lines += ["", *told] if told else []
+    lines.append("")
     lines += [f"left out: {kind}: {why}" for kind, why in found.result["left_out"].items()]
-    lines += [f"warning: {row['name']}: {text}" for row in rows for text in row["warnings"]]
-    return "\n".join(lines)
+    common = found.result["warnings"]
+    lines += [f"warning: {text}" for text in common]
+    lines += [f"warning: {row['name']}: {text}" for row in rows for text in row["warnings"] if text not in common]
+    return "\n".join(lines).rstrip()
 
 
 def _matching(path: Path, job: Job) -> Model:
@@ -133,12 +167,15 @@ def _offset(progress: Progress | None, number: int, job: Job) -> Progress | None
     return lambda run, iteration, loss: progress(number * runs + run, iteration, loss)
 
 
-def _row(kind: str, one: Fitted) -> dict[str, Any]:
-    keys = ("parameters", "orthogonality_defect", "scores", "warnings")
+def _row(kind: str, one: Fitted, verdict: Verdict | None) -> dict[str, Any]:
+    keys = ("parameters", "orthogonality_defect", "scores", "residuals", "warnings")
     status = one.result["status"]
     weights = one.fit.model.form.bound.size if one.fit.model.form.bound else 0
     kept = {key: one.result[key] for key in keys}
-    return {"name": kind, "status": status["code"], "seconds": status["seconds"], "weights": weights, **kept}
+    return {"name": kind, "status": status["code"], "seconds": status["seconds"], "weights": weights, **kept} | {
+        "learner_to_physics": dominance(one.fit) if one.fit.status.ok else None,
+        "validation": None if verdict is None else verdict.as_dict(),
+    }
 
 
 def _saved_row(name: str, model: Model, job: Job) -> dict[str, Any]:
@@ -153,6 +190,9 @@ def _saved_row(name: str, model: Model, job: Job) -> dict[str, Any]:
             for p, value in zip(model.form.baseline.parameters, model.theta, strict=True)
         ],
         "orthogonality_defect": None,
+        "learner_to_physics": None,
+        "residuals": None,
+        "validation": None,
         "scores": {part.name: score_part(model, part, warnings)[0] for part in job.parts},
         "warnings": warnings,
     }

@@ -59,6 +59,8 @@ def theta_block(information: Matrix, ridge: float, nt: int, fixed: Collection[in
     """
     free = [i for i in range(nt) if i not in fixed]
     covariance = np.full((nt, nt), np.nan)
+    if not np.isfinite(information).all():
+        return covariance
     size = np.sqrt(np.maximum(np.diag(information), 0.0))
     unit = 1 / np.where(size > 1e-150, size, 1.0)
     scaled = information * np.outer(unit, unit)

@@ -8,7 +8,8 @@ import numpy as np
 
 from orthaug.estimation import Progress, estimate
 from orthaug.folders import whole_folder
-from orthaug.jobs import Fitted, fill_result, fit_job, is_result, open_job
+from orthaug.jobs import open_job
+from orthaug.outcome import Fitted, fill_result, fit_job, is_result
 from orthaug.result import Estimate
 from orthaug.solvers import LevenbergMarquardt
 from orthaug.structures import Additive

@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import json
-import math
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from orthaug import __version__
 from orthaug.errors import InputError
-from orthaug.excitation import Excitation, identifiability
-from orthaug.folders import check_replaceable, whole_folder
 from orthaug.problem import Problem, check_defined, pose, regressor_of
 from orthaug.readers import read_record
 from orthaug.record import Record, check_channels, same_step
@@ -24,11 +17,10 @@ from orthaug.spec import Part, Spec, load_spec
 from orthaug.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty, Structure
 
 if TYPE_CHECKING:
-    from orthaug.model import Model, Response
     from orthaug.result import Estimate
 
-SCHEMA = 1
 Progress = Callable[[int, int, float], None]
+FOLD_ITERATIONS = 60  # enough to tell whether a learner helps, on every block of cross-validation
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,31 +182,18 @@ def _check_scorable(part: LoadedPart, start: int, sampling_time: float) -> None:
             )
 
 
-def check_report(job: Job) -> dict[str, Any]:
-    """What `orthaug check` tells: excitation on the data, identifiability of the physics; nothing is trained."""
-    problem = job.problem
-    found = identifiability(problem.baseline, problem.layout, problem.outputs, problem.rows.x)
-    return {
-        "schema": SCHEMA,
-        "orthaug": __version__,
-        "data": data_of(job),
-        "parameters": list(problem.baseline.names),
-        "regressor": [str(lag) for lag in problem.layout],
-        "rows": len(problem.rows),
-        "excitation": _excitation(problem.excitation) | {"collinear": [list(g) for g in problem.excitation.collinear]},
-        "identifiability": {
-            "identifiable": found.full_rank,
-            "rank": found.rank,
-            "columns": found.columns,
-            "inseparable": [list(group) for group in found.collinear],
-        },
-        "bias": None,
-        "warnings": list(job.warnings),
-    }
+def run_fit(
+    job: Job,
+    progress: Progress | None = None,
+    *,
+    kind: str | None = None,
+    alone: bool = False,
+    fold: Record | None = None,
+) -> Estimate:
+    """Train as the spec says; with another `kind` of structure, or the physics `alone`.
 
-
-def run_fit(job: Job, progress: Progress | None = None, *, kind: str | None = None, alone: bool = False) -> Estimate:
-    """Train as the spec says; with another `kind` of structure, or the physics `alone`."""
+    On a `fold` of cross-validation: that record, one start, few iterations, and nothing to choose from.
+    """
     from orthaug.criteria import Prediction, Simulation
     from orthaug.estimation import estimate
     from orthaug.learners import MLP
@@ -224,187 +203,26 @@ def run_fit(job: Job, progress: Progress | None = None, *, kind: str | None = No
     learner = None
     if spec.learner.kind == "mlp" and not alone:
         learner = MLP(tuple(spec.learner.hidden), spec.learner.activation, spec.learner_inputs())
+    criterion = Prediction(training.horizon)
+    if training.focus == "simulation":
+        criterion = Simulation(training.segment, training.washout, training.start_iterations)
     if training.solver == "adam-lbfgs":
         solver = AdamLBFGS(training.adam_iterations, training.lbfgs_iterations, training.learning_rate)
     else:
-        solver = LevenbergMarquardt(training.iterations)
+        solver = LevenbergMarquardt(training.iterations if fold is None else min(training.iterations, FOLD_ITERATIONS))
+    validated = job.validation is not None and fold is None
+    choices = training.regularizations(validated)
     return estimate(
-        job.train.record,
+        job.train.record if fold is None else fold,
         job.problem.baseline,
         lags=spec.lag_orders() if learner is not None else None,
         learner=learner,
         structure=Orthogonal() if alone else structure_of(spec, kind),
-        criterion=Simulation(training.segment, training.washout, training.start_iterations)
-        if training.focus == "simulation"
-        else Prediction(training.horizon),
+        criterion=criterion,
         solver=solver,
-        regularization=training.regularizations(job.validation is not None),
-        restarts=training.restarts,
+        regularization=choices if fold is None or not isinstance(choices, tuple) else choices[0],
+        restarts=training.restarts if fold is None else 1,
         seed=training.seed,
-        validation=job.validation.scored(job.problem.rows.start) if job.validation else None,
+        validation=job.validation.scored(job.problem.rows.start) if validated and job.validation else None,
         progress=progress,
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Fitted:
-    """A fit with its scores on every part, and the content of result.json."""
-
-    job: Job
-    fit: Estimate
-    result: dict[str, Any]
-    responses: tuple[Response, Response] | None
-    """One-step prediction and free run of the last part."""
-
-
-def fit_job(job: Job, progress: Progress | None = None, *, kind: str | None = None, alone: bool = False) -> Fitted:
-    """Train, score every part, and put the result together; the arguments as in `run_fit`."""
-    fit = run_fit(job, progress, kind=kind, alone=alone)
-    warnings = [*job.warnings, *fit.warnings]
-    scores, responses = {}, None
-    if fit.status.ok:
-        for part in job.parts:
-            scores[part.name], responses = score_part(fit.model, part, warnings)
-    spec = job.spec.model_dump(mode="json", exclude_unset=True)
-    status = fit.status
-    result = {
-        "schema": SCHEMA,
-        "orthaug": __version__,
-        "spec": spec,
-        "data": data_of(job),
-        "status": {
-            "code": status.code,
-            "message": status.message,
-            "iterations": status.iterations,
-            "seconds": status.seconds,
-            "loss": status.loss,
-        },
-        "restarts": [asdict(restart) for restart in fit.restarts],
-        "parameters": _parameters(fit),
-        "physical_parameters": None,
-        "structure": fit.model.structure,
-        "measure": job.spec.structure.measure.kind if fit.model.structure == "orthogonal" else None,
-        "orthogonality_defect": fit.defect,
-        "excitation": _excitation(fit.excitation),
-        "scores": scores,
-        "bias": None,
-        "residuals": None,
-        "validation": None,
-        "warnings": warnings,
-    }
-    return Fitted(job, fit, plain(result), responses)
-
-
-def is_result(folder: Path) -> bool:
-    """Whether a folder holds a result that orthaug wrote."""
-    try:
-        content = json.loads((folder / "result.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    return isinstance(content, dict) and "schema" in content and "orthaug" in content
-
-
-def check_output(folder: Path) -> None:
-    """Raise InputError early where the result could not be written."""
-    check_replaceable(folder, is_result)
-
-
-def check_inputs_kept(job: Job, folder: Path) -> None:
-    """Raise InputError where the result would take the place of a file that the job reads."""
-    files = [job.path, *(job.path.parent / entry["file"] for part in job.parts for entry in part.files)]
-    for file in files:
-        if file.resolve().is_relative_to(folder.resolve()):
-            raise InputError(f"{folder}: holds {file.name}, which this fit reads; give another folder.")
-
-
-def write_result(fitted: Fitted, folder: Path) -> None:
-    """result.json, model/ and figures/, whole or not at all; without a model where training failed."""
-    with whole_folder(folder, is_result) as partial:
-        fill_result(fitted, partial)
-
-
-def fill_result(fitted: Fitted, folder: Path) -> None:
-    """Write the files of a result into an existing folder."""
-    from orthaug import plots, storage
-
-    text = json.dumps(fitted.result, indent=1, ensure_ascii=False, allow_nan=False)
-    (folder / "result.json").write_text(text + "\n", encoding="utf-8")
-    if not fitted.fit.status.ok:
-        return
-    (folder / "model").mkdir()
-    storage.write(fitted.fit.model, folder / "model")
-    (folder / "figures").mkdir()
-    assert fitted.responses is not None
-    one_step, free = fitted.responses
-    where = f"{fitted.job.parts[-1].name}, {fitted.fit.model.structure}"
-    drawn = {
-        "prediction": plots.output_figure(one_step, f"one-step prediction, {where}"),
-        "simulation": plots.output_figure(free, f"free run, {where}"),
-        "residual": plots.residual_figure(one_step, f"one-step residual, {where}"),
-    }
-    if fitted.fit.model.form.bound is not None:
-        drawn["components"] = plots.components_figure(one_step, f"parts of the one-step prediction, {where}")
-    for name, figure in drawn.items():
-        plots.save(figure, folder / "figures" / f"{name}.png")
-
-
-def plain(value: Any) -> Any:
-    """The same with None for every number that is not finite: JSON has no NaN."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    return value
-
-
-def score_part(model: Model, part: LoadedPart, warnings: list[str]) -> tuple[dict[str, Any], tuple[Response, Response]]:
-    """Scores of a part and the responses they come from; what does not exist is None, with a sentence in `warnings`."""
-    responses = model.predict(part.record), model.simulate(part.record)
-    found = {}
-    for kind, response in zip(("prediction", "simulation"), responses, strict=True):
-        runaway = next((t.diverged for t in response.trajectories if t.diverged), None)
-        scored = response.scores(part.skips)
-        found[kind] = scored.as_dict()
-        if runaway is not None:
-            step, output = runaway
-            found[kind] = {"rmse": None, "nrmse": None, "fit": None}
-            warnings.append(
-                f"{part.name}: the free run diverged in output '{output}' at step {step}; no simulation scores."
-            )
-        elif np.isnan(scored.rmse).any():
-            warnings.append(f"{part.name}: the {kind} is not finite on some rows; no scores.")
-        elif np.isnan(scored.nrmse).any():
-            warnings.append(
-                f"{part.name}: an output is constant over the scored samples; no NRMSE and FIT of its {kind}."
-            )
-    return found, responses
-
-
-def data_of(job: Job) -> dict[str, Any]:
-    """The files of each part, as result.json lists them."""
-    return {
-        "train": list(job.train.files),
-        **({"validation": list(job.validation.files)} if job.validation else {}),
-        **({"tests": {part.name.removeprefix("tests."): list(part.files) for part in job.tests}} if job.tests else {}),
-    }
-
-
-def _excitation(found: Excitation) -> dict[str, Any]:
-    return {"rank": found.rank, "columns": found.columns, "condition": found.condition}
-
-
-def _parameters(fit: Estimate) -> list[dict[str, Any]]:
-    std, ci = fit.std, fit.interval
-    return [
-        {
-            "name": p.name,
-            "unit": p.unit,
-            "initial": p.initial,
-            "value": float(fit.theta[i]) if fit.status.ok else None,
-            "std": None if std is None else float(std[i]),
-            "ci95": None if ci is None or np.isnan(ci[i]).any() else [float(v) for v in ci[i]],
-        }
-        for i, p in enumerate(fit.problem.baseline.parameters)
-    ]

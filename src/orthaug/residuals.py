@@ -1,10 +1,10 @@
 """Residual analysis: is what a model leaves over white, independent of the inputs, and flat over the regressors?
 
-Ljung, System Identification (1999), sect. 16.6. Experiments are pooled: sums run over all of them, and no product of
-two samples reaches from one into the next. Where the residual is coloured, `e = H ε` with `H = 1/A` an autoregression,
-the tests for dependence are made on `A e` and on equally filtered regressors: `e = Z β + H ε` is `A e = (A Z) β + ε`,
-whose F-test keeps its level, also where Z holds past outputs. On large records every test rejects; the sizes of
-the effects stand beside the p-values for that reason. There is no verdict here.
+Ljung, System Identification (1999), sect. 16.6. Experiments are pooled, no product crosses their boundaries. Where the
+residual is coloured, `e = H ε` with `H = 1/A` an autoregression, dependence is tested by `A e` on equally filtered
+regressors: `e = Z β + H ε` is `A e = (A Z) β + ε`, whose F-test keeps its level, also where Z holds past outputs. What
+Z β adds to the colour costs some power, most with a sine. On large records every test rejects; the sizes of the effects
+stand beside the p-values for that reason. There is no verdict here.
 """
 
 from __future__ import annotations
@@ -190,8 +190,7 @@ def _one_output(
 def autocorrelation(segments: Segments, lags: int = 25) -> Vector | None:
     """r_e(τ) = Σ e_k e_{k−τ} / Σ e_k², e less its mean, for τ = 0…lags, (lags + 1,).
 
-    The mean is that of all experiments. Lags that no experiment is long enough for are cut; None for a signal that is
-    constant or not finite.
+    The mean is that of all experiments. Lags as long as the longest experiment are cut; None for a constant signal.
     """
     values = cross_correlation(segments, segments, lags)
     return None if values is None else values[len(values) // 2 :]
@@ -246,7 +245,8 @@ def normality(segments: Segments) -> Normality | None:
 def whitening(segments: Segments, largest: int = 25) -> Vector | None:
     """The coefficients (1, a_1, …, a_p) of `A(q) e_k = ε_k`, ε white: Burg's recursion over all experiments, p by AIC.
 
-    None for a signal that is constant or not finite. Burg's A is stable and, unlike that of Yule and Walker, hardly biased near the unit circle.
+    None for a signal that is constant or not finite. Burg's A is stable and, unlike that of Yule and Walker, hardly
+    biased near the unit circle.
     """
     forward = backward = _standardised(segments)
     if forward is None or backward is None:
@@ -342,8 +342,7 @@ def _standardised(segments: Segments) -> list[Vector] | None:
     size = np.abs(whole).max(initial=0.0)
     if not 0 < size < _LARGEST:
         return None
-    whole = whole / size  # so that no square underflows
-    whole = whole - whole.mean()
+    whole = whole / size - np.mean(whole / size)  # so that no square underflows
     norm = np.linalg.norm(whole)
     return None if norm <= _CONSTANT * np.sqrt(len(whole)) else _cut(whole / norm, parts)
 
@@ -360,19 +359,20 @@ def _spectral_product(a: Vector, u: list[Vector]) -> float:
     product = 0.0
     for one in u:
         size = 1 << max(2 * len(one), 2048).bit_length()  # zeros behind the record, so that it does not meet its start
-        gain = 1 / np.abs(np.fft.fft(a, size)) ** 2
+        gain = 1 / np.maximum(np.abs(np.fft.fft(a, size)), np.finfo(float).eps * np.abs(a).sum()) ** 2
         product += float(np.mean(np.abs(np.fft.fft(one, size)) ** 2 * gain) / np.mean(gain))
     return product
 
 
 def _lag_blocks(e: list[Vector], u: list[Vector], a: Vector, lags: int) -> Iterator[Matrix]:
-    """Rows of `(1, A u_k, …, A u_{k−lags}, A e_k)`; the input counts as at its mean before an experiment."""
+    """Rows of `(1, A u_k, …, A u_{k−lags}, A e_k)`; if rows are few also the first, with lags at the input's mean."""
+    known = lags if 2 * lags * len(e) < sum(map(len, e)) else 0  # a start from rest would excite all directions
     for one, other in zip(e, u, strict=True):
         if len(one) >= len(a):
             target = np.convolve(one, a, "valid")
             padded = np.concatenate([np.zeros(lags), np.convolve(other, a, "valid")])
             windows = np.lib.stride_tricks.sliding_window_view(padded, lags + 1)
-            for i in range(0, len(target), _ROWS):
+            for i in range(known, len(target), _ROWS):
                 part = target[i : i + _ROWS]
                 yield np.column_stack([np.ones(len(part)), windows[i : i + _ROWS], part])
 

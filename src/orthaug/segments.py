@@ -152,4 +152,5 @@ def _derivatives(form: Form, numbers: Numbers, past: Any, inputs: Any) -> tuple[
         to_c, to_leaves, to_past = pullback(seed)
         slopes.append(jnp.concatenate([to_c, *(jnp.ravel(leaf) for leaf in to_leaves)]))
         feedback.append(jnp.stack([to_past[lag - 1, output] for lag, output in form.fed_back] or [jnp.zeros(())]))
-    return value, jnp.stack(slopes), jnp.stack(feedback)
+    flat = (jnp.where(jnp.isfinite(d), d, 0.0) for d in (jnp.stack(slopes), jnp.stack(feedback)))
+    return value, *flat  # a kink without a derivative, such as sqrt(max(y, 0)) at 0, counts as flat

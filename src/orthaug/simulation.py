@@ -146,8 +146,6 @@ class FreeRun:
         return np.zeros(len(self.problem.outputs)) if self.task is None else self.task.unit
 
 
-
-
 class Flight(NamedTuple):
     """A finished run on the free-run criterion."""
 

@@ -155,6 +155,12 @@ class TrainingSection(Section):
         return tuple(self.regularization) if isinstance(self.regularization, list) else self.regularization
 
 
+class ValidationSection(Section):
+    """Blocked cross-validation of the learner; absent: 4 blocks in `compare`, and in `fit` where nothing is held out."""
+
+    blocks: Annotated[int, Field(ge=0, strict=True)] | None = None
+
+
 class Spec(Section):
     """A whole spec file; absent sections take their defaults."""
 
@@ -165,6 +171,7 @@ class Spec(Section):
     learner: LearnerSection = LearnerSection()
     structure: StructureSection = StructureSection()
     training: TrainingSection = TrainingSection()
+    validation: ValidationSection = ValidationSection()
 
     @model_validator(mode="after")
     def _seeds_fit(self) -> Spec:
@@ -183,6 +190,12 @@ class Spec(Section):
             )
         if (training.focus == "simulation" or training.horizon > 1) and training.solver == "adam-lbfgs":
             raise ValueError("`training.solver` = adam-lbfgs trains one step ahead; expected levenberg-marquardt here")
+        return self
+
+    @model_validator(mode="after")
+    def _blocks_are_several(self) -> Spec:
+        if self.validation.blocks == 1:
+            raise ValueError("`validation.blocks`: found 1; expected 2 or more, or 0 for no cross-validation")
         return self
 
     @model_validator(mode="after")

@@ -46,7 +46,7 @@ class Extrapolation:
     def __str__(self) -> str:
         low, high = self.training
         return (
-            f"{self.part} leaves the training range of {self.lag}, {low:.4g} to {high:.4g}: it goes from "
+            f"In {self.lag}, {self.part} leaves the training range of {low:.4g} to {high:.4g}: it goes from "
             f"{self.found[0]:.4g} to {self.found[1]:.4g}, outside on {100 * self.share:.2g} % of its rows"
         )
 
@@ -82,13 +82,18 @@ class Verdict:
 
 
 def free_run_error(model: Model, record: Record, skip: int | tuple[int, ...] = 0, unit: Any = None) -> float:
-    """RMS of the free run's error over all outputs, each in its `unit`, by default its own deviation; inf if it diverges."""
+    """RMS of the free run's error, each output in its `unit`, by default its own deviation; inf where it diverges."""
     response = model.simulate(record)
     if any(trajectory.diverged for trajectory in response.trajectories):
         return math.inf
     scores = response.scores(skip)
     relative = scores.nrmse if unit is None else scores.rmse / unit
     return float(np.sqrt(np.mean(relative**2))) if np.isfinite(relative).all() else math.inf
+
+
+def trial_on(where: str, record: Record, skip: tuple[int, ...], alone: Model, model: Model) -> Trial:
+    """Both models' free runs on a record that was not fitted."""
+    return Trial(where, free_run_error(alone, record, skip), free_run_error(model, record, skip))
 
 
 def blocked(record: Record, blocks: int, start: int) -> list[tuple[Record, Record]]:
@@ -177,21 +182,24 @@ def judge(trials: Sequence[Trial], extrapolation: Sequence[Extrapolation] = ()) 
     for where, group in groups:
         alone, model = (math.sqrt(sum(getattr(t, k) ** 2 for t in group) / len(group)) for k in ("alone", "model"))
         code = _compare(alone, model)
-        told = f"{where}: free-run NRMSE {_shown(model)} with the learner, {_shown(alone)} with physics alone"
+        told = f"free-run NRMSE {_shown(model)} with the learner, {_shown(alone)} with physics alone"
         if len(group) > 1:
-            told += f" ({sum(t.model < t.alone for t in group)} of {len(group)} blocks better)"
+            told = f"In {where} ({len(group)} blocks, {sum(t.model < t.alone for t in group)} of them better): {told}"
+        else:
+            told = f"On {where}: {told}"
         sentences.append(told)
         codes.append(code)
     worst = next(code for code in ("hurts", "no_help", "helps") if code in codes)
-    beyond = [e for e in extrapolation if e.part in {where for (where, _), c in zip(groups, codes, strict=True) if c == "hurts"}]
+    hurt = {where for (where, _), code in zip(groups, codes, strict=True) if code == "hurts"}
+    beyond = [e for e in extrapolation if e.part in hurt]
     opening = {
         "helps": "The learner helps",
         "no_help": "The learner does not help",
         "hurts": "The learner hurts in extrapolation" if beyond else "The learner hurts",
     }[worst]
     reasons = sentences if worst == "helps" else [s for s, c in zip(sentences, codes, strict=True) if c != "helps"]
-    text = ". ".join([f"{opening}. {reasons[0][0].upper()}{reasons[0][1:]}", *reasons[1:], *map(str, extrapolation)]) + "."
-    return Verdict(worst, text, tuple(trials), tuple(extrapolation))
+    text = ". ".join([opening, *reasons, *map(str, extrapolation)])
+    return Verdict(worst, f"{text}.", tuple(trials), tuple(extrapolation))
 
 
 def _compare(alone: float, model: float) -> str:
@@ -203,16 +211,16 @@ def _compare(alone: float, model: float) -> str:
 
 
 def extrapolation(part: str, record: Record, training: Record, layout: Layout) -> list[Extrapolation]:
-    """Entries of the regressor in which a record leaves the range of the training data."""
+    """Entries of the regressor in which a record leaves the range of the training data; one lag a channel."""
     inside, outside = stack_rows(training, layout).x, stack_rows(record, layout).x
-    found = []
+    found: dict[str, Extrapolation] = {}
     for j, lag in enumerate(layout):
         low, high = float(inside[:, j].min()), float(inside[:, j].max())
         beyond = (outside[:, j] < low) | (outside[:, j] > high)
-        if beyond.any():
+        if beyond.any() and lag.channel not in found:
             reach = (float(outside[:, j].min()), float(outside[:, j].max()))
-            found.append(Extrapolation(part, str(lag), (low, high), reach, float(beyond.mean())))
-    return found
+            found[lag.channel] = Extrapolation(part, str(lag), (low, high), reach, float(beyond.mean()))
+    return list(found.values())
 
 
 def dominance(fit: Estimate) -> float | None:

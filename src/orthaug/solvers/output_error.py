@@ -8,7 +8,7 @@ and a trial that is not finite is rejected like one that does not descend. The r
 from __future__ import annotations
 
 import time
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import scipy.linalg
@@ -22,6 +22,7 @@ _NO_CORRELATION = 0.05  # below it a correlation of the errors does not count
 _SMALLEST_CURVATURE = 1e-14  # of the largest: what a direction that does nothing is damped with
 
 
+@runtime_checkable
 class Objective(Protocol):
     """`‖r(p)‖²` of p = (θ, w), θ in front."""
 
@@ -80,6 +81,8 @@ def minimise(
     if not np.isfinite(loss):
         return Outcome(p, np.eye(len(p)), loss, ridge, 0.0, 0, NON_FINITE, time.perf_counter() - began)
     hessian, gradient = objective.normal(p)
+    if not np.isfinite(hessian).all():
+        return Outcome(p, np.eye(len(p)), loss, ridge, 0.0, 0, NON_FINITE, time.perf_counter() - began)
     if evidence:
         ridge = _evidence(objective, p, hessian, loss, ridge, physics)
     damping, growth, small, accepted, code, done = _FIRST_DAMPING, 2.0, 0, 0, RUNNING, 0
@@ -90,9 +93,10 @@ def minimise(
         done += 1
         before = loss + ridge * float(penalty @ p**2)
         after = trial + ridge * float(penalty @ (p + step) ** 2)
-        if np.isfinite(after) and after < before:
+        moved = objective.normal(p + step) if np.isfinite(after) and after < before else None
+        if moved is not None and np.isfinite(moved[0]).all():
             p, loss, accepted = p + step, trial, accepted + 1
-            hessian, gradient = objective.normal(p)
+            hessian, gradient = moved
             gain = (before - after) / expected if expected > 0 else 1.0
             damping, growth = damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), 2.0
             small = small + 1 if before - after < tolerance * before else 0
@@ -122,7 +126,8 @@ def _step(
     matrix = hessian[np.ix_(free, free)] * np.outer(unit, unit) + damping * np.eye(len(free))
     step = np.zeros(len(p))
     try:
-        step[free] = unit * scipy.linalg.solve(matrix, unit * downhill[free], assume_a="pos", check_finite=False)
+        factor = scipy.linalg.cho_factor(matrix, check_finite=False)
+        step[free] = unit * scipy.linalg.cho_solve(factor, unit * downhill[free], check_finite=False)
     except np.linalg.LinAlgError:  # curvature lost to rounding: more damping mends it
         return step, 0.0
     step = np.clip(p + step, lower, upper) - p
