@@ -43,6 +43,7 @@ LAYERS = (
     "covariance",
     "training",
     "simulation",
+    "ensemble",
     "parallel",
     "physics",
     "physical",

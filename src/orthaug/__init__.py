@@ -41,6 +41,7 @@ _HOME = {
     "Trajectory": "model",
     "scores": "metrics",
     "identifiability": "excitation",
+    "diagnose": "diagnosis",
     "load": "storage",
     "save": "storage",
     "synthetic": "",
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
     from orthaug.baseline import Term as Term
     from orthaug.criteria import Prediction as Prediction
     from orthaug.criteria import Simulation as Simulation
+    from orthaug.diagnosis import diagnose as diagnose
     from orthaug.errors import InputError as InputError
     from orthaug.errors import RankError as RankError
     from orthaug.errors import TrainingError as TrainingError

@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 
 from orthaug._arrays import Vector
+from orthaug.criteria import Simulation
 from orthaug.model import Response
+from orthaug.parallel import one_blas_thread
 from orthaug.problem import Problem
 from orthaug.regressors import stack_rows
 from orthaug.residuals import ResidualTest, analyse
@@ -24,6 +26,10 @@ _PRACTICALLY_WHITE = 0.05  # correlations below this are no matter, however sure
 _AS_GOOD = 1.05  # free-run error / one-step error up to which the measured lags add nothing
 _INSTRUMENT_STEPS = 5
 _TOO_FAST = 0.05  # noise variance / smallest variance among the lagged outputs
+
+_COLOURED = (
+    "standard errors of θ are those of a white residual, but the {what} is coloured: take them for a rough guide."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,13 +60,9 @@ class Diagnosis:
         }
 
 
-def diagnose(fit: Estimate, *, simulated: bool = False) -> Diagnosis:
-    """Analyse the residuals of a fit on its training record.
-
-    Args:
-        simulated: whether the fit was trained on the free run.
-    """
-    problem, model = fit.problem, fit.model
+def diagnose(fit: Estimate) -> Diagnosis:
+    """Analyse the residuals of a fit on its training record."""
+    problem, model, simulated = fit.problem, fit.model, isinstance(fit.criterion, Simulation)
     one_step = model.predict(problem.record)
     free_run = model.simulate(problem.record)
     tests = _tests(problem, one_step)
@@ -76,12 +78,16 @@ def diagnose(fit: Estimate, *, simulated: bool = False) -> Diagnosis:
     free_white = free_tests is not None and all(_is_white(test) for test in free_tests)
     verdict = ("white" if free_white else "equation_noise") if white else "sensor_noise" if sensor else "unmodelled"
     text, warnings = _words(verdict, fit, tests, ratio, noise, simulated)
+    if fit.std is not None and not warnings and not (free_white if simulated else white):
+        warnings = (_COLOURED.format(what="errors of the free run" if simulated else "one-step residual"),)
     return Diagnosis(verdict, text, tests, free_tests, ratio, noise, warnings)
 
 
 def _static(fit: Estimate, tests: tuple[ResidualTest, ...], white: bool) -> Diagnosis:
     verdict = "white" if white else "unmodelled"
     text, warnings = _words(verdict, fit, tests, None, None, False)
+    if fit.std is not None and not white:
+        warnings = (_COLOURED.format(what="one-step residual"),)
     return Diagnosis(verdict, text, tests, None, None, None, warnings)
 
 
@@ -102,7 +108,8 @@ def _tests(problem: Problem, response: Response) -> tuple[ResidualTest, ...]:
         alone = replace(record, experiments=(experiment,))
         regressors.append(stack_rows(alone, layout).x)
     names = ([c.name for c in record.outputs], [c.name for c in record.inputs], [str(lag) for lag in layout])
-    return analyse(residuals, inputs, regressors, *names, lags=LAGS)
+    with one_blas_thread():
+        return analyse(residuals, inputs, regressors, *names, lags=LAGS)
 
 
 def _errors(response: Response) -> Vector:
@@ -214,8 +221,7 @@ def _words(
         told += [f"{test.name} is curved over {name}" for name in test.curved_regressors]
     share = max((t.rms or 0.0) * w for t, w in zip(tests, fit.problem.weight, strict=True))
     text = (
-        f"The one-step residual, {100 * share:.2g} % of the output's deviation, is not white: {', '.join(told)}. Dynamics "
-        "or nonlinearity are missing, or the noise is coloured. Try more lags, other learner inputs or more neurons"
+        f"The one-step residual, {100 * share:.2g} % of the output's deviation, is not white: {', '.join(told)}. "
+        "Dynamics or nonlinearity are missing, or the noise is coloured. Try more lags, other learner inputs or neurons"
     )
-    warning = "standard errors take the residual for white, and it is not: they are too small or too large."
-    return f"{text}.", (warning,) if fit.std is not None and not simulated else ()
+    return f"{text}.", ()

@@ -15,6 +15,7 @@ from orthaug._jax import jax, jnp
 from orthaug.baseline import Baseline
 from orthaug.covariance import degrees_of_freedom, noise_covariance, theta_covariance
 from orthaug.criteria import Criterion, Prediction, Simulation
+from orthaug.ensemble import combine
 from orthaug.errors import InputError
 from orthaug.excitation import ILL_CONDITIONED
 from orthaug.learners import MLP, Bound, External, Learner
@@ -56,6 +57,7 @@ def estimate(
     regularization: Regularization | Sequence[Regularization] = "none",
     restarts: int = 1,
     seed: int = 0,
+    ensemble: bool = False,
     initial: Estimate | Model | None = None,
     validation: Record | None = None,
     progress: Progress | None = None,
@@ -79,6 +81,7 @@ def estimate(
         restarts: runs from initial weights of seeds `seed … seed + restarts - 1`, spread over the cores; the lowest
             training loss is kept, or with `validation` the lowest error there, one-step or of the free run as trained.
         seed: of the initial weights.
+        ensemble: the median of all restarts as one model, instead of the best one.
         initial: warm start from an earlier estimate or model: its learner, features, scaling and weights take
             the place of `learner`, `restarts` and `seed`.
         validation: a record that chooses between restarts and regularizations; it is never fitted.
@@ -99,6 +102,8 @@ def estimate(
     _check_arguments(record, baseline, lags, learner, structure, criterion, solver, initial, validation)
     flown = _free_run_of(criterion)
     choices = _regularizations(regularization, validation)
+    if ensemble and (restarts < 2 or initial is not None):
+        raise InputError("an ensemble needs `restarts` of 2 or more to be the median of.")
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
     if seed + restarts >= 2**63:
         raise InputError(f"`seed` must be below 2**63; got {seed}.")
@@ -117,7 +122,7 @@ def estimate(
     weights = {s: task.bound.init(jax.random.key(s)) for s in range(seed, seed + restarts)}
     starts = [_Start(s, w, choice) for choice in choices for s, w in weights.items()]
     place = FreeRun.of(problem, task, flown) if flown else task
-    return _train(place, starts, structure, solver, validation, progress)
+    return _train(place, starts, structure, solver, validation, progress, ensemble)
 
 
 def _free_run_of(criterion: Criterion) -> Simulation | None:
@@ -158,6 +163,8 @@ def _warm_start(
     """The task of going on from an earlier model's weights, in its scaling."""
     model = initial.model if isinstance(initial, Estimate) else initial
     bound, numbers = model.form.bound, model.numbers
+    if numbers.tilt is not None:
+        raise InputError("`initial` is an ensemble, which has no single weights to start from; fit anew.")
     if bound is None:
         raise InputError("`initial` is physics alone and has nothing to start from; leave it out.")
     problem = pose(record, baseline, lags, tuple(str(entry) for entry in model.form.features.entries))
@@ -183,6 +190,7 @@ def _train(
     solver: Solver,
     validation: Record | None,
     progress: Progress | None,
+    ensemble: bool = False,
 ) -> Estimate:
     """Run from every start and conclude with the best, by training loss or by the criterion's validation error."""
 
@@ -204,26 +212,36 @@ def _train(
         errors = [_validation_error(fit, validation, isinstance(task, FreeRun)) for fit in concluded.values()]
     ranking = np.array(losses if validation is None else errors)
     best = int(np.nanargmin(ranking)) if np.isfinite(ranking).any() else 0
-    fit = concluded[best] if validation is not None else _concluded(task, structure, runs[best])
+    if ensemble:
+        members = [i for i, run in enumerate(runs) if starts[i].regularization == starts[best].regularization]
+        fit = _concluded(task, structure, runs[best], [runs[i] for i in members])
+    else:
+        members = [best]
+        fit = concluded[best] if validation is not None else _concluded(task, structure, runs[best])
     restarts = tuple(
         Restart(
             seed=start.seed,
             loss=_finite(losses[i]),
             iterations=run.iterations,
             code=_CODES[run.code],
-            chosen=i == best,
+            chosen=i in members,
             regularization=start.regularization,
             validation=_finite(errors[i]),
         )
         for i, (start, run) in enumerate(zip(starts, runs, strict=True))
     )
     seconds = sum(run.seconds for run in runs)
-    return replace(fit, restarts=restarts, status=replace(fit.status, seconds=seconds))
+    criterion = task.criterion if isinstance(task, FreeRun) else Prediction()
+    return replace(fit, criterion=criterion, restarts=restarts, status=replace(fit.status, seconds=seconds))
 
 
-def _concluded(task: Task | FreeRun, structure: Structure, run: Any) -> Estimate:
-    """The estimate that a run leads to."""
+def _concluded(task: Task | FreeRun, structure: Structure, run: Any, members: Sequence[Any] = ()) -> Estimate:
+    """The estimate that a run leads to, or the median of several `members` with it as the best one."""
     learned = task.learned(run)
+    if members:
+        found = [learned if member is run else task.learned(member) for member in members]
+        found = [one for one in found if np.isfinite(one.values).all()]
+        learned = combine(task, found, found.index(learned)) if learned in found else learned
     code = _CODES[run.code] if np.isfinite(learned.values).all() else "non_finite"
     return _conclude(task.problem, structure, learned, Status(code, run.iterations, run.seconds, np.nan))
 
@@ -265,7 +283,7 @@ def _conclude(problem: Problem, structure: Structure, learned: Learned, status: 
     known = noise is not None and _unique(structure, learned) and not learned.elsewhere
     form = Form(problem.baseline, problem.features, problem.layout, problem.outputs, learned.bound)
     numbers = Numbers(
-        theta, theta_aux, learned.weights, learned.scaling.centre, learned.scaling.halfwidth, learned.unit
+        theta, theta_aux, learned.weights, learned.scaling.centre, learned.scaling.halfwidth, learned.unit, learned.tilt
     )
     record = problem.record
     return Estimate(

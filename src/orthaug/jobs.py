@@ -223,6 +223,7 @@ def run_fit(
         regularization=choices if fold is None or not isinstance(choices, tuple) else choices[0],
         restarts=training.restarts if fold is None else 1,
         seed=training.seed,
+        ensemble=training.ensemble and fold is None and learner is not None,
         validation=job.validation.scored(job.problem.rows.start) if validated and job.validation else None,
         progress=progress,
     )

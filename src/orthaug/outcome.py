@@ -81,7 +81,7 @@ def fit_job(
     if fit.status.ok:
         for part in job.parts:
             scores[part.name], responses = score_part(fit.model, part, warnings)
-        diagnosis = diagnose(fit, simulated=job.spec.training.focus == "simulation")
+        diagnosis = diagnose(fit)
         warnings += diagnosis.warnings
         if judged and not alone and fit.model.form.bound is not None:
             verdict = judge_fit(job, fit)
@@ -207,6 +207,12 @@ def fill_result(fitted: Fitted, folder: Path) -> None:
         "simulation": plots.output_figure(free, f"free run, {where}"),
         "residual": plots.residual_figure(one_step, f"one-step residual, {where}"),
     }
+    if fitted.diagnosis is not None:
+        analysed = {"one-step": fitted.diagnosis.one_step, "free-run": fitted.diagnosis.free_run}
+        for kind, tests in analysed.items():
+            if tests is not None:
+                title = f"{kind} residual on the training data, {fitted.fit.model.structure}"
+                drawn[f"residuals_{kind.replace('-', '_')}"] = plots.residual_analysis_figure(tests, title)
     if fitted.fit.model.form.bound is not None:
         drawn["components"] = plots.components_figure(one_step, f"parts of the one-step prediction, {where}")
     for name, figure in drawn.items():
@@ -261,13 +267,14 @@ def _excitation(found: Excitation) -> dict[str, Any]:
 
 
 def _parameters(fit: Estimate) -> list[dict[str, Any]]:
-    std, ci = fit.std, fit.interval
+    std, ci, one_step = fit.std, fit.interval, fit.one_step_theta
     return [
         {
             "name": p.name,
             "unit": p.unit,
             "initial": p.initial,
             "value": float(fit.theta[i]) if fit.status.ok else None,
+            **({} if one_step is None else {"one_step": float(one_step[i])}),
             "std": None if std is None else float(std[i]),
             "ci95": None if ci is None or np.isnan(ci[i]).any() else [float(v) for v in ci[i]],
         }

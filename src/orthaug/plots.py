@@ -10,9 +10,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from orthaug.model import Response
+from orthaug.residuals import ResidualTest
 
 # Okabe-Ito: told apart by every reader
 _BLACK, _GREY, _BLUE, _ORANGE, _GREEN = "#000000", "#B8B8B8", "#0072B2", "#E69F00", "#009E73"
+_CYCLE = (_BLUE, _ORANGE, _GREEN, _BLACK)
 _KINDS = ("prediction", "simulation")
 _WINDOW = 250  # samples of a long record that are shown, so that single swings can be seen
 _SIZE = (7.0, 2.4)  # inches per panel
@@ -71,6 +73,42 @@ def components_figure(response: Response, title: str) -> Figure:
             _legend(axis)
     axes[-1].set_xlabel("time [s]")
     figure.align_ylabels()
+    return figure
+
+
+def residual_analysis_figure(tests: Sequence[ResidualTest], title: str) -> Figure:
+    """Of each residual: autocorrelation, correlation with the inputs, means over its most telling regressor."""
+    figure = Figure(figsize=(_SIZE[0] * 1.3, 0.5 + 2.6 * len(tests)), layout="constrained")
+    axes = figure.subplots(len(tests), 3, squeeze=False)
+    figure.suptitle(f"{title}: 99 % bands", fontsize=10)
+    for row, test in zip(axes, tests, strict=True):
+        if test.acf is not None and test.acf_band is not None:
+            row[0].bar(np.arange(1, len(test.acf)), test.acf[1:], color=_BLUE, width=0.6)
+            row[0].axhspan(-test.acf_band, test.acf_band, color=_GREY, alpha=0.5)
+        row[0].set_ylabel(f"residual of {test.name}")
+        row[0].set_xlabel("lag")
+        row[0].set_title("autocorrelation", fontsize=9)
+        shown = [(name, cross) for name, cross in test.cross.items() if cross is not None]
+        for (name, cross), color in zip(shown, _CYCLE, strict=False):
+            reach = len(cross.values) // 2
+            row[1].plot(np.arange(-reach, reach + 1), cross.values, ".-", color=color, linewidth=0.8, label=name)
+        if shown:
+            band = max(cross.band for _, cross in shown)
+            row[1].axhspan(-band, band, color=_GREY, alpha=0.5)
+            row[1].legend(fontsize=8, frameon=False)
+        row[1].set_xlabel("lag behind the input")
+        row[1].set_title("correlation with the inputs", fontsize=9)
+        curved = {name: found for name, found in test.regressors.items() if found is not None}
+        if curved:
+            name = max(curved, key=lambda key: curved[key].share)
+            found = curved[name]
+            row[2].errorbar(found.centres, found.means, 2.576 * found.errors, fmt="o", color=_GREEN, markersize=3)
+            row[2].axhline(0.0, color=_BLACK, linewidth=0.6)
+            row[2].set_xlabel(name)
+            row[2].set_title(f"mean over {name}, {100 * found.share:.2g} % explained", fontsize=9)
+        for axis in row:
+            axis.grid(alpha=0.25)
+            axis.spines[["top", "right"]].set_visible(False)
     return figure
 
 

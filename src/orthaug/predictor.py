@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float
 
-from orthaug._jax import jnp
+from orthaug._jax import jax, jnp
 from orthaug.baseline import Baseline
 from orthaug.learners import Bound
 from orthaug.regressors import Features, Layout, largest_lag
@@ -58,6 +58,8 @@ class Numbers(NamedTuple):
     halfwidth: Float[AnyArray, "nz"]
     gain: Float[AnyArray, "ny"]
     """Unit of the learner's output, in the outputs' units."""
+    tilt: Any = None
+    """(members, nθ) where the learner is the median of several, one row of weights each: the physics each one adds."""
 
 
 class Parts(NamedTuple):
@@ -76,8 +78,16 @@ def parts(form: Form, numbers: Numbers, x: Float[Array, "nx"]) -> Parts:
         raw = jnp.zeros(len(form.outputs))
     else:
         z = (form.features.evaluate(x, form.layout, jnp) - numbers.centre) / numbers.halfwidth
-        raw = numbers.gain * form.bound.values(numbers.weights, z)
+        raw = _learned(form.bound, numbers, z, phi)
     return Parts(known + phi @ numbers.theta, raw - phi @ numbers.theta_aux, raw)
+
+
+def _learned(bound: Bound, numbers: Numbers, z: Any, phi: Any) -> Any:
+    """f (ny,) at scaled features z; of an ensemble the median of `f_i + φ tilt_i`."""
+    if numbers.tilt is None:
+        return numbers.gain * bound.values(numbers.weights, z)
+    each = jax.vmap(lambda w, tilt: numbers.gain * bound.values(w, z) + phi @ tilt)(numbers.weights, numbers.tilt)
+    return jnp.median(each, axis=0)
 
 
 def regressor(form: Form, past: Any, inputs: Any) -> Any:

@@ -12,6 +12,7 @@ import numpy as np
 
 from orthaug._arrays import Matrix, Vector
 from orthaug.covariance import interval
+from orthaug.criteria import Criterion, Prediction, Simulation
 from orthaug.excitation import Excitation
 from orthaug.model import Model
 from orthaug.problem import Problem
@@ -92,6 +93,7 @@ class Estimate:
     defect: float | None
     """‖QᵀF̃‖ / ‖F‖ over the training rows: how much of the learner the physics could express; None without one."""
     problem: Problem = field(repr=False)
+    criterion: Criterion = Prediction()  # noqa: RUF009  (frozen)
     at_bound: Mapping[str, float] = field(default_factory=dict)
     """Parameters that stand at a bound, with its value."""
     warnings: tuple[str, ...] = ()
@@ -100,6 +102,13 @@ class Estimate:
     def theta(self) -> Vector:
         """θ̂ (nθ,)."""
         return self.model.theta
+
+    @property
+    def one_step_theta(self) -> Vector | None:
+        """Φ⁺Y (nθ,), what one-step least squares gives, where θ was trained on something else; None otherwise."""
+        if not isinstance(self.criterion, Simulation):
+            return None
+        return self.problem.projection.solve(self.problem.whitened_target)
 
     @property
     def std(self) -> Vector | None:
@@ -163,6 +172,10 @@ def summary_lines(fit: Estimate) -> Sequence[str]:
         f"excitation  rank {fit.excitation.rank} of {fit.excitation.columns}"
         + (f", condition {condition:.3g}" if condition else "")
     )
+    one_step = fit.one_step_theta
+    if one_step is not None:
+        moved = ", ".join(f"{name} {value:.6g}" for name, value in zip(baseline.names, one_step, strict=True))
+        lines.append(f"one step    Φ⁺Y would give {moved}")
     width = max([9, *(len(name) for name in baseline.names)])
     lines += ["", f"{'parameter':<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  {'initial':>11}  unit"]
     std, ci = fit.std, fit.interval

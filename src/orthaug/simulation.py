@@ -55,14 +55,16 @@ class FreeRun:
         whole = segments if not criterion.segment else lay_segments(problem.record, form, 0, criterion.washout)
         return cls(problem, task, form, segments, whole, rms, criterion)
 
-    def numbers(self, c: Vector, w: Any) -> Numbers:
+    def numbers(self, c: Vector, w: Any, tilt: Any = None) -> Numbers:
         """The model's numbers before the split."""
-        return Numbers(c, np.zeros_like(c), np.asarray(w), self.scaling.centre, self.scaling.halfwidth, self.unit)
+        return Numbers(c, np.zeros_like(c), np.asarray(w), self.scaling.centre, self.scaling.halfwidth, self.unit, tilt)
 
-    def errors(self, c: Vector, w: Any, past: Any, segments: Segments | None = None) -> Float[np.ndarray, "k T ny m"]:
+    def errors(self, c: Vector, w: Any, past: Any) -> Float[np.ndarray, "k T ny m"]:
         """Errors of every segment from its past, in the outputs' units; 0 where they are not scored."""
-        segments = self.segments if segments is None else segments
-        run = np.asarray(respond(self.form, self.numbers(c, w), segments, jnp.asarray(past)))
+        return self._errors(self.numbers(c, w), past, self.segments)
+
+    def _errors(self, numbers: Numbers, past: Any, segments: Segments) -> Float[np.ndarray, "k T ny m"]:
+        run = np.asarray(respond(self.form, numbers, segments, jnp.asarray(past)))
         with np.errstate(all="ignore"):
             return np.where(np.asarray(segments.scored)[:, :, None], np.asarray(segments.target) - run, 0.0)
 
@@ -102,7 +104,7 @@ class FreeRun:
         found = objective.minimise(places[int(np.argmin(losses))], solver, ridge, evidence, tell)
         _, c, w = objective.place(found.p)
         iterations, seconds = begun + found.iterations, seconds + found.seconds
-        return Flight(w, c, objective, found, found.code, self._mean_square(c, w), iterations, seconds)
+        return Flight(w, c, objective, found, found.code, self.mean_square(c, w), iterations, seconds)
 
     def _shorter(self) -> FreeRun:
         """The same over segments of a quarter of the length, from which training reaches where longer ones run away."""
@@ -111,12 +113,14 @@ class FreeRun:
         return FreeRun.of(self.problem, self.task, shorter)
 
     def loss(self, flight: Flight) -> float:
-        """Mean of squared errors over whole experiments, in deviations of the outputs; NaN where it diverges."""
+        """The run's `mean_square`."""
         return flight.mean_square
 
-    def _mean_square(self, c: Vector, w: Vector) -> float:
+    def mean_square(self, c: Vector, w: Any, tilt: Any = None) -> float:
+        """Mean of squared errors over whole experiments, in deviations of the outputs; NaN where it diverges."""
+        numbers = self.numbers(c, w, tilt)
         with np.errstate(all="ignore"):
-            errors = self.errors(c, w, self.whole.past, self.whole) * self.problem.weight[:, None]
+            errors = self._errors(numbers, self.whole.past, self.whole) * self.problem.weight[:, None]
             found = float(np.sum(errors**2)) / (self.whole.count * len(self.form.outputs))
         return found if found < _RUNAWAY else np.nan
 

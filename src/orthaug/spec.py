@@ -145,6 +145,7 @@ class TrainingSection(Section):
     washout: Count = 40
     start_iterations: Count = 20
     restarts: Positive = 1
+    ensemble: bool = False
     seed: Annotated[int, Field(ge=0, lt=2**63, strict=True)] = 0
     regularization: Regularization | Annotated[list[Regularization], Field(min_length=1)] | None = None
 
@@ -156,7 +157,7 @@ class TrainingSection(Section):
 
 
 class ValidationSection(Section):
-    """Blocked cross-validation of the learner; absent: 4 blocks in `compare`, and in `fit` where nothing is held out."""
+    """Blocked cross-validation; absent: 4 blocks in `compare`, and in `fit` where no part is held out."""
 
     blocks: Annotated[int, Field(ge=0, strict=True)] | None = None
 
@@ -190,6 +191,12 @@ class Spec(Section):
             )
         if (training.focus == "simulation" or training.horizon > 1) and training.solver == "adam-lbfgs":
             raise ValueError("`training.solver` = adam-lbfgs trains one step ahead; expected levenberg-marquardt here")
+        return self
+
+    @model_validator(mode="after")
+    def _ensembles_have_members(self) -> Spec:
+        if self.training.ensemble and self.training.restarts < 2:
+            raise ValueError(f"`training.restarts`: found {self.training.restarts}; expected 2 or more for an ensemble")
         return self
 
     @model_validator(mode="after")

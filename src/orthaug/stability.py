@@ -1,11 +1,10 @@
 """Does a model's free run stay bounded and forget its start? Evidence from sampled points, never a proof.
 
 With `A_{k,i} = ∂g/∂y_{k−i}` (ny, ny) a small change of the past, `s_k = (δy_{k−1}, …, δy_{k−na})`, obeys
-`s_{k+1} = A_k s_k` in a free run, where the companion matrix A_k has the A_{k,i} in its first ny rows and shifts the
-rest. Two checks look at A_k: its spectral radius, step by step, and a quadratic norm in which all sampled A_k contract
-(Lohmiller and Slotine, Automatica 1998). A third runs the model on larger and larger inputs.
-
-The paper's `cond:pred_stab` is another matter: it asks for the one-step predictor, whose past is measured; `lipschitz`.
+`s_{k+1} = A_k s_k` in a free run; the companion matrix A_k has the A_{k,i} in its first ny rows and shifts the rest.
+Two checks look at A_k: its spectral radius at every step, and a quadratic norm in which all sampled A_k contract
+(Lohmiller and Slotine, Automatica 34, 1998). A third runs the model on larger and larger inputs. The paper's
+`cond:pred_stab` is another matter: it asks for the one-step predictor, whose past is measured; see `lipschitz`.
 """
 
 from __future__ import annotations
@@ -16,294 +15,222 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.linalg
-import scipy.optimize
 from jaxtyping import Array, Float, Int
 
-from orthaug._arrays import Matrix, Vector, check_choice, check_count, check_number
+from orthaug._arrays import Matrix, Vector, check_choice, check_count
 from orthaug._jax import jax, jnp
-from orthaug.errors import InputError
 from orthaug.learners import External
 from orthaug.model import Model
 from orthaug.predictor import Form, Numbers, parts
-from orthaug.record import Experiment, Record
-from orthaug.regressors import lag_matrix
+from orthaug.record import Record
 
 _BATCH = 1024  # rows per compiled call
-_STEPS = 20_000  # most rows that are looked at; longer trajectories are sampled evenly
-_SAMPLES = 2000  # most points of the contraction check
-_STEEPEST = 50  # points of largest spectral radius that are always among them
+_STEPS = 20_000  # most rows that are looked at; longer records are sampled evenly
+_SAMPLES, _STEEPEST = 2000, 50  # most points of the contraction check; those of largest radius always among them
 _WORK = 4e7  # most rows times (na ny)³
-_LONGEST_STATE = 200  # na ny beyond which no eigenvalues are computed
-_LARGEST_SEARCH = 12  # na ny beyond which the metric is Lyapunov's and not improved
-_ACTIVE = 64  # points that a round of the search adds, the worst ones
-_ROUNDS = 6
-_ABOVE_ONE = 1e-6  # a spectral radius beyond 1 by less is the rounding of a pole at 1
-_DIFFERENCE = 1e-3  # step of differences of an external learner, in standard deviations; bears single precision
-_LARGEST_FACTOR = 1e4  # the outputs of a stable linear model grow with the inputs; 10⁶ times the largest is "diverged"
-_CLOSE = 1.05  # the factor at which a run diverges is known up to this
-_SMALL_MARGIN = 1.5
-_MANY = 0.01
+_LONGEST_STATE, _LARGEST_SEARCH = 200, 12  # na ny with eigenvalues at all; with a metric better than Lyapunov's
+_ACTIVE = 64  # worst points that a round of the search for a metric adds
+_HUGE = 1e100  # a derivative beyond this is none
+_ABOVE_ONE = 1 + 1e-6  # a radius between 1 and this is the rounding of a pole at 1
+_DIFFERENCE = 1e-3  # step of differences for an external learner, in standard deviations; bears single precision
+_LARGEST_FACTOR = 1e4  # outputs of a stable linear model grow with its inputs, and 10⁶ times the largest is "diverged"
+_PER_STEP = ("points", "jacobians", "radius")  # too long for JSON
 
 
 @dataclass(frozen=True)
 class Place:
-    """A point of a record: number of the experiment and row in it (None off the trajectory), and the regressor."""
+    """A point: experiment, row in it and its name in messages, and the regressor there; no row off the trajectory."""
 
     experiment: int | None
     row: int | None
     where: str
-    """As messages name it: the line of a file, where there is one."""
     regressor: dict[str, float]
-    """Value of each lag, `y[k-1]` and so on, in the channels' units."""
 
     def __str__(self) -> str:
         return f"{self.where} ({', '.join(f'{name} = {value:.4g}' for name, value in self.regressor.items())})"
 
-    def as_dict(self) -> dict[str, Any]:
-        return {**self.__dict__, "regressor": dict(self.regressor)}
 
-
-class _Points(NamedTuple):
-    """Regressors x (m, nx) with the experiment and the row of each; -1 for points that are on none."""
+class Points(NamedTuple):
+    """Regressors (m, nx) with the experiment and the row of each; -1 for points off the trajectory."""
 
     x: Matrix
     experiment: Int[np.ndarray, "m"]
     row: Int[np.ndarray, "m"]
 
-    def take(self, which: Any) -> _Points:
-        return _Points(self.x[which], self.experiment[which], self.row[which])
+    def take(self, which: Any) -> Points:
+        return Points(*(part[which] for part in self))
 
 
 @dataclass(frozen=True, eq=False)
 class Feedback:
-    """How each looked-at step of a run depends on its past outputs; m steps, na the memory of the model."""
+    """How m steps of a run depend on the past outputs; radii are None where no A_k could be computed."""
 
-    points: _Points
+    points: Points
     jacobians: Float[np.ndarray, "m na ny ny"]
-    """A_{k,i} = ∂g/∂y_{k−i} at [:, i − 1], in the outputs' units."""
+    """A_{k,i} = ∂g/∂y_{k−i} at [:, i − 1], in the outputs' units; na is the memory of the model."""
     radius: Vector
-    """Spectral radius of the companion matrix of each step, (m,)."""
+    """Spectral radius of A_k at each step (m,), and over the steps:"""
+    largest: float | None
+    median: float | None
+    share_above_one: float | None
+    worst: Place | None
     steps: int
     """Steps of the run; where they are more than m, the m are spread evenly over them."""
     skipped: int
     """Points left out because the model has no finite derivative there."""
-    worst: Place | None
-
-    @property
-    def companions(self) -> Float[np.ndarray, "m n n"]:
-        """Companion matrices, n = na ny, of the state (y_{k−1}, …, y_{k−na})."""
-        return _companions(self.jacobians)
-
-    @property
-    def largest(self) -> float | None:
-        """The largest spectral radius; None where there is none."""
-        return float(self.radius.max()) if len(self.radius) else None
-
-    @property
-    def median(self) -> float | None:
-        return float(np.median(self.radius)) if len(self.radius) else None
-
-    @property
-    def share_above_one(self) -> float | None:
-        """Share of the steps, 0 to 1, whose spectral radius is above 1."""
-        return float(np.mean(self.radius > 1 + _ABOVE_ONE)) if len(self.radius) else None
-
-    def as_dict(self) -> dict[str, Any]:
-        return {
-            "steps": self.steps,
-            "looked_at": len(self.radius),
-            "skipped": self.skipped,
-            "largest_radius": self.largest,
-            "median_radius": self.median,
-            "share_above_one": self.share_above_one,
-            "worst": self.worst.as_dict() if self.worst else None,
-        }
+    diverged: tuple[str, ...]
+    """Output and place at which the free run of an experiment left all bounds."""
 
 
 @dataclass(frozen=True, eq=False)
 class Contraction:
-    """The best quadratic norm that was found, `|s|_P = √(sᵀ P s)`: by how much each sampled step shrinks it.
+    """The best norm that was found, `|s|_P = √(sᵀ P s)`, P (na ny)² for s = (y_{k−1}, …, y_{k−na}), up to a factor.
 
     While all points met have a rate below 1, two free runs under one input approach each other as
     `|s_k − s̃_k| ≤ overshoot · rateᵏ |s_0 − s̃_0|`, outputs in their standard deviations.
     """
 
     rate: float
-    """Largest `‖A_k‖_P` over the samples."""
+    """Largest `‖A_k‖_P` over the samples; no norm has one below `bound`, the largest spectral radius."""
+    bound: float
     share: float
     """Share of the samples, 0 to 1, with `‖A_k‖_P < 1`."""
     samples: int
-    bound: float
-    """Largest spectral radius over the samples: no norm has a smaller rate."""
     overshoot: float
-    """Square root of the condition number of P."""
     metric: Matrix
-    """P (na ny, na ny) for the state (y_{k−1}, …, y_{k−na}), up to a factor."""
     worst: Place
 
     @property
-    def found(self) -> bool:
-        """Whether all samples contract."""
-        return self.rate < 1
-
-    @property
     def text(self) -> str:
-        if self.found:
+        if self.rate < 1:
             return (
                 f"On all {self.samples} sampled points the free run contracts in one metric (rate {self.rate:.4g}): "
                 "evidence, not proof, that it forgets its start."
             )
         return (
-            f"No metric was found in which the free run contracts on all {self.samples} sampled points: at "
-            f"{_percent(1 - self.share)} of them it does not, worst at {self.worst}, rate {self.rate:.4g}."
+            f"At {_percent(1 - self.share)} of the {self.samples} sampled points the free run does not contract in the "
+            f"best metric that was found, worst at {self.worst}, rate {self.rate:.4g}."
         )
-
-    def as_dict(self) -> dict[str, Any]:
-        plain = {**self.__dict__, "metric": self.metric.tolist(), "worst": self.worst.as_dict()}
-        return {**plain, "found": self.found, "text": self.text}
 
 
 @dataclass(frozen=True)
 class Lipschitz:
-    """Largest gradients of the one-step predictor over measured rows; None where there is no finite one.
+    """Largest ‖∂g/∂x‖₂ and ‖∂φ/∂x‖₂ of the one-step predictor over measured rows; None where none is finite.
 
-    `gradient` is the largest ‖∂g/∂x‖₂ (ny, nx), in output units per regressor unit, and `phi` the largest ‖∂φ/∂x‖₂,
-    with (ny nθ) rows. Scaled: each regressor and output in its standard deviation, each column of φ in its RMS.
+    ∂g/∂x is (ny, nx) in output units per regressor unit, ∂φ/∂x is (ny nθ, nx). Scaled, and for the places: regressors
+    and outputs in their standard deviations, each column of φ in its RMS.
     """
 
     gradient: float | None
     gradient_scaled: float | None
     worst: Place | None
-    """Of the scaled gradient."""
     phi: float | None
     phi_scaled: float | None
     phi_worst: Place | None
     rows: int
 
-    def as_dict(self) -> dict[str, Any]:
-        places = {name: p.as_dict() if (p := getattr(self, name)) else None for name in ("worst", "phi_worst")}
-        return {**self.__dict__, **places}
-
 
 @dataclass(frozen=True, eq=False)
 class Stability:
-    """Evidence on the free run (None in a model without past outputs), and the one-step predictor apart from it."""
+    """Evidence on the free run (None in a model without past outputs), and the one-step predictor apart from it.
+
+    `diverges_at` is the factor of `divergence_scaling`, None where there is none up to `searched`.
+    """
 
     feedback: Feedback | None
     contraction: Contraction | None
     diverges_at: float | None
-    """Factor on the inputs' deviations from their means from which the free run leaves all bounds; None up to
-    `searched`."""
     searched: float
-    diverged: tuple[str, ...]
-    """Where and in which output the free run of the record itself left all bounds, per experiment that did."""
     lipschitz: Lipschitz
     warnings: tuple[str, ...]
     text: str
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain content for JSON; never NaN or infinity."""
-        return {
-            "feedback": self.feedback.as_dict() if self.feedback else None,
-            "contraction": self.contraction.as_dict() if self.contraction else None,
-            "diverges_at": self.diverges_at,
-            "searched": self.searched,
-            "diverged": list(self.diverged),
-            "lipschitz": self.lipschitz.as_dict(),
-            "warnings": list(self.warnings),
-            "text": self.text,
-        }
+        """Plain content for JSON, without what is there for every step; never NaN or infinity."""
+        return _plain(self)
 
 
 def stability(model: Model, record: Record, *, box: int = 0, largest: float = 1024.0) -> Stability:
     """All checks of a model on a record, with a text that says what they mean.
 
-    A free run that diverges is looked at up to the step at which it left all bounds.
-
-    Args:
-        model: the fitted model.
-        record: measured inputs and outputs; its free run starts from the measured outputs.
-        box: points for the contraction check besides the trajectory, see `contraction`.
-        largest: factor on the inputs up to which divergence is searched, see `divergence_scaling`.
+    A free run that diverges is looked at up to the step at which it left all bounds. `box` is that of `contraction`,
+    `largest` that of `divergence_scaling`.
 
     Raises:
         InputError: a record that does not fit the model, a `box` or a `largest` that are no such numbers.
     """
-    largest, box = _checked_factor(largest), check_count(box, "box", 0)
+    _check_factor(largest)
+    check_count(box, "box", 0)
     gradients = lipschitz(model, record)
-    if not model.form.memory:
-        text = "The model uses no past outputs: its free run cannot diverge, and keeps nothing of its start.\n"
-        return Stability(None, None, None, largest, (), gradients, (), text + _gradient_text(gradients))
-    found, diverged = _feedback(model, record, "simulation")
-    contracts = _contraction(model, record, found, box)
+    found = feedback(model, record)
+    contracts = _contraction(model, record, found, box) if found else None
     factor = divergence_scaling(model, record, largest)
-    warnings = tuple(_warnings(found, contracts, factor, diverged))
-    text = "\n".join(_lines(found, contracts, factor, largest, diverged) + [_gradient_text(gradients)])
-    return Stability(found, contracts, factor, largest, diverged, gradients, warnings, text)
+    text = "\n".join([*_free_run_lines(found, contracts, factor, largest), _gradient_line(gradients)])
+    warnings = tuple(_warnings(found, contracts, factor)) if found else ()
+    return Stability(found, contracts, factor, float(largest), gradients, warnings, text)
 
 
 def feedback(model: Model, record: Record, *, along: str = "simulation") -> Feedback | None:
-    """Local Jacobians A_{k,i} = ∂g/∂y_{k−i} and the spectral radius of their companion matrix, along a run.
+    """A_{k,i} = ∂g/∂y_{k−i} and the spectral radius of A_k along a run; None for a model without past outputs.
 
-    At most 20000 steps, fewer where na ny is large, spread evenly. A radius below 1 at every step does not make a
-    time-varying or nonlinear run stable, nor does one above 1 make it unstable: it says where to look.
+    At most 20000 steps, fewer where na ny is large and none where it is above 200, spread evenly. Radii below 1 do not
+    make a nonlinear run stable, nor do some above 1 make it unstable: they say where to look.
 
     Args:
         model: the fitted model.
         record: inputs, and measured outputs to start from.
         along: "simulation", regressors of the model's own outputs, up to where it diverges, or "measured".
 
-    Returns:
-        None for a model without past outputs; no radius (m = 0) where na ny is above 200.
-
     Raises:
         InputError: a record that does not fit the model, or another `along`.
     """
-    check_choice(along, ("simulation", "measured"), "`along`")
-    return _feedback(model, record, along)[0] if model.form.memory else None
+    free = check_choice(along, ("simulation", "measured"), "`along`") == "simulation"
+    if not model.form.memory:
+        return None
+    every, diverged = _simulated(model, record) if free else (_measured(model, record), ())
+    size = model.form.memory * len(model.outputs)
+    points = every.take(_evenly(len(every.x), 0 if size > _LONGEST_STATE else min(_STEPS, _WORK / size**3)))
+    points, jacobians, radius, skipped = _linearised(model, points)
+    largest, worst = _worst(model, record, points, radius)
+    median, share = (float(np.median(radius)), float(np.mean(radius > _ABOVE_ONE))) if worst else (None, None)
+    return Feedback(points, jacobians, radius, largest, median, share, worst, len(every.x), skipped, diverged)
 
 
 def contraction(model: Model, record: Record, *, box: int = 0) -> Contraction | None:
-    """The quadratic norm in which the free run contracts on as many sampled points as could be reached.
+    """The quadratic norm in which the free run contracts on as many of at most 2000 sampled points as was reached.
 
-    Minimises `max_k ‖T A_k T⁻¹‖₂`, P = TᵀT. Along `T(t) = exp(tX) T` with X symmetric the logarithm of each norm is
-    convex in t, with the derivative `uᵀXu − vᵀXv` for the singular vectors u, v: there are no false minima. It starts
-    from Lyapunov's P of the mean A_k and takes quasi-Newton steps on a smooth maximum over the worst points.
+    Minimises `max_k ‖T A_k T⁻¹‖₂`, P = TᵀT. Along `T(t) = exp(tX) T`, X symmetric, the logarithm of each norm is convex
+    in t with the slope `uᵀXu − vᵀXv`, u and v its singular vectors: there are no false minima. It starts from
+    Lyapunov's P of the mean A_k and takes quasi-Newton steps on a smooth maximum over the worst points; where not all
+    points contract, it does so again without the worst of them. None as for `feedback`.
 
     Args:
         model: the fitted model.
         record: inputs, and measured outputs to start from.
-        box: that many points more, uniform in the box of the regressors met by the free run.
-
-    Returns:
-        None for a model without past outputs, or where no A_k could be computed.
+        box: that many points more, uniform in the box of the regressors that the free run meets.
 
     Raises:
         InputError: a record that does not fit the model, or a `box` that is no number of points.
     """
-    found = feedback(model, record)
-    return _contraction(model, record, found, check_count(box, "box", 0)) if found else None
+    box, found = check_count(box, "box", 0), feedback(model, record)
+    return _contraction(model, record, found, box) if found else None
 
 
 def divergence_scaling(model: Model, record: Record, largest: float = 1024.0) -> float | None:
     """Factor on the inputs from which the free run leaves all bounds (10⁶ times the largest training output).
 
     It scales each input's deviation from its mean over the record; the measured outputs that the run starts from stay.
-    Doubled until a run diverges, then bisected to 5 %; what is returned diverged. The first 20000 rows are used. An
-    answer between the factors that were tried is not excluded, nor another input that diverges below it.
-
-    Returns:
-        None where no run up to `largest` diverged, as for a model without past outputs; below 1 where the record's own
-        run diverges, 0 where it does so with inputs at rest.
+    Doubled until a run diverges, then bisected to 5 %; what is returned did diverge. Only the first 20000 rows are
+    used, and factors between those that were tried may diverge too. None where no run up to `largest` does, as without
+    past outputs; at most 1 where the record's own run diverges, and 0 where it does with its inputs at their means.
 
     Raises:
-        InputError: a record that does not fit the model, or a `largest` outside 1 to 10⁴.
+        InputError: a record that does not fit the model, or a `largest` that is not above 1 and at most 10⁴.
     """
-    largest = _checked_factor(largest)
+    _check_factor(largest)
     if not model.form.memory:
         return None
-    record = _first_rows(record, model.form.start, _STEPS)
+    record = _first_rows(record, model.form.start)
     mean = np.concatenate([e.inputs for e in record.experiments]).mean(axis=0)
 
     def diverges(factor: float) -> bool:
@@ -311,66 +238,54 @@ def divergence_scaling(model: Model, record: Record, largest: float = 1024.0) ->
         run = model.simulate(replace(record, experiments=tuple(scaled)))
         return any(t.diverged for t in run.trajectories)
 
-    low, high = 0.0, 1.0
+    low = high = 1.0
     if diverges(1.0):
-        if diverges(0.0):
-            return 0.0
-        while high > 1 / largest and diverges(high / 2):
-            high /= 2
-        if high <= 1 / largest:
-            return high
-        low = high / 2
+        while diverges(low := low / 2 if low > 1 / _LARGEST_FACTOR else 0.0):
+            high = low
+            if low == 0:
+                return 0.0
+        low = low or high / 2
     else:
-        while not diverges(min(2 * high, largest)):
-            high = min(2 * high, largest)
-            if high >= largest:
+        while not diverges(high := min(2 * low, float(largest))):
+            low = high
+            if low == largest:
                 return None
-        low, high = high, min(2 * high, largest)
-    while high > _CLOSE * low:
+    while high > 1.05 * low:
         middle = float(np.sqrt(low * high))
         low, high = (low, middle) if diverges(middle) else (middle, high)
     return high
 
 
 def lipschitz(model: Model, record: Record) -> Lipschitz:
-    """Gradients of the one-step predictor, g and ∂g/∂θ = φ, over measured regressors (`cond:pred_stab`).
+    """Gradients of the one-step predictor g, and of ∂g/∂θ = φ, over measured regressors (`cond:pred_stab`).
 
-    The predictor γ_k = g(x_k) reads the last n samples only. If ‖∂g/∂x‖ ≤ L on a convex set that holds all regressors,
+    The predictor γ_k = g(x_k) reads the last n samples only. With ‖∂g/∂x‖ ≤ L on a convex set of all regressors,
     `|γ − γ̃| ≤ L Σ_{i≥k−n} (|u_i − ũ_i| + |y_i − ỹ_i|) ≤ L λ⁻ⁿ Γ_k` for every λ in (0, 1), because λ^{k−i} ≥ λⁿ there:
-    the condition holds with `C = max(L λ⁻ⁿ, |g(0)|)`, and for ∂γ/∂θ likewise with the gradient of φ. So bounded
-    gradients are all that it asks of a finite memory. The numbers here are L on at most 20000 measured rows: a
-    polynomial has a larger one farther out, and other θ or the learner's own weights have others. None of this speaks
-    about the free run, whose memory does not end: y_k = 2 y_{k−1} fulfils the condition.
+    the condition holds with `C = max(L λ⁻ⁿ, |g(0)|)`, and likewise for ∂γ/∂θ. Bounded gradients are all that it asks
+    of a finite memory. Here L is that of at most 20000 measured rows and of this θ; a polynomial has a larger one
+    farther out, and the learner's weights are not in φ. Nothing of this speaks about the free run, whose memory does
+    not end: y_k = 2 y_{k−1} fulfils the condition.
 
     Raises:
         InputError: a record that does not fit the model, or has no outputs.
     """
-    form = model.form
-    model.predict(record)  # refuses a record that does not fit
-    y_scale, every = _deviation(model, record), _measured(model, record)
-    points, x_scale = every.take(_evenly(len(every.x), _STEPS)), every.x.std(axis=0)
+    every, form = _measured(model, record), model.form
+    points, x_scale, y_scale = every.take(_evenly(len(every.x), _STEPS)), every.x.std(axis=0), _unit(model, record)
     with np.errstate(all="ignore"):
-        phi = np.asarray(form.baseline.phi(points.x, form.layout, form.outputs, np)) / y_scale[:, None]
-        rms = np.sqrt(np.nanmean(np.sum(phi**2, axis=1), axis=0))
-    phi_scale = y_scale[:, None] * np.where(np.isfinite(rms) & (rms > 0), rms, 1.0)  # (ny, nθ)
-    gradient, gradient_scaled = _norms(_gradients(model, points.x), y_scale, x_scale)
-    curvature, curvature_scaled = _norms(_phi_gradients(model, points.x), phi_scale.ravel(), x_scale)
-    return Lipschitz(
-        _peak(gradient),
-        _peak(gradient_scaled),
-        _place(model, record, points, gradient_scaled),
-        _peak(curvature),
-        _peak(curvature_scaled),
-        _place(model, record, points, curvature_scaled),
-        len(points.x),
-    )
+        phi = np.asarray(form.baseline.phi(points.x, form.layout, form.outputs, np))
+        rms = np.sqrt(np.mean(np.sum((phi / y_scale[:, None]) ** 2, axis=1), axis=0))
+    phi_scale = np.outer(y_scale, np.where(np.isfinite(rms) & (rms > 0), rms, 1.0)).ravel()
+    found: list[Any] = []
+    for gradients, scale in ((_gradients(model, points.x), y_scale), (_phi_gradients(model, points.x), phi_scale)):
+        norms = [(_spectral(batch), _spectral(batch * x_scale / scale[:, None])) for batch in gradients]
+        plain, scaled = (np.concatenate(column) for column in zip(*norms, strict=True))
+        found += [_worst(model, record, points, plain)[0], *_worst(model, record, points, scaled)]
+    return Lipschitz(*found, len(points.x))
 
 
 @partial(jax.jit, static_argnames="form")
-def _gradient_rows(
-    form: Form, numbers: Numbers, x: Float[Array, "m nx"], step: Float[Array, "nx"]
-) -> Float[Array, "m ny nx"]:
-    """∂g/∂x of every row; by central differences of width `step` where a learner has no derivative."""
+def _gradient_rows(form: Form, numbers: Numbers, x: Float[Array, "m nx"], step: Float[Array, "nx"]) -> Array:
+    """∂g/∂x (m, ny, nx); by central differences of width `step` where the learner has no derivative."""
 
     def g(row: Any) -> Any:
         found = parts(form, numbers, row)
@@ -396,9 +311,11 @@ def _gradients(model: Model, x: Matrix) -> Iterator[Any]:
 
 
 def _phi_gradients(model: Model, x: Matrix) -> Iterator[Any]:
-    rows = len(model.outputs) * len(model.theta)
-    found = _batches(lambda batch: _phi_gradient_rows(model.form, batch), x)
-    return (batch.reshape(len(batch), rows, x.shape[1]) for batch in found)
+    shape = (len(model.outputs) * len(model.theta), x.shape[1])
+    return (
+        batch.reshape(-1, *shape) if batch.size else np.zeros((len(batch), *shape))
+        for batch in _batches(lambda rows: _phi_gradient_rows(model.form, rows), x)
+    )
 
 
 def _batches(function: Callable[[Any], Any], x: Matrix) -> Iterator[Any]:
@@ -409,114 +326,92 @@ def _batches(function: Callable[[Any], Any], x: Matrix) -> Iterator[Any]:
         yield np.asarray(function(jnp.asarray(padded)))[: len(rows)]
 
 
-def _norms(gradients: Iterator[Any], row_scale: Vector, x_scale: Vector) -> tuple[Vector, Vector]:
-    """Spectral norms of matrices in batches (m, rows, nx), as they are and scaled; NaN where one is not finite."""
-    plain, scaled = [], []
-    for batch in gradients:
-        plain.append(_spectral(batch))
-        scaled.append(_spectral(batch * x_scale / row_scale[:, None]))
-    return np.concatenate(plain), np.concatenate(scaled)
-
-
 def _spectral(matrices: Any) -> Vector:
     """‖·‖₂ of each matrix (m, r, c); NaN where one is not finite."""
-    finite = np.isfinite(matrices).all(axis=(1, 2))
+    finite = (np.abs(matrices) < _HUGE).all(axis=(1, 2))
     found = np.full(len(matrices), np.nan)
-    if min(matrices.shape[1:]):
+    if matrices[0].size:
         found[finite] = np.linalg.norm(matrices[finite], 2, axis=(1, 2))
     return found
 
 
-def _feedback(model: Model, record: Record, along: str) -> tuple[Feedback, tuple[str, ...]]:
-    """With where the free run left all bounds."""
-    form, ny = model.form, len(model.outputs)
-    diverged: tuple[str, ...] = ()
-    if along == "simulation":
-        every, diverged = _simulated(model, record)
-    else:
-        model.predict(record)  # refuses a record that does not fit
-        every = _measured(model, record)
-    size = form.memory * ny
-    allowed = 0 if size > _LONGEST_STATE else int(min(_STEPS, _WORK / size**3))
-    points = every.take(_evenly(len(every.x), allowed))
-    jacobians = _jacobians(model, points.x)
-    finite = np.isfinite(jacobians).all(axis=(1, 2, 3))
-    points, jacobians = points.take(finite), jacobians[finite]
-    radius = np.abs(np.linalg.eigvals(_companions(jacobians))).max(axis=1, initial=0.0)
-    worst = _place(model, record, points, radius)
-    return Feedback(points, jacobians, radius, len(every.x), int(np.sum(~finite)), worst), diverged
-
-
-def _jacobians(model: Model, x: Matrix) -> Float[np.ndarray, "m na ny ny"]:
-    """A_{k,i} at regressors (m, nx)."""
-    found = np.zeros((len(x), model.form.memory, len(model.outputs), len(model.outputs)))
-    if len(x):
-        gradients = np.concatenate(list(_gradients(model, x)))
-        for column, (lag, output) in enumerate(model.form.fed_back):
-            found[:, lag - 1, :, output] = gradients[:, :, column]
-    return found
-
-
-def _companions(jacobians: Float[np.ndarray, "m na ny ny"]) -> Float[np.ndarray, "m n n"]:
+def companions(jacobians: Float[np.ndarray, "m na ny ny"]) -> Float[np.ndarray, "m n n"]:
+    """Companion matrices, n = na ny, of A_{k,i} at [k, i − 1]; the state is (y_{k−1}, …, y_{k−na})."""
     m, na, ny, _ = jacobians.shape
-    shift = np.broadcast_to(np.eye(na * ny, k=-ny)[ny:], (m, (na - 1) * ny, na * ny))
+    shift = np.broadcast_to(np.eye(na * ny)[: (na - 1) * ny], (m, (na - 1) * ny, na * ny))
     return np.concatenate([jacobians.swapaxes(1, 2).reshape(m, ny, na * ny), shift], axis=1)
 
 
-def _simulated(model: Model, record: Record) -> tuple[_Points, tuple[str, ...]]:
+def _linearised(model: Model, points: Points) -> tuple[Points, Float[np.ndarray, "m na ny ny"], Vector, int]:
+    """The points with finite derivatives, their A_{k,i} and spectral radii, and how many points had none."""
+    ny = len(model.outputs)
+    found = np.zeros((len(points.x), model.form.memory, ny, ny))
+    if len(found):
+        gradients = np.concatenate(list(_gradients(model, points.x)))
+        for column, (lag, output) in enumerate(model.form.fed_back):
+            found[:, lag - 1, :, output] = gradients[:, :, column]
+    finite = (np.abs(found) < _HUGE).all(axis=(1, 2, 3))
+    found = found[finite]
+    radius = np.abs(np.linalg.eigvals(companions(found))).max(axis=1, initial=0.0)
+    return points.take(finite), found, radius, int(np.sum(~finite))
+
+
+def _simulated(model: Model, record: Record) -> tuple[Points, tuple[str, ...]]:
     """Regressors of the free run, up to the step at which it diverged, and where that was."""
-    experiments, stops, diverged = [], [], []
-    for e, t in zip(record.experiments, model.simulate(record).trajectories, strict=True):
-        assert t.measured is not None  # a model without past outputs does not come here
-        experiments.append(replace(e, outputs=np.concatenate([t.measured[: t.start], t.model[t.start :]])))
-        stops.append(t.diverged[0] + 1 if t.diverged else len(e))
+    own, diverged = [], []
+    for i, (e, t) in enumerate(zip(record.experiments, model.simulate(record).trajectories, strict=True)):
+        assert t.measured is not None  # a run from measured outputs was refused without them
+        outputs = np.concatenate([t.measured[: t.start], t.model[t.start :]])
+        own.append(replace(e, outputs=outputs).rows(None, t.diverged[0] + 1 if t.diverged else None))
         if t.diverged:
-            diverged.append(f"output {t.diverged[1]} at {_where(record, len(stops) - 1, t.diverged[0])}")
-    return _measured(model, replace(record, outputs=model.outputs, experiments=tuple(experiments)), stops), (*diverged,)
+            diverged.append(f"{t.diverged[1]} at {_where(record, i, t.diverged[0])}")
+    return _points(model, replace(record, outputs=model.outputs, experiments=tuple(own))), tuple(diverged)
 
 
-def _measured(model: Model, record: Record, stops: list[int] | None = None) -> _Points:
-    """Regressors of a record's rows, of each experiment up to its stop."""
-    form, stops = model.form, stops or [len(e) for e in record.experiments]
-    pieces = [
-        (lag_matrix(e.rows(None, stop), form.layout, record, form.start), i, np.arange(form.start, stop))
-        for i, (e, stop) in enumerate(zip(record.experiments, stops, strict=True))
-    ]
-    x, row = np.concatenate([p[0] for p in pieces]), np.concatenate([p[2] for p in pieces])
-    return _Points(x, np.repeat([p[1] for p in pieces], [len(p[2]) for p in pieces]), row)
+def _measured(model: Model, record: Record) -> Points:
+    model.predict(record)  # refuses a record that does not fit
+    return _points(model, record)
 
 
-def _evenly(count: int, most: int) -> Int[np.ndarray, "m"]:
-    """At most `most` of `count` indices, spread evenly, the first and the last among them."""
-    return np.arange(count) if count <= most else np.linspace(0, count - 1, most).round().astype(int)
+def _points(model: Model, record: Record) -> Points:
+    """The regressor of every usable row."""
+    start, experiments = model.form.start, record.experiments
+    x = np.concatenate([lag_matrix(e, model.form.layout, record, start) for e in experiments])
+    number = np.repeat(np.arange(len(experiments)), [len(e) - start for e in experiments])
+    return Points(x, number, np.concatenate([np.arange(start, len(e)) for e in experiments]))
+
+
+def _evenly(count: int, most: float) -> Int[np.ndarray, "m"]:
+    """At most `most` of `count` indices, spread evenly."""
+    return np.arange(count) if count <= most else np.linspace(0, count - 1, int(most)).round().astype(int)
+
+
+def _unit(model: Model, record: Record) -> Vector:
+    """Standard deviation of each output of the model over a record; 1 for one that does not move."""
+    place = [[c.name for c in record.outputs].index(c.name) for c in model.outputs]
+    deviation = np.concatenate([e.outputs for e in record.experiments])[:, place].std(axis=0)
+    return np.where(deviation > 0, deviation, 1.0)
 
 
 def _contraction(model: Model, record: Record, found: Feedback, box: int) -> Contraction | None:
-    if not len(found.radius):
+    if not found.worst:
         return None
-    most = int(min(_SAMPLES, _WORK / len(found.companions[0]) ** 3))
+    unit = np.tile(_unit(model, record), model.form.memory)
+    most = min(_SAMPLES, int(_WORK / len(unit) ** 3))
     steepest = np.argsort(-found.radius, kind="stable")[: min(_STEEPEST, most // 2)]
     points = found.points.take(np.union1d(_evenly(len(found.radius), most - len(steepest)), steepest))
     if box:
-        low, high = found.points.x.min(axis=0), found.points.x.max(axis=0)
+        low, high, nowhere = found.points.x.min(axis=0), found.points.x.max(axis=0), np.full(box, -1)
         more = np.random.default_rng(0).uniform(low, high, (box, len(low)))  # the same points on every call
-        nowhere = np.full(box, -1)
-        points = _Points(*(np.concatenate(p) for p in zip(points, (more, nowhere, nowhere), strict=True)))
-    jacobians = _jacobians(model, points.x)
-    finite = np.isfinite(jacobians).all(axis=(1, 2, 3))
-    points, a = points.take(finite), _companions(jacobians[finite])
-    unit = np.tile(_deviation(model, record), model.form.memory)
-    a = a * unit / unit[:, None]
-    radius = np.abs(np.linalg.eigvals(a)).max(axis=1)
-    t = _metric(a, radius)
-    stable = radius < 1
-    if _sizes(t, a).max() >= 1 and 0 < stable.sum() < len(a):  # no norm contracts where the radius is above 1
-        t = max(t, _metric(a[stable], radius[stable]), key=lambda t: np.mean(_sizes(t, a) < 1))
+        points = Points(*(np.concatenate(p) for p in zip(points, (more, nowhere, nowhere), strict=True)))
+    points, jacobians, _, _ = _linearised(model, points)
+    a = companions(jacobians) * unit / unit[:, None]
+    t = _best_metric(a)
     sizes, metric = _sizes(t, a), (t / unit).T @ (t / unit)
-    worst = _place(model, record, points, sizes)
-    assert worst is not None
-    rate, share, overshoot = float(sizes.max()), float(np.mean(sizes < 1)), float(np.linalg.cond(t))
-    return Contraction(rate, share, len(a), float(radius.max()), overshoot, metric / np.trace(metric), worst)
+    rate, worst = _worst(model, record, points, sizes)
+    assert rate is not None and worst is not None
+    bound, share = float(np.abs(np.linalg.eigvals(a)).max()), float(np.mean(sizes < 1))
+    return Contraction(rate, bound, share, len(a), float(np.linalg.cond(t)), metric / np.trace(metric), worst)
 
 
 def _sizes(t: Matrix, a: Float[np.ndarray, "m n n"]) -> Vector:
@@ -524,17 +419,29 @@ def _sizes(t: Matrix, a: Float[np.ndarray, "m n n"]) -> Vector:
     return np.linalg.norm(t @ a @ np.linalg.inv(t), 2, axis=(1, 2))
 
 
-def _metric(a: Float[np.ndarray, "m n n"], radius: Vector) -> Matrix:
-    """T (n, n) with a small largest `‖T A T⁻¹‖₂`; deterministic."""
-    n = a.shape[1]
-    best = min([np.eye(n), *_lyapunov(a.mean(axis=0))], key=lambda t: _sizes(t, a).max())
-    if n == 1 or n > _LARGEST_SEARCH:
+def _best_metric(a: Float[np.ndarray, "m n n"]) -> Matrix:
+    """T (n, n) in which all of the matrices contract, or else as many as was reached; deterministic."""
+    best = _metric(a)
+    if _sizes(best, a).max() < 1:
         return best
-    active = np.zeros(len(a), dtype=bool)
-    for sharpness in 2.0 ** np.arange(1, _ROUNDS + 1):
+    best = max([best, *_lyapunov(a.mean(axis=0))], key=lambda t: np.mean(_sizes(t, a) < 1))
+    for quantile in (0.95, 0.8, 0.5):
         sizes = _sizes(best, a)
-        gap = np.log(sizes.max() / max(radius.max(), 1e-3 * sizes.max())) if sizes.max() > 0 else 0.0
-        if gap < 0.01 * abs(np.log(sizes.max())) + 1e-12:
+        t = _metric(a[sizes <= np.quantile(sizes, quantile)])
+        best = max(best, t, key=lambda t: np.mean(_sizes(t, a) < 1))
+    return best
+
+
+def _metric(a: Float[np.ndarray, "m n n"]) -> Matrix:
+    """T (n, n) with a small largest `‖T A T⁻¹‖₂`, close to the least."""
+    n, bound = a.shape[1], np.abs(np.linalg.eigvals(a)).max()
+    best = min([np.eye(n), *_lyapunov(a.mean(axis=0))], key=lambda t: _sizes(t, a).max())
+    active = np.zeros(len(a), dtype=bool)
+    for sharpness in (2, 4, 8, 16, 32) if 1 < n <= _LARGEST_SEARCH else ():
+        sizes = _sizes(best, a)
+        largest = max(sizes.max(), 1e-9)
+        gap = np.log(largest / max(bound, 1e-3 * largest))
+        if gap <= 0.05 * abs(np.log(largest)):  # the rest would cost overshoot
             break
         active[np.argsort(-sizes, kind="stable")[:_ACTIVE]] = True
         t = _descend(best @ a[active] @ np.linalg.inv(best), sharpness * np.log(n * active.sum()) / gap) @ best
@@ -545,11 +452,11 @@ def _metric(a: Float[np.ndarray, "m n n"], radius: Vector) -> Matrix:
 def _lyapunov(mean: Matrix) -> Iterator[Matrix]:
     """Factors T of P = TᵀT with `(A/c)ᵀ P (A/c) − P = −I`, so that `‖A‖_P < c`, for some c above the radius of A."""
     radius = max(float(np.abs(np.linalg.eigvals(mean)).max()), 1e-3)
-    for c in (radius**0.9, radius**0.5, 1.1 * radius, 1.5 * radius):
+    for c in (radius**0.95, radius**0.8, radius**0.5, 1.1 * radius, 1.5 * radius):
         if c > radius:
             p = scipy.linalg.solve_discrete_lyapunov((mean / c).T, np.eye(len(mean)))
             values, vectors = np.linalg.eigh((p + p.T) / 2)
-            if np.isfinite(values).all() and values[0] > 1e-14 * values[-1]:
+            if values[0] > 1e-14 * values[-1]:
                 yield np.sqrt(values / values[-1])[:, None] * vectors.T
 
 
@@ -559,114 +466,109 @@ def _descend(a: Float[np.ndarray, "m n n"], sharpness: float) -> Matrix:
 
     def value(flat: Vector) -> tuple[float, Vector]:
         y = flat.reshape(n, n)
-        if np.linalg.cond(y) > 1e8:
+        if np.linalg.cond(y) > 1e6:
             return 1e6, np.zeros(n * n)
         inverse = np.linalg.inv(y)
         b = y @ a @ inverse
         squares, v = np.linalg.eigh(b.swapaxes(1, 2) @ b)
         squares = np.maximum(squares, 1e-200)
         logarithms = sharpness * np.log(squares) / 2
-        top = logarithms.max()
+        top, u = logarithms.max(), b @ v
         weight = np.exp(logarithms - top)
         total, weight = weight.sum(), weight / weight.sum()
-        right = np.einsum("mij,mj,mkj->ik", v, weight, v, optimize=True)
-        u = b @ v
-        left = np.einsum("mij,mj,mkj->ik", u, weight / squares, u, optimize=True)
+        left, right = (
+            np.einsum("mij,mj,mkj->ik", q, w, q, optimize=True) for q, w in ((u, weight / squares), (v, weight))
+        )
         return (top + np.log(total)) / sharpness, ((left - right) @ inverse.T).ravel()
 
     found = scipy.optimize.minimize(value, np.eye(n).ravel(), jac=True, method="L-BFGS-B", options={"maxiter": 40})
     return np.asarray(found.x).reshape(n, n)
 
 
-def _deviation(model: Model, record: Record) -> Vector:
-    """Standard deviation of each output of the model over a record; 1 for one that does not move."""
-    place = [[c.name for c in record.outputs].index(c.name) for c in model.outputs]
-    deviation = np.concatenate([e.outputs for e in record.experiments])[:, place].std(axis=0)
-    return np.where(deviation > 0, deviation, 1.0)
-
-
-def _first_rows(record: Record, start: int, most: int) -> Record:
+def _first_rows(record: Record, start: int) -> Record:
     """The first rows of a record, whole experiments and a piece of one; at least one row after the lags."""
     kept: list[Experiment] = []
-    left = max(most, start + 1)
+    left = max(_STEPS, start + 1)
     for e in record.experiments:
         if left > start:
-            kept.append(e.rows(None, left) if len(e) > left else e)
+            kept.append(e.rows(None, left))
             left -= len(e)
     return replace(record, experiments=tuple(kept))
 
 
-def _checked_factor(largest: float) -> float:
+def _check_factor(largest: float) -> None:
     if not 1 < check_number(largest, "largest", positive=True) <= _LARGEST_FACTOR:
         raise InputError(f"`largest` must be a factor above 1 and at most {_LARGEST_FACTOR:g}; got {largest!r}.")
-    return float(largest)
 
 
-def _peak(values: Vector) -> float | None:
-    return float(np.nanmax(values)) if np.isfinite(values).any() else None
-
-
-def _place(model: Model, record: Record, points: _Points, values: Vector) -> Place | None:
-    """The point of the largest value."""
+def _worst(model: Model, record: Record, points: Points, values: Vector) -> tuple[float | None, Place | None]:
+    """The largest value and its point; None where no value is finite."""
     if not np.isfinite(values).any():
-        return None
+        return None, None
     i = int(np.nanargmax(values))
+    number, row = int(points.experiment[i]), int(points.row[i])
     regressor = {str(lag): float(v) for lag, v in zip(model.form.layout, points.x[i], strict=True)}
-    experiment, row = int(points.experiment[i]), int(points.row[i])
-    if experiment < 0:
-        return Place(None, None, "a point off the trajectory", regressor)
-    return Place(experiment, row, _where(record, experiment, row), regressor)
+    if number < 0:
+        return float(values[i]), Place(None, None, "a point off the trajectory", regressor)
+    return float(values[i]), Place(number, row, _where(record, number, row), regressor)
 
 
-def _where(record: Record, experiment: int, row: int) -> str:
-    e = record.experiments[experiment]
-    return e.where(row) if e.source or len(record.experiments) == 1 else f"experiment {experiment}, {e.where(row)}"
+def _where(record: Record, number: int, row: int) -> str:
+    e = record.experiments[number]
+    return e.where(row) if e.source or len(record.experiments) == 1 else f"experiment {number}, {e.where(row)}"
 
 
 def _percent(share: float) -> str:
-    return f"{100 * share:.2g} %"
+    return f"{100 * share:.3g} %"
 
 
-def _lines(
-    found: Feedback, contracts: Contraction | None, factor: float | None, largest: float, diverged: tuple[str, ...]
-) -> list[str]:
-    """What the checks of the free run say."""
-    lines = [f"The free run diverges ({'; '.join(diverged)}); looked at up to there."] if diverged else []
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return list(value)
+    if hasattr(value, "__dataclass_fields__"):
+        return {name: _plain(v) for name, v in value.__dict__.items() if name not in _PER_STEP}
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+def _free_run_lines(
+    found: Feedback | None, contracts: Contraction | None, factor: float | None, largest: float
+) -> Iterator[str]:
+    if not found:
+        yield "The model uses no past outputs: its free run cannot diverge, and keeps nothing of its start."
+        return
+    if found.diverged:
+        yield f"The free run diverges ({'; '.join(found.diverged)}); looked at up to there."
     if found.worst:
-        lines.append(
+        yield (
             f"Free run of {found.steps} steps, {len(found.radius)} looked at: local spectral radius {found.median:.4g} "
             f"in the median and at most {found.largest:.4g}, at {found.worst}; above 1 at "
             f"{_percent(found.share_above_one or 0.0)} of the steps."
         )
-    lines += [contracts.text] if contracts else []
-    if factor is None:
-        lines.append(f"It stays in bounds with the inputs' deviations from their means {largest:g} times as large.")
-    else:
-        lines.append(f"It leaves all bounds with the inputs' deviations from their means {factor:.3g} times as large.")
-    return lines
+    if contracts:
+        yield contracts.text
+    how, times = ("stays within", largest) if factor is None else ("leaves", factor)
+    yield f"It {how} all bounds with the inputs' deviations from their means {times:.3g} times as large."
 
 
-def _gradient_text(found: Lipschitz) -> str:
-    if found.gradient is None:
-        return "The one-step predictor has no finite gradient on the measured rows."
+def _gradient_line(found: Lipschitz) -> str:
+    largest = "has no finite gradient" if found.gradient is None else f"gradient at most {found.gradient:.4g}"
     return (
-        f"One-step predictor, which remembers only its lags: gradient at most {found.gradient:.4g} on {found.rows} "
-        "measured rows. That bounds its predictions from measured outputs and says nothing about the free run."
+        f"One-step predictor, which remembers only its lags: {largest} on {found.rows} measured rows. That bears on "
+        "predictions from measured outputs and says nothing about the free run."
     )
 
 
-def _warnings(
-    found: Feedback, contracts: Contraction | None, factor: float | None, diverged: tuple[str, ...]
-) -> Iterator[str]:
-    if diverged:
-        yield f"the free run diverges: {'; '.join(diverged)}."
-    if (found.share_above_one or 0.0) > _MANY:
-        yield f"the local spectral radius is above 1 at {_percent(found.share_above_one or 0.0)} of the steps."
-    if factor is not None and factor < _SMALL_MARGIN and not diverged:
+def _warnings(found: Feedback, contracts: Contraction | None, factor: float | None) -> Iterator[str]:
+    share = found.share_above_one or 0.0
+    if found.diverged:
+        yield f"the free run diverges: {'; '.join(found.diverged)}."
+    elif factor is not None and factor < 1.5:
         yield f"the free run diverges with inputs only {factor:.3g} times as large; do not use it beyond its data."
+    if share > 0.01:
+        yield f"the local spectral radius is above 1 at {_percent(share)} of the steps."
     if contracts is None:
-        yield "contraction could not be checked: no derivatives, or more than 200 past outputs."
-    elif not contracts.found:
-        yield f"contraction was not found: at {_percent(1 - contracts.share)} of the sampled points, rate {contracts.rate:.4g}."
+        yield "contraction could not be checked: no finite derivatives, or more than 200 past outputs."
+    elif contracts.rate >= 1:
+        yield f"contraction was not found: not at {_percent(1 - contracts.share)} of the sampled points."
     if found.skipped:
         yield f"at {found.skipped} points of the free run the model has no finite derivative; they are left out."

@@ -50,7 +50,8 @@ def save(model: Model, folder: str | Path) -> None:
 
 def write(model: Model, folder: Path) -> None:
     """Write the two files into an existing folder."""
-    arrays = {f"numbers.{name}": np.asarray(value) for name, value in model.numbers._asdict().items()}
+    numbers = {name: value for name, value in model.numbers._asdict().items() if value is not None}
+    arrays = {f"numbers.{name}": np.asarray(value) for name, value in numbers.items()}
     arrays |= {"largest_output": model.largest_output}
     arrays |= {name: value for name, value in (("gram", model.gram), ("noise", model.noise)) if value is not None}
     packed = save_arrays({name: np.ascontiguousarray(value, dtype=np.float64) for name, value in arrays.items()})
@@ -156,8 +157,8 @@ def _rebuild(
         elif learner is None:
             raise InputError(f"{path}: the learner was a Python callable; give it again, load(…, learner=…).")
         bound = Bound(learner, kept["nz"], kept["ny"])  # type: ignore[arg-type]
-        if bound.size != len(arrays["numbers.weights"]):
-            found = len(arrays["numbers.weights"])
+        found = arrays["numbers.weights"].shape[-1]
+        if bound.size != found:
             raise InputError(f"{path}: the learner has {bound.size} weights, the saved one {found}; give the same one.")
     features = Features(tuple(Expression(e["text"], tuple(e["constants"].items())) for e in declared["features"]))
     outputs, inputs_ = (tuple(Channel(**c) for c in declared[kind]) for kind in ("outputs", "inputs"))
@@ -166,7 +167,7 @@ def _rebuild(
     )
     return Model(
         form=form,
-        numbers=Numbers(**{name: arrays[f"numbers.{name}"] for name in Numbers._fields}),
+        numbers=Numbers(**{name: arrays.get(f"numbers.{name}") for name in Numbers._fields}),
         outputs=outputs,
         inputs=inputs_,
         sampling_time=float(declared["sampling_time"]),

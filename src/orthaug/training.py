@@ -58,6 +58,8 @@ class Learned:
     coefficients: Vector | None = None
     """c = θ − θ_aux (nθ,) where it was an unknown of training; None where θ is solved."""
     free: FreeStatistics | None = None
+    tilt: Matrix | None = None
+    """(members, nθ) of an ensemble, whose weights are (members, nw)."""
     elsewhere: bool = False
     """Whether it is a function from another toolbox."""
 

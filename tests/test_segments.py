@@ -1,0 +1,299 @@
+"""Free runs in segments: their layout against a double loop, their sensitivities against autodiff and differences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache, partial
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import naive
+import numpy as np
+import pytest
+
+import orthaug.segments
+from orthaug._jax import jax, jnp
+from orthaug.baseline import Baseline, Term
+from orthaug.estimation import estimate
+from orthaug.learners import MLP, Bound
+from orthaug.predictor import Form, Numbers
+from orthaug.problem import pose
+from orthaug.record import Record
+from orthaug.regressors import Lags
+from orthaug.segments import Segments, lay_segments, respond, sensitivity
+from orthaug.solvers import LevenbergMarquardt
+
+SEGMENT, WASHOUT, LENGTHS = 7, 3, (23, 9, 30)
+NETWORK = MLP(hidden=(2,))
+
+# name → (terms, lags, learner)
+ONE = [Term("a", "y1[k-1]"), Term("b", "y1[k-2]"), Term("g", "u[k-1]")]
+SHARED = [
+    Term("a", "y1[k-1]", output="y1"),
+    Term("a", "y2[k-1]", output="y2"),
+    Term("b", "y1[k-2]", output="y2"),
+    Term("g", "u[k]", output="y1"),
+]
+CASES = {
+    "one output": (ONE, Lags(2, 2, 0), NETWORK),
+    "gaps between lags": ([Term("a", "y1[k-1]"), Term("b", "y1[k-3]"), Term("g", "u[k]")], None, NETWORK),
+    "expressions": (ONE, None, MLP(hidden=(2,), inputs=("sin(y1[k-1])", "y1[k-3]*u[k]"))),
+    "nonlinear physics and a fixed term": (
+        [Term("a", "y1[k-1] - 0.1*y1[k-1]**3"), Term("g", "u[k]"), Term("d", "y1[k-2]", 0.2, fixed=True)],
+        None,
+        NETWORK,
+    ),
+    "two outputs share theta": (SHARED, None, NETWORK),
+    "two outputs, no learner": (SHARED, None, None),
+    "no learner": (ONE, None, None),
+    "no feedback": ([Term("g", "u[k]"), Term("h", "u[k-1]**2")], None, NETWORK),
+}
+OUTPUTS = {name: 2 if "two outputs" in name else 1 for name in CASES}
+
+
+def record_of(ny, lengths=LENGTHS):
+    rng = np.random.default_rng(ny)
+    names = {"inputs": ["u"], "outputs": ["y1", "y2"][:ny]}
+    return Record.join(Record.from_arrays(*rng.normal(size=(2, n, 1)), **names) if ny == 1
+                       else Record.from_arrays(rng.normal(size=n), rng.normal(size=(n, 2)), **names)
+                       for n in lengths)  # fmt: skip
+
+
+class Case(NamedTuple):
+    """A model with arbitrary numbers, its record in two chunks of segments, and pasts that are not the measured."""
+
+    record: Record
+    form: Form
+    numbers: Numbers
+    segments: Segments
+    past: np.ndarray
+    weight: np.ndarray
+
+
+@cache
+def case(name):
+    terms, lags, learner = CASES[name]
+    ny = OUTPUTS[name]
+    rng = np.random.default_rng(len(name))
+    posed = pose(record_of(ny), Baseline.from_terms(terms), lags, None if learner is None else learner.inputs)
+    nz = posed.feature_rows().shape[1]
+    bound = None if learner is None else Bound(learner, nz, ny)
+    form = Form(posed.baseline, posed.features, posed.layout, posed.outputs, bound)
+    w = np.zeros(0) if bound is None else np.asarray(bound.init(jax.random.key(1))) + 0.1
+    c = 0.4 * rng.normal(size=len(posed.baseline.names))
+    empty = np.zeros(0)
+    scaling = (empty, empty, np.zeros(ny)) if bound is None else (rng.normal(size=nz), 1 + rng.random(nz), 0.5 * (1 + rng.random(ny)))  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(orthaug.segments, "_CHUNK", 9)
+        segments = lay_segments(posed.record, form, SEGMENT, WASHOUT)
+    past = np.asarray(segments.past) + 0.3 * rng.normal(size=segments.past.shape)
+    return Case(posed.record, form, Numbers(c, 0 * c, w, *scaling), segments, past, rng.normal(size=(ny, ny)))
+
+
+def spread_out(part):
+    """(k, …, m) as (segments, …)."""
+    moved = np.moveaxis(np.asarray(part), -1, 1)
+    return moved.reshape(-1, *moved.shape[2:])
+
+
+# --- layout
+
+
+def laid_out(record, start, memory, segment, washout):
+    """[(experiment, first row, scored rows)] of all segments, by counting."""
+    longest = max(len(e) - start for e in record.experiments)
+    steps = min(segment, longest) if segment else longest
+    washout = min(washout, steps - 1)
+    found = []
+    for i, experiment in enumerate(record.experiments):
+        first = start
+        while first == start or first + washout < len(experiment):
+            found.append((i, first, [k for k in range(first + washout, first + steps) if k < len(experiment)]))
+            first += steps - washout
+    return found, steps, washout
+
+
+@pytest.mark.parametrize("segment", [0, 1, 5, 7, 500])
+@pytest.mark.parametrize("washout", [0, 3])
+@pytest.mark.parametrize("name", ["gaps between lags", "two outputs share theta", "no feedback"])
+def test_layout_by_a_double_loop(name, segment, washout):
+    if segment and washout >= segment:
+        pytest.skip("refused by Simulation")
+    record, form = case(name).record, case(name).form
+    found = lay_segments(record, form, segment, washout)
+    expected, steps, _ = laid_out(record, form.start, form.memory, segment, washout)
+    past, inputs, target, scored = map(spread_out, found)
+    assert inputs.shape[1] == target.shape[1] == scored.shape[1] == steps
+    assert past.shape[1:] == (form.memory, OUTPUTS[name])
+    for s, (i, first, rows) in enumerate(expected):
+        experiment = record.experiments[i]
+        for lag in range(1, form.memory + 1):
+            np.testing.assert_array_equal(past[s, lag - 1], experiment.outputs[first - lag])
+        assert [first + t for t in np.flatnonzero(scored[s])] == rows
+        for t in range(min(steps, len(experiment) - first)):
+            np.testing.assert_array_equal(target[s, t], experiment.outputs[first + t])
+            lagged = [experiment.inputs[first + t - lag.lag, 0] for lag in form.input_layout]
+            np.testing.assert_array_equal(inputs[s, t], lagged)
+    assert not scored[len(expected) :].any() and found.count == sum(len(rows) for *_, rows in expected)
+
+
+@pytest.mark.parametrize(("segment", "washout"), [(0, 0), (0, 4), (7, 3), (7, 0), (9, 8)])
+def test_every_usable_row_is_scored_once_but_the_first_washout(segment, washout):
+    record, form = case("one output").record, case("one output").form
+    layout, _, washout = laid_out(record, form.start, form.memory, segment, washout)
+    rows = [(i, k) for i, _, scored in layout for k in scored]
+    usable = [(i, k) for i, e in enumerate(record.experiments) for k in range(form.start + washout, len(e))]
+    assert sorted(rows) == usable
+    assert lay_segments(record, form, segment, washout).count == len(usable)
+
+
+def test_segments_stand_in_chunks_of_one_width(monkeypatch):
+    record, form = case("one output").record, case("one output").form
+    monkeypatch.setattr(orthaug.segments, "_CHUNK", 4)
+    chunked = lay_segments(record, form, SEGMENT, WASHOUT)
+    monkeypatch.undo()
+    one = lay_segments(record, form, SEGMENT, WASHOUT)
+    assert one.past.shape[0] == 1 and chunked.past.shape[0] == 4 and chunked.past.shape[-1] <= 4
+    assert {part.shape[0] for part in chunked} == {4} and {part.shape[-1] for part in one} == {one.past.shape[-1]}
+    count = len(laid_out(record, form.start, form.memory, SEGMENT, WASHOUT)[0])
+    for found, expected in zip(chunked, one, strict=True):
+        np.testing.assert_array_equal(spread_out(found)[:count], spread_out(expected)[:count])
+
+
+def test_an_experiment_shorter_than_the_washout_is_not_scored():
+    form = case("one output").form
+    record = record_of(1, (30, 5))
+    found = lay_segments(record, form, 7, 4)
+    assert found.count == 30 - form.start - 4
+
+
+# --- free run
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_respond_is_a_loop_over_time(name):
+    given = case(name)
+    found = spread_out(respond(given.form, given.numbers, given.segments, given.past))
+    model, start = SimpleNamespace(form=given.form, numbers=given.numbers), given.form.start
+    layout, steps, _ = laid_out(given.record, start, given.form.memory, SEGMENT, WASHOUT)
+    past = spread_out(given.past)
+    for s, (i, first, _) in enumerate(layout):
+        experiment = given.record.experiments[i]
+        signals = naive.signals_of(experiment, given.record)
+        for lag in range(1, given.form.memory + 1):
+            for j, output in enumerate(given.form.outputs):
+                signals[output][first - lag] = past[s, lag - 1, j]
+        for t in range(min(steps, len(experiment) - first)):
+            value = sum(naive.row(model, signals, first + t)[:2])
+            np.testing.assert_allclose(found[s, t], value, rtol=1e-11, atol=1e-12)
+            for j, output in enumerate(given.form.outputs):
+                signals[output][first + t] = value[j]
+
+
+@pytest.mark.parametrize("ny", [1, 2])
+def test_respond_over_whole_experiments_is_simulate(ny):
+    name = "two outputs share theta" if ny == 2 else "one output"
+    terms, lags, learner = CASES[name]
+    record = record_of(ny)
+    model = estimate(
+        record, Baseline.from_terms(terms), lags=lags, learner=learner, solver=LevenbergMarquardt(2)
+    ).model
+    assert np.abs(model.theta_aux).max() > 0
+    whole = lay_segments(record, model.form, 0, 0)
+    found = spread_out(respond(model.form, model.numbers, whole, whole.past))
+    for s, trajectory in enumerate(model.simulate(record).trajectories):
+        expected = trajectory.model[model.form.start :]
+        np.testing.assert_allclose(found[s, : len(expected)], expected, rtol=1e-10, atol=1e-12)
+
+
+# --- sensitivities
+
+
+class Dense(NamedTuple):
+    """The scored rows' errors and Jacobian, weighted: columns are the pasts of all segments, then (c, w)."""
+
+    error: np.ndarray
+    past: np.ndarray
+    shared: np.ndarray
+
+
+def errors(given, p, past):
+    nt = len(given.form.baseline.names)
+    numbers = given.numbers._replace(theta=p[:nt], weights=p[nt:])
+    miss = jnp.where(given.segments.scored[:, :, None], respond(given.form, numbers, given.segments, past), 0.0)
+    return jnp.einsum("oi,ktim->ktom", given.weight, miss)
+
+
+@cache
+def dense(name):
+    """Everything by `jax.jacfwd` through the scan."""
+    given = case(name)
+    p = jnp.concatenate([jnp.asarray(given.numbers.theta), jnp.asarray(given.numbers.weights)])
+    past = jnp.asarray(given.past)
+    jacobian = jax.jit(jax.jacfwd(partial(errors, given), argnums=(0, 1)))(p, past)
+    target = jnp.where(given.segments.scored[:, :, None], given.segments.target, 0.0)
+    error = jnp.einsum("oi,ktim->ktom", given.weight, target) - errors(given, p, past)
+    return Dense(np.asarray(error), np.asarray(jacobian[1]), np.asarray(jacobian[0]))
+
+
+def assert_close(found, expected, relative):
+    assert found.shape == expected.shape
+    assert np.max(np.abs(found - expected), initial=0.0) <= relative * np.max(np.abs(expected), initial=1e-300)
+
+
+@cache
+def found_of(name):
+    given = case(name)
+    return sensitivity(given.form, given.numbers, given.segments, jnp.asarray(given.past), jnp.asarray(given.weight))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_gram_matrix_of_the_sensitivities_is_that_of_autodiff(name):
+    exact = dense(name)
+    columns = np.concatenate([exact.shared, exact.error[..., None]], axis=-1)
+    columns = columns.reshape(-1, columns.shape[-1])
+    assert_close(np.asarray(found_of(name).shared), columns.T @ columns, 1e-8)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_gram_matrices_of_the_pasts_are_those_of_autodiff(name):
+    exact = dense(name)
+    chunks, _, _, width, na, ny = (*exact.error.shape, *case(name).segments.past.shape[1:3])
+    own = np.zeros((chunks, na * ny, na * ny + exact.shared.shape[-1] + 1, width))
+    for k in range(chunks):
+        for m in range(width):
+            others = exact.past[k, :, :, m].copy()  # (T, ny, k, na, ny, m)
+            past = others[:, :, k, :, :, m].reshape(-1, na * ny)
+            others[:, :, k, :, :, m] = 0
+            assert not others.any()  # a past touches its own segment only
+            rows = np.column_stack(
+                [past, exact.shared[k, :, :, m].reshape(len(past), -1), exact.error[k, :, :, m].ravel()]
+            )
+            own[k, :, :, m] = past.T @ rows
+    assert_close(np.asarray(found_of(name).own), own, 1e-8)
+
+
+@pytest.mark.parametrize("name", ["expressions", "two outputs share theta"])
+def test_gram_matrix_of_the_sensitivities_is_that_of_differences(name):
+    given, nt = case(name), len(case(name).form.baseline.names)
+    p = np.concatenate([given.numbers.theta, given.numbers.weights])
+    scored = np.asarray(given.segments.scored)[:, :, None]
+
+    def run(p):
+        numbers = given.numbers._replace(theta=p[:nt], weights=p[nt:])
+        response = np.where(scored, respond(given.form, numbers, given.segments, given.past), 0.0)
+        return np.einsum("oi,ktim->ktom", given.weight, response).ravel()
+
+    steps = 1e-5 * np.eye(len(p))
+    jacobian = np.stack([(run(p + d) - run(p - d)) / 2e-5 for d in steps], axis=-1)
+    assert_close(np.asarray(found_of(name).shared)[:-1, :-1], jacobian.T @ jacobian, 1e-7)
+
+
+def test_a_kink_without_a_derivative_counts_as_flat():
+    record = Record.from_arrays(np.arange(9.0), np.r_[0.0, np.arange(8.0)], outputs=["y1"])
+    form = replace(case("no learner").form, baseline=Baseline.from_terms([Term("a", "sqrt(max(y1[k-1], 0))")]),
+                   layout=case("gaps between lags").form.layout[:1])  # fmt: skip
+    segments = lay_segments(record, form, 0, 0)
+    numbers = case("no learner").numbers._replace(theta=np.ones(1), theta_aux=np.zeros(1))
+    found = sensitivity(form, numbers, segments, segments.past, jnp.eye(1))
+    assert np.isfinite(found.shared).all() and np.isfinite(found.own).all()
