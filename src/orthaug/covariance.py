@@ -7,6 +7,7 @@ factor 2 of the paper's eq:cov_approx cancels against the second derivative of t
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.special
@@ -49,6 +50,34 @@ def theta_covariance(projection: Projection, weight: Vector, noise: Matrix, fixe
     covariance = np.full((nt, nt), np.nan)
     covariance[np.ix_(free, free)] = found
     return covariance
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """Cov of all that training estimated, p = (c, w): `σ² M⁻¹` with `M = G + ridge` on the weights.
+
+    G is the Gram matrix of ∂ŷ/∂p in whitened outputs. Only functions of the fitted model have a variance: directions of
+    p that change no prediction on the training rows count as absent.
+    """
+
+    gram: Matrix
+    ridge: float
+    middle: Matrix
+    """ΣψᵀΣ_eψ in whitened outputs, `σ² G` for one output."""
+    nt: int
+
+    def of(self, k: Float[np.ndarray, "m n"]) -> Matrix:
+        """Cov of `K p`, (m, m): `K M⁻¹ (ΣψᵀΣ_eψ + σ² ridge) M⁻¹ Kᵀ`, the ridge counted as the prior it is."""
+        nw = len(self.gram) - self.nt
+        prior = self.ridge * np.concatenate([np.zeros(self.nt), np.ones(nw)])
+        matrix = self.gram + np.diag(prior)
+        size = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+        unit = 1 / np.where(size > 1e-150, size, 1.0)
+        values, vectors = np.linalg.eigh(matrix * np.outer(unit, unit))
+        kept = values > len(matrix) * np.finfo(float).eps * values.max(initial=0.0)
+        reach = ((k * unit) @ vectors[:, kept]) / values[kept] @ vectors[:, kept].T * unit
+        variance = float(np.trace(self.middle) / max(np.trace(self.gram), 1e-300))
+        return reach @ (self.middle + variance * np.diag(prior)) @ reach.T
 
 
 def theta_block(information: Matrix, ridge: float, nt: int, fixed: Collection[int] = ()) -> Matrix:

@@ -149,6 +149,27 @@ def linearise(
     return criterion(w, *arguments, first.overlap)
 
 
+@partial(jax.jit, static_argnames="bound")
+def share_of(bound: Bound, w: Float[Array, "nw"], chunks: Chunks) -> Overlap:
+    """QᵀJ and QᵀF of the learner in one pass."""
+    one = OneStep(bound)
+    nt = chunks.q.shape[2]
+    nothing = Overlap(jnp.zeros((nt, w.shape[0])), jnp.zeros(nt))
+    return one(w, chunks, Hold(jnp.zeros((nt, nt)), jnp.zeros(nt)), nothing).overlap
+
+
+@partial(jax.jit, static_argnames="bound")
+def mixed_gram(bound: Bound, w: Float[Array, "nw"], chunks: Chunks, mix: Float[Array, "ny ny"]) -> Float[Array, "n n"]:
+    """Gram matrix of `[Q J]` with the outputs of every row multiplied by `mix`: `ΣψᵀΣ_eψ` for `Σ_e = mixᵀ mix`."""
+
+    def one_chunk(chunk: Chunks) -> Float[Array, "n n"]:
+        jacobian = bound.jacobian(w, chunk.z, chunk.gain)[1]
+        columns = jnp.concatenate([jnp.moveaxis(chunk.q, 1, 0), jacobian])
+        return gram(jnp.einsum("oi,nim->nom", mix, columns).reshape(len(columns), -1))
+
+    return row_sum(one_chunk, chunks)
+
+
 class Physics(NamedTuple):
     """θ as an unknown beside w: coordinates `q = start + basis v` in whitened rows, and the structure's rows."""
 

@@ -6,10 +6,9 @@ eq:error_val; Ljung 1999, ch. 9 and 13):
 
     bias = Φ⁺Δ,   Cov θ̂ = Φ⁺Σ_eΦ⁺ᵀ,   cost = ‖W bias‖² + tr(W Cov θ̂ Wᵀ),   W = diag(1/|θ|) by default,
 
-so that √cost is the root mean square of `‖(θ̂ − θ)/θ‖`. Several outputs are each divided by their standard deviation,
-as in `orthaug.problem`. The search is deterministic: the families of `orthaug.signals`; periodic patterns, improved by
-one level, sign pair or length at a time on a shortened record; and mixtures, one signal after the other, whose Φ
-follows from the R factors of the parts (convex designs: Fedorov 1972). What is kept is simulated over all N samples.
+so that √cost is the root mean square of `‖(θ̂ − θ)/θ‖`; outputs are weighted as in `orthaug.problem`. The search is
+deterministic: the families of `orthaug.signals`, then periodic patterns of levels and hold lengths, improved by one
+level, pair or length at a time on a shortened record; the best of them are simulated again over all N samples.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -32,15 +32,14 @@ from orthaug.suspects import Suspect
 
 LONGEST_PATTERN = 32  # held samples; a longer period needs a longer hold
 SEARCH_ROWS, SEARCH_PERIODS = 512, 40  # of the shortened record: samples, or periods of the best square if more
-STARTS = 6  # patterns of different lengths that are improved
-POOL = 200  # patterns that a mixture may take
-MOST_PARTS = 4  # of a mixture
-LEAST_GAIN = 1e-4  # of the cost, relative, for which a search goes on
+STARTS, FINALISTS = 6, 12  # patterns that are improved, each of another length; that are tried over all N samples
+LEAST_GAIN = 1e-4  # of the cost, relative, for another change of a pattern
 RUNS_AWAY = 1e4  # largest output of the second half of a record over that of the first
 SINGULAR = 1e12  # condition number of Φ above which neither bias nor variance is computed
 BATCH = 2_000_000  # samples that are simulated side by side
 _STEPS = (2.0, 1.0, 0.5, 0.25, 0.1)  # changes of one level of a pattern, in units of the amplitude
-_SHARES = (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7)  # of a part that is added to a mixture
+
+Factors = Float[np.ndarray, "M 2 n n"]  # per candidate the R of rows [Φ Δ] and of σ[Φ Δ], n = nt + 1
 
 
 class Candidate(NamedTuple):
@@ -55,10 +54,9 @@ class Candidate(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """An input (N,) in the channel's unit, and what it is predicted to do to θ.
+    """An input (N,) and what it is predicted to do to θ: `bias` and `std` (nt,) in θ's units, `relative_error` = √cost.
 
-    `bias` and `std` (nt,) are in θ's units, `relative_error` is √cost, `candidates` all that were tried over N
-    samples, the best first; those above the cap on the condition number come last.
+    `candidates` are all that were tried over N samples, the best first, those above the cap on the condition last.
     """
 
     signal: Vector
@@ -98,7 +96,6 @@ def design_input(
     known_inputs: Mapping[str, Any] | None = None,
     initial_outputs: Any = 0.0,
     iterations: int = 30,
-    progress: Callable[[str], None] | None = None,
 ) -> Design:
     """The input of least predicted error of θ within |u| ≤ amplitude and |u_k − u_{k−1}| ≤ rate · Ts.
 
@@ -109,23 +106,21 @@ def design_input(
         samples: N.
         amplitude: in the channel's unit; `rate` in that unit per second, counted from 0 before the first sample.
         suspects: with their coefficients; without any the design has least variance (A-optimal for W θ).
-        noise: standard deviation of the equation noise, in the output's unit, or one for each output. 0 counts the
-            bias alone; without suspects 0 means 1, and `std` is per unit of noise.
+        noise: standard deviation of the equation noise in the output's unit, or one for each; 0 counts the bias alone.
+            Without suspects 0 means 1, and `std` is per unit of noise.
         theta: θ to simulate with (nt,); None for the baseline's initial values.
-        weights: W, (nt,) for a diagonal one, or (m, nt), such as dp/dθ / p for physical parameters p; None for 1/|θ|.
+        weights: W, (nt,) for a diagonal, or (m, nt), such as dp/dθ / p for physical parameters p; None for 1/|θ|.
         condition: cap on the condition number of Φ with columns of unit norm.
         channel: the input that is designed; may be left out where there is one.
         seed: of the random signals among the candidates.
         known_inputs: samples (N,) of other inputs, by name; zero where absent.
         initial_outputs: a number, (ny,) or (largest lag, ny): the outputs before the first row.
         iterations: the most improvements of one pattern.
-        progress: called with a line of text before each stage.
 
     Raises:
         InputError: numbers out of range, unknown channels, a suspect without coefficient, θ of 0 without `weights`,
             a simulated output that runs away, no candidate within the cap on the condition number.
     """
-    say = progress or (lambda text: None)
     amplitude = check_number(amplitude, "amplitude", positive=True)
     sampling_time = check_number(sampling_time, "sampling_time", positive=True)
     step = math.inf if rate is None else check_number(rate, "rate", positive=True) * sampling_time
@@ -133,7 +128,7 @@ def design_input(
     if baseline.function is not None or not baseline.names:
         raise InputError("a design needs physics that is made of terms, with one parameter or more.")
     theta = _numbers(baseline.initial if theta is None else theta, (len(baseline.names),), "theta")
-    plant = _Plant(baseline, tuple(outputs), tuple(inputs), tuple(suspects), theta, channel)
+    plant = _Plant(baseline, (tuple(outputs), tuple(inputs)), suspects, theta, channel)
     samples = check_count(samples, "samples", plant.start + 4 * len(theta) + 16)
     for name, values in (known_inputs or {}).items():
         check_choice(name, plant.others, "a channel of `known_inputs`")
@@ -142,10 +137,10 @@ def design_input(
     sigma = _numbers(noise, (len(outputs),), "noise")
     if np.any(sigma < 0):
         raise InputError(f"`noise` must be a standard deviation, 0 or more; got {noise!r}.")
-    sigma = sigma if len(suspects) or sigma.any() else np.ones(len(outputs))
+    sigma = sigma if suspects or sigma.any() else np.ones(len(outputs))
     cap = check_number(condition, "condition", positive=True)
     search = _Search(plant, amplitude, step, sigma, _weights(weights, plant), cap, samples)
-    return search.run(seed, iterations, say)
+    return search.run(seed, iterations)
 
 
 def _numbers(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
@@ -167,10 +162,9 @@ def _weights(weights: Any, plant: _Plant) -> Matrix:
             raise InputError(f"θ of {', '.join(zero)} is 0, so that relative errors have no meaning; give `weights`.")
         return np.diag(1 / np.abs(plant.theta))
     found = _numbers(weights, np.shape(weights) if np.ndim(weights) == 2 else (nt,), "weights")
-    found = np.diag(found) if found.ndim == 1 else found
-    if found.shape[1] != nt or not found.any():
+    if found.shape[-1] != nt or not found.any():
         raise InputError(f"`weights` must be of shape ({nt},) or (m, {nt}), and not all 0.")
-    return found
+    return np.diag(found) if found.ndim == 1 else found
 
 
 class _Node(np.lib.mixins.NDArrayOperatorsMixin):
@@ -204,13 +198,15 @@ class _Tape:
             self.steps.append((function, slots[0], slots[1] if len(slots) > 1 else -1, len(self.values)))
         return self._node((function, *slots))
 
-    def add(self, total: _Node | None, expression: Expression, coefficient: float = 1.0) -> _Node:
-        """`total + coefficient * expression`."""
+    def trace(self, expression: Expression, coefficient: float | None = None) -> _Node:
+        """The value of an expression, times a coefficient if given."""
         nodes = {lag: self._node(lag) for lag in expression.lags}
         self.lags |= {lag: node.slot for lag, node in nodes.items()}
         value = self.asarray(expression.evaluate(nodes, self))
-        value = value if coefficient == 1.0 else self.record(np.multiply, value, coefficient)
-        return value if total is None else self.record(np.add, total, value)
+        return value if coefficient is None else self.record(np.multiply, value, coefficient)
+
+    def total(self, values: Sequence[_Node]) -> _Node:
+        return reduce(lambda a, b: self.record(np.add, a, b), values) if values else self.asarray(0.0)
 
     def _node(self, key: Any, value: Any = None) -> _Node:
         if key not in self.known:
@@ -232,14 +228,9 @@ class _Plant:
     """The physics at θ with the suspected terms, simulated for many inputs side by side."""
 
     def __init__(
-        self,
-        baseline: Baseline,
-        outputs: tuple[str, ...],
-        inputs: tuple[str, ...],
-        suspects: tuple[Suspect, ...],
-        theta: Vector,
-        channel: str | None,
+        self, baseline: Baseline, channels: Any, suspects: Sequence[Suspect], theta: Vector, channel: str | None
     ):
+        outputs, inputs = channels
         if channel is None and len(inputs) != 1:
             raise InputError(f"`channel` is missing: the input to design, one of the inputs ({', '.join(inputs)}).")
         self.channel = inputs[0] if channel is None else check_choice(channel, inputs, "`channel`")
@@ -248,25 +239,25 @@ class _Plant:
         self.names, self.theta, self.outputs = baseline.names, theta, outputs
         self.others = {name: np.zeros((1, 1)) for name in inputs if name != self.channel}
         self.before = np.zeros((0, len(outputs)))
-        self.steps, self.table = _Tape(), _Tape()
-        nt = len(theta)
-        total: list[_Node | None] = [None] * len(outputs)
-        entries: list[list[_Node | None]] = [[None] * (nt + 2) for _ in outputs]  # a row of Φ, of Δ, the fixed terms
+        self.tape, nt = _Tape(), len(theta)
+        parts: list[list[list[_Node]]] = [[[] for _ in range(nt + 2)] for _ in outputs]  # of φ, of δ, the fixed terms
         for term, expression in zip(baseline.terms, baseline.expressions, strict=True):
             i = 0 if term.output is None else outputs.index(term.output)
             j = nt + 1 if term.fixed else self.names.index(term.parameter)
-            known = float(term.initial or 0.0) if term.fixed else 1.0
-            entries[i][j] = self.table.add(entries[i][j], expression, known)
-            total[i] = self.steps.add(total[i], expression, known if term.fixed else float(theta[j]))
+            parts[i][j].append(self.tape.trace(expression, (term.initial or 0.0) if term.fixed else None))
         for suspect in suspects:
-            i, coefficient = _place(suspect, outputs, inputs)
-            entries[i][nt] = self.table.add(entries[i][nt], suspect.parsed, coefficient)
-            total[i] = self.steps.add(total[i], suspect.parsed, coefficient)
-        if self.channel not in {lag.channel for lag in self.steps.lags}:
+            in_order(suspect.lags, outputs, inputs)
+            if suspect.coefficient is None:
+                raise InputError(f"suspect '{suspect.name}' has no `coefficient`; a design needs a guess of its size.")
+            parts[suspect._column_of(outputs)][nt].append(self.tape.trace(suspect.parsed, suspect.coefficient))
+        table = [[self.tape.total(entry) for entry in row] for row in parts]
+        factors = [*theta.tolist(), 1.0, 1.0]
+        sums = [[self.tape.record(np.multiply, v, f) for v, f in zip(row, factors, strict=True)] for row in table]
+        if self.channel not in {lag.channel for lag in self.tape.lags}:
             raise InputError(f"no term reads the input '{self.channel}', so that it cannot be designed.")
-        self.start = largest_lag(tuple(self.steps.lags))
-        self._total = [self.steps.asarray(0.0 if node is None else node).slot for node in total]
-        self._table = [self.table.asarray(0.0 if node is None else node).slot for row in entries for node in row]
+        self.start = largest_lag(tuple(self.tape.lags))
+        self._total = [self.tape.total(row).slot for row in sums]
+        self._table = [node.slot for row in table for node in row]
 
     def rows(self, u: Float[np.ndarray, "N M"]) -> tuple[Float[np.ndarray, "M R ny nt+1"], Float[np.ndarray, "M R ny"]]:
         """Rows `[Φ Δ]`, and the outputs less fixed terms; zero for an input under which they run away."""
@@ -275,14 +266,14 @@ class _Plant:
         y[:, :start] = self.before.T[:, :, None]
         signals = {self.channel: u} | {name: np.resize(v, (length, 1)) for name, v in self.others.items()}
         signals |= dict(zip(self.outputs, y, strict=True))
-        reads = [(signals[lag.channel], lag.lag) for lag in self.steps.lags]
+        reads = [(signals[lag.channel], lag.lag) for lag in self.tape.lags]
         with np.errstate(all="ignore"):
             for k in range(start, length):
-                for i, value in enumerate(self.steps.replay([s[k - lag] for s, lag in reads], self._total)):
+                for i, value in enumerate(self.tape.replay([s[k - lag] for s, lag in reads], self._total)):
                     y[i, k] = value
-            columns = [signals[lag.channel][start - lag.lag : length - lag.lag] for lag in self.table.lags]
+            columns = [signals[lag.channel][start - lag.lag : length - lag.lag] for lag in self.tape.lags]
             rows = np.empty((count, length - start, len(self._table)))
-            for j, value in enumerate(self.table.replay(columns, self._table)):
+            for j, value in enumerate(self.tape.replay(columns, self._table)):
                 rows[:, :, j] = np.transpose(value)
             early, late = np.abs(y[:, :half]).max(axis=1), np.abs(y[:, half:]).max(axis=1)
             sound = np.isfinite(rows).all(axis=(1, 2)) & (late <= RUNS_AWAY * np.where(early > 0, early, late)).all(0)
@@ -290,21 +281,6 @@ class _Plant:
             target = y[:, start:].transpose(2, 1, 0) - rows[..., -1]
         rows[~sound], target[~sound] = 0.0, 0.0
         return rows[..., :-1], target
-
-
-def _place(suspect: Suspect, outputs: tuple[str, ...], inputs: tuple[str, ...]) -> tuple[int, float]:
-    """The output of a suspect and its coefficient."""
-    what = f"suspect '{suspect.name}'"
-    try:
-        in_order(suspect.lags, outputs, inputs)
-    except InputError as error:
-        raise InputError(f"{what}: {error}") from None
-    if suspect.coefficient is None:
-        raise InputError(f"{what} has no `coefficient`; a design needs a guess of its size.")
-    if suspect.output is None and len(outputs) > 1:
-        raise InputError(f"{what}: `output` is missing; one of {', '.join(outputs)}.")
-    output = outputs[0] if suspect.output is None else check_choice(suspect.output, outputs, f"{what}: `output`")
-    return outputs.index(output), float(suspect.coefficient)
 
 
 class _Pattern(NamedTuple):
@@ -322,7 +298,7 @@ class _Pattern(NamedTuple):
         return f"pattern [{shown}]{', then its negative' * self.odd}{f', hold {self.hold}' * (self.hold > 1)}"
 
     def __call__(self, samples: int) -> Vector:
-        unit = np.array(self.levels * 1 + tuple(-v for v in self.levels) * self.odd)
+        unit = np.array(self.levels + tuple(-v for v in self.levels) * self.odd)
         return unit[np.arange(samples) // self.hold % len(unit)]
 
     def neighbours(self) -> list[_Pattern]:
@@ -356,27 +332,30 @@ def _families(samples: int, seed: int) -> tuple[dict[str, Vector], dict[str, int
     def spaced(first: int, last: int) -> list[int]:
         return sorted({*range(first, min(last, 8) + 1), *(round(8 * 1.4**i) for i in range(60) if 8 * 1.4**i <= last)})
 
+    holds, shares = (
+        spaced(1, max(samples // 64, 1))[::2],
+        [s for s in (1.0, 0.5, 0.2, 0.1, 0.03, 0.01) if s * samples > 16],
+    )
+    even, unit = samples + samples % 2, {"amplitude": 1.0}
     squares = {f"square, period {2 * half}": 2 * half for half in spaced(1, samples // 8)}
     found = {
-        "white Gaussian": signals.white_gaussian(samples, amplitude=1, seed=seed),
-        "white uniform": signals.white_uniform(samples, amplitude=1, seed=seed),
+        "white Gaussian": signals.white_gaussian(samples, seed=seed, **unit),
+        "white uniform": signals.white_uniform(samples, seed=seed, **unit),
     }
-    for hold in spaced(1, samples // 64)[::2] or [1]:
-        found[f"white binary, hold {hold}"] = signals.white_binary(samples, amplitude=1, seed=seed, hold=hold)
-        found[f"PRBS, hold {hold}"] = signals.prbs(samples, amplitude=1, hold=hold)
-    for share in (1.0, 0.5, 0.2, 0.1, 0.03, 0.01):
-        if share * samples > 16:
-            band, even = (0.0, share / 2), samples + samples % 2
-            found[f"multisine up to {share:g} Nyquist"] = signals.multisine(samples, amplitude=1, band=band)
-            odd = signals.multisine(even, amplitude=1, band=band, odd=True)[:samples]
-            swept = signals.swept_square(samples, amplitude=1, band=(1 / samples, share / 2), logarithmic=True)
-            found |= {f"odd multisine up to {share:g} Nyquist": odd, f"swept square up to {share:g} Nyquist": swept}
-    found |= {name: signals.square(samples, amplitude=1, period=period) for name, period in squares.items()}
+    for h in holds:
+        found[f"white binary, hold {h}"] = signals.white_binary(samples, seed=seed, hold=h, **unit)
+        found[f"PRBS, hold {h}"] = signals.prbs(samples, hold=h, **unit)
+    for s in shares:
+        band = (1 / samples, s / 2)
+        found[f"multisine up to {s:g} Nyquist"] = signals.multisine(samples, band=band, **unit)
+        found[f"odd multisine up to {s:g} Nyquist"] = signals.multisine(even, band=band, odd=True, **unit)[:samples]
+        found[f"swept square up to {s:g} Nyquist"] = signals.swept_square(samples, band=band, logarithmic=True, **unit)
+    found |= {name: signals.square(samples, period=period, **unit) for name, period in squares.items()}
     return found, squares
 
 
 class _Scores(NamedTuple):
-    """Of M candidates: their cost, ‖W bias‖, √tr(W Cov Wᵀ), condition number, bias (M, nt) and std (M, nt)."""
+    """Of M candidates: as in `Candidate`, then bias and std (M, nt)."""
 
     cost: Vector
     relative_bias: Vector
@@ -388,7 +367,7 @@ class _Scores(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """What is asked for; see `design_input`. A `factor` (2, nt+1, nt+1) is the R of rows [Φ Δ], and of σ[Φ Δ]."""
+    """What is asked for; see `design_input`."""
 
     plant: _Plant
     amplitude: float
@@ -398,28 +377,20 @@ class _Search:
     cap: float
     samples: int
 
-    def run(self, seed: int, iterations: int, say: Callable[[str], None]) -> Design:
-        say("families of signals")
+    def run(self, seed: int, iterations: int) -> Design:
         families, squares = _families(self.samples, seed)
-        names, waves = list(families), np.stack(list(families.values()), axis=1)
-        u, factors = self.measured(waves)
-        rank = self.ranked(self.scores(factors))
+        names = list(families)
+        u, factors = self.measured(np.stack(list(families.values()), axis=1))
         if not factors.any():
             raise InputError(
                 "the simulated output runs away, or is not a number, under every input; "
                 "give a `theta` for which the physics is stable, and check the suspects' coefficients."
             )
-        best_square = min(squares, key=lambda name: rank[names.index(name)])
-        say("periodic patterns")
-        patterns, found = self.patterns(squares[best_square], seed, iterations)
-        say("mixtures")
-        parts = [*(lambda n, wave=wave: wave[:n] for wave in waves.T), *patterns]
-        labels = names + [pattern.name for pattern in patterns]
-        mixed = self.mixtures(np.concatenate([factors, found]), labels, parts)
-        say("finalists")
-        finalists = {pattern.name: pattern(self.samples) for pattern in patterns[: 2 * STARTS]} | mixed
-        more, found = self.measured(np.stack(list(finalists.values()), axis=1))
-        return self.best([*names, *finalists], np.hstack([u, more]), self.scores(np.concatenate([factors, found])))
+        rank = dict(zip(names, self.ranked(self.scores(factors)), strict=True))
+        patterns = self.patterns(squares[min(squares, key=lambda name: rank[name])], seed, iterations)
+        more, found = self.measured(np.stack([pattern(self.samples) for pattern in patterns], axis=1))
+        names += [pattern.name for pattern in patterns]
+        return self.best(names, np.hstack([u, more]), self.scores(np.concatenate([factors, found])))
 
     def best(self, names: list[str], u: Matrix, scores: _Scores) -> Design:
         order = np.lexsort((scores.condition, self.ranked(scores), scores.condition > self.cap))
@@ -431,19 +402,12 @@ class _Search:
                 f"{scores.condition[k]:.3g} ({names[k]}). Raise `condition`, or fix a parameter."
             )
         table = [Candidate(names[i], *(float(column[i]) for column in scores[:4])) for i in order]
-        return Design(
-            np.ascontiguousarray(u[:, k]),
-            names[k],
-            self.plant.names,
-            scores.bias[k],
-            scores.std[k],
-            math.sqrt(table[0].cost),
-            table[0].condition,
-            table[0].cost,
-            tuple(table),
-        )
+        cost, error, bias, std = table[0].cost, math.sqrt(table[0].cost), scores.bias[k], scores.std[k]
+        signal = np.ascontiguousarray(u[:, k])
+        found = self.plant.names, bias, std, error, table[0].condition, cost, tuple(table)
+        return Design(signal, names[k], *found)
 
-    def measured(self, waves: Matrix, period: Vector | None = None) -> tuple[Matrix, Float[np.ndarray, "M 2 n n"]]:
+    def measured(self, waves: Matrix, period: Vector | None = None) -> tuple[Matrix, Factors]:
         """The limited signals (N, M) of waves of amplitude 1, and their factors per row; of whole periods if given."""
         signals, factors = [], []
         size = max(1, BATCH // len(waves))
@@ -455,11 +419,15 @@ class _Search:
                 here = period[first : first + size]
                 counted = np.maximum(rows.shape[1] * 3 // 4 // here, 1) * np.minimum(here, rows.shape[1])
             rows = rows * (np.arange(rows.shape[1]) >= rows.shape[1] - counted[:, None])[:, :, None, None]
-            deviation = target.std(axis=1)[:, None, :, None]
-            weight = 1 / np.where(deviation > 0, deviation, 1.0) if rows.shape[2] > 1 else 1.0
-            pair = [rows * weight, rows * weight**2 * self.sigma[:, None]]
-            both = [np.linalg.qr(x.reshape(len(rows), -1, x.shape[-1]), mode="r") for x in pair]
             signals.append(u)
+            if rows.shape[2] == 1:
+                r = np.linalg.qr(rows[:, :, 0], mode="r")
+                both = [r, r * self.sigma]
+            else:
+                deviation = target.std(axis=1)[:, None, :, None]
+                weight = 1 / np.where(deviation > 0, deviation, 1.0)
+                pair = rows * weight, rows * weight**2 * self.sigma[:, None]
+                both = [np.linalg.qr(x.reshape(len(rows), -1, x.shape[-1]), mode="r") for x in pair]
             factors.append(np.stack(both, axis=1) / np.sqrt(counted)[:, None, None, None])
         return np.hstack(signals), np.concatenate(factors)
 
@@ -468,14 +436,12 @@ class _Search:
         u = np.clip(u, -self.amplitude, self.amplitude)
         if self.step >= 2 * self.amplitude:
             return u
-        step, value, out = max(self.step - 4 * np.spacing(self.amplitude), 0.0), np.zeros(u.shape[1]), np.empty_like(u)
-        for k, wanted in enumerate(u):
-            change = wanted - value
-            value = np.where(np.abs(change) <= step, wanted, value + np.copysign(step, change))
-            out[k] = value
-        return out
+        from orthaug.signals import limit_rate
 
-    def scores(self, factors: Float[np.ndarray, "M 2 n n"]) -> _Scores:
+        step = max(self.step - 4 * np.spacing(self.amplitude), self.step / 2)
+        return np.stack([limit_rate(column, step, 0.0) for column in u.T], axis=1)
+
+    def scores(self, factors: Factors) -> _Scores:
         """Bias, variance and cost over all N samples."""
         nt = len(self.plant.theta)
         r = factors[:, 0, :nt, :nt]
@@ -498,56 +464,25 @@ class _Search:
         """The cost, infinite above the cap."""
         return np.where(scores.condition <= self.cap, scores.cost, np.inf)
 
-    def patterns(self, period: int, seed: int, iterations: int) -> tuple[list[_Pattern], Float[np.ndarray, "M 2 n n"]]:
-        """The best patterns and their factors, best first; the first few of different lengths are improved."""
+    def patterns(self, period: int, seed: int, iterations: int) -> list[_Pattern]:
+        """The best patterns, best first; the first few of different lengths were improved."""
         length = min(self.samples, max(SEARCH_ROWS, SEARCH_PERIODS * period) + self.plant.start)
 
-        def tried(patterns: list[_Pattern]) -> tuple[Vector, np.ndarray]:
+        def tried(patterns: list[_Pattern]) -> Vector:
             waves = np.stack([pattern(length) for pattern in patterns], axis=1)
             periods = np.array([len(p.levels) * p.hold * (1 + p.odd) for p in patterns])
-            factors = self.measured(waves, periods)[1]
-            return self.ranked(self.scores(factors)), factors
+            return self.ranked(self.scores(self.measured(waves, periods)[1]))
 
         starts = _starts(period, seed)
-        values, factors = tried(starts)
-        order = np.argsort(values, kind="stable")[:POOL]
-        pool = {starts[k]: (values[k], factors[k]) for k in order}
-        chosen = {(len(p.levels), p.odd): p for p in reversed(pool)}  # the best of each length
-        for pattern in sorted(chosen.values(), key=lambda p: pool[p][0])[:STARTS]:
+        pool = dict(zip(starts, tried(starts), strict=True))
+        chosen = {(len(p.levels), p.odd): p for p in sorted(pool, key=lambda p: -pool[p])}  # the best of each length
+        for pattern in sorted(chosen.values(), key=lambda p: pool[p])[:STARTS]:
             for _ in range(iterations):
                 near = pattern.neighbours()
-                values, factors = tried(near)
+                values = tried(near)
                 k = int(np.argmin(values))
-                if not values[k] < pool[pattern][0] * (1 - LEAST_GAIN):
+                if not values[k] < pool[pattern] * (1 - LEAST_GAIN):
                     break
                 pattern = near[k]
-                pool[pattern] = values[k], factors[k]
-        patterns = sorted(pool, key=lambda p: pool[p][0])
-        return patterns, np.stack([pool[p][1] for p in patterns])
-
-    def mixtures(
-        self, factors: Float[np.ndarray, "M 2 n n"], names: list[str], parts: list[Callable[[int], Vector]]
-    ) -> dict[str, Vector]:
-        """Signals one after the other, built up by the part and the share that lower the cost most."""
-        k = int(np.argmin(self.ranked(self.scores(factors))))
-        shares, current, found = {k: 1.0}, factors[k], {}
-        value = self.ranked(self.scores(factors[k : k + 1]))[0]
-        while len(shares) < MOST_PARTS:
-            mixed = [
-                np.concatenate([np.broadcast_to(np.sqrt(1 - s) * current, factors.shape), np.sqrt(s) * factors], axis=2)
-                for s in _SHARES
-            ]
-            reduced = np.linalg.qr(np.concatenate(mixed), mode="r")
-            values = self.ranked(self.scores(reduced))
-            k = int(np.argmin(values))
-            if not values[k] < value * (1 - LEAST_GAIN):
-                break
-            share, part = _SHARES[k // len(factors)], k % len(factors)
-            current, value = reduced[k], values[k]
-            shares = {p: s * (1 - share) for p, s in shares.items()}
-            shares[part] = shares.get(part, 0.0) + share
-            order = sorted(shares, key=lambda p: -shares[p])
-            ends = np.rint(np.cumsum([0.0, *(shares[p] for p in order)]) * self.samples).astype(int)
-            name = "; then ".join(f"{100 * shares[p]:.3g} % {names[p]}" for p in order)
-            found[name] = np.concatenate([parts[p](n) for p, n in zip(order, np.diff(ends), strict=True)])
-        return found
+                pool[pattern] = values[k]
+        return sorted(pool, key=lambda p: pool[p])[:FINALISTS]

@@ -262,8 +262,15 @@ def _finite(value: float) -> float | None:
 def _nothing_learned(problem: Problem) -> Learned:
     nothing, zeros = np.zeros(0), np.zeros(len(problem.outputs))
     phi = problem.projection.phi
-    gram = np.tensordot(phi, phi, axes=([0, 1], [0, 1]))
-    return Learned(None, nothing, Scaling(nothing, nothing), zeros, np.zeros_like(problem.target), 0.0, gram)
+    return Learned(
+        bound=None,
+        weights=nothing,
+        scaling=Scaling(nothing, nothing),
+        unit=zeros,
+        values=np.zeros_like(problem.target),
+        gram=np.tensordot(phi, phi, axes=([0, 1], [0, 1])),
+        middle=lambda noise: np.einsum("kit,ij,kjs->ts", phi, noise, phi, optimize=True),
+    )
 
 
 def _conclude(problem: Problem, structure: Structure, learned: Learned, status: Status) -> Estimate:
@@ -296,7 +303,10 @@ def _conclude(problem: Problem, structure: Structure, learned: Learned, status: 
             time_column=record.time_column,
             structure=structure.name,
             largest_output=np.max([np.abs(e.outputs).max(axis=0) for e in record.experiments], axis=0),
+            weight=problem.weight,
             gram=learned.gram,
+            ridge=learned.ridge,
+            middle=_middle(learned, noise, weight),
             noise=noise,
         ),
         status=Status(status.code, status.iterations, status.seconds, found.mean_square),
@@ -320,6 +330,17 @@ def _one_step_statistics(problem: Problem, learned: Learned, c: Vector, fixed: F
     noise = noise_covariance(residual / weight, freedom) if np.isfinite(residual).all() else None
     covariance = None if noise is None else theta_covariance(projection, weight, noise, fixed)
     return FreeStatistics(noise, covariance, float(freedom.min()), float(np.mean(residual**2)), fixed)
+
+
+def _middle(learned: Learned, noise: Matrix | None, weight: Vector) -> Matrix | None:
+    """ΣψᵀΣ_eψ in whitened outputs, for the intervals of later splits and of predictions."""
+    if noise is None or learned.gram is None:
+        return None
+    whitened = noise * np.outer(weight, weight)
+    if len(weight) == 1:
+        return whitened[0, 0] * learned.gram
+    singular = np.linalg.eigvalsh(whitened).min() <= 0
+    return None if learned.middle is None or singular else learned.middle(whitened)
 
 
 def _unique(structure: Structure, learned: Learned) -> bool:

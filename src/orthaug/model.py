@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from orthaug._arrays import Matrix, Vector, as_signal
 from orthaug._jax import jax, jnp
+from orthaug.covariance import Joint
 from orthaug.errors import InputError
 from orthaug.metrics import Scores, scores
 from orthaug.predictor import Form, Numbers, Parts, parts, push, regressor
@@ -142,8 +143,10 @@ class Response:
 class Model:
     """A fitted model; `estimate` makes it, `orthaug.save` and `orthaug.load` keep it.
 
-    `gram` (nθ + nw)² is the Gram matrix of `[Φ J]` over the training rows in whitened outputs,
-    `noise` (ny, ny) the noise covariance: with them a later split has intervals too.
+    `weight` (ny,) is one over each output's standard deviation; outputs times it are whitened. `gram` (nθ + nw)² is
+    the Gram matrix of ∂ŷ/∂(c, w), `[Φ J]` one step ahead, over the training rows in whitened outputs, `noise` (ny, ny)
+    the noise covariance, `ridge` the prior precision of the weights beside `gram`, `middle` = ΣψᵀΣ_eψ: with them every function of the model
+    has an interval (`Joint`).
     """
 
     form: Form
@@ -152,10 +155,14 @@ class Model:
     inputs: tuple[Channel, ...]
     sampling_time: float
     structure: str
+    measure: str = field(default="training", kw_only=True)
     largest_output: Vector
+    weight: Vector
     time_column: str | None = None
     gram: Matrix | None = None
     noise: Matrix | None = None
+    ridge: float = 0.0
+    middle: Matrix | None = None
 
     def __repr__(self) -> str:
         learner = self.form.bound.learner if self.form.bound else "none"
@@ -165,6 +172,17 @@ class Model:
     def theta(self) -> Vector:
         """θ̂ (nθ,)."""
         return np.asarray(self.numbers.theta)
+
+    @property
+    def joint(self) -> Joint | None:
+        """Cov(c, w); None where training left no statistics."""
+        if self.gram is None or self.middle is None:
+            return None
+        return Joint(self.gram, self.ridge, self.middle, len(self.theta))
+
+    def learner_at(self, x: Float[np.ndarray, "M nx"]) -> Float[np.ndarray, "M ny"]:
+        """f, before any split, at regressors of the form's layout; in the outputs' units."""
+        return _in_batches(lambda rows: _predict_rows(self.form, self.numbers, rows), (x,)).raw
 
     @property
     def theta_aux(self) -> Vector:

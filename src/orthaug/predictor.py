@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from orthaug._jax import jax, jnp
 from orthaug.baseline import Baseline
+from orthaug.expressions import Lag
 from orthaug.learners import Bound
 from orthaug.regressors import Features, Layout, largest_lag
 
@@ -40,6 +41,12 @@ class Form:
     def memory(self) -> int:
         """How many past outputs a free run keeps."""
         return max((lag for lag, _ in self.fed_back), default=0)
+
+    @property
+    def used(self) -> tuple[Lag, ...]:
+        """The raw lags that the physics or the learner reads."""
+        read = {*self.baseline.lags, *self.features.lags}
+        return tuple(lag for lag in self.layout if lag in read or self.baseline.function is not None)
 
     @property
     def input_layout(self) -> Layout:

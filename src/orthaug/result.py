@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from orthaug._arrays import Matrix, Vector
+from orthaug._arrays import Matrix, Vector, check_type
 from orthaug.covariance import interval
 from orthaug.criteria import Criterion, Prediction, Simulation
+from orthaug.errors import InputError
 from orthaug.excitation import Excitation
+from orthaug.measures import Measure, Support
 from orthaug.model import Model
 from orthaug.problem import Problem
+from orthaug.splitting import MeasureSplit, split_under
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -94,6 +97,8 @@ class Estimate:
     """‖QᵀF̃‖ / ‖F‖ over the training rows: how much of the learner the physics could express; None without one."""
     problem: Problem = field(repr=False)
     criterion: Criterion = Prediction()  # noqa: RUF009  (frozen)
+    measure: MeasureSplit | None = None
+    """What θ was split under, if not the training measure."""
     at_bound: Mapping[str, float] = field(default_factory=dict)
     """Parameters that stand at a bound, with its value."""
     warnings: tuple[str, ...] = ()
@@ -139,6 +144,30 @@ class Estimate:
                 "ci95_high": ci[:, 1],
             },
             index=pd.Index(baseline.names, name="parameter"),
+        )
+
+    def split(self, measure: Measure) -> Estimate:
+        """The same fitted function with θ, θ_aux, components and intervals under another measure, without training (F2).
+
+        Raises:
+            InputError: a measure that does not fit the model, a θ at a bound, or a θ of a penalty, which is no split.
+        """
+        check_type(measure, Measure, "measure", "a measure such as Uniform()")
+        if self.at_bound:
+            raise InputError(
+                f"{', '.join(self.at_bound)} stand at a bound, which a split under the {measure.name} measure would leave; "
+                "drop the bounds, or keep the training measure."
+            )
+        support = Support(self.problem.record, self.problem.layout, self.model.form.used)
+        found = split_under(measure, self.model, support, self.model.joint)
+        numbers = self.model.numbers._replace(theta=found.theta, theta_aux=found.theta_aux)
+        return replace(
+            self,
+            model=replace(self.model, numbers=numbers, structure="orthogonal", measure=measure.name),
+            covariance=found.covariance,
+            defect=found.defect,
+            measure=found,
+            warnings=(*self.warnings, *found.warnings),
         )
 
     def __repr__(self) -> str:

@@ -134,6 +134,8 @@ class FreeRun:
             values=np.zeros_like(self.problem.target) if self.task is None else self.task.values(flight.w),
             effective=flight.found.effective,
             gram=flight.objective.gram(flight.found),
+            ridge=flight.found.ridge * self.rms**2,
+            middle=lambda noise: flight.objective.middle(flight.found, noise),
             code=flight.code,
             iterations=flight.iterations,
             seconds=flight.seconds,
@@ -284,7 +286,9 @@ class Objective:
             self._settle(found.p)
             noise = self._noise(found)
             if noise is not None:
-                self.weight, self._anchor = np.linalg.inv(np.linalg.cholesky(noise)), None
+                white = self.weight @ noise @ self.weight.T  # the ridge keeps its place beside rows of the same size
+                scale = np.sqrt(np.trace(white) / ny)
+                self.weight, self._anchor = scale * np.linalg.inv(np.linalg.cholesky(noise)), None
                 done = found.iterations
                 again = minimise(
                     self,
@@ -304,10 +308,15 @@ class Objective:
         self.errors = self.free_run.errors(c, w, self.pasts.values)
 
     def gram(self, found: Outcome) -> Matrix:
-        """Gram matrix of the sensitivities ∂ŷ/∂(c, w) in whitened outputs, (nθ + nw)²."""
+        """Gram matrix of ∂ŷ/∂(c, w) as trained, rows times `weight`, in whitened outputs (nθ + nw)²."""
         _, c, w = self.place(found.p)
-        weight = np.diag(self.free_run.problem.weight)
-        return self.pasts.eliminate(self._sensitivity(c, w, weight), weight)[0]
+        return self._linearise(c, w)[0] * self.free_run.rms**2
+
+    def middle(self, found: Outcome, noise: Matrix) -> Matrix:
+        """ΣψᵀΣ_eψ of the rows of `gram`, which are white where `weight` made them so."""
+        whitening = self.weight / self.free_run.problem.weight  # of errors in whitened outputs
+        white = whitening @ noise @ whitening.T * self.free_run.rms**2
+        return self.gram(found) * float(np.trace(white)) / len(white)
 
     def statistics(self, flight: Flight) -> FreeStatistics:
         """Noise covariance of the free run and Cov θ̂ from its sensitivities."""

@@ -9,32 +9,33 @@ Two checks look at A_k: its spectral radius at every step, and a quadratic norm 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.linalg
+import scipy.optimize
 from jaxtyping import Array, Float, Int
 
-from orthaug._arrays import Matrix, Vector, check_choice, check_count
+from orthaug._arrays import Matrix, Vector, check_choice, check_count, check_number
 from orthaug._jax import jax, jnp
+from orthaug.errors import InputError
 from orthaug.learners import External
 from orthaug.model import Model
 from orthaug.predictor import Form, Numbers, parts
 from orthaug.record import Record
+from orthaug.regressors import lag_matrix
 
 _BATCH = 1024  # rows per compiled call
-_STEPS = 20_000  # most rows that are looked at; longer records are sampled evenly
-_SAMPLES, _STEEPEST = 2000, 50  # most points of the contraction check; those of largest radius always among them
+_STEPS, _SAMPLES = 20_000, 2000  # most rows that are looked at, spread evenly; most points of the contraction check
+_STEEPEST, _ACTIVE = 50, 64  # points of largest radius always among them; worst points that a round of search adds
 _WORK = 4e7  # most rows times (na ny)³
 _LONGEST_STATE, _LARGEST_SEARCH = 200, 12  # na ny with eigenvalues at all; with a metric better than Lyapunov's
-_ACTIVE = 64  # worst points that a round of the search for a metric adds
-_HUGE = 1e100  # a derivative beyond this is none
-_ABOVE_ONE = 1 + 1e-6  # a radius between 1 and this is the rounding of a pole at 1
 _DIFFERENCE = 1e-3  # step of differences for an external learner, in standard deviations; bears single precision
 _LARGEST_FACTOR = 1e4  # outputs of a stable linear model grow with its inputs, and 10⁶ times the largest is "diverged"
-_PER_STEP = ("points", "jacobians", "radius")  # too long for JSON
+_PER_STEP = ("points", "jacobians", "radius", "unit")  # too long for JSON
 
 
 @dataclass(frozen=True)
@@ -63,59 +64,48 @@ class Points(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Feedback:
-    """How m steps of a run depend on the past outputs; radii are None where no A_k could be computed."""
+    """How m of the `steps` of a run, spread evenly, depend on the past outputs.
+
+    `jacobians[:, i - 1]` are the A_{k,i} in the outputs' units, `radius` (m,) the spectral radii of the A_k, and their
+    summary is None where there are none. `skipped` points are left out because the model has no finite derivative
+    there; `diverged` says in which output and where the free run of an experiment left all bounds; `unit` (ny,) are the
+    standard deviations of the measured outputs.
+    """
 
     points: Points
     jacobians: Float[np.ndarray, "m na ny ny"]
-    """A_{k,i} = ∂g/∂y_{k−i} at [:, i − 1], in the outputs' units; na is the memory of the model."""
     radius: Vector
-    """Spectral radius of A_k at each step (m,), and over the steps:"""
+    unit: Vector
     largest: float | None
     median: float | None
     share_above_one: float | None
     worst: Place | None
     steps: int
-    """Steps of the run; where they are more than m, the m are spread evenly over them."""
     skipped: int
-    """Points left out because the model has no finite derivative there."""
     diverged: tuple[str, ...]
-    """Output and place at which the free run of an experiment left all bounds."""
 
 
 @dataclass(frozen=True, eq=False)
 class Contraction:
     """The best norm that was found, `|s|_P = √(sᵀ P s)`, P (na ny)² for s = (y_{k−1}, …, y_{k−na}), up to a factor.
 
-    While all points met have a rate below 1, two free runs under one input approach each other as
-    `|s_k − s̃_k| ≤ overshoot · rateᵏ |s_0 − s̃_0|`, outputs in their standard deviations.
+    `rate` is the largest `‖A_k‖_P` over the samples; `bound`, the largest spectral radius, is the least that any norm
+    has. `share`, 0 to 1, is that of the samples with `‖A_k‖_P < 1`. Were it so at all points between two runs under one
+    input: `|s_k − s̃_k| ≤ overshoot · rateᵏ |s_0 − s̃_0|`, outputs in their standard deviations.
     """
 
     rate: float
-    """Largest `‖A_k‖_P` over the samples; no norm has one below `bound`, the largest spectral radius."""
     bound: float
     share: float
-    """Share of the samples, 0 to 1, with `‖A_k‖_P < 1`."""
     samples: int
     overshoot: float
     metric: Matrix
     worst: Place
 
-    @property
-    def text(self) -> str:
-        if self.rate < 1:
-            return (
-                f"On all {self.samples} sampled points the free run contracts in one metric (rate {self.rate:.4g}): "
-                "evidence, not proof, that it forgets its start."
-            )
-        return (
-            f"At {_percent(1 - self.share)} of the {self.samples} sampled points the free run does not contract in the "
-            f"best metric that was found, worst at {self.worst}, rate {self.rate:.4g}."
-        )
-
 
 @dataclass(frozen=True)
 class Lipschitz:
-    """Largest ‖∂g/∂x‖₂ and ‖∂φ/∂x‖₂ of the one-step predictor over measured rows; None where none is finite.
+    """Largest ‖∂g/∂x‖ and ‖∂φ/∂x‖ (Frobenius, no less than ‖·‖₂) over measured rows; None where none is finite.
 
     ∂g/∂x is (ny, nx) in output units per regressor unit, ∂φ/∂x is (ny nθ, nx). Scaled, and for the places: regressors
     and outputs in their standard deviations, each column of φ in its RMS.
@@ -147,7 +137,7 @@ class Stability:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain content for JSON, without what is there for every step; never NaN or infinity."""
-        return _plain(self)
+        return asdict(self, dict_factory=_plain)
 
 
 def stability(model: Model, record: Record, *, box: int = 0, largest: float = 1024.0) -> Stability:
@@ -159,14 +149,11 @@ def stability(model: Model, record: Record, *, box: int = 0, largest: float = 10
     Raises:
         InputError: a record that does not fit the model, a `box` or a `largest` that are no such numbers.
     """
-    _check_factor(largest)
-    check_count(box, "box", 0)
-    gradients = lipschitz(model, record)
-    found = feedback(model, record)
-    contracts = _contraction(model, record, found, box) if found else None
+    gradients, found = lipschitz(model, record), feedback(model, record)
+    contracts = contraction(model, record, box=box, along=found)
     factor = divergence_scaling(model, record, largest)
-    text = "\n".join([*_free_run_lines(found, contracts, factor, largest), _gradient_line(gradients)])
-    warnings = tuple(_warnings(found, contracts, factor)) if found else ()
+    says = list(_sentences(found, contracts, factor, largest, gradients))
+    warnings, text = tuple(line for line, warns in says if warns), "\n".join(line for line, _ in says)
     return Stability(found, contracts, factor, float(largest), gradients, warnings, text)
 
 
@@ -177,8 +164,7 @@ def feedback(model: Model, record: Record, *, along: str = "simulation") -> Feed
     make a nonlinear run stable, nor do some above 1 make it unstable: they say where to look.
 
     Args:
-        model: the fitted model.
-        record: inputs, and measured outputs to start from.
+        model, record: a fitted model, and inputs with measured outputs to start from.
         along: "simulation", regressors of the model's own outputs, up to where it diverges, or "measured".
 
     Raises:
@@ -187,50 +173,69 @@ def feedback(model: Model, record: Record, *, along: str = "simulation") -> Feed
     free = check_choice(along, ("simulation", "measured"), "`along`") == "simulation"
     if not model.form.memory:
         return None
-    every, diverged = _simulated(model, record) if free else (_measured(model, record), ())
+    every, unit, diverged = _visited(model, record, free)
     size = model.form.memory * len(model.outputs)
-    points = every.take(_evenly(len(every.x), 0 if size > _LONGEST_STATE else min(_STEPS, _WORK / size**3)))
-    points, jacobians, radius, skipped = _linearised(model, points)
+    some = every.take(_evenly(len(every.x), 0 if size > _LONGEST_STATE else min(_STEPS, _WORK / size**3)))
+    points, jacobians, radius = _linearised(model, some)
     largest, worst = _worst(model, record, points, radius)
-    median, share = (float(np.median(radius)), float(np.mean(radius > _ABOVE_ONE))) if worst else (None, None)
-    return Feedback(points, jacobians, radius, largest, median, share, worst, len(every.x), skipped, diverged)
+    median, share = (float(np.median(radius)), float(np.mean(radius > 1 + 1e-6))) if worst else (None, None)
+    skipped = len(some.x) - len(points.x)
+    return Feedback(points, jacobians, radius, unit, largest, median, share, worst, len(every.x), skipped, diverged)
 
 
-def contraction(model: Model, record: Record, *, box: int = 0) -> Contraction | None:
+def contraction(model: Model, record: Record, *, box: int = 0, along: Feedback | None = None) -> Contraction | None:
     """The quadratic norm in which the free run contracts on as many of at most 2000 sampled points as was reached.
 
     Minimises `max_k ‖T A_k T⁻¹‖₂`, P = TᵀT. Along `T(t) = exp(tX) T`, X symmetric, the logarithm of each norm is convex
     in t with the slope `uᵀXu − vᵀXv`, u and v its singular vectors: there are no false minima. It starts from
     Lyapunov's P of the mean A_k and takes quasi-Newton steps on a smooth maximum over the worst points; where not all
-    points contract, it does so again without the worst of them. None as for `feedback`.
+    points contract, it does so again without the worst of them. None where no A_k is there.
 
     Args:
-        model: the fitted model.
-        record: inputs, and measured outputs to start from.
-        box: that many points more, uniform in the box of the regressors that the free run meets.
+        model, record: as for `feedback`; `along` is its result where there is one already.
+        box: that many points more, uniform in the box of the regressors that the run meets.
 
     Raises:
         InputError: a record that does not fit the model, or a `box` that is no number of points.
     """
-    box, found = check_count(box, "box", 0), feedback(model, record)
-    return _contraction(model, record, found, box) if found else None
+    box, found = check_count(box, "box", 0), along or feedback(model, record)
+    if not found or not found.worst:
+        return None
+    unit = np.tile(found.unit, model.form.memory)
+    most = min(_SAMPLES, int(_WORK / len(unit) ** 3))
+    steepest = np.argsort(-found.radius, kind="stable")[: min(_STEEPEST, most // 2)]
+    points = found.points.take(np.union1d(_evenly(len(found.radius), most - len(steepest)), steepest))
+    if box:
+        low, high, nowhere = found.points.x.min(axis=0), found.points.x.max(axis=0), np.full(box, -1)
+        more = np.random.default_rng(0).uniform(low, high, (box, len(low)))  # the same points on every call
+        points = Points(*(np.concatenate(p) for p in zip(points, (more, nowhere, nowhere), strict=True)))
+    points, jacobians, radius = _linearised(model, points)
+    a = companions(jacobians) * unit / unit[:, None]
+    t = _best_metric(a)
+    sizes, metric, overshoot = _sizes(t, a), (t / unit).T @ (t / unit), float(np.linalg.cond(t))
+    rate, worst = _worst(model, record, points, sizes)
+    assert rate is not None and worst is not None
+    share = float(np.mean(sizes < 1))
+    return Contraction(rate, float(radius.max()), share, len(a), overshoot, metric / np.trace(metric), worst)
 
 
 def divergence_scaling(model: Model, record: Record, largest: float = 1024.0) -> float | None:
     """Factor on the inputs from which the free run leaves all bounds (10⁶ times the largest training output).
 
     It scales each input's deviation from its mean over the record; the measured outputs that the run starts from stay.
-    Doubled until a run diverges, then bisected to 5 %; what is returned did diverge. Only the first 20000 rows are
-    used, and factors between those that were tried may diverge too. None where no run up to `largest` does, as without
+    Doubled until a run diverges, then bisected to 5 %; what is returned did diverge. The first rows are used, 20000
+    shared among the experiments, and factors between those that were tried may diverge too. None where no run up to `largest` does, as without
     past outputs; at most 1 where the record's own run diverges, and 0 where it does with its inputs at their means.
 
     Raises:
         InputError: a record that does not fit the model, or a `largest` that is not above 1 and at most 10⁴.
     """
-    _check_factor(largest)
+    if not 1 < check_number(largest, "largest", positive=True) <= _LARGEST_FACTOR:
+        raise InputError(f"`largest` must be a factor above 1 and at most {_LARGEST_FACTOR:g}; got {largest!r}.")
     if not model.form.memory:
         return None
-    record = _first_rows(record, model.form.start)
+    rows = max(_STEPS // len(record.experiments), model.form.start + 1)
+    record = replace(record, experiments=tuple(e.rows(None, rows) for e in record.experiments))
     mean = np.concatenate([e.inputs for e in record.experiments]).mean(axis=0)
 
     def diverges(factor: float) -> bool:
@@ -269,23 +274,25 @@ def lipschitz(model: Model, record: Record) -> Lipschitz:
     Raises:
         InputError: a record that does not fit the model, or has no outputs.
     """
-    every, form = _measured(model, record), model.form
-    points, x_scale, y_scale = every.take(_evenly(len(every.x), _STEPS)), every.x.std(axis=0), _unit(model, record)
+    (every, y_scale, _), form = _visited(model, record, False), model.form
+    points, x_scale, found = every.take(_evenly(len(every.x), _STEPS)), every.x.std(axis=0), []
     with np.errstate(all="ignore"):
         phi = np.asarray(form.baseline.phi(points.x, form.layout, form.outputs, np))
         rms = np.sqrt(np.mean(np.sum((phi / y_scale[:, None]) ** 2, axis=1), axis=0))
     phi_scale = np.outer(y_scale, np.where(np.isfinite(rms) & (rms > 0), rms, 1.0)).ravel()
-    found: list[Any] = []
-    for gradients, scale in ((_gradients(model, points.x), y_scale), (_phi_gradients(model, points.x), phi_scale)):
-        norms = [(_spectral(batch), _spectral(batch * x_scale / scale[:, None])) for batch in gradients]
+    for curve, scale in ((False, y_scale), (True, phi_scale)):
+        batches = (g.reshape(len(g), len(scale), len(x_scale)) for g in _gradients(model, points.x, curve))
+        norms = [
+            (np.linalg.norm(g, axis=(1, 2)), np.linalg.norm(g * x_scale / scale[:, None], axis=(1, 2))) for g in batches
+        ]
         plain, scaled = (np.concatenate(column) for column in zip(*norms, strict=True))
         found += [_worst(model, record, points, plain)[0], *_worst(model, record, points, scaled)]
-    return Lipschitz(*found, len(points.x))
+    return Lipschitz(*found, rows=len(points.x))
 
 
-@partial(jax.jit, static_argnames="form")
-def _gradient_rows(form: Form, numbers: Numbers, x: Float[Array, "m nx"], step: Float[Array, "nx"]) -> Array:
-    """∂g/∂x (m, ny, nx); by central differences of width `step` where the learner has no derivative."""
+@partial(jax.jit, static_argnames=("form", "of_phi"))
+def _gradient_rows(form: Form, numbers: Numbers, x: Float[Array, "m nx"], step: Any, of_phi: bool) -> Array:
+    """∂g/∂x (m, ny, nx), by differences of width `step` (nx,) where a learner has no derivative; or ∂φ/∂x."""
 
     def g(row: Any) -> Any:
         found = parts(form, numbers, row)
@@ -295,44 +302,20 @@ def _gradient_rows(form: Form, numbers: Numbers, x: Float[Array, "m nx"], step: 
         ahead, back = (jax.vmap(g)(row + sign * jnp.diag(step)) for sign in (1.0, -1.0))
         return ((ahead - back) / (2 * step[:, None])).T
 
+    if of_phi:
+        return jax.vmap(jax.jacfwd(lambda row: form.baseline.phi(row, form.layout, form.outputs, jnp)))(x)
     external = form.bound is not None and isinstance(form.bound.learner, External)
     return jax.vmap(differences if external else jax.jacrev(g))(x)
 
 
-@partial(jax.jit, static_argnames="form")
-def _phi_gradient_rows(form: Form, x: Float[Array, "m nx"]) -> Float[Array, "m ny nt nx"]:
-    return jax.vmap(jax.jacfwd(lambda row: form.baseline.phi(row, form.layout, form.outputs, jnp)))(x)
-
-
-def _gradients(model: Model, x: Matrix) -> Iterator[Any]:
+def _gradients(model: Model, x: Matrix, of_phi: bool = False) -> Iterator[Any]:
+    """∂g/∂x or ∂φ/∂x in batches that are computed at one shape."""
     deviation = x.std(axis=0)
-    step = jnp.asarray(_DIFFERENCE * np.where(deviation > 0, deviation, 1.0))
-    return _batches(lambda rows: _gradient_rows(model.form, model.numbers, rows, step), x)
-
-
-def _phi_gradients(model: Model, x: Matrix) -> Iterator[Any]:
-    shape = (len(model.outputs) * len(model.theta), x.shape[1])
-    return (
-        batch.reshape(-1, *shape) if batch.size else np.zeros((len(batch), *shape))
-        for batch in _batches(lambda rows: _phi_gradient_rows(model.form, rows), x)
-    )
-
-
-def _batches(function: Callable[[Any], Any], x: Matrix) -> Iterator[Any]:
-    """`function` of batches of rows that all have one shape."""
+    step = _DIFFERENCE * np.where(deviation > 0, deviation, 1.0)
     for begin in range(0, len(x), _BATCH):
         rows = x[begin : begin + _BATCH]
         padded = np.concatenate([rows, np.repeat(rows[-1:], _BATCH - len(rows), axis=0)])
-        yield np.asarray(function(jnp.asarray(padded)))[: len(rows)]
-
-
-def _spectral(matrices: Any) -> Vector:
-    """‖·‖₂ of each matrix (m, r, c); NaN where one is not finite."""
-    finite = (np.abs(matrices) < _HUGE).all(axis=(1, 2))
-    found = np.full(len(matrices), np.nan)
-    if matrices[0].size:
-        found[finite] = np.linalg.norm(matrices[finite], 2, axis=(1, 2))
-    return found
+        yield np.asarray(_gradient_rows(model.form, model.numbers, padded, step, of_phi))[: len(rows)]
 
 
 def companions(jacobians: Float[np.ndarray, "m na ny ny"]) -> Float[np.ndarray, "m n n"]:
@@ -342,76 +325,39 @@ def companions(jacobians: Float[np.ndarray, "m na ny ny"]) -> Float[np.ndarray, 
     return np.concatenate([jacobians.swapaxes(1, 2).reshape(m, ny, na * ny), shift], axis=1)
 
 
-def _linearised(model: Model, points: Points) -> tuple[Points, Float[np.ndarray, "m na ny ny"], Vector, int]:
-    """The points with finite derivatives, their A_{k,i} and spectral radii, and how many points had none."""
+def _linearised(model: Model, points: Points) -> tuple[Points, Float[np.ndarray, "m na ny ny"], Vector]:
+    """The points with finite derivatives, their A_{k,i} and their spectral radii."""
     ny = len(model.outputs)
     found = np.zeros((len(points.x), model.form.memory, ny, ny))
     if len(found):
         gradients = np.concatenate(list(_gradients(model, points.x)))
         for column, (lag, output) in enumerate(model.form.fed_back):
             found[:, lag - 1, :, output] = gradients[:, :, column]
-    finite = (np.abs(found) < _HUGE).all(axis=(1, 2, 3))
-    found = found[finite]
-    radius = np.abs(np.linalg.eigvals(companions(found))).max(axis=1, initial=0.0)
-    return points.take(finite), found, radius, int(np.sum(~finite))
+    finite = (np.abs(found) < 1e100).all(axis=(1, 2, 3))  # beyond, a derivative is none
+    radius = np.abs(np.linalg.eigvals(companions(found[finite]))).max(axis=1, initial=0.0)
+    return points.take(finite), found[finite], radius
 
 
-def _simulated(model: Model, record: Record) -> tuple[Points, tuple[str, ...]]:
-    """Regressors of the free run, up to the step at which it diverged, and where that was."""
-    own, diverged = [], []
-    for i, (e, t) in enumerate(zip(record.experiments, model.simulate(record).trajectories, strict=True)):
-        assert t.measured is not None  # a run from measured outputs was refused without them
-        outputs = np.concatenate([t.measured[: t.start], t.model[t.start :]])
-        own.append(replace(e, outputs=outputs).rows(None, t.diverged[0] + 1 if t.diverged else None))
-        if t.diverged:
-            diverged.append(f"{t.diverged[1]} at {_where(record, i, t.diverged[0])}")
-    return _points(model, replace(record, outputs=model.outputs, experiments=tuple(own))), tuple(diverged)
-
-
-def _measured(model: Model, record: Record) -> Points:
-    model.predict(record)  # refuses a record that does not fit
-    return _points(model, record)
-
-
-def _points(model: Model, record: Record) -> Points:
-    """The regressor of every usable row."""
-    start, experiments = model.form.start, record.experiments
-    x = np.concatenate([lag_matrix(e, model.form.layout, record, start) for e in experiments])
-    number = np.repeat(np.arange(len(experiments)), [len(e) - start for e in experiments])
-    return Points(x, number, np.concatenate([np.arange(start, len(e)) for e in experiments]))
+def _visited(model: Model, record: Record, free: bool) -> tuple[Points, Vector, tuple[str, ...]]:
+    """Regressors of a free run, up to where it diverged, or measured ones; standard deviations of y; where that was."""
+    response = model.simulate(record) if free else model.predict(record)
+    pieces, measured, diverged, start = [], [], [], model.form.start
+    for i, (e, t) in enumerate(zip(record.experiments, response.trajectories, strict=True)):
+        assert t.measured is not None  # a record without outputs was refused
+        outputs = np.concatenate([t.measured[:start], (t.model if free else t.measured)[start:]])
+        run = replace(e, outputs=outputs).rows(None, t.diverged[0] + 1 if t.diverged else None)
+        x = lag_matrix(run, model.form.layout, replace(record, outputs=model.outputs), start)
+        pieces.append((x, np.full(len(x), i), np.arange(start, len(run))))
+        measured.append(t.measured)
+        diverged += [f"{t.diverged[1]} at {_where(record, i, t.diverged[0])}"] if t.diverged else []
+    deviation = np.concatenate(measured).std(axis=0)
+    points = Points(*(np.concatenate(part) for part in zip(*pieces, strict=True)))
+    return points, np.where(deviation > 0, deviation, 1.0), tuple(diverged)
 
 
 def _evenly(count: int, most: float) -> Int[np.ndarray, "m"]:
     """At most `most` of `count` indices, spread evenly."""
     return np.arange(count) if count <= most else np.linspace(0, count - 1, int(most)).round().astype(int)
-
-
-def _unit(model: Model, record: Record) -> Vector:
-    """Standard deviation of each output of the model over a record; 1 for one that does not move."""
-    place = [[c.name for c in record.outputs].index(c.name) for c in model.outputs]
-    deviation = np.concatenate([e.outputs for e in record.experiments])[:, place].std(axis=0)
-    return np.where(deviation > 0, deviation, 1.0)
-
-
-def _contraction(model: Model, record: Record, found: Feedback, box: int) -> Contraction | None:
-    if not found.worst:
-        return None
-    unit = np.tile(_unit(model, record), model.form.memory)
-    most = min(_SAMPLES, int(_WORK / len(unit) ** 3))
-    steepest = np.argsort(-found.radius, kind="stable")[: min(_STEEPEST, most // 2)]
-    points = found.points.take(np.union1d(_evenly(len(found.radius), most - len(steepest)), steepest))
-    if box:
-        low, high, nowhere = found.points.x.min(axis=0), found.points.x.max(axis=0), np.full(box, -1)
-        more = np.random.default_rng(0).uniform(low, high, (box, len(low)))  # the same points on every call
-        points = Points(*(np.concatenate(p) for p in zip(points, (more, nowhere, nowhere), strict=True)))
-    points, jacobians, _, _ = _linearised(model, points)
-    a = companions(jacobians) * unit / unit[:, None]
-    t = _best_metric(a)
-    sizes, metric = _sizes(t, a), (t / unit).T @ (t / unit)
-    rate, worst = _worst(model, record, points, sizes)
-    assert rate is not None and worst is not None
-    bound, share = float(np.abs(np.linalg.eigvals(a)).max()), float(np.mean(sizes < 1))
-    return Contraction(rate, bound, share, len(a), float(np.linalg.cond(t)), metric / np.trace(metric), worst)
 
 
 def _sizes(t: Matrix, a: Float[np.ndarray, "m n n"]) -> Vector:
@@ -421,15 +367,13 @@ def _sizes(t: Matrix, a: Float[np.ndarray, "m n n"]) -> Vector:
 
 def _best_metric(a: Float[np.ndarray, "m n n"]) -> Matrix:
     """T (n, n) in which all of the matrices contract, or else as many as was reached; deterministic."""
-    best = _metric(a)
-    if _sizes(best, a).max() < 1:
-        return best
-    best = max([best, *_lyapunov(a.mean(axis=0))], key=lambda t: np.mean(_sizes(t, a) < 1))
-    for quantile in (0.95, 0.8, 0.5):
-        sizes = _sizes(best, a)
-        t = _metric(a[sizes <= np.quantile(sizes, quantile)])
-        best = max(best, t, key=lambda t: np.mean(_sizes(t, a) < 1))
-    return best
+    tried = [_metric(a)]
+    if _sizes(tried[0], a).max() >= 1:
+        tried += _lyapunov(a.mean(axis=0))
+        for quantile in (0.95, 0.8, 0.5):
+            best = max(tried, key=lambda t: np.mean(_sizes(t, a) < 1))
+            tried.append(_metric(a[_sizes(best, a) <= np.quantile(_sizes(best, a), quantile)]))
+    return max(tried, key=lambda t: np.mean(_sizes(t, a) < 1))
 
 
 def _metric(a: Float[np.ndarray, "m n n"]) -> Matrix:
@@ -441,7 +385,7 @@ def _metric(a: Float[np.ndarray, "m n n"]) -> Matrix:
         sizes = _sizes(best, a)
         largest = max(sizes.max(), 1e-9)
         gap = np.log(largest / max(bound, 1e-3 * largest))
-        if gap <= 0.05 * abs(np.log(largest)):  # the rest would cost overshoot
+        if gap <= 0.06 * abs(np.log(largest)):  # the rest would cost overshoot
             break
         active[np.argsort(-sizes, kind="stable")[:_ACTIVE]] = True
         t = _descend(best @ a[active] @ np.linalg.inv(best), sharpness * np.log(n * active.sum()) / gap) @ best
@@ -485,27 +429,12 @@ def _descend(a: Float[np.ndarray, "m n n"], sharpness: float) -> Matrix:
     return np.asarray(found.x).reshape(n, n)
 
 
-def _first_rows(record: Record, start: int) -> Record:
-    """The first rows of a record, whole experiments and a piece of one; at least one row after the lags."""
-    kept: list[Experiment] = []
-    left = max(_STEPS, start + 1)
-    for e in record.experiments:
-        if left > start:
-            kept.append(e.rows(None, left))
-            left -= len(e)
-    return replace(record, experiments=tuple(kept))
-
-
-def _check_factor(largest: float) -> None:
-    if not 1 < check_number(largest, "largest", positive=True) <= _LARGEST_FACTOR:
-        raise InputError(f"`largest` must be a factor above 1 and at most {_LARGEST_FACTOR:g}; got {largest!r}.")
-
-
 def _worst(model: Model, record: Record, points: Points, values: Vector) -> tuple[float | None, Place | None]:
     """The largest value and its point; None where no value is finite."""
-    if not np.isfinite(values).any():
+    values = np.where(np.isfinite(values), values, -1.0)
+    i = int(np.argmax(values)) if len(values) else -1
+    if i < 0 or values[i] < 0:
         return None, None
-    i = int(np.nanargmax(values))
     number, row = int(points.experiment[i]), int(points.row[i])
     regressor = {str(lag): float(v) for lag, v in zip(model.form.layout, points.x[i], strict=True)}
     if number < 0:
@@ -518,57 +447,55 @@ def _where(record: Record, number: int, row: int) -> str:
     return e.where(row) if e.source or len(record.experiments) == 1 else f"experiment {number}, {e.where(row)}"
 
 
-def _percent(share: float) -> str:
-    return f"{100 * share:.3g} %"
+def _plain(items: list[tuple[str, Any]]) -> dict[str, Any]:
+    return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in items if k not in _PER_STEP}
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, tuple):
-        return list(value)
-    if hasattr(value, "__dataclass_fields__"):
-        return {name: _plain(v) for name, v in value.__dict__.items() if name not in _PER_STEP}
-    return value.tolist() if isinstance(value, np.ndarray) else value
-
-
-def _free_run_lines(
-    found: Feedback | None, contracts: Contraction | None, factor: float | None, largest: float
-) -> Iterator[str]:
-    if not found:
-        yield "The model uses no past outputs: its free run cannot diverge, and keeps nothing of its start."
-        return
-    if found.diverged:
-        yield f"The free run diverges ({'; '.join(found.diverged)}); looked at up to there."
-    if found.worst:
-        yield (
-            f"Free run of {found.steps} steps, {len(found.radius)} looked at: local spectral radius {found.median:.4g} "
-            f"in the median and at most {found.largest:.4g}, at {found.worst}; above 1 at "
-            f"{_percent(found.share_above_one or 0.0)} of the steps."
+def _sentences(
+    found: Feedback | None, contracts: Contraction | None, factor: float | None, largest: float, step: Lipschitz
+) -> Iterator[tuple[str, bool]]:
+    """What the checks say, sentence by sentence, and whether it is a warning."""
+    if found is None:
+        yield "The model uses no past outputs: its free run cannot diverge, and keeps nothing of its start.", False
+    else:
+        if found.diverged:
+            yield f"The free run diverges ({'; '.join(found.diverged)}); it is looked at up to there.", True
+        if found.worst and found.share_above_one is not None:
+            yield (
+                (
+                    f"Local spectral radius at {len(found.radius)} of {found.steps} steps of the free run: median "
+                    f"{found.median:.4g}, above 1 at {100 * found.share_above_one:.3g} % of them, at most "
+                    f"{found.largest:.4g}, at {found.worst}."
+                ),
+                found.share_above_one > 0.01,
+            )
+        if found.skipped:
+            yield f"At {found.skipped} points more the model has no finite derivative; they are left out.", True
+        yield _contraction_sentence(contracts), contracts is None or contracts.rate >= 1
+        how, times = ("stays within", largest) if factor is None else ("leaves", factor)
+        bounds = (
+            f"The free run {how} all bounds with the inputs' deviations from their means {times:.4g} times as large."
         )
-    if contracts:
-        yield contracts.text
-    how, times = ("stays within", largest) if factor is None else ("leaves", factor)
-    yield f"It {how} all bounds with the inputs' deviations from their means {times:.3g} times as large."
-
-
-def _gradient_line(found: Lipschitz) -> str:
-    largest = "has no finite gradient" if found.gradient is None else f"gradient at most {found.gradient:.4g}"
-    return (
-        f"One-step predictor, which remembers only its lags: {largest} on {found.rows} measured rows. That bears on "
-        "predictions from measured outputs and says nothing about the free run."
+        yield bounds, factor is not None and factor < 1.5
+    gradient = "no finite gradient" if step.gradient is None else f"a gradient of at most {step.gradient:.4g}"
+    yield (
+        (
+            f"The one-step predictor, which remembers only its lags, has {gradient} on {step.rows} measured rows; that says "
+            "nothing about the free run."
+        ),
+        False,
     )
 
 
-def _warnings(found: Feedback, contracts: Contraction | None, factor: float | None) -> Iterator[str]:
-    share = found.share_above_one or 0.0
-    if found.diverged:
-        yield f"the free run diverges: {'; '.join(found.diverged)}."
-    elif factor is not None and factor < 1.5:
-        yield f"the free run diverges with inputs only {factor:.3g} times as large; do not use it beyond its data."
-    if share > 0.01:
-        yield f"the local spectral radius is above 1 at {_percent(share)} of the steps."
-    if contracts is None:
-        yield "contraction could not be checked: no finite derivatives, or more than 200 past outputs."
-    elif contracts.rate >= 1:
-        yield f"contraction was not found: not at {_percent(1 - contracts.share)} of the sampled points."
-    if found.skipped:
-        yield f"at {found.skipped} points of the free run the model has no finite derivative; they are left out."
+def _contraction_sentence(found: Contraction | None) -> str:
+    if found is None:
+        return "Contraction could not be checked: no finite derivatives, or more than 200 past outputs."
+    if found.rate < 1:
+        return (
+            f"On all {found.samples} sampled points the free run contracts in one metric (rate {found.rate:.4g}): "
+            "evidence, not proof, that it forgets its start."
+        )
+    return (
+        f"At {100 * (1 - found.share):.3g} % of the {found.samples} sampled points the free run does not contract in the "
+        f"best metric that was found, worst at {found.worst}, rate {found.rate:.4g}."
+    )

@@ -52,8 +52,12 @@ def write(model: Model, folder: Path) -> None:
     """Write the two files into an existing folder."""
     numbers = {name: value for name, value in model.numbers._asdict().items() if value is not None}
     arrays = {f"numbers.{name}": np.asarray(value) for name, value in numbers.items()}
-    arrays |= {"largest_output": model.largest_output}
-    arrays |= {name: value for name, value in (("gram", model.gram), ("noise", model.noise)) if value is not None}
+    arrays |= {"largest_output": model.largest_output, "weight": model.weight, "ridge": np.array([model.ridge])}
+    arrays |= {
+        name: value
+        for name, value in (("gram", model.gram), ("noise", model.noise), ("middle", model.middle))
+        if value is not None
+    }
     packed = save_arrays({name: np.ascontiguousarray(value, dtype=np.float64) for name, value in arrays.items()})
     declaration = _declare(model) | {"arrays_sha256": hashlib.sha256(packed).hexdigest()}
     declaration["checksum"] = _checksum(declaration)
@@ -174,7 +178,10 @@ def _rebuild(
         time_column=declared["time_column"],
         structure=declared["structure"],
         largest_output=arrays["largest_output"],
+        weight=arrays["weight"],
+        ridge=float(arrays["ridge"][0]),
         gram=arrays.get("gram"),
+        middle=arrays.get("middle"),
         noise=arrays.get("noise"),
     )
 

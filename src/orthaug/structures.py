@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from orthaug._arrays import Matrix, Vector
 from orthaug.errors import InputError
+from orthaug.measures import Measure, Training
 from orthaug.problem import Problem
 
 Fixed = dict[int, float]
@@ -50,8 +51,13 @@ def _no_rows(nt: int) -> Rows:
 
 @dataclass(frozen=True)
 class Orthogonal:
-    """ŷ = φ(θ − θ_aux) + f with θ_aux = Φ⁺F (eq:orth_param): θ̂ = Φ⁺Y for every learner (F1)."""
+    """ŷ = φ(θ − θ_aux) + f with θ_aux = Φ_μ⁺F_μ (eq:orth_param).
 
+    Under the training measure θ̂ = Φ⁺Y for every learner (F1); under another `measure` training is the same, and the
+    fitted function is split over the measure's points at the end (F2).
+    """
+
+    measure: Measure = Training()  # noqa: RUF009  (frozen)
     name: str = "orthogonal"
 
     def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> Rows:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -11,7 +12,7 @@ from jaxtyping import Array, Float
 
 from orthaug._arrays import Matrix, Vector
 from orthaug._jax import jax, jnp
-from orthaug.criteria import Chunks, Hold, Joint, OneStep, Overlap, Physics, linearise
+from orthaug.criteria import Chunks, Hold, Joint, OneStep, Overlap, Physics, linearise, mixed_gram, share_of
 from orthaug.errors import InputError
 from orthaug.gram import chunk_shape, from_chunks, in_chunks
 from orthaug.learners import Bound, Learner
@@ -52,6 +53,10 @@ class Learned:
     values: Float[np.ndarray, "N ny"]
     effective: float = 0.0
     gram: Matrix | None = None
+    ridge: float = 0.0
+    """Of the weights, in the units of `gram`."""
+    middle: Callable[[Matrix], Matrix] | None = None
+    """ΣψᵀΣ_eψ in the units of `gram`, for the noise covariance (ny, ny) of whitened outputs."""
     code: int | None = None
     iterations: int = 0
     seconds: float = 0.0
@@ -222,6 +227,8 @@ class Task:
             values=self.values(run.w),
             effective=run.effective,
             gram=self.gram(run),
+            ridge=run.ridge * self.rms**2,
+            middle=lambda noise: self.middle(run.w, noise),
             code=run.code,
             iterations=run.iterations,
             seconds=run.seconds,
@@ -230,7 +237,7 @@ class Task:
 
     def overlap(self, w: Any) -> Matrix:
         """QᵀJ (nθ, nw) at the training rows, in whitened outputs."""
-        return np.asarray(_share(OneStep(self.bound), w, self.chunks).jacobian) * self.rms
+        return np.asarray(share_of(self.bound, w, self.chunks).jacobian) * self.rms
 
     def values(self, w: Any) -> Float[np.ndarray, "N ny"]:
         """f at the training rows, in the outputs' units."""
@@ -250,12 +257,15 @@ class Task:
         cross = to_phi.T @ overlap
         return np.block([[to_phi.T @ to_phi, cross], [cross.T, inner]])
 
-
-@partial(jax.jit, static_argnames="criterion")
-def _share(criterion: OneStep, w: Float[Array, "nw"], chunks: Chunks) -> Overlap:
-    nt = chunks.q.shape[2]
-    nothing = Overlap(jnp.zeros((nt, w.shape[0])), jnp.zeros(nt))
-    return criterion(w, chunks, Hold(jnp.zeros((nt, nt)), jnp.zeros(nt)), nothing).overlap
+    def middle(self, w: Any, noise: Matrix) -> Matrix:
+        """ΣψᵀΣ_eψ of `[Φ J]` for the noise covariance of whitened outputs; one pass over the rows."""
+        projection = self.problem.projection
+        mix = jnp.asarray(np.linalg.cholesky(noise).T)
+        found = np.asarray(mixed_gram(self.bound, jnp.asarray(w), self.chunks, mix))
+        nt = len(projection.scale)
+        change = np.eye(len(found)) * self.rms
+        change[:nt, :nt] = projection.r / projection.scale
+        return change.T @ found @ change
 
 
 @partial(jax.jit, static_argnames="bound")

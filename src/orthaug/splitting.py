@@ -1,0 +1,109 @@
+"""θ of a fitted function under any measure, with its uncertainty: `θ_μ = c + Φ_μ⁺F_μ`, without training again (F2).
+
+With `Cov(c, w)` from training, `Cov θ_μ = K Cov(c, w) Kᵀ`, `K = [I, Φ_μ⁺J_μ]`: under another measure θ depends on the
+learner, and shares its variance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from orthaug._arrays import Matrix, Vector
+from orthaug._jax import jnp
+from orthaug.covariance import Joint
+from orthaug.errors import InputError
+from orthaug.excitation import excitation, require_rank
+from orthaug.gram import chunk_shape, in_chunks
+from orthaug.measures import Measure, Points, Support
+from orthaug.model import Model
+from orthaug.projection import Projection
+
+SUPPORTED = 0.9  # share of a measure within reach of the data, below which it is warned of
+
+
+@dataclass(frozen=True, eq=False)
+class MeasureSplit:
+    """θ and θ_aux under a measure, Cov θ (None without statistics), and how far the data support the measure."""
+
+    name: str
+    theta: Vector
+    theta_aux: Vector
+    covariance: Matrix | None
+    defect: float | None
+    support: float
+    points: int
+    condition: float | None
+    warnings: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """What result.json tells of the measure."""
+        return {"kind": self.name, "points": self.points, "support": self.support, "condition": self.condition}
+
+
+def split_under(measure: Measure, model: Model, support: Support, joint: Joint | None) -> MeasureSplit:
+    """Split a model under a measure.
+
+    Args:
+        model: any, however it was trained: with c = θ − θ_aux its prediction stays what it is.
+        support: the training data.
+        joint: Cov(c, w) from training; None for no intervals.
+
+    Raises:
+        InputError: a measure that does not fit the model, or under which the physics is rank-deficient.
+    """
+    points = measure.points(support)
+    form, numbers = model.form, model.numbers
+    with np.errstate(all="ignore"):
+        phi = np.asarray(form.baseline.phi(points.x, form.layout, form.outputs, np))
+    if not np.isfinite(phi).all():
+        raise InputError(f"the physics is not finite on all points of the {measure.name} measure; narrow it.")
+    unit = np.sqrt(points.weight)[:, None] * model.weight
+    projection = Projection.factor(phi * unit[:, :, None])
+    found = excitation(projection.r, form.baseline.names)
+    try:
+        require_rank(found, phi.shape[0] * phi.shape[1])
+    except InputError as error:
+        raise type(error)(f"under the {measure.name} measure {error}") from None
+    raw = model.learner_at(points.x)
+    if not np.isfinite(raw).all():
+        raise InputError(f"the learner is not finite on all points of the {measure.name} measure; narrow it.")
+    values = raw * unit
+    aux = projection.solve(values)
+    theta = model.theta - model.theta_aux + aux
+    covariance = None
+    if joint is not None and numbers.tilt is None:
+        slope = learner_slope(model, points, projection, unit)
+        covariance = joint.of(np.column_stack([np.eye(len(theta)), slope]))
+    size = np.linalg.norm(values)
+    rest = values - projection.phi @ aux
+    defect = float(np.linalg.norm(projection.coordinates(rest)) / size) if 0 < size < np.inf else None
+    share = support.share(points)
+    warnings = (
+        (
+            f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the training data: elsewhere θ "
+            "rests on how the learner extrapolates.",
+        )
+        if share < SUPPORTED
+        else ()
+    )
+    return MeasureSplit(measure.name, theta, aux, covariance, defect, share, len(points.x), found.condition, warnings)
+
+
+def learner_slope(model: Model, points: Points, projection: Projection, unit: Matrix) -> Matrix:
+    """Φ_μ⁺J_μ (nθ, nw), in one pass over the points."""
+    from orthaug.criteria import Chunks, share_of
+
+    bound, numbers = model.form.bound, model.numbers
+    nt = len(model.theta)
+    if bound is None or not bound.size:
+        return np.zeros((nt, 0))
+    shape = chunk_shape(len(points.x))
+    z = np.asarray(model.form.features.evaluate(points.x, model.form.layout, np))
+    scaled = (z - np.asarray(numbers.centre)) / np.asarray(numbers.halfwidth)
+    gain = unit * np.asarray(numbers.gain)
+    pieces = (in_chunks(scaled, shape, repeat=True), *(in_chunks(p, shape) for p in (projection.q, 0 * gain, gain)))
+    overlap = share_of(bound, jnp.asarray(numbers.weights), Chunks(*map(jnp.asarray, pieces)))
+    return projection.from_coordinates(np.asarray(overlap.jacobian))
