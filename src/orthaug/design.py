@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -54,10 +53,7 @@ class Candidate(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """An input (N,) and what it is predicted to do to θ: `bias` and `std` (nt,) in θ's units, `relative_error` = √cost.
-
-    `candidates` are all that were tried over N samples, the best first, those above the cap on the condition last.
-    """
+    """An input (N,) and its prediction: `bias` and `std` (nt,) in θ's units, √cost, what else was tried, best first."""
 
     signal: Vector
     kind: str
@@ -100,8 +96,7 @@ def design_input(
     """The input of least predicted error of θ within |u| ≤ amplitude and |u_k − u_{k−1}| ≤ rate · Ts.
 
     Args:
-        baseline: made of terms.
-        outputs: names of the channels; `inputs` likewise.
+        baseline: made of terms; of channels with the names `outputs` and `inputs`.
         sampling_time: Ts, s.
         samples: N.
         amplitude: in the channel's unit; `rate` in that unit per second, counted from 0 before the first sample.
@@ -112,10 +107,9 @@ def design_input(
         weights: W, (nt,) for a diagonal, or (m, nt), such as dp/dθ / p for physical parameters p; None for 1/|θ|.
         condition: cap on the condition number of Φ with columns of unit norm.
         channel: the input that is designed; may be left out where there is one.
-        seed: of the random signals among the candidates.
         known_inputs: samples (N,) of other inputs, by name; zero where absent.
-        initial_outputs: a number, (ny,) or (largest lag, ny): the outputs before the first row.
-        iterations: the most improvements of one pattern.
+        initial_outputs: before the first row, a number, (ny,) or (largest lag, ny).
+        iterations: the most improvements of one pattern; `seed` is that of the random candidates.
 
     Raises:
         InputError: numbers out of range, unknown channels, a suspect without coefficient, θ of 0 without `weights`,
@@ -124,7 +118,7 @@ def design_input(
     amplitude = check_number(amplitude, "amplitude", positive=True)
     sampling_time = check_number(sampling_time, "sampling_time", positive=True)
     step = math.inf if rate is None else check_number(rate, "rate", positive=True) * sampling_time
-    iterations, seed = check_count(iterations, "iterations", 0), check_count(seed, "seed", 0)
+    iterations, seed, suspects = check_count(iterations, "iterations", 0), check_count(seed, "seed", 0), tuple(suspects)
     if baseline.function is not None or not baseline.names:
         raise InputError("a design needs physics that is made of terms, with one parameter or more.")
     theta = _numbers(baseline.initial if theta is None else theta, (len(baseline.names),), "theta")
@@ -134,13 +128,10 @@ def design_input(
         check_choice(name, plant.others, "a channel of `known_inputs`")
         plant.others[name] = _numbers(values, (samples,), f"known_inputs['{name}']")[:, None]
     plant.before = _numbers(initial_outputs, (plant.start, len(outputs)), "initial_outputs")
-    sigma = _numbers(noise, (len(outputs),), "noise")
-    if np.any(sigma < 0):
-        raise InputError(f"`noise` must be a standard deviation, 0 or more; got {noise!r}.")
-    sigma = sigma if suspects or sigma.any() else np.ones(len(outputs))
-    cap = check_number(condition, "condition", positive=True)
-    search = _Search(plant, amplitude, step, sigma, _weights(weights, plant), cap, samples)
-    return search.run(seed, iterations)
+    sigma = np.array([check_number(value, "noise") for value in _numbers(noise, (len(outputs),), "noise")])
+    sigma = (sigma if suspects or sigma.any() else np.ones(len(outputs))) / math.sqrt(samples - plant.start)
+    limits = amplitude, step, check_number(condition, "condition", positive=True), samples
+    return _Search(plant, _weights(weights, plant), sigma, *limits).run(seed, iterations)
 
 
 def _numbers(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
@@ -157,10 +148,10 @@ def _weights(weights: Any, plant: _Plant) -> Matrix:
     """W, (m, nt)."""
     nt = len(plant.theta)
     if weights is None:
-        zero = [name for name, value in zip(plant.names, plant.theta, strict=True) if value == 0]
-        if zero:
-            raise InputError(f"θ of {', '.join(zero)} is 0, so that relative errors have no meaning; give `weights`.")
-        return np.diag(1 / np.abs(plant.theta))
+        if not plant.theta.all():
+            zero = plant.names[int(np.argmin(np.abs(plant.theta)))]
+            raise InputError(f"θ of {zero} is 0, so that its relative error has no meaning; give `weights`.")
+        weights = 1 / np.abs(plant.theta)
     found = _numbers(weights, np.shape(weights) if np.ndim(weights) == 2 else (nt,), "weights")
     if found.shape[-1] != nt or not found.any():
         raise InputError(f"`weights` must be of shape ({nt},) or (m, {nt}), and not all 0.")
@@ -206,7 +197,7 @@ class _Tape:
         return value if coefficient is None else self.record(np.multiply, value, coefficient)
 
     def total(self, values: Sequence[_Node]) -> _Node:
-        return reduce(lambda a, b: self.record(np.add, a, b), values) if values else self.asarray(0.0)
+        return sum(values[1:], values[0]) if values else self.asarray(0.0)
 
     def _node(self, key: Any, value: Any = None) -> _Node:
         if key not in self.known:
@@ -227,9 +218,7 @@ class _Tape:
 class _Plant:
     """The physics at θ with the suspected terms, simulated for many inputs side by side."""
 
-    def __init__(
-        self, baseline: Baseline, channels: Any, suspects: Sequence[Suspect], theta: Vector, channel: str | None
-    ):
+    def __init__(self, baseline: Baseline, channels: Any, suspects: Sequence[Suspect], theta: Vector, channel: Any):
         outputs, inputs = channels
         if channel is None and len(inputs) != 1:
             raise InputError(f"`channel` is missing: the input to design, one of the inputs ({', '.join(inputs)}).")
@@ -238,9 +227,9 @@ class _Plant:
         check_unique((suspect.name for suspect in suspects), "suspect")
         self.names, self.theta, self.outputs = baseline.names, theta, outputs
         self.others = {name: np.zeros((1, 1)) for name in inputs if name != self.channel}
-        self.before = np.zeros((0, len(outputs)))
+        self.before = np.zeros((0, 0))
         self.tape, nt = _Tape(), len(theta)
-        parts: list[list[list[_Node]]] = [[[] for _ in range(nt + 2)] for _ in outputs]  # of φ, of δ, the fixed terms
+        parts: list[list[list[_Node]]] = [[[] for _ in range(nt + 2)] for _ in outputs]  # φ, then δ, then fixed terms
         for term, expression in zip(baseline.terms, baseline.expressions, strict=True):
             i = 0 if term.output is None else outputs.index(term.output)
             j = nt + 1 if term.fixed else self.names.index(term.parameter)
@@ -251,16 +240,15 @@ class _Plant:
                 raise InputError(f"suspect '{suspect.name}' has no `coefficient`; a design needs a guess of its size.")
             parts[suspect._column_of(outputs)][nt].append(self.tape.trace(suspect.parsed, suspect.coefficient))
         table = [[self.tape.total(entry) for entry in row] for row in parts]
-        factors = [*theta.tolist(), 1.0, 1.0]
-        sums = [[self.tape.record(np.multiply, v, f) for v, f in zip(row, factors, strict=True)] for row in table]
+        scaled = [[*(v * t for v, t in zip(row, theta.tolist(), strict=False)), *row[nt:]] for row in table]
         if self.channel not in {lag.channel for lag in self.tape.lags}:
             raise InputError(f"no term reads the input '{self.channel}', so that it cannot be designed.")
         self.start = largest_lag(tuple(self.tape.lags))
-        self._total = [self.tape.total(row).slot for row in sums]
+        self._total = [self.tape.total(row).slot for row in scaled]
         self._table = [node.slot for row in table for node in row]
 
-    def rows(self, u: Float[np.ndarray, "N M"]) -> tuple[Float[np.ndarray, "M R ny nt+1"], Float[np.ndarray, "M R ny"]]:
-        """Rows `[Φ Δ]`, and the outputs less fixed terms; zero for an input under which they run away."""
+    def rows(self, u: Float[np.ndarray, "N M"]) -> tuple[Float[np.ndarray, "M R ny nt+1"], np.ndarray]:
+        """Rows `[Φ Δ]`, zero for an input under which they run away, and the weights of the outputs (M, 1, ny, 1)."""
         (length, count), start, half = u.shape, self.start, len(u) // 2
         y = np.zeros((len(self.outputs), length, count))
         y[:, :start] = self.before.T[:, :, None]
@@ -278,9 +266,9 @@ class _Plant:
             early, late = np.abs(y[:, :half]).max(axis=1), np.abs(y[:, half:]).max(axis=1)
             sound = np.isfinite(rows).all(axis=(1, 2)) & (late <= RUNS_AWAY * np.where(early > 0, early, late)).all(0)
             rows = rows.reshape(count, length - start, len(self.outputs), -1)
-            target = y[:, start:].transpose(2, 1, 0) - rows[..., -1]
-        rows[~sound], target[~sound] = 0.0, 0.0
-        return rows[..., :-1], target
+            deviation = (y[:, start:].transpose(2, 1, 0) - rows[..., -1]).std(axis=1)[:, None, :, None]
+        rows[~sound], deviation[~sound] = 0.0, 1.0
+        return rows[..., :-1], 1 / np.where((deviation > 0) & (len(y) > 1), deviation, 1.0)
 
 
 class _Pattern(NamedTuple):
@@ -313,15 +301,14 @@ class _Pattern(NamedTuple):
 
 
 def _starts(period: int, seed: int) -> list[_Pattern]:
-    """Square waves of about this period cut at every length, all short binary patterns, and some at random."""
+    """Square waves of about this period cut at every length, all short binary patterns, some at random and of four levels."""
     rng, found = np.random.default_rng(seed), []
     for hold in sorted({1} if period <= 16 else {round(period / 6), round(period / 12)}):
-        cycle = period / hold
-        square = [1.0 if k % cycle < cycle / 2 else -1.0 for k in range(LONGEST_PATTERN)]
+        square = [1.0 if k * hold % period < period / 2 else -1.0 for k in range(LONGEST_PATTERN)]
         for n, odd in product(range(2, LONGEST_PATTERN + 1), (False, True)):
-            chance = 2.0 * rng.integers(0, 2, n) - 1.0
-            found += [_Pattern(tuple(square[:n]), hold, odd), _Pattern(tuple(chance.tolist()), hold, odd)]
+            found += [_Pattern(tuple(x), hold, odd) for x in (square[:n], rng.choice([-1.0, 1.0], n).tolist())]
         found += [_Pattern(levels, hold, False) for n in range(3, 8) for levels in product((-1.0, 1.0), repeat=n)]
+        found += [_Pattern(levels, hold, True) for levels in product((-1.0, -0.5, 0.5, 1.0), repeat=4)]
     return sorted(set(found))
 
 
@@ -332,25 +319,19 @@ def _families(samples: int, seed: int) -> tuple[dict[str, Vector], dict[str, int
     def spaced(first: int, last: int) -> list[int]:
         return sorted({*range(first, min(last, 8) + 1), *(round(8 * 1.4**i) for i in range(60) if 8 * 1.4**i <= last)})
 
-    holds, shares = (
-        spaced(1, max(samples // 64, 1))[::2],
-        [s for s in (1.0, 0.5, 0.2, 0.1, 0.03, 0.01) if s * samples > 16],
-    )
-    even, unit = samples + samples % 2, {"amplitude": 1.0}
     squares = {f"square, period {2 * half}": 2 * half for half in spaced(1, samples // 8)}
-    found = {
-        "white Gaussian": signals.white_gaussian(samples, seed=seed, **unit),
-        "white uniform": signals.white_uniform(samples, seed=seed, **unit),
-    }
-    for h in holds:
-        found[f"white binary, hold {h}"] = signals.white_binary(samples, seed=seed, hold=h, **unit)
-        found[f"PRBS, hold {h}"] = signals.prbs(samples, hold=h, **unit)
-    for s in shares:
-        band = (1 / samples, s / 2)
-        found[f"multisine up to {s:g} Nyquist"] = signals.multisine(samples, band=band, **unit)
-        found[f"odd multisine up to {s:g} Nyquist"] = signals.multisine(even, band=band, odd=True, **unit)[:samples]
-        found[f"swept square up to {s:g} Nyquist"] = signals.swept_square(samples, band=band, logarithmic=True, **unit)
-    found |= {name: signals.square(samples, period=period, **unit) for name, period in squares.items()}
+    found = {"white Gaussian": signals.white_gaussian(samples, amplitude=1, seed=seed)}
+    found["white uniform"] = signals.white_uniform(samples, amplitude=1, seed=seed)
+    for h in spaced(1, max(samples // 64, 1))[::2]:
+        found[f"white binary, hold {h}"] = signals.white_binary(samples, amplitude=1, seed=seed, hold=h)
+        found[f"PRBS, hold {h}"] = signals.prbs(samples, amplitude=1, hold=h)
+    even = samples + samples % 2
+    for part in [s for s in (1.0, 0.5, 0.2, 0.1, 0.03, 0.01) if s * samples > 16]:
+        band, name = (1 / samples, part / 2), f"up to {part:g} Nyquist"
+        found[f"multisine {name}"] = signals.multisine(samples, amplitude=1, band=band)
+        found[f"odd multisine {name}"] = signals.multisine(even, amplitude=1, band=band, odd=True)[:samples]
+        found[f"swept square {name}"] = signals.swept_square(samples, amplitude=1, band=band, logarithmic=True)
+    found |= {name: signals.square(samples, amplitude=1, period=period) for name, period in squares.items()}
     return found, squares
 
 
@@ -363,6 +344,7 @@ class _Scores(NamedTuple):
     condition: Vector
     bias: Matrix
     std: Matrix
+    ranked: Vector  # the cost, infinite above the cap
 
 
 @dataclass(frozen=True, eq=False)
@@ -370,65 +352,52 @@ class _Search:
     """What is asked for; see `design_input`."""
 
     plant: _Plant
+    weights: Matrix
+    sigma: Vector  # of the noise, over the square root of the number of rows
     amplitude: float
     step: float
-    sigma: Vector
-    weights: Matrix
     cap: float
     samples: int
 
     def run(self, seed: int, iterations: int) -> Design:
         families, squares = _families(self.samples, seed)
-        names = list(families)
         u, factors = self.measured(np.stack(list(families.values()), axis=1))
         if not factors.any():
-            raise InputError(
-                "the simulated output runs away, or is not a number, under every input; "
-                "give a `theta` for which the physics is stable, and check the suspects' coefficients."
-            )
-        rank = dict(zip(names, self.ranked(self.scores(factors)), strict=True))
+            raise InputError("the simulated output runs away under every input; give a `theta` that is stable.")
+        rank = dict(zip(families, self.scores(factors).ranked, strict=True))
         patterns = self.patterns(squares[min(squares, key=lambda name: rank[name])], seed, iterations)
         more, found = self.measured(np.stack([pattern(self.samples) for pattern in patterns], axis=1))
-        names += [pattern.name for pattern in patterns]
-        return self.best(names, np.hstack([u, more]), self.scores(np.concatenate([factors, found])))
-
-    def best(self, names: list[str], u: Matrix, scores: _Scores) -> Design:
-        order = np.lexsort((scores.condition, self.ranked(scores), scores.condition > self.cap))
-        k = order[0]
-        if not scores.condition[k] <= self.cap:
-            k = int(np.argmin(scores.condition))
+        u, scores = np.hstack([u, more]), self.scores(np.concatenate([factors, found]))
+        names = [*families, *(pattern.name for pattern in patterns)]
+        order = np.lexsort((scores.cost, scores.ranked))
+        table = tuple(Candidate(names[i], *(float(column[i]) for column in scores[:4])) for i in order)
+        if not table[0].condition <= self.cap:
+            best = min(table, key=lambda row: row.condition)
             raise InputError(
-                f"no candidate keeps the condition number of Φ at or below {self.cap:g}; the smallest is "
-                f"{scores.condition[k]:.3g} ({names[k]}). Raise `condition`, or fix a parameter."
+                f"no candidate has a condition number of Φ of {self.cap:g} or less; the best has {best.condition:.4g}: "
+                f"{best.name}. Raise `condition`, or fix a parameter."
             )
-        table = [Candidate(names[i], *(float(column[i]) for column in scores[:4])) for i in order]
-        cost, error, bias, std = table[0].cost, math.sqrt(table[0].cost), scores.bias[k], scores.std[k]
-        signal = np.ascontiguousarray(u[:, k])
-        found = self.plant.names, bias, std, error, table[0].condition, cost, tuple(table)
-        return Design(signal, names[k], *found)
+        (name, cost, _, _, condition), k = table[0], order[0]
+        own = u[:, k].copy(), name, self.plant.names, scores.bias[k], scores.std[k]
+        return Design(*own, math.sqrt(cost), condition, cost, table)
 
     def measured(self, waves: Matrix, period: Vector | None = None) -> tuple[Matrix, Factors]:
         """The limited signals (N, M) of waves of amplitude 1, and their factors per row; of whole periods if given."""
-        signals, factors = [], []
-        size = max(1, BATCH // len(waves))
+        signals, factors, size = [], [], max(1, BATCH // len(waves))
         for first in range(0, waves.shape[1], size):
             u = self.limited(waves[:, first : first + size] * self.amplitude)
-            rows, target = self.plant.rows(u)
+            rows, weight = self.plant.rows(u)
             counted = np.full(len(rows), rows.shape[1])
             if period is not None:  # a quarter is left to the transient
                 here = period[first : first + size]
                 counted = np.maximum(rows.shape[1] * 3 // 4 // here, 1) * np.minimum(here, rows.shape[1])
-            rows = rows * (np.arange(rows.shape[1]) >= rows.shape[1] - counted[:, None])[:, :, None, None]
+            rows *= (np.arange(rows.shape[1]) >= rows.shape[1] - counted[:, None])[:, :, None, None] * weight
+            shape = len(rows), -1, rows.shape[-1]
+            r = np.linalg.qr(rows.reshape(shape), mode="r")
+            noisy = rows * weight * self.sigma[:, None]
+            s = np.linalg.qr(noisy.reshape(shape), mode="r") if len(self.sigma) > 1 else r * self.sigma
             signals.append(u)
-            if rows.shape[2] == 1:
-                r = np.linalg.qr(rows[:, :, 0], mode="r")
-                both = [r, r * self.sigma]
-            else:
-                deviation = target.std(axis=1)[:, None, :, None]
-                weight = 1 / np.where(deviation > 0, deviation, 1.0)
-                pair = rows * weight, rows * weight**2 * self.sigma[:, None]
-                both = [np.linalg.qr(x.reshape(len(rows), -1, x.shape[-1]), mode="r") for x in pair]
-            factors.append(np.stack(both, axis=1) / np.sqrt(counted)[:, None, None, None])
+            factors.append(np.stack([r, s], axis=1) / np.sqrt(counted)[:, None, None, None])
         return np.hstack(signals), np.concatenate(factors)
 
     def limited(self, u: Matrix) -> Matrix:
@@ -436,7 +405,7 @@ class _Search:
         u = np.clip(u, -self.amplitude, self.amplitude)
         if self.step >= 2 * self.amplitude:
             return u
-        from orthaug.signals import limit_rate
+        from orthaug.signals import limit_rate  # after scipy.signal, which is slow to import
 
         step = max(self.step - 4 * np.spacing(self.amplitude), self.step / 2)
         return np.stack([limit_rate(column, step, 0.0) for column in u.T], axis=1)
@@ -445,24 +414,18 @@ class _Search:
         """Bias, variance and cost over all N samples."""
         nt = len(self.plant.theta)
         r = factors[:, 0, :nt, :nt]
-        norms = np.linalg.norm(r, axis=1)
-        unit = r / np.where(norms > 0, norms, 1.0)[:, None]
+        norms = np.where((norms := np.linalg.norm(r, axis=1)) > 0, norms, 1.0)
+        unit = r / norms[:, None]
         sigma = np.linalg.svd(unit, compute_uv=False)
         condition = np.divide(sigma[:, 0], sigma[:, -1], out=np.full(len(r), np.inf), where=sigma[:, -1] > 0)
         fine = condition < SINGULAR
-        inverse = np.linalg.inv(np.where(fine[:, None, None], unit, np.eye(nt)))
-        inverse = inverse / np.where(norms > 0, norms, 1.0)[:, :, None]
+        inverse = np.linalg.inv(np.where(fine[:, None, None], unit, np.eye(nt))) / norms[:, :, None]
         bias = (inverse @ factors[:, 0, :nt, nt:])[:, :, 0]
-        rows = self.samples - self.plant.start
-        half = factors[:, 1, :nt, :nt] @ inverse @ inverse.transpose(0, 2, 1) / math.sqrt(rows)  # Cov = halfᵀ half
+        half = factors[:, 1, :nt, :nt] @ inverse @ inverse.transpose(0, 2, 1)  # Cov = halfᵀ half
         relative = [np.linalg.norm(bias @ self.weights.T, axis=1), np.linalg.norm(half @ self.weights.T, axis=(1, 2))]
-        relative = [np.where(fine, values, np.inf) for values in relative]
-        cost = relative[0] ** 2 + relative[1] ** 2
-        return _Scores(cost, *relative, condition, bias, np.linalg.norm(half, axis=1))
-
-    def ranked(self, scores: _Scores) -> Vector:
-        """The cost, infinite above the cap."""
-        return np.where(scores.condition <= self.cap, scores.cost, np.inf)
+        parts = [np.where(fine, values, np.inf) for values in relative]
+        ranked = np.where(condition <= self.cap, cost := parts[0] ** 2 + parts[1] ** 2, np.inf)
+        return _Scores(cost, parts[0], parts[1], condition, bias, np.linalg.norm(half, axis=1), ranked)
 
     def patterns(self, period: int, seed: int, iterations: int) -> list[_Pattern]:
         """The best patterns, best first; the first few of different lengths were improved."""
@@ -471,15 +434,14 @@ class _Search:
         def tried(patterns: list[_Pattern]) -> Vector:
             waves = np.stack([pattern(length) for pattern in patterns], axis=1)
             periods = np.array([len(p.levels) * p.hold * (1 + p.odd) for p in patterns])
-            return self.ranked(self.scores(self.measured(waves, periods)[1]))
+            return self.scores(self.measured(waves, periods)[1]).ranked
 
         starts = _starts(period, seed)
         pool = dict(zip(starts, tried(starts), strict=True))
         chosen = {(len(p.levels), p.odd): p for p in sorted(pool, key=lambda p: -pool[p])}  # the best of each length
         for pattern in sorted(chosen.values(), key=lambda p: pool[p])[:STARTS]:
             for _ in range(iterations):
-                near = pattern.neighbours()
-                values = tried(near)
+                values = tried(near := pattern.neighbours())
                 k = int(np.argmin(values))
                 if not values[k] < pool[pattern] * (1 - LEAST_GAIN):
                     break

@@ -19,6 +19,7 @@ from orthaug.ensemble import combine
 from orthaug.errors import InputError
 from orthaug.excitation import ILL_CONDITIONED
 from orthaug.learners import MLP, Bound, External, Learner
+from orthaug.measures import Training
 from orthaug.model import Model
 from orthaug.parallel import spread
 from orthaug.predictor import Form, Numbers
@@ -100,6 +101,7 @@ def estimate(
         '2.000'
     """
     _check_arguments(record, baseline, lags, learner, structure, criterion, solver, initial, validation)
+    _check_splittable(structure, baseline, learner)
     flown = _free_run_of(criterion)
     choices = _regularizations(regularization, validation)
     if ensemble and (restarts < 2 or initial is not None):
@@ -123,6 +125,23 @@ def estimate(
     starts = [_Start(s, w, choice) for choice in choices for s, w in weights.items()]
     place = FreeRun.of(problem, task, flown) if flown else task
     return _train(place, starts, structure, solver, validation, progress, ensemble)
+
+
+def _check_splittable(structure: Structure, baseline: Baseline, learner: Learner | None) -> None:
+    """Raise InputError for bounds on a θ that is split off after training."""
+    if not _splits(structure) or learner is None:
+        return
+    bounded = [p.name for p in baseline.parameters if np.isfinite(p.min) or np.isfinite(p.max)]
+    if bounded:
+        raise InputError(
+            f"{', '.join(bounded)} have bounds, which hold under the training measure only: under another one θ is "
+            "split off after training. Drop the bounds or the measure."
+        )
+
+
+def _splits(structure: Structure) -> bool:
+    """Whether θ is split off under another measure than that of training."""
+    return isinstance(structure, Orthogonal) and structure.measure != Training()
 
 
 def _free_run_of(criterion: Criterion) -> Simulation | None:
@@ -232,7 +251,9 @@ def _train(
     )
     seconds = sum(run.seconds for run in runs)
     criterion = task.criterion if isinstance(task, FreeRun) else Prediction()
-    return replace(fit, criterion=criterion, restarts=restarts, status=replace(fit.status, seconds=seconds))
+    fit = replace(fit, criterion=criterion, restarts=restarts, status=replace(fit.status, seconds=seconds))
+    split_off = isinstance(structure, Orthogonal) and _splits(structure) and fit.status.ok and task.bound is not None
+    return fit.split(structure.measure) if split_off else fit  # type: ignore[attr-defined]
 
 
 def _concluded(task: Task | FreeRun, structure: Structure, run: Any, members: Sequence[Any] = ()) -> Estimate:
@@ -306,6 +327,7 @@ def _conclude(problem: Problem, structure: Structure, learned: Learned, status: 
             weight=problem.weight,
             gram=learned.gram,
             ridge=learned.ridge,
+            freedom=found.freedom,
             middle=_middle(learned, noise, weight),
             noise=noise,
         ),

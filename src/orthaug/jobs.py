@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthaug.errors import InputError
+from orthaug.expressions import Lag
+from orthaug.measures import Measure, Support, Symmetrized, Training, Uniform
 from orthaug.problem import Problem, check_defined, pose, regressor_of
-from orthaug.readers import read_record
+from orthaug.readers import read_record, read_samples
 from orthaug.record import Record, check_channels, same_step
 from orthaug.regressors import largest_lag
-from orthaug.spec import Part, Spec, load_spec
+from orthaug.spec import MeasureSection, Part, Spec, load_spec
 from orthaug.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty, Structure
 
 if TYPE_CHECKING:
@@ -69,6 +71,7 @@ class Job:
     validation: LoadedPart | None
     tests: tuple[LoadedPart, ...]
     problem: Problem
+    measure: Measure
     warnings: tuple[str, ...]
 
     @property
@@ -114,7 +117,10 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
         train, validation, *tests = (p and p.without_short(largest_lag(layout)) for p in (train, validation, *tests))
         problem = pose(train.record, baseline, lags, learner_inputs, require_full_rank=require_full_rank)
         problem.feature_rows()
-        job = Job(path, spec, train, validation, tuple(tests), problem, ())
+        section = spec.structure.measure
+        measure = measure_of(section.kind, [str(lag) for lag in _used(problem)], section, path.parent)
+        measure.points(Support(train.record, problem.layout, _used(problem)))  # what is wrong with it shows here
+        job = Job(path, spec, train, validation, tuple(tests), problem, measure, ())
         for part in job.parts:
             _check_scorable(part, problem.rows.start, train.record.sampling_time)
             check_defined(problem, part.record)
@@ -131,16 +137,32 @@ def _thinned(name: str, every: int) -> str:
     return f"{name}: one row in {every} is kept without a filter; content above the new Nyquist frequency folds back."
 
 
-def structure_of(spec: Spec, kind: str | None = None) -> Structure:
+def structure_of(spec: Spec, kind: str | None = None, measure: Measure | None = None) -> Structure:
     """The structure that a spec declares, or another kind with its weight."""
     weight = spec.structure.weight
     known = {
         "additive": Additive(),
-        "orthogonal": Orthogonal(),
+        "orthogonal": Orthogonal(measure or Training()),
         "orthogonal-penalty": OrthogonalPenalty(weight),
         "baseline-penalty": BaselinePenalty(weight),
     }
     return known[kind or spec.structure.kind]
+
+
+def measure_of(kind: str, lags: Sequence[str], section: MeasureSection, folder: Path) -> Measure:
+    """The measure that a section declares; `lags` are the raw lags that the model reads."""
+    rows = section.rows
+    if kind == "samples":
+        files = [folder / file for file in section.files]
+        return read_samples(files, lags, rows=rows, every=section.every)
+    if kind == "uniform":
+        return Uniform({lag: tuple(limits) for lag, limits in section.box.items()})
+    return Symmetrized() if kind == "symmetrized" else Training()
+
+
+def _used(problem: Problem) -> tuple[Lag, ...]:
+    read = {*problem.baseline.lags, *problem.features.lags}
+    return tuple(lag for lag in problem.layout if lag in read)
 
 
 def _load(path: Path, spec: Spec, part: Part, name: str) -> LoadedPart:
@@ -217,7 +239,7 @@ def run_fit(
         job.problem.baseline,
         lags=spec.lag_orders() if learner is not None else None,
         learner=learner,
-        structure=Orthogonal() if alone else structure_of(spec, kind),
+        structure=Orthogonal() if alone else structure_of(spec, kind, job.measure),
         criterion=criterion,
         solver=solver,
         regularization=choices if fold is None or not isinstance(choices, tuple) else choices[0],

@@ -12,8 +12,6 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-import scipy.spatial
-import scipy.stats.qmc
 
 from orthaug._arrays import Matrix, Vector, nearest
 from orthaug.errors import InputError
@@ -61,6 +59,8 @@ class Support:
         known = np.unique(x[:: -(-len(x) // _NEIGHBOURS)] / unit, axis=0)
         if len(known) < 2:
             return float(np.sum(points.weight[(points.x[:, columns] / unit == known).all(axis=1)]))
+        import scipy.spatial  # slow to import, and few runs need it
+
         tree = scipy.spatial.cKDTree(known)
         reach = 2 * np.quantile(tree.query(known, k=2)[0][:, 1], 0.99)
         return float(np.sum(points.weight[tree.query(points.x[:, columns] / unit)[0] <= reach]))
@@ -243,5 +243,7 @@ def _rule(coordinates: int) -> Points:
         grid = np.meshgrid(*[line] * coordinates, indexing="ij")
         shares = np.meshgrid(*[share] * coordinates, indexing="ij")
         return Points(np.stack([g.ravel() for g in grid], axis=-1), np.prod([s.ravel() for s in shares], axis=0))
+    import scipy.stats.qmc  # slow to import, and few boxes have so many coordinates
+
     quasi = 2 * scipy.stats.qmc.Sobol(coordinates, scramble=True, rng=0).random(_QUASI_RANDOM) - 1
     return _even(np.concatenate([quasi, -quasi]))

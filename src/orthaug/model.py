@@ -143,10 +143,10 @@ class Response:
 class Model:
     """A fitted model; `estimate` makes it, `orthaug.save` and `orthaug.load` keep it.
 
-    `weight` (ny,) is one over each output's standard deviation; outputs times it are whitened. `gram` (nθ + nw)² is
-    the Gram matrix of ∂ŷ/∂(c, w), `[Φ J]` one step ahead, over the training rows in whitened outputs, `noise` (ny, ny)
-    the noise covariance, `ridge` the prior precision of the weights beside `gram`, `middle` = ΣψᵀΣ_eψ: with them every function of the model
-    has an interval (`Joint`).
+    `weight` (ny,) is one over each output's deviation; outputs times it are whitened. With the following every function
+    of the model has an interval (`Joint`): `gram` (nθ + nw)², the Gram matrix of ∂ŷ/∂(c, w) over the training rows in
+    whitened outputs, `[Φ J]` one step ahead; `ridge`, the weights' prior precision beside it; `middle` = ΣψᵀΣ_eψ;
+    `noise` (ny, ny), the noise covariance; `freedom`, its degrees of freedom.
     """
 
     form: Form
@@ -163,6 +163,7 @@ class Model:
     noise: Matrix | None = None
     ridge: float = 0.0
     middle: Matrix | None = None
+    freedom: float = np.inf
 
     def __repr__(self) -> str:
         learner = self.form.bound.learner if self.form.bound else "none"
@@ -201,7 +202,7 @@ class Model:
         """
         if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1:
             raise InputError(f"`horizon` must be a whole number of steps, 1 or more; got {horizon}.")
-        record = self._fitting(record, need_outputs=True)
+        record = self.fitting(record, need_outputs=True)
         trajectories = []
         for experiment in record.experiments:
             first = self.form.start + horizon - 1
@@ -225,7 +226,7 @@ class Model:
         Raises:
             InputError: other channels, too few rows, or initial values that are not there.
         """
-        record = self._fitting(record, need_outputs=False)
+        record = self.fitting(record, need_outputs=False)
         trajectories = []
         for experiment in record.experiments:
             self._check_rows(experiment, self.form.start)
@@ -306,7 +307,7 @@ class Model:
             name = experiment.source or "the record"
             raise InputError(f"{name} has {len(experiment)} rows, too few: the first value is at row {first}.")
 
-    def _fitting(self, record: Record, *, need_outputs: bool) -> Record:
+    def fitting(self, record: Record, *, need_outputs: bool) -> Record:
         """The record's channels in the model's order, by name.
 
         Raises:

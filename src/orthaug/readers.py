@@ -8,13 +8,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from orthaug._arrays import check_choice
 from orthaug.errors import InputError
+from orthaug.measures import Samples
 from orthaug.record import Channel, Experiment, Record, same_step
-from orthaug.tables import Table, read_table
+from orthaug.tables import Table, check_readable, has_column, read_table
 
 RowRange = tuple[int, int] | list[int]
 _MISSING = ("", "nan", "na", "n/a", "null", "none")  # how files write a sample that is not there
@@ -85,6 +87,30 @@ def read_record(
             )
     left_out = recorded - sum(len(experiment) for experiment in experiments)
     return Record(tuple(channels[0]), tuple(channels[1]), step * every, tuple(experiments), time, left_out)
+
+
+def read_samples(paths: Sequence[str | Path], lags: Sequence[str], *, rows: Any = None, every: int = 1) -> Samples:
+    """A measure's points from files: a column per raw lag, named as in expressions, and optionally `weight`.
+
+    Raises:
+        InputError: no such file, missing columns, cells that are no finite numbers.
+    """
+    pieces, weighted = [], None
+    for path in map(Path, paths):
+        check_readable(path)
+        own = has_column(path, "weight")
+        if weighted not in (None, own):
+            raise InputError(f"{path}: some files of the samples have a column 'weight' and some have not.")
+        weighted = own
+        names = [*lags, *(["weight"] if own else [])]
+        table = _trim(read_table(path, names))
+        total = len(table.columns[names[0]])
+        for start, stop in _ranges(rows, total, path):
+            _check_cells(table, names, start, stop)
+            pieces.append(np.stack([table.columns[name][start:stop:every] for name in names], axis=-1))
+    values = np.concatenate(pieces)
+    weights = values[:, -1] if weighted else None
+    return Samples({lag: values[:, j] for j, lag in enumerate(lags)}, weights)
 
 
 def _trim(table: Table) -> Table:

@@ -15,7 +15,7 @@ from orthaug.covariance import interval
 from orthaug.criteria import Criterion, Prediction, Simulation
 from orthaug.errors import InputError
 from orthaug.excitation import Excitation
-from orthaug.measures import Measure, Support
+from orthaug.measures import Measure, Support, Training
 from orthaug.model import Model
 from orthaug.problem import Problem
 from orthaug.splitting import MeasureSplit, split_under
@@ -147,19 +147,23 @@ class Estimate:
         )
 
     def split(self, measure: Measure) -> Estimate:
-        """The same fitted function with θ, θ_aux, components and intervals under another measure, without training (F2).
+        """The same fitted function with θ, θ_aux, components and intervals under a measure, without training (F2).
 
         Raises:
-            InputError: a measure that does not fit the model, a θ at a bound, or a θ of a penalty, which is no split.
+            InputError: a measure that does not fit the model, or a θ at a bound.
         """
         check_type(measure, Measure, "measure", "a measure such as Uniform()")
         if self.at_bound:
             raise InputError(
-                f"{', '.join(self.at_bound)} stand at a bound, which a split under the {measure.name} measure would leave; "
-                "drop the bounds, or keep the training measure."
+                f"{', '.join(self.at_bound)} stand at a bound, which a split under the {measure.name} measure would "
+                "leave; drop the bounds, or keep the training measure."
             )
         support = Support(self.problem.record, self.problem.layout, self.model.form.used)
-        found = split_under(measure, self.model, support, self.model.joint)
+        found, training = (split_under(m, self.model, support, self.model.joint) for m in (measure, Training()))
+        if found.covariance is not None and training.covariance is not None:
+            with np.errstate(all="ignore"):
+                price = np.sqrt(np.diag(found.covariance) / np.diag(training.covariance))
+            found = replace(found, price=price)
         numbers = self.model.numbers._replace(theta=found.theta, theta_aux=found.theta_aux)
         return replace(
             self,
@@ -167,7 +171,7 @@ class Estimate:
             covariance=found.covariance,
             defect=found.defect,
             measure=found,
-            warnings=(*self.warnings, *found.warnings),
+            warnings=(*(w for w in self.warnings if "not unique" not in w), *found.warnings),
         )
 
     def __repr__(self) -> str:
@@ -201,6 +205,8 @@ def summary_lines(fit: Estimate) -> Sequence[str]:
         f"excitation  rank {fit.excitation.rank} of {fit.excitation.columns}"
         + (f", condition {condition:.3g}" if condition else "")
     )
+    if fit.measure is not None:
+        lines.append(f"measure     {fit.measure}")
     one_step = fit.one_step_theta
     if one_step is not None:
         moved = ", ".join(f"{name} {value:.6g}" for name, value in zip(baseline.names, one_step, strict=True))

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from orthaug import __version__
+from orthaug._arrays import check_choice
 from orthaug.errors import InputError
-from orthaug.readers import read_record
+from orthaug.measures import Measure, Support, Symmetrized, Training, Uniform
+from orthaug.readers import read_record, read_samples
 from orthaug.record import Record
 from orthaug.tables import check_readable, has_column
 
@@ -76,6 +80,110 @@ def with_initial(run: Run, initial: str | Any) -> Record:
     rows = np.zeros((start, outputs.shape[1])) if isinstance(initial, str) else initial[:start]
     outputs[start - len(rows) : start] = rows
     return replace(run.record, experiments=(replace(experiment, outputs=outputs),))
+
+
+def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | None) -> Run:
+    """A model with the files that it was trained on, `rows` of each."""
+    from orthaug.storage import load
+
+    for path in data:
+        check_readable(path)
+    loaded = load(model)
+    step = None if loaded.time_column else loaded.sampling_time
+    channels = {"inputs": loaded.inputs, "outputs": loaded.outputs}
+    time = loaded.time_column
+    records = [read_record(path, sampling_time=step, time=time, rows=rows, **channels) for path in data]
+    return Run(loaded, Record.join(records), data[0])
+
+
+def read_rows(text: str | None) -> tuple[int, int] | None:
+    """`A:B` as a half-open range of rows."""
+    if text is None:
+        return None
+    start, _, stop = text.partition(":")
+    if not (start.isdigit() and stop.isdigit()):
+        raise InputError(f"--rows: found '{text}'; expected a half-open range of rows such as 0:1000.")
+    return int(start), int(stop)
+
+
+def read_measure(kind: str, run: Run, box: Sequence[str], samples: Path | None) -> Measure:
+    """The measure that the options of `orthaug split` declare.
+
+    Raises:
+        InputError: an unknown kind, a box that is not `lag=low:high`, samples without a file.
+    """
+    check_choice(kind, ("training", "symmetrized", "uniform", "samples"), "--measure")
+    if kind == "samples":
+        if samples is None:
+            raise InputError("--samples is missing; give the CSV file that holds the points of the samples measure.")
+        return read_samples([samples], [str(lag) for lag in run.model.form.used])
+    if kind != "uniform":
+        return Symmetrized() if kind == "symmetrized" else Training()
+    limits = {}
+    for text in box:
+        lag, equals, both = text.partition("=")
+        try:
+            low, high = (float(limit) for limit in both.split(":"))
+        except ValueError:
+            equals = ""
+        if not equals:
+            raise InputError(f"--box: found '{text}'; expected a raw lag and its limits, such as 'u[k]=-0.6:0.6'.")
+        limits[lag.strip()] = (low, high)
+    return Uniform(limits)
+
+
+def split(run: Run, measure: Measure) -> dict[str, Any]:
+    """θ of a saved model under a measure, as JSON content."""
+    from orthaug.covariance import interval
+    from orthaug.outcome import SCHEMA, plain
+    from orthaug.splitting import split_under
+
+    model = run.model
+    support = Support(run.model.fitting(run.record, need_outputs=True), model.form.layout, model.form.used)
+    found = split_under(measure, model, support, model.joint)
+    std = None if found.covariance is None else np.sqrt(np.diag(found.covariance))
+    ci = None if std is None else interval(found.theta, std, model.freedom)
+    parameters = [
+        {
+            "name": parameter.name,
+            "unit": parameter.unit,
+            "initial": parameter.initial,
+            "value": float(found.theta[i]),
+            "std": None if std is None else float(std[i]),
+            "ci95": None if ci is None else [float(limit) for limit in ci[i]],
+        }
+        for i, parameter in enumerate(model.form.baseline.parameters)
+    ]
+    content = {
+        "schema": SCHEMA,
+        "orthaug": __version__,
+        "parameters": parameters,
+        "theta_aux": [float(value) for value in found.theta_aux],
+        "measure": measure.name,
+        "measure_detail": found.as_dict(),
+        "orthogonality_defect": found.defect,
+        "warnings": [
+            *found.warnings,
+            *([] if std is not None else ["no standard errors: training left no statistics."]),
+        ],
+    }
+    return plain(content)
+
+
+def split_text(found: dict[str, Any]) -> str:
+    """The content of `split` for a reader."""
+    detail = found["measure_detail"]
+    support = f"{100 * detail['support']:.0f} % of it within reach of the data"
+    lines = [f"measure     {found['measure']}, {detail['points']} points, {support}"]
+    width = max([9, *(len(parameter["name"]) for parameter in found["parameters"])])
+    lines.append(f"{'parameter':<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  unit")
+    for parameter in found["parameters"]:
+        std, ci = parameter["std"], parameter["ci95"]
+        spread = f"{std:11.4g}" if std is not None else f"{'–':>11}"
+        reach = f"[{ci[0]:13.7g}, {ci[1]:13.7g}]" if ci is not None else f"{'–':^29}"
+        name = f"{parameter['name']:<{width}}"
+        lines.append(f"{name}  {parameter['value']:14.8g}  {spread}  {reach}  {parameter['unit']}".rstrip())
+    return "\n".join([*lines, *(f"warning: {text}" for text in found["warnings"])])
 
 
 def warnings(response: Response) -> list[str]:

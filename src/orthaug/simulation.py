@@ -17,6 +17,7 @@ from orthaug._arrays import Matrix, Vector
 from orthaug._jax import jnp
 from orthaug.covariance import noise_covariance, theta_block
 from orthaug.criteria import Simulation
+from orthaug.learners import Bound
 from orthaug.pasts import Pasts
 from orthaug.predictor import Form, Numbers
 from orthaug.problem import Problem
@@ -142,6 +143,10 @@ class FreeRun:
             coefficients=flight.c,
             free=flight.objective.statistics(flight),
         )
+
+    @property
+    def bound(self) -> Bound | None:
+        return self.form.bound
 
     @property
     def scaling(self) -> Scaling:

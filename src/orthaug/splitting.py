@@ -37,10 +37,20 @@ class MeasureSplit:
     points: int
     condition: float | None
     warnings: tuple[str, ...]
+    price: Vector | None = None
+    """Standard error of each θ over that under the training measure (nθ,)."""
+
+    def __str__(self) -> str:
+        told = f"{self.name}, {self.points} points, {100 * self.support:.0f} % of it within reach of the data"
+        if self.price is None or not np.isfinite(self.price).all():
+            return told
+        return f"{told}; standard errors {', '.join(f'{r:.2f}' for r in self.price)} times the training measure's"
 
     def as_dict(self) -> dict[str, Any]:
         """What result.json tells of the measure."""
-        return {"kind": self.name, "points": self.points, "support": self.support, "condition": self.condition}
+        price = None if self.price is None else [float(ratio) for ratio in self.price]
+        found = {"kind": self.name, "points": self.points, "support": self.support, "condition": self.condition}
+        return {**found, "std_over_training": price}
 
 
 def split_under(measure: Measure, model: Model, support: Support, joint: Joint | None) -> MeasureSplit:
@@ -81,14 +91,8 @@ def split_under(measure: Measure, model: Model, support: Support, joint: Joint |
     rest = values - projection.phi @ aux
     defect = float(np.linalg.norm(projection.coordinates(rest)) / size) if 0 < size < np.inf else None
     share = support.share(points)
-    warnings = (
-        (
-            f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the training data: elsewhere θ "
-            "rests on how the learner extrapolates.",
-        )
-        if share < SUPPORTED
-        else ()
-    )
+    reach = f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the training data"
+    warnings = (f"{reach}: elsewhere θ rests on how the learner extrapolates.",) if share < SUPPORTED else ()
     return MeasureSplit(measure.name, theta, aux, covariance, defect, share, len(points.x), found.condition, warnings)
 
 

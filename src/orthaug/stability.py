@@ -15,9 +15,8 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.linalg
-import scipy.optimize
 from jaxtyping import Array, Float, Int
+from scipy import linalg, optimize
 
 from orthaug._arrays import Matrix, Vector, check_choice, check_count, check_number
 from orthaug._jax import jax, jnp
@@ -28,12 +27,10 @@ from orthaug.predictor import Form, Numbers, parts
 from orthaug.record import Record
 from orthaug.regressors import lag_matrix
 
-_BATCH = 1024  # rows per compiled call
 _STEPS, _SAMPLES = 20_000, 2000  # most rows that are looked at, spread evenly; most points of the contraction check
 _STEEPEST, _ACTIVE = 50, 64  # points of largest radius always among them; worst points that a round of search adds
-_WORK = 4e7  # most rows times (na ny)³
+_BATCH, _WORK = 1024, 4e7  # rows per compiled call; most rows times (na ny)³
 _LONGEST_STATE, _LARGEST_SEARCH = 200, 12  # na ny with eigenvalues at all; with a metric better than Lyapunov's
-_DIFFERENCE = 1e-3  # step of differences for an external learner, in standard deviations; bears single precision
 _LARGEST_FACTOR = 1e4  # outputs of a stable linear model grow with its inputs, and 10⁶ times the largest is "diverged"
 _PER_STEP = ("points", "jacobians", "radius", "unit")  # too long for JSON
 
@@ -68,8 +65,7 @@ class Feedback:
 
     `jacobians[:, i - 1]` are the A_{k,i} in the outputs' units, `radius` (m,) the spectral radii of the A_k, and their
     summary is None where there are none. `skipped` points are left out because the model has no finite derivative
-    there; `diverged` says in which output and where the free run of an experiment left all bounds; `unit` (ny,) are the
-    standard deviations of the measured outputs.
+    there; `diverged` says in which output and where a free run left all bounds; `unit` (ny,) is the deviation of y.
     """
 
     points: Points
@@ -122,10 +118,7 @@ class Lipschitz:
 
 @dataclass(frozen=True, eq=False)
 class Stability:
-    """Evidence on the free run (None in a model without past outputs), and the one-step predictor apart from it.
-
-    `diverges_at` is the factor of `divergence_scaling`, None where there is none up to `searched`.
-    """
+    """Evidence on the free run (None without past outputs); `diverges_at` is searched up to the factor `searched`."""
 
     feedback: Feedback | None
     contraction: Contraction | None
@@ -137,35 +130,34 @@ class Stability:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain content for JSON, without what is there for every step; never NaN or infinity."""
-        return asdict(self, dict_factory=_plain)
+
+        def plain(items: list[tuple[str, Any]]) -> dict[str, Any]:
+            kept = {name: value for name, value in items if name not in _PER_STEP}
+            return {
+                name: np.asarray(v).tolist() if isinstance(v, tuple | np.ndarray) else v for name, v in kept.items()
+            }
+
+        return asdict(self, dict_factory=plain)
 
 
 def stability(model: Model, record: Record, *, box: int = 0, largest: float = 1024.0) -> Stability:
     """All checks of a model on a record, with a text that says what they mean.
 
-    A free run that diverges is looked at up to the step at which it left all bounds. `box` is that of `contraction`,
-    `largest` that of `divergence_scaling`.
-
-    Raises:
-        InputError: a record that does not fit the model, a `box` or a `largest` that are no such numbers.
+    `box` is that of `contraction`, `largest` that of `divergence_scaling`, and so are the errors.
     """
     gradients, found = lipschitz(model, record), feedback(model, record)
-    contracts = contraction(model, record, box=box, along=found)
-    factor = divergence_scaling(model, record, largest)
-    says = list(_sentences(found, contracts, factor, largest, gradients))
-    warnings, text = tuple(line for line, warns in says if warns), "\n".join(line for line, _ in says)
-    return Stability(found, contracts, factor, float(largest), gradients, warnings, text)
+    contracts, factor = contraction(model, record, box=box, along=found), divergence_scaling(model, record, largest)
+    checks = Stability(found, contracts, factor, float(largest), gradients, (), "")
+    says = list(_sentences(checks))
+    return replace(checks, warnings=tuple(s for s, warns in says if warns), text="\n".join(s for s, _ in says))
 
 
 def feedback(model: Model, record: Record, *, along: str = "simulation") -> Feedback | None:
     """A_{k,i} = ∂g/∂y_{k−i} and the spectral radius of A_k along a run; None for a model without past outputs.
 
     At most 20000 steps, fewer where na ny is large and none where it is above 200, spread evenly. Radii below 1 do not
-    make a nonlinear run stable, nor do some above 1 make it unstable: they say where to look.
-
-    Args:
-        model, record: a fitted model, and inputs with measured outputs to start from.
-        along: "simulation", regressors of the model's own outputs, up to where it diverges, or "measured".
+    make a nonlinear run stable, nor do some above 1 make it unstable: they say where to look. `along` is "simulation",
+    regressors of the model's own outputs up to where it diverges, or "measured".
 
     Raises:
         InputError: a record that does not fit the model, or another `along`.
@@ -189,14 +181,11 @@ def contraction(model: Model, record: Record, *, box: int = 0, along: Feedback |
     Minimises `max_k ‖T A_k T⁻¹‖₂`, P = TᵀT. Along `T(t) = exp(tX) T`, X symmetric, the logarithm of each norm is convex
     in t with the slope `uᵀXu − vᵀXv`, u and v its singular vectors: there are no false minima. It starts from
     Lyapunov's P of the mean A_k and takes quasi-Newton steps on a smooth maximum over the worst points; where not all
-    points contract, it does so again without the worst of them. None where no A_k is there.
-
-    Args:
-        model, record: as for `feedback`; `along` is its result where there is one already.
-        box: that many points more, uniform in the box of the regressors that the run meets.
+    points contract, it does so again without the worst of them. None where no A_k is there. `along` is a result of
+    `feedback`, computed if it is not given; `box` adds points uniform in the box of the regressors that it met.
 
     Raises:
-        InputError: a record that does not fit the model, or a `box` that is no number of points.
+        InputError: as `feedback`, or a `box` that is no number of points.
     """
     box, found = check_count(box, "box", 0), along or feedback(model, record)
     if not found or not found.worst:
@@ -206,26 +195,25 @@ def contraction(model: Model, record: Record, *, box: int = 0, along: Feedback |
     steepest = np.argsort(-found.radius, kind="stable")[: min(_STEEPEST, most // 2)]
     points = found.points.take(np.union1d(_evenly(len(found.radius), most - len(steepest)), steepest))
     if box:
-        low, high, nowhere = found.points.x.min(axis=0), found.points.x.max(axis=0), np.full(box, -1)
-        more = np.random.default_rng(0).uniform(low, high, (box, len(low)))  # the same points on every call
+        x, nowhere = found.points.x, np.full(box, -1)  # the same points on every call:
+        more = np.random.default_rng(0).uniform(x.min(axis=0), x.max(axis=0), (box, x.shape[1]))
         points = Points(*(np.concatenate(p) for p in zip(points, (more, nowhere, nowhere), strict=True)))
     points, jacobians, radius = _linearised(model, points)
     a = companions(jacobians) * unit / unit[:, None]
-    t = _best_metric(a)
-    sizes, metric, overshoot = _sizes(t, a), (t / unit).T @ (t / unit), float(np.linalg.cond(t))
+    sizes, metric = _sizes(t := _best_metric(a), a), (t / unit).T @ (t / unit)
     rate, worst = _worst(model, record, points, sizes)
-    assert rate is not None and worst is not None
-    share = float(np.mean(sizes < 1))
-    return Contraction(rate, float(radius.max()), share, len(a), overshoot, metric / np.trace(metric), worst)
+    assert rate is not None and worst is not None  # there are points, and no norm is infinite
+    bound, share, overshoot = float(radius.max()), float(np.mean(sizes < 1)), float(np.linalg.cond(t))
+    return Contraction(rate, bound, share, len(a), overshoot, metric / np.trace(metric), worst)
 
 
 def divergence_scaling(model: Model, record: Record, largest: float = 1024.0) -> float | None:
     """Factor on the inputs from which the free run leaves all bounds (10⁶ times the largest training output).
 
     It scales each input's deviation from its mean over the record; the measured outputs that the run starts from stay.
-    Doubled until a run diverges, then bisected to 5 %; what is returned did diverge. The first rows are used, 20000
-    shared among the experiments, and factors between those that were tried may diverge too. None where no run up to `largest` does, as without
-    past outputs; at most 1 where the record's own run diverges, and 0 where it does with its inputs at their means.
+    Doubled until a run diverges, then bisected to 5 %; what is returned did diverge, and others below it may. Of longer
+    records 20000 rows are used, the first of each experiment. None where no run up to `largest` diverges, as without
+    past outputs; at most 1 where the record's own run does, and 0 where it does with its inputs at their means.
 
     Raises:
         InputError: a record that does not fit the model, or a `largest` that is not above 1 and at most 10⁴.
@@ -240,16 +228,14 @@ def divergence_scaling(model: Model, record: Record, largest: float = 1024.0) ->
 
     def diverges(factor: float) -> bool:
         scaled = (replace(e, inputs=mean + factor * (e.inputs - mean)) for e in record.experiments)
-        run = model.simulate(replace(record, experiments=tuple(scaled)))
-        return any(t.diverged for t in run.trajectories)
+        return any(t.diverged for t in model.simulate(replace(record, experiments=tuple(scaled))).trajectories)
 
     low = high = 1.0
     if diverges(1.0):
-        while diverges(low := low / 2 if low > 1 / _LARGEST_FACTOR else 0.0):
+        while diverges(low := low / 2):
             high = low
-            if low == 0:
-                return 0.0
-        low = low or high / 2
+            if low < 1 / _LARGEST_FACTOR:
+                return 0.0 if diverges(0.0) else low
     else:
         while not diverges(high := min(2 * low, float(largest))):
             low = high
@@ -267,26 +253,23 @@ def lipschitz(model: Model, record: Record) -> Lipschitz:
     The predictor γ_k = g(x_k) reads the last n samples only. With ‖∂g/∂x‖ ≤ L on a convex set of all regressors,
     `|γ − γ̃| ≤ L Σ_{i≥k−n} (|u_i − ũ_i| + |y_i − ỹ_i|) ≤ L λ⁻ⁿ Γ_k` for every λ in (0, 1), because λ^{k−i} ≥ λⁿ there:
     the condition holds with `C = max(L λ⁻ⁿ, |g(0)|)`, and likewise for ∂γ/∂θ. Bounded gradients are all that it asks
-    of a finite memory. Here L is that of at most 20000 measured rows and of this θ; a polynomial has a larger one
-    farther out, and the learner's weights are not in φ. Nothing of this speaks about the free run, whose memory does
-    not end: y_k = 2 y_{k−1} fulfils the condition.
+    of a finite memory. Here L is that of at most 20000 measured rows and of this θ; it may be larger elsewhere, and the
+    learner's weights are not in φ. None of it tells about the free run: y_k = 2 y_{k−1} fulfils the condition.
 
     Raises:
         InputError: a record that does not fit the model, or has no outputs.
     """
     (every, y_scale, _), form = _visited(model, record, False), model.form
     points, x_scale, found = every.take(_evenly(len(every.x), _STEPS)), every.x.std(axis=0), []
+    size = partial(np.linalg.norm, axis=(1, 2))
     with np.errstate(all="ignore"):
         phi = np.asarray(form.baseline.phi(points.x, form.layout, form.outputs, np))
         rms = np.sqrt(np.mean(np.sum((phi / y_scale[:, None]) ** 2, axis=1), axis=0))
-    phi_scale = np.outer(y_scale, np.where(np.isfinite(rms) & (rms > 0), rms, 1.0)).ravel()
-    for curve, scale in ((False, y_scale), (True, phi_scale)):
-        batches = (g.reshape(len(g), len(scale), len(x_scale)) for g in _gradients(model, points.x, curve))
-        norms = [
-            (np.linalg.norm(g, axis=(1, 2)), np.linalg.norm(g * x_scale / scale[:, None], axis=(1, 2))) for g in batches
-        ]
-        plain, scaled = (np.concatenate(column) for column in zip(*norms, strict=True))
-        found += [_worst(model, record, points, plain)[0], *_worst(model, record, points, scaled)]
+        for of_phi, scale in ((False, y_scale), (True, np.outer(y_scale, _positive(rms)).ravel())):
+            batches = (g.reshape(len(g), len(scale), len(x_scale)) for g in _gradients(model, points.x, of_phi))
+            norms = [(size(g), size(g * x_scale / scale[:, None])) for g in batches]
+            plain, scaled = (np.concatenate(column) for column in zip(*norms, strict=True))
+            found += [_worst(model, record, points, plain)[0], *_worst(model, record, points, scaled)]
     return Lipschitz(*found, rows=len(points.x))
 
 
@@ -299,8 +282,8 @@ def _gradient_rows(form: Form, numbers: Numbers, x: Float[Array, "m nx"], step: 
         return found.baseline + found.learner
 
     def differences(row: Any) -> Any:
-        ahead, back = (jax.vmap(g)(row + sign * jnp.diag(step)) for sign in (1.0, -1.0))
-        return ((ahead - back) / (2 * step[:, None])).T
+        width = jnp.diag(step)
+        return ((jax.vmap(g)(row + width) - jax.vmap(g)(row - width)) / (2 * step[:, None])).T
 
     if of_phi:
         return jax.vmap(jax.jacfwd(lambda row: form.baseline.phi(row, form.layout, form.outputs, jnp)))(x)
@@ -310,8 +293,7 @@ def _gradient_rows(form: Form, numbers: Numbers, x: Float[Array, "m nx"], step: 
 
 def _gradients(model: Model, x: Matrix, of_phi: bool = False) -> Iterator[Any]:
     """∂g/∂x or ∂φ/∂x in batches that are computed at one shape."""
-    deviation = x.std(axis=0)
-    step = _DIFFERENCE * np.where(deviation > 0, deviation, 1.0)
+    step = 1e-3 * _positive(x.std(axis=0))  # bears a learner in single precision
     for begin in range(0, len(x), _BATCH):
         rows = x[begin : begin + _BATCH]
         padded = np.concatenate([rows, np.repeat(rows[-1:], _BATCH - len(rows), axis=0)])
@@ -327,8 +309,7 @@ def companions(jacobians: Float[np.ndarray, "m na ny ny"]) -> Float[np.ndarray, 
 
 def _linearised(model: Model, points: Points) -> tuple[Points, Float[np.ndarray, "m na ny ny"], Vector]:
     """The points with finite derivatives, their A_{k,i} and their spectral radii."""
-    ny = len(model.outputs)
-    found = np.zeros((len(points.x), model.form.memory, ny, ny))
+    found = np.zeros((len(points.x), model.form.memory, len(model.outputs), len(model.outputs)))
     if len(found):
         gradients = np.concatenate(list(_gradients(model, points.x)))
         for column, (lag, output) in enumerate(model.form.fed_back):
@@ -349,10 +330,13 @@ def _visited(model: Model, record: Record, free: bool) -> tuple[Points, Vector, 
         x = lag_matrix(run, model.form.layout, replace(record, outputs=model.outputs), start)
         pieces.append((x, np.full(len(x), i), np.arange(start, len(run))))
         measured.append(t.measured)
-        diverged += [f"{t.diverged[1]} at {_where(record, i, t.diverged[0])}"] if t.diverged else []
-    deviation = np.concatenate(measured).std(axis=0)
+        diverged += [f"{t.diverged[1]} at experiment {i}, {e.where(t.diverged[0])}"] if t.diverged else []
     points = Points(*(np.concatenate(part) for part in zip(*pieces, strict=True)))
-    return points, np.where(deviation > 0, deviation, 1.0), tuple(diverged)
+    return points, _positive(np.concatenate(measured).std(axis=0)), tuple(diverged)
+
+
+def _positive(scale: Vector) -> Vector:
+    return np.where(np.isfinite(scale) & (scale > 0), scale, 1.0)
 
 
 def _evenly(count: int, most: float) -> Int[np.ndarray, "m"]:
@@ -383,8 +367,7 @@ def _metric(a: Float[np.ndarray, "m n n"]) -> Matrix:
     active = np.zeros(len(a), dtype=bool)
     for sharpness in (2, 4, 8, 16, 32) if 1 < n <= _LARGEST_SEARCH else ():
         sizes = _sizes(best, a)
-        largest = max(sizes.max(), 1e-9)
-        gap = np.log(largest / max(bound, 1e-3 * largest))
+        gap = np.log((largest := max(sizes.max(), 1e-9)) / max(bound, 1e-3 * largest))
         if gap <= 0.06 * abs(np.log(largest)):  # the rest would cost overshoot
             break
         active[np.argsort(-sizes, kind="stable")[:_ACTIVE]] = True
@@ -398,7 +381,7 @@ def _lyapunov(mean: Matrix) -> Iterator[Matrix]:
     radius = max(float(np.abs(np.linalg.eigvals(mean)).max()), 1e-3)
     for c in (radius**0.95, radius**0.8, radius**0.5, 1.1 * radius, 1.5 * radius):
         if c > radius:
-            p = scipy.linalg.solve_discrete_lyapunov((mean / c).T, np.eye(len(mean)))
+            p = linalg.solve_discrete_lyapunov((mean / c).T, np.eye(len(mean)))
             values, vectors = np.linalg.eigh((p + p.T) / 2)
             if values[0] > 1e-14 * values[-1]:
                 yield np.sqrt(values / values[-1])[:, None] * vectors.T
@@ -406,7 +389,7 @@ def _lyapunov(mean: Matrix) -> Iterator[Matrix]:
 
 def _descend(a: Float[np.ndarray, "m n n"], sharpness: float) -> Matrix:
     """Y that lowers `log Σ σ^sharpness / sharpness`, over all singular values σ of all Y A Y⁻¹, from Y = I."""
-    n = a.shape[1]
+    n, outer = a.shape[1], partial(np.einsum, "mij,mj,mkj->ik", optimize=True)
 
     def value(flat: Vector) -> tuple[float, Vector]:
         y = flat.reshape(n, n)
@@ -415,87 +398,55 @@ def _descend(a: Float[np.ndarray, "m n n"], sharpness: float) -> Matrix:
         inverse = np.linalg.inv(y)
         b = y @ a @ inverse
         squares, v = np.linalg.eigh(b.swapaxes(1, 2) @ b)
-        squares = np.maximum(squares, 1e-200)
-        logarithms = sharpness * np.log(squares) / 2
-        top, u = logarithms.max(), b @ v
+        squares, u = np.maximum(squares, 1e-200), b @ v
+        top = (logarithms := sharpness * np.log(squares) / 2).max()
         weight = np.exp(logarithms - top)
         total, weight = weight.sum(), weight / weight.sum()
-        left, right = (
-            np.einsum("mij,mj,mkj->ik", q, w, q, optimize=True) for q, w in ((u, weight / squares), (v, weight))
-        )
-        return (top + np.log(total)) / sharpness, ((left - right) @ inverse.T).ravel()
+        slope = outer(u, weight / squares, u) - outer(v, weight, v)
+        return (top + np.log(total)) / sharpness, (slope @ inverse.T).ravel()
 
-    found = scipy.optimize.minimize(value, np.eye(n).ravel(), jac=True, method="L-BFGS-B", options={"maxiter": 40})
+    found = optimize.minimize(value, np.eye(n).ravel(), jac=True, method="L-BFGS-B", options={"maxiter": 40})
     return np.asarray(found.x).reshape(n, n)
 
 
 def _worst(model: Model, record: Record, points: Points, values: Vector) -> tuple[float | None, Place | None]:
     """The largest value and its point; None where no value is finite."""
     values = np.where(np.isfinite(values), values, -1.0)
-    i = int(np.argmax(values)) if len(values) else -1
-    if i < 0 or values[i] < 0:
+    if values.max(initial=-1.0) < 0:
         return None, None
-    number, row = int(points.experiment[i]), int(points.row[i])
+    i = int(np.argmax(values))
+    number, row, size = int(points.experiment[i]), int(points.row[i]), float(values[i])
     regressor = {str(lag): float(v) for lag, v in zip(model.form.layout, points.x[i], strict=True)}
     if number < 0:
-        return float(values[i]), Place(None, None, "a point off the trajectory", regressor)
-    return float(values[i]), Place(number, row, _where(record, number, row), regressor)
+        return size, Place(None, None, "a point off the trajectory", regressor)
+    return size, Place(number, row, f"experiment {number}, {record.experiments[number].where(row)}", regressor)
 
 
-def _where(record: Record, number: int, row: int) -> str:
-    e = record.experiments[number]
-    return e.where(row) if e.source or len(record.experiments) == 1 else f"experiment {number}, {e.where(row)}"
-
-
-def _plain(items: list[tuple[str, Any]]) -> dict[str, Any]:
-    return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in items if k not in _PER_STEP}
-
-
-def _sentences(
-    found: Feedback | None, contracts: Contraction | None, factor: float | None, largest: float, step: Lipschitz
-) -> Iterator[tuple[str, bool]]:
+def _sentences(given: Stability) -> Iterator[tuple[str, bool]]:
     """What the checks say, sentence by sentence, and whether it is a warning."""
+    found, contracts, factor, steepest = given.feedback, given.contraction, given.diverges_at, given.lipschitz.gradient
+    gradient = "no finite gradient" if steepest is None else f"a gradient of at most {steepest:.4g}"
+    yield f"The one-step predictor has {gradient} on measured rows; that says nothing about the free run.", False
     if found is None:
         yield "The model uses no past outputs: its free run cannot diverge, and keeps nothing of its start.", False
+        return
+    if found.diverged:
+        yield f"The free run diverges ({'; '.join(found.diverged)}); it is looked at up to there.", True
+    if found.share_above_one is not None:
+        above = f"above 1 at {100 * found.share_above_one:.3g} % of {len(found.radius)} steps of the free run"
+        peak = f"median {found.median:.4g}, largest {found.largest:.4g} at {found.worst}"
+        yield f"The local spectral radius is {above}; {peak}.", found.share_above_one > 0.01
+    if found.skipped:
+        yield f"At {found.skipped} points more the model has no finite derivative; they are left out.", True
+    if contracts is None:
+        yield "Contraction could not be checked: no finite derivatives, or more than 200 past outputs.", True
+    elif contracts.rate < 1:
+        how = f"contracts in one metric (rate {contracts.rate:.4g}): evidence, not proof, that it forgets its start"
+        yield f"On all {contracts.samples} sampled points the free run {how}.", False
     else:
-        if found.diverged:
-            yield f"The free run diverges ({'; '.join(found.diverged)}); it is looked at up to there.", True
-        if found.worst and found.share_above_one is not None:
-            yield (
-                (
-                    f"Local spectral radius at {len(found.radius)} of {found.steps} steps of the free run: median "
-                    f"{found.median:.4g}, above 1 at {100 * found.share_above_one:.3g} % of them, at most "
-                    f"{found.largest:.4g}, at {found.worst}."
-                ),
-                found.share_above_one > 0.01,
-            )
-        if found.skipped:
-            yield f"At {found.skipped} points more the model has no finite derivative; they are left out.", True
-        yield _contraction_sentence(contracts), contracts is None or contracts.rate >= 1
-        how, times = ("stays within", largest) if factor is None else ("leaves", factor)
-        bounds = (
-            f"The free run {how} all bounds with the inputs' deviations from their means {times:.4g} times as large."
-        )
-        yield bounds, factor is not None and factor < 1.5
-    gradient = "no finite gradient" if step.gradient is None else f"a gradient of at most {step.gradient:.4g}"
-    yield (
-        (
-            f"The one-step predictor, which remembers only its lags, has {gradient} on {step.rows} measured rows; that says "
-            "nothing about the free run."
-        ),
-        False,
-    )
-
-
-def _contraction_sentence(found: Contraction | None) -> str:
-    if found is None:
-        return "Contraction could not be checked: no finite derivatives, or more than 200 past outputs."
-    if found.rate < 1:
-        return (
-            f"On all {found.samples} sampled points the free run contracts in one metric (rate {found.rate:.4g}): "
-            "evidence, not proof, that it forgets its start."
-        )
-    return (
-        f"At {100 * (1 - found.share):.3g} % of the {found.samples} sampled points the free run does not contract in the "
-        f"best metric that was found, worst at {found.worst}, rate {found.rate:.4g}."
-    )
+        share = f"{100 * (1 - contracts.share):.3g} % of the {contracts.samples} sampled points"
+        worst = f"worst at {contracts.worst}, rate {contracts.rate:.4g}"
+        yield f"At {share} the free run does not contract in the best metric that was found, {worst}.", True
+    stays, times = ("stays within", given.searched) if factor is None else ("leaves", factor)
+    bounds = f"{stays} all bounds with the inputs' deviations from their means {times:.4g} times as large"
+    yield f"The free run {bounds}.", factor is not None and factor < 1.5

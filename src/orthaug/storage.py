@@ -52,7 +52,7 @@ def write(model: Model, folder: Path) -> None:
     """Write the two files into an existing folder."""
     numbers = {name: value for name, value in model.numbers._asdict().items() if value is not None}
     arrays = {f"numbers.{name}": np.asarray(value) for name, value in numbers.items()}
-    arrays |= {"largest_output": model.largest_output, "weight": model.weight, "ridge": np.array([model.ridge])}
+    arrays |= {"largest_output": model.largest_output, "weight": model.weight, "scalars": np.array([model.ridge, model.freedom])}
     arrays |= {
         name: value
         for name, value in (("gram", model.gram), ("noise", model.noise), ("middle", model.middle))
@@ -123,6 +123,7 @@ def _declare(model: Model) -> dict[str, Any]:
         "format": FORMAT,
         "orthaug": __version__,
         "structure": model.structure,
+        "measure": model.measure,
         "sampling_time": model.sampling_time,
         "time_column": model.time_column,
         "outputs": [asdict(channel) for channel in model.outputs],
@@ -177,9 +178,11 @@ def _rebuild(
         sampling_time=float(declared["sampling_time"]),
         time_column=declared["time_column"],
         structure=declared["structure"],
+        measure=declared["measure"],
         largest_output=arrays["largest_output"],
         weight=arrays["weight"],
-        ridge=float(arrays["ridge"][0]),
+        ridge=float(arrays["scalars"][0]),
+        freedom=float(arrays["scalars"][1]),
         gram=arrays.get("gram"),
         middle=arrays.get("middle"),
         noise=arrays.get("noise"),
