@@ -41,6 +41,14 @@ _HOME = {
     "Trajectory": "model",
     "scores": "metrics",
     "identifiability": "excitation",
+    "Training": "measures",
+    "Symmetrized": "measures",
+    "Weighted": "measures",
+    "Samples": "measures",
+    "Uniform": "measures",
+    "PhysicalParameter": "physics",
+    "PhysicsMap": "physics",
+    "Suspect": "suspects",
     "diagnose": "diagnosis",
     "load": "storage",
     "save": "storage",
@@ -66,10 +74,17 @@ if TYPE_CHECKING:
     from orthaug.learners import EquinoxModule as EquinoxModule
     from orthaug.learners import External as External
     from orthaug.learners import Function as Function
+    from orthaug.measures import Samples as Samples
+    from orthaug.measures import Symmetrized as Symmetrized
+    from orthaug.measures import Training as Training
+    from orthaug.measures import Uniform as Uniform
+    from orthaug.measures import Weighted as Weighted
     from orthaug.metrics import scores as scores
     from orthaug.model import Model as Model
     from orthaug.model import Response as Response
     from orthaug.model import Trajectory as Trajectory
+    from orthaug.physics import PhysicalParameter as PhysicalParameter
+    from orthaug.physics import PhysicsMap as PhysicsMap
     from orthaug.readers import read_record as read_record
     from orthaug.record import Channel as Channel
     from orthaug.record import Experiment as Experiment
@@ -85,6 +100,7 @@ if TYPE_CHECKING:
     from orthaug.structures import BaselinePenalty as BaselinePenalty
     from orthaug.structures import Orthogonal as Orthogonal
     from orthaug.structures import OrthogonalPenalty as OrthogonalPenalty
+    from orthaug.suspects import Suspect as Suspect
 
 
 def __getattr__(name: str) -> Any:

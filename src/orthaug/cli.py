@@ -20,7 +20,6 @@ from orthaug.errors import InputError, TrainingError
 if TYPE_CHECKING:
     from orthaug.jobs import Progress
     from orthaug.model import Response
-    from orthaug.outcome import Fitted
 
 
 class Interrupted(Exception):
@@ -113,12 +112,12 @@ def demo(out: OutFolder = None) -> None:
 @app.command()
 def check(spec: SpecPath, as_json: AsJson = False) -> None:
     """Report excitation and identifiability; trains nothing."""
-    from orthaug import jobs, outcome
+    from orthaug import jobs, outcome, report
     from orthaug.excitation import require_rank
 
     job = jobs.open_job(spec, require_full_rank=False)
-    report = outcome.plain(outcome.check_report(job))
-    typer.echo(_json(report) if as_json else _check_text(report))
+    found = outcome.plain(outcome.check_report(job))
+    typer.echo(_json(found) if as_json else report.check_text(found))
     try:
         require_rank(job.problem.excitation, job.problem.rows.y.size)
     except InputError as error:
@@ -128,7 +127,7 @@ def check(spec: SpecPath, as_json: AsJson = False) -> None:
 @app.command()
 def fit(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False) -> None:
     """Fit a spec, print a summary and write the result folder."""
-    from orthaug import jobs, outcome
+    from orthaug import jobs, outcome, report
 
     folder = out or Path("orthaug-out") / spec.stem
     outcome.check_output(folder)
@@ -141,8 +140,7 @@ def fit(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False) -> None:
     if as_json:
         typer.echo(_json(fitted.result))
     else:
-        typer.echo(fitted.fit.summary() if fitted.fit.status.ok else "")
-        typer.echo(_scores_text(fitted))
+        typer.echo(report.fit_text(fitted))
         typer.echo(f"\nwritten to {folder}")
     if not fitted.fit.status.ok:
         raise TrainingError(f"{fitted.fit.status.message}. The account is in {folder / 'result.json'}.")
@@ -315,43 +313,3 @@ def _write_response(response: Response, out: Path | None) -> None:
 
 def _json(content: Any) -> str:
     return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
-
-
-def _check_text(report: dict[str, Any]) -> str:
-    found, ident = report["excitation"], report["identifiability"]
-    condition = f"{found['condition']:.4g}" if found["condition"] is not None else "infinite"
-    lines = [
-        f"parameters       {', '.join(report['parameters']) or 'none'}",
-        f"regressor        {', '.join(report['regressor'])}",
-        f"usable rows      {report['rows']}",
-        f"excitation       rank {found['rank']} of {found['columns']} on the data, condition {condition}",
-        f"identifiability  rank {ident['rank']} of {ident['columns']} at random points: "
-        + ("the parameters can be told apart" if ident["identifiable"] else "no data can tell the parameters apart"),
-    ]
-    for group in ident["inseparable"]:
-        lines.append(f"  inseparable by any data: {', '.join(group)}")
-    if ident["identifiable"]:
-        for group in found["collinear"]:
-            lines.append(f"  not excited separately by these data: {', '.join(group)}")
-    lines += [f"warning: {text}" for text in report["warnings"]]
-    return "\n".join(lines)
-
-
-def _scores_text(fitted: Fitted) -> str:
-    """The scores as a table, one line per part, kind and output."""
-    rows = []
-    outputs = fitted.job.problem.record.outputs
-    for part, kinds in fitted.result["scores"].items():
-        for kind, entry in kinds.items():
-            for i, channel in enumerate(outputs):
-                cells = [entry[key][i] if entry[key] is not None else None for key in ("rmse", "nrmse", "fit")]
-                rmse, nrmse, percent = ("–" if c is None else f"{c:.6g}" for c in cells)
-                rows.append((part, kind, channel.name, f"{rmse} {channel.unit}".strip(), nrmse, percent))
-    if not rows:
-        return ""
-    table = [("part", "horizon", "output", "RMSE", "NRMSE", "FIT %"), *rows]
-    widths = [max(len(row[i]) for row in table) for i in range(6)]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in table]
-    told = {f"warning: {w}" for w in fitted.fit.warnings}
-    more = [f"warning: {w}" for w in fitted.result["warnings"] if f"warning: {w}" not in told]
-    return "\n".join(["", *lines, *more])

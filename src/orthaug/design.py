@@ -301,7 +301,7 @@ class _Pattern(NamedTuple):
 
 
 def _starts(period: int, seed: int) -> list[_Pattern]:
-    """Square waves of about this period cut at every length, all short binary patterns, some at random and of four levels."""
+    """Squares of about this period cut at every length, short binary and four-level patterns, and some at random."""
     rng, found = np.random.default_rng(seed), []
     for hold in sorted({1} if period <= 16 else {round(period / 6), round(period / 12)}):
         square = [1.0 if k * hold % period < period / 2 else -1.0 for k in range(LONGEST_PATTERN)]

@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Any
 from orthaug.errors import InputError
 from orthaug.expressions import Lag
 from orthaug.measures import Measure, Support, Symmetrized, Training, Uniform
+from orthaug.physics import PhysicsMap, with_initial
 from orthaug.problem import Problem, check_defined, pose, regressor_of
 from orthaug.readers import read_record, read_samples
 from orthaug.record import Record, check_channels, same_step
 from orthaug.regressors import largest_lag
 from orthaug.spec import MeasureSection, Part, Spec, load_spec
 from orthaug.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty, Structure
+from orthaug.suspicion import check_suspects
 
 if TYPE_CHECKING:
     from orthaug.result import Estimate
@@ -72,6 +74,7 @@ class Job:
     tests: tuple[LoadedPart, ...]
     problem: Problem
     measure: Measure
+    physics: PhysicsMap | None
     warnings: tuple[str, ...]
 
     @property
@@ -90,6 +93,11 @@ class Job:
         return training.iterations + (training.start_iterations if free_run else 0)
 
     @property
+    def used(self) -> tuple[Lag, ...]:
+        """The raw lags that the model reads."""
+        return used_lags(self.problem)
+
+    @property
     def parts(self) -> tuple[LoadedPart, ...]:
         return (self.train, *([self.validation] if self.validation else []), *self.tests)
 
@@ -102,7 +110,9 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
     """
     spec = load_spec(path)
     try:
-        baseline, learner_inputs = spec.declared_baseline(), spec.learner_inputs()
+        baseline, learner_inputs, physics = spec.declared_baseline(), spec.learner_inputs(), spec.physics_map()
+        if physics is not None:
+            baseline = with_initial(physics, baseline)
         check_channels(spec.channels(spec.data.inputs), spec.channels(spec.data.outputs))
         structure_of(spec).penalty(baseline.names, baseline.initial, 1.0)
         baseline.check_channels(spec.data.outputs, spec.data.inputs)
@@ -118,9 +128,10 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
         problem = pose(train.record, baseline, lags, learner_inputs, require_full_rank=require_full_rank)
         problem.feature_rows()
         section = spec.structure.measure
-        measure = measure_of(section.kind, [str(lag) for lag in _used(problem)], section, path.parent)
-        measure.points(Support(train.record, problem.layout, _used(problem)))  # what is wrong with it shows here
-        job = Job(path, spec, train, validation, tuple(tests), problem, measure, ())
+        measure = measure_of(section.kind, [str(lag) for lag in used_lags(problem)], section, path.parent)
+        measure.points(Support(train.record, problem.layout, used_lags(problem)))  # what is wrong with it shows here
+        job = Job(path, spec, train, validation, tuple(tests), problem, measure, physics, ())
+        check_suspects(job)
         for part in job.parts:
             _check_scorable(part, problem.rows.start, train.record.sampling_time)
             check_defined(problem, part.record)
@@ -160,7 +171,8 @@ def measure_of(kind: str, lags: Sequence[str], section: MeasureSection, folder: 
     return Symmetrized() if kind == "symmetrized" else Training()
 
 
-def _used(problem: Problem) -> tuple[Lag, ...]:
+def used_lags(problem: Problem) -> tuple[Lag, ...]:
+    """The raw lags that the physics or the learner reads."""
     read = {*problem.baseline.lags, *problem.features.lags}
     return tuple(lag for lag in problem.layout if lag in read)
 

@@ -17,10 +17,13 @@ from orthaug.errors import InputError
 from orthaug.excitation import Excitation, identifiability
 from orthaug.folders import check_replaceable, whole_folder
 from orthaug.jobs import Job, LoadedPart, Progress, run_fit
+from orthaug.measures import Support
+from orthaug.suspicion import suspected
 
 if TYPE_CHECKING:
     from orthaug.diagnosis import Diagnosis
     from orthaug.model import Model, Response
+    from orthaug.physical import PhysicalEstimate
     from orthaug.record import Record
     from orthaug.result import Estimate
     from orthaug.validation import Trial, Verdict
@@ -47,7 +50,7 @@ def check_report(job: Job) -> dict[str, Any]:
             "columns": found.columns,
             "inseparable": [list(group) for group in found.collinear],
         },
-        "bias": None,
+        "bias": suspected(job) if problem.excitation.full_rank else None,
         "warnings": list(job.warnings),
     }
 
@@ -77,8 +80,11 @@ def fit_job(
 
     fit = run_fit(job, progress, kind=kind, alone=alone)
     warnings = [*job.warnings, *fit.warnings]
-    scores, responses, diagnosis, verdict = {}, None, None, None
+    scores, responses, diagnosis, verdict, physical, bias = {}, None, None, None, None, None
     if fit.status.ok:
+        physical = _physical(job, fit)
+        warnings += physical.warnings if physical is not None else ()
+        bias = suspected(job, fit.theta, _learned(job, fit))
         for part in job.parts:
             scores[part.name], responses = score_part(fit.model, part, warnings)
         diagnosis = diagnose(fit)
@@ -102,14 +108,18 @@ def fit_job(
         },
         "restarts": [asdict(restart) for restart in fit.restarts],
         "parameters": _parameters(fit),
-        "physical_parameters": None,
+        "physical_parameters": None if physical is None else _physical_rows(job, physical, fit),
+        "physical_consistency": None
+        if physical is None or physical.consistency is None
+        else physical.consistency._asdict(),
+        "sensitivities": None if physical is None or physical.sensitivities is None else _sensitivities(job, physical),
         "structure": fit.model.structure,
         "measure": fit.model.measure if fit.model.structure == "orthogonal" else None,
         "measure_detail": None if fit.measure is None else fit.measure.as_dict(),
         "orthogonality_defect": fit.defect,
         "excitation": _excitation(fit.excitation),
         "scores": scores,
-        "bias": None,
+        "bias": bias,
         "residuals": None if diagnosis is None else diagnosis.as_dict(),
         "validation": None if verdict is None else verdict.as_dict(),
         "warnings": warnings,
@@ -159,6 +169,44 @@ def cross_validated(job: Job, blocks: int, kinds: Sequence[str | None]) -> dict[
 
 def _fold_fit(job: Job, kind: str | None, alone: bool, fold: Record) -> Estimate:
     return run_fit(job, kind=kind, alone=alone, fold=fold)
+
+
+def _physical(job: Job, fit: Estimate) -> PhysicalEstimate | None:
+    """p̂ of θ̂, where the spec has a map."""
+    if job.physics is None:
+        return None
+    return fit.physical(job.physics)
+
+
+def _physical_rows(job: Job, found: PhysicalEstimate, fit: Estimate) -> list[dict[str, Any]]:
+    """The physical parameters as result.json lists them, with profile intervals where the spec asks for them."""
+    rows = found.as_rows()
+    if job.spec.physics is None or not job.spec.physics.profile or found.covariance is None:
+        return rows
+    for row in rows:
+        low, high = fit.physical_profile(job.physics, row["name"])
+        row["profile95"] = [_finite(low), _finite(high)]
+    return rows
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _sensitivities(job: Job, found: PhysicalEstimate) -> dict[str, dict[str, float]]:
+    """∂ln p / ∂ln θ by name."""
+    assert job.physics is not None and found.sensitivities is not None
+    return {
+        name: dict(zip(job.physics.theta_names, map(float, row), strict=True))
+        for name, row in zip(found.names, found.sensitivities, strict=True)
+    }
+
+
+def _learned(job: Job, fit: Estimate) -> Any:
+    """f at the points of the spec's measure."""
+    if fit.model.form.bound is None:
+        return None
+    return fit.model.learner_at(job.measure.points(Support(job.train.record, job.problem.layout, job.used)).x)
 
 
 def is_result(folder: Path) -> bool:

@@ -17,6 +17,8 @@ from orthaug.errors import InputError
 from orthaug.excitation import Excitation
 from orthaug.measures import Measure, Support, Training
 from orthaug.model import Model
+from orthaug.physical import PhysicalEstimate, profile, solve
+from orthaug.physics import PhysicsMap
 from orthaug.problem import Problem
 from orthaug.splitting import MeasureSplit, split_under
 
@@ -173,6 +175,26 @@ class Estimate:
             measure=found,
             warnings=(*(w for w in self.warnings if "not unique" not in w), *found.warnings),
         )
+
+    def physical(self, physics: PhysicsMap) -> PhysicalEstimate:
+        """The physical parameters that θ̂ is made of, with intervals by the delta method."""
+        order, covariance = self._in_order_of(physics)
+        return solve(physics, self.theta[order], covariance, freedom=max(self.freedom, 1.0))
+
+    def physical_profile(self, physics: PhysicsMap, name: str) -> tuple[float, float]:
+        """95 % profile-likelihood interval of one physical parameter; a side without limit is infinite."""
+        order, covariance = self._in_order_of(physics)
+        if covariance is None:
+            raise InputError("θ has no standard errors, so physical parameters have no profile.")
+        return profile(physics, self.theta[order], covariance, name, freedom=max(self.freedom, 1.0))
+
+    def _in_order_of(self, physics: PhysicsMap) -> tuple[list[int], Matrix | None]:
+        names = self.problem.baseline.names
+        missing = [name for name in physics.theta_names if name not in names]
+        if missing:
+            raise InputError(f"the physics gives {', '.join(missing)}, which the baseline does not have.")
+        order = [names.index(name) for name in physics.theta_names]
+        return order, None if self.covariance is None else self.covariance[np.ix_(order, order)]
 
     def __repr__(self) -> str:
         values = ", ".join(f"{n} = {v:.6g}" for n, v in zip(self.problem.baseline.names, self.theta, strict=True))

@@ -6,6 +6,7 @@ Every error is one line that names the file, the key, what was found and what wa
 from __future__ import annotations
 
 import json
+import math
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from orthaug._arrays import nearest
 from orthaug.baseline import Baseline, Term
 from orthaug.errors import InputError
+from orthaug.physics import PhysicalParameter, PhysicsMap
 from orthaug.record import Channel
 from orthaug.regressors import Lags
 from orthaug.tables import check_readable
@@ -104,6 +106,34 @@ class BaselineSection(Section):
     constants: dict[str, Finite] = {}
 
 
+class PhysicalSection(Section):
+    """One physical parameter."""
+
+    initial: Finite
+    unit: str = ""
+    min: Finite | None = None
+    max: Finite | None = None
+
+
+class PhysicsSection(Section):
+    """What θ is made of."""
+
+    parameters: Annotated[dict[str, PhysicalSection], Field(min_length=1)]
+    theta: Annotated[dict[str, str], Field(min_length=1)]
+    profile: bool = False
+
+
+class SuspectSection(Section):
+    """A term that may be missing from the physics."""
+
+    kind: str = "expression"
+    on: str | None = None
+    width: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    output: str | None = None
+    coefficient: Finite | None = None
+    name: str | None = None
+
+
 class LearnerSection(Section):
     """The learned correction."""
 
@@ -168,7 +198,8 @@ class Spec(Section):
     data: Data
     lags: LagsSection | None = None
     baseline: BaselineSection
-    physics: dict[str, Any] | None = None
+    physics: PhysicsSection | None = None
+    suspects: list[SuspectSection] = []
     learner: LearnerSection = LearnerSection()
     structure: StructureSection = StructureSection()
     training: TrainingSection = TrainingSection()
@@ -239,6 +270,19 @@ class Spec(Section):
         ]
         return Baseline.from_terms(terms, self.baseline.constants)
 
+    def physics_map(self) -> PhysicsMap | None:
+        """The physical parameters and their map to θ, if the spec has one."""
+        if self.physics is None:
+            return None
+        limits = {"min": -math.inf, "max": math.inf}
+        parameters = [
+            PhysicalParameter(
+                name, p.initial, p.unit, *(limits[k] if v is None else v for k, v in (("min", p.min), ("max", p.max)))
+            )
+            for name, p in self.physics.parameters.items()
+        ]
+        return PhysicsMap.of(parameters, self.physics.theta, self.baseline.constants)
+
     def learner_inputs(self) -> tuple[str, ...] | None:
         """What the learner sees; None for all lags."""
         return tuple(self.learner.inputs) if self.learner.inputs is not None and self.learner.kind != "none" else None
@@ -252,8 +296,7 @@ def load_spec(path: Path) -> Spec:
     """Read and check a spec file.
 
     Raises:
-        InputError: no such file, broken TOML, unknown or missing keys, values of the wrong kind, or a part
-            of the contract that is not built yet.
+        InputError: no such file, broken TOML, unknown or missing keys, or values of the wrong kind.
     """
     check_readable(path)
     try:
@@ -263,24 +306,9 @@ def load_spec(path: Path) -> Spec:
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file; expected TOML in UTF-8.") from None
     try:
-        spec = Spec.model_validate(content)
+        return Spec.model_validate(content)
     except ValidationError as error:
         raise InputError(f"{path}: {_first_message(error, content)}.") from None
-    try:
-        _refuse_unbuilt(spec)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    return spec
-
-
-def _refuse_unbuilt(spec: Spec) -> None:
-    """Parts of the contract that this version does not build yet."""
-    unbuilt = {
-        "[physics]": spec.physics is not None,
-    }
-    for what, used in unbuilt.items():
-        if used:
-            raise InputError(f"{what} is not built yet in this version; leave it out.")
 
 
 def _first_message(error: ValidationError, content: dict[str, Any]) -> str:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float, Int
-from scipy import linalg, optimize
+from scipy import linalg, optimize, special
 
 from orthaug._arrays import Matrix, Vector, check_choice, check_count, check_number
 from orthaug._jax import jax, jnp
@@ -395,15 +395,13 @@ def _descend(a: Float[np.ndarray, "m n n"], sharpness: float) -> Matrix:
         y = flat.reshape(n, n)
         if np.linalg.cond(y) > 1e6:
             return 1e6, np.zeros(n * n)
-        inverse = np.linalg.inv(y)
-        b = y @ a @ inverse
+        b = y @ a @ (inverse := np.linalg.inv(y))
         squares, v = np.linalg.eigh(b.swapaxes(1, 2) @ b)
         squares, u = np.maximum(squares, 1e-200), b @ v
-        top = (logarithms := sharpness * np.log(squares) / 2).max()
-        weight = np.exp(logarithms - top)
-        total, weight = weight.sum(), weight / weight.sum()
+        total = special.logsumexp(logarithms := sharpness * np.log(squares) / 2)
+        weight = np.exp(logarithms - total)
         slope = outer(u, weight / squares, u) - outer(v, weight, v)
-        return (top + np.log(total)) / sharpness, (slope @ inverse.T).ravel()
+        return total / sharpness, (slope @ inverse.T).ravel()
 
     found = optimize.minimize(value, np.eye(n).ravel(), jac=True, method="L-BFGS-B", options={"maxiter": 40})
     return np.asarray(found.x).reshape(n, n)

@@ -52,7 +52,11 @@ def write(model: Model, folder: Path) -> None:
     """Write the two files into an existing folder."""
     numbers = {name: value for name, value in model.numbers._asdict().items() if value is not None}
     arrays = {f"numbers.{name}": np.asarray(value) for name, value in numbers.items()}
-    arrays |= {"largest_output": model.largest_output, "weight": model.weight, "scalars": np.array([model.ridge, model.freedom])}
+    arrays |= {
+        "largest_output": model.largest_output,
+        "weight": model.weight,
+        "scalars": np.array([model.ridge, model.freedom]),
+    }
     arrays |= {
         name: value
         for name, value in (("gram", model.gram), ("noise", model.noise), ("middle", model.middle))

@@ -1,0 +1,276 @@
+"""Designed inputs against regressions on simulated records, known figures of usual inputs, and limits."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+from orthaug import signals
+from orthaug.baseline import Baseline, Term
+from orthaug.bias import bias_table
+from orthaug.design import Design, design_input
+from orthaug.errors import InputError
+from orthaug.problem import pose
+from orthaug.record import Record
+from orthaug.suspects import Suspect, suspect_columns
+from orthaug.synthetic import MassSpringDamper, mass_spring_damper
+
+SYSTEM = MassSpringDamper()
+THETA = SYSTEM.paper_theta()
+SAMPLES, NOISE, AMPLITUDE = 10_000, 0.00018, 100.0
+VELOCITY = "(position[k-1] - position[k-2])/Ts"
+FRICTION = Suspect(
+    "friction",
+    f"sign({VELOCITY})*(coulomb + (static - coulomb)*exp(-abs({VELOCITY})/vs))",
+    coefficient=-THETA[2],
+    constants={"Ts": 0.01, "coulomb": SYSTEM.coulomb, "static": SYSTEM.static, "vs": SYSTEM.stribeck},
+)
+MACHINE = mass_spring_damper().baseline
+FIRST = Baseline.from_terms([Term("a", "y[k-1]", initial=0.9), Term("b", "u[k-1]", initial=0.1)])
+
+
+def machine(**changes: Any) -> Design:
+    given = {"outputs": ["position"], "inputs": ["force"], "sampling_time": 0.01, "samples": SAMPLES}
+    given |= {"amplitude": AMPLITUDE, "suspects": [FRICTION], "noise": NOISE, "theta": THETA}
+    return design_input(MACHINE, **(given | changes))
+
+
+def first(baseline: Baseline = FIRST, **changes: Any) -> Design:
+    given = {"outputs": ["y"], "inputs": ["u"], "sampling_time": 1.0, "samples": 400, "amplitude": 1.0, "noise": 0.1}
+    return design_input(baseline, **(given | changes))
+
+
+def errors(force: np.ndarray, draws: int = 20) -> np.ndarray:
+    """‖(θ̂ − θ*)/θ*‖ of least squares on simulated records, (draws,)."""
+    found = []
+    for draw in range(draws):
+        y = SYSTEM.simulate(force, THETA, np.random.default_rng(1000 + draw).normal(0, NOISE, len(force) - 2))
+        phi = np.stack([y[1:-1], y[:-2], force[1:-1]], axis=1)
+        size = np.linalg.norm(phi, axis=0)
+        theta = np.linalg.lstsq(phi / size, y[2:], rcond=None)[0] / size
+        found.append(np.linalg.norm((theta - THETA) / THETA))
+    return np.array(found)
+
+
+@pytest.fixture(scope="module")
+def designed() -> Design:
+    return machine()
+
+
+def test_it_beats_every_usual_input_on_the_paper_machine(designed: Design) -> None:
+    found = errors(designed.signal)
+    assert np.median(found) <= 0.0072
+    assert np.sqrt(np.mean(found**2)) == pytest.approx(designed.relative_error, rel=0.05)
+    assert designed.relative_error < 0.0068
+    assert designed.condition < 5
+    assert np.abs(designed.signal).max() <= AMPLITUDE
+
+
+@pytest.mark.parametrize(
+    ("name", "wave", "known"),
+    [
+        ("white Gaussian", signals.white_gaussian(SAMPLES, amplitude=100, deviation=33, seed=0), 0.041),
+        ("white uniform", signals.white_uniform(SAMPLES, amplitude=100, seed=0), 0.024),
+        ("white binary, hold 1", signals.white_binary(SAMPLES, amplitude=100, seed=0), 0.0142),
+        ("square, period 6", signals.square(SAMPLES, amplitude=100, period=6), 0.0084),
+    ],
+)
+def test_predicted_and_measured_errors_of_usual_inputs(
+    designed: Design, name: str, wave: np.ndarray, known: float
+) -> None:
+    candidate = next(row for row in designed.candidates if row.name == name)
+    assert np.sqrt(candidate.cost) == pytest.approx(known, rel=0.05)
+    assert np.median(errors(wave)) == pytest.approx(known, rel=0.08)
+
+
+def test_the_prediction_is_what_the_bias_table_and_least_squares_say(designed: Design) -> None:
+    """Φ⁺Δ of `bias_table` and σ²(ΦᵀΦ)⁻¹ on an independent simulation of the same input."""
+    record = Record.from_arrays(
+        designed.signal,
+        SYSTEM.simulate(designed.signal, THETA),
+        inputs=["force"],
+        outputs=["position"],
+        sampling_time=0.01,
+    )
+    posed = pose(record, MACHINE)
+    deltas = suspect_columns([FRICTION], posed.rows.x, posed.layout, posed.outputs)
+    (entry,) = bias_table(
+        posed.projection, posed.baseline.names, [FRICTION], deltas, gain=posed.weight, theta=THETA, certify=False
+    )
+    assert designed.bias == pytest.approx(entry.expected, rel=1e-9)
+    factor = posed.projection.covariance_factor() * posed.weight[0]
+    assert designed.std == pytest.approx(NOISE * np.sqrt(np.sum(factor**2, axis=1)), rel=1e-9)
+    assert designed.condition == pytest.approx(posed.excitation.condition, rel=1e-9)
+    assert designed.cost == pytest.approx(np.sum((designed.bias**2 + designed.std**2) / THETA**2), rel=1e-12)
+
+
+def test_the_same_seed_gives_the_same_signal(designed: Design) -> None:
+    again = machine()
+    assert np.array_equal(designed.signal, again.signal)
+    assert designed.candidates == again.candidates
+    json.dumps(designed.as_dict(), allow_nan=False)
+
+
+@pytest.mark.parametrize("rate", [5000.0, 700.0])
+def test_limits_hold_to_the_last_bit(rate: float) -> None:
+    found = machine(samples=2000, rate=rate, iterations=5).signal
+    assert np.abs(found).max() <= AMPLITUDE
+    assert np.abs(np.diff(found, prepend=0.0)).max() <= rate * 0.01
+    assert np.abs(np.diff(found)).max() >= 0.99 * rate * 0.01
+
+
+def test_the_cap_on_the_condition_number_is_kept() -> None:
+    free, capped = machine(samples=2000, iterations=5), machine(samples=2000, iterations=5, condition=2.0)
+    assert capped.condition <= 2 < free.condition
+    assert capped.cost > free.cost
+    assert np.all(np.diff([row.cost for row in capped.candidates if row.condition <= 2]) >= 0)
+    with pytest.raises(InputError, match=r"^no candidate has a condition number of Φ of 1\.01 or less; the best has"):
+        machine(samples=2000, iterations=0, condition=1.01)
+
+
+def test_without_suspects_the_variance_is_least() -> None:
+    found = machine(samples=2000, suspects=(), noise=0.0)
+    best = min(row.std for row in found.candidates if row.name.startswith(("white", "PRBS", "square")))
+    assert found.relative_error < 0.95 * best
+    assert np.all(found.bias == 0)
+    noisy = machine(samples=2000, suspects=(), noise=3.0)  # noise only scales
+    assert np.array_equal(noisy.signal, found.signal)
+    assert noisy.std == pytest.approx(3 * found.std)
+
+
+def test_an_even_suspect_leads_to_an_odd_signal() -> None:
+    baseline = Baseline.from_terms([Term("b1", "u[k]", initial=1.0), Term("b3", "u[k]**3", initial=0.1)])
+    suspect = Suspect.of("expression", "u[k]**2", coefficient=-0.5)
+    found = first(baseline, suspects=[suspect], noise=0.001)
+    assert np.abs(found.bias).max() < 1e-3
+    assert found.relative_error < 1.2 * np.linalg.norm(found.std / [1.0, 0.1])
+
+
+def test_weights_say_what_counts() -> None:
+    own = first(weights=[0.0, 1.0])
+    assert own.cost == pytest.approx(own.bias[1] ** 2 + own.std[1] ** 2)
+    assert own.std[1] < first(weights=[1.0, 0.0]).std[1]
+    gain = np.array([0.1 / 0.1**2, 1 / 0.1])  # derivative of the static gain b/(1 − a)
+    found, y = first(weights=gain[None]), np.zeros(400)
+    for k in range(1, 400):
+        y[k] = 0.9 * y[k - 1] + 0.1 * found.signal[k - 1]
+    phi = np.stack([y[:-1], found.signal[:-1]], axis=1)
+    assert found.cost == pytest.approx(0.1**2 * gain @ np.linalg.inv(phi.T @ phi) @ gain)
+
+
+def test_two_outputs_with_other_noise_shared_parameters_and_a_known_input() -> None:
+    """Against a Monte-Carlo regression that whitens the outputs as `pose` does."""
+    baseline = Baseline.from_terms(
+        [
+            Term("a", "y[k-1]", initial=0.5, output="y"),
+            Term("b", "u[k-1] + w[k-1]", initial=1.0, output="y"),
+            Term("b", "10*u[k-2]", output="z"),
+            Term("f", "y[k-1]", initial=2.0, fixed=True, output="z"),
+        ]
+    )
+    drag = Suspect("drag", "y[k-1]*abs(y[k-1])", output="y", coefficient=-0.05)
+    names = {"outputs": ["y", "z"], "inputs": ["u", "w"]}
+    w = np.random.default_rng(0).normal(size=300)
+    given = {"sampling_time": 1.0, "samples": 300, "amplitude": 2.0, "noise": [0.1, 3.0], "initial_outputs": 0.2}
+    found = design_input(baseline, **names, **given, suspects=[drag], channel="u", known_inputs={"w": w}, iterations=3)
+    rng, thetas = np.random.default_rng(1), []
+    for _ in range(400):
+        u, y, z = found.signal, np.full(300, 0.2), np.full(300, 0.2)
+        e = rng.normal(size=(300, 2)) * [0.1, 3.0]
+        for k in range(2, 300):
+            y[k] = 0.5 * y[k - 1] + u[k - 1] + w[k - 1] - 0.05 * y[k - 1] * abs(y[k - 1]) + e[k, 0]
+            z[k] = 10 * u[k - 2] + 2 * y[k - 1] + e[k, 1]
+        record = Record.from_arrays(np.stack([u, w], 1), np.stack([y, z], 1), **names)
+        posed = pose(record, baseline)
+        thetas.append(posed.projection.solve(posed.whitened_target))
+    assert np.mean(thetas, axis=0) - [0.5, 1.0] == pytest.approx(found.bias, abs=3e-3)
+    assert np.std(thetas, axis=0) == pytest.approx(found.std, rel=0.15)
+
+
+def test_expressions_mean_what_they_mean_elsewhere() -> None:
+    """Every function and operator, against `Suspect.values` on the rows of the designed record."""
+    text = "min(u[k-1], 0.3, y[k-1]) + max(y[k-1], -1)*tanh(y[k-2])**2 - sqrt(abs(y[k-1]))/(1 + exp(-u[k])) + 2**-1"
+    text += " + sin(y[k-1]) - cos(-u[k-1]) + tan(0.1*y[k-1])*log(2 + sign(y[k-2])) + c**2*(+y[k-1])"
+    suspect = Suspect("all", text, coefficient=0.01, constants={"c": 0.3})
+    found = first(suspects=[suspect], iterations=0, samples=200)
+    u, y = found.signal, np.zeros(200)
+    x = np.zeros((200, 4))
+    layout: Any = None
+    for k in range(2, 200):
+        layout = suspect.lags
+        x[k] = [{"y": y, "u": u}[lag.channel][k - lag.lag] for lag in layout]
+        y[k] = 0.9 * y[k - 1] + 0.1 * u[k - 1] + 0.01 * suspect.values(x[k : k + 1], layout, ["y"])[0, 0]
+    phi = np.stack([y[1:-1], u[1:-1]], axis=1)
+    bias = np.linalg.lstsq(phi, 0.01 * suspect.values(x[2:], layout, ["y"])[:, 0], rcond=None)[0]
+    assert found.bias == pytest.approx(bias, rel=1e-8)
+
+
+def test_the_pole_of_a_slow_system_needs_a_slow_input() -> None:
+    slow = Baseline.from_terms([Term("a", "y[k-1]", initial=0.99), Term("b", "u[k-1]", initial=0.01)])
+    found = first(slow, samples=4000, iterations=3, weights=[1.0, 0.0])
+    assert np.sum(np.diff(found.signal) != 0) < 400
+    assert found.condition < 1e3
+
+
+UNSTABLE = Baseline.from_terms([Term("a", "y[k-1]", initial=1.2), Term("b", "u[k-1]", initial=0.1)])
+AWAY = r"^the simulated output runs away under every input; give a `theta` that is stable\.$"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"amplitude": 0}, r"^`amplitude` must be a positive number; got 0\.$"),
+        ({"amplitude": -1.0}, r"^`amplitude` must be a positive number; got -1\.0\.$"),
+        ({"rate": 0.0}, r"^`rate` must be a positive number; got 0\.0\.$"),
+        ({"sampling_time": 0.0}, r"^`sampling_time` must be a positive number"),
+        ({"samples": 20}, r"^`samples` must be a whole number, 25 or more; got 20\.$"),
+        ({"noise": -0.1}, r"^`noise` must be a number, 0 or more"),
+        ({"noise": [0.1, 0.1]}, r"^`noise` must be finite numbers of shape \(1,\), or a single one\.$"),
+        ({"theta": [0.9, np.nan]}, r"^`theta` must be finite numbers of shape \(2,\), or a single one\.$"),
+        ({"theta": [0.9, 0.0]}, r"^θ of b is 0, so that its relative error has no meaning; give `weights`\.$"),
+        ({"weights": [0.0, 0.0]}, r"^`weights` must be of shape \(2,\) or \(m, 2\), and not all 0\.$"),
+        ({"weights": np.ones((2, 3))}, r"^`weights` must be of shape \(2,\) or \(m, 2\)"),
+        ({"condition": 0}, r"^`condition` must be a positive number"),
+        ({"iterations": -1}, r"^`iterations` must be a whole number, 0 or more"),
+        ({"channel": "v"}, r"^`channel` must be one of u; got 'v'\.$"),
+        ({"inputs": ["u", "w"]}, r"^`channel` is missing: the input to design, one of the inputs \(u, w\)\.$"),
+        ({"inputs": ["u", "w"], "channel": "w"}, r"^no term reads the input 'w', so that it cannot be designed\.$"),
+        ({"inputs": []}, r"^`channel` is missing"),
+        ({"known_inputs": {"u": 1.0}}, r"^a channel of `known_inputs` must be one of"),
+        ({"initial_outputs": np.inf}, r"^`initial_outputs` must be finite numbers of shape \(1, 1\)"),
+        ({"suspects": [Suspect("s", "y[k-1]**2")]}, r"^suspect 's' has no `coefficient`; a design needs a guess"),
+        ({"suspects": [Suspect("s", "v[k-1]", coefficient=1.0)]}, r"^'v\[k-1\]' uses the unknown channel 'v'"),
+        ({"suspects": [Suspect("s", "1", output="q", coefficient=1.0)]}, r"^suspect 's': unknown output 'q'"),
+        ({"suspects": [Suspect("s", "1", coefficient=1.0)] * 2}, r"^suspect 's' is given twice"),
+        ({"suspects": [Suspect("s", "y[k-1]**3", coefficient=1e6)]}, AWAY),
+        ({"suspects": [Suspect("s", "log(y[k-1])", coefficient=0.1)]}, AWAY),
+        ({"theta": [1.2, 0.1]}, AWAY),
+    ],
+)
+def test_errors_in_words(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        first(**changes)
+    assert "\n" not in str(caught.value)
+
+
+def test_physics_that_cannot_be_designed_for() -> None:
+    for baseline in (
+        Baseline.from_function(lambda x: x, ["a"]),
+        Baseline.from_terms([Term("a", "u[k]", 1.0, fixed=True)]),
+    ):
+        with pytest.raises(InputError, match=r"^a design needs physics that is made of terms, with one parameter"):
+            first(baseline)
+    twins = Baseline.from_terms([Term("a", "u[k]", initial=1.0), Term("b", "2*u[k]", initial=1.0)])
+    with pytest.raises(InputError, match=r"^no candidate has a condition number of Φ of 1000 or less"):
+        first(twins)
+
+
+def test_an_input_that_drives_the_model_away_is_only_left_out() -> None:
+    """A cubic that is unstable beyond |y| = 1/√0.1: large slow inputs run away, the others do not."""
+    found = first(amplitude=2.0, theta=[0.9, 1.0], suspects=[Suspect("s", "y[k-1]**3", coefficient=0.02)], iterations=2)
+    assert any(row.cost == np.inf for row in found.candidates)
+    assert np.isfinite(found.cost)
+    assert any(row["cost"] is None for row in found.as_dict()["candidates"])

@@ -1,0 +1,446 @@
+"""Evidence on the free run: Jacobians against differences, known poles, known divergence; the predictor apart."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from orthaug import stability as module
+from orthaug.baseline import Baseline, Term
+from orthaug.errors import InputError
+from orthaug.estimation import estimate, orthogonalize
+from orthaug.learners import MLP
+from orthaug.model import Model
+from orthaug.record import Record
+from orthaug.regressors import Lags
+from orthaug.solvers import LevenbergMarquardt
+from orthaug.stability import companions, contraction, divergence_scaling, feedback, lipschitz, stability
+from orthaug.storage import load, save
+
+FEW = LevenbergMarquardt(iterations=5)
+
+
+def model_of(terms: list[Term], theta, outputs=("y",), largest: float = 10.0) -> Model:
+    """Physics alone with a given θ; `largest` is its largest training output."""
+    rng = np.random.default_rng(0)
+    y = 20 * rng.normal(size=(500, len(outputs)))
+    record = Record.from_arrays(rng.normal(size=500), y, outputs=list(outputs))
+    model = estimate(record, Baseline.from_terms(terms), learner=None).model
+    numbers = model.numbers._replace(theta=np.asarray(theta, dtype=float))
+    return replace(model, numbers=numbers, largest_output=np.full(len(outputs), largest))
+
+
+def driven(model: Model, u, initial: float = 0.0) -> Record:
+    """The model's own response to u: what it would have been fitted to."""
+    names = [c.name for c in model.outputs]
+    rows = np.full((len(u), len(names)), initial)
+    y = model.simulate(Record.from_arrays(u, rows, outputs=names)).model
+    return Record.from_arrays(u, np.where(np.isfinite(y), y, rows), outputs=names)
+
+
+def linear(poles) -> Model:
+    """y_k = Σ a_i y_{k−i} + u_{k−1} with these poles."""
+    a = -np.poly(poles)[1:].real
+    terms = [Term(f"a{i}", f"y[k-{i + 1}]") for i in range(len(a))]
+    return model_of([*terms, Term("b", "u[k-1]")], [*a, 1.0])
+
+
+def noise(rows: int, seed: int = 1):
+    return np.random.default_rng(seed).normal(size=rows)
+
+
+DUFFING = [Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("c", "y[k-1]**3"), Term("d", "u[k-1]")]
+BOTH = [
+    Term("a", "p[k-1]", output="p"),
+    Term("b", "q[k-1]", output="p"),
+    Term("c", "p[k-1]", output="q"),
+    Term("d", "q[k-1]", output="q"),
+    Term("e", "u[k-1]", output="q"),
+]
+
+
+@pytest.fixture(scope="module")
+def duffing():
+    """A hardening oscillator that diverges where its inputs are large, with its response to noise."""
+    model = model_of(DUFFING, [1.6, -0.8, -0.05, 0.2], largest=3.0)
+    return model, driven(model, noise(3000))
+
+
+@pytest.fixture(scope="module")
+def network():
+    """Two outputs, unequal lags and a network, shortly trained."""
+    rng = np.random.default_rng(3)
+    u, y = rng.normal(size=150), np.zeros((150, 2))
+    for k in range(3, 150):
+        y[k, 0] = 0.5 * y[k - 1, 0] - 0.2 * y[k - 3, 0] + u[k - 1] + 0.3 * np.tanh(y[k - 1, 1])
+        y[k, 1] = 0.3 * y[k - 1, 1] + 0.4 * np.sin(y[k - 2, 0]) + 0.1 * rng.normal()
+    record = Record.from_arrays(u, y, outputs=["p", "q"])
+    terms = [Term("a", "p[k-1]", output="p"), Term("b", "q[k-1]*p[k-2]", output="q")]
+    lags = Lags(na=[3, 1], nb=2)
+    fit = estimate(record, Baseline.from_terms(terms), lags=lags, learner=MLP((4,)), solver=FEW, regularization=1.0)
+    return fit.model, record
+
+
+def differences(model: Model, record: Record, row: int, along) -> np.ndarray:
+    """A_{k,i} (na, ny, ny) at a row of one experiment by differences of the prediction from past outputs `along`."""
+    (e,), names = record.experiments, [c.name for c in record.outputs]
+    found, h = np.zeros((model.form.memory, len(names), len(names))), 1e-6
+    for i in range(1, model.form.memory + 1):
+        for j in range(len(names)):
+            sides = []
+            for sign in (1, -1):
+                y = along.copy()
+                y[row - i, j] += sign * h
+                moved = Record.from_arrays(e.inputs, y, outputs=names)
+                sides.append(model.predict(moved).model[row])
+            found[i - 1, :, j] = (sides[0] - sides[1]) / (2 * h)
+    return found
+
+
+@pytest.mark.parametrize("along", ["simulation", "measured"])
+def test_jacobians_are_differences(network, along):
+    model, record = network
+    found = feedback(model, record, along=along)
+    measured = record.experiments[0].outputs
+    run = model.simulate(record).model if along == "simulation" else measured
+    past = np.where(np.isfinite(run), run, measured)
+    assert found.jacobians.shape == (147, 3, 2, 2) and found.steps == 147 and found.skipped == 0
+    for place in (0, 1, 60, 146):
+        expected = differences(model, record, int(found.points.row[place]), past)
+        np.testing.assert_allclose(found.jacobians[place], expected, atol=1e-7)
+
+
+def test_companion_moves_the_state(network):
+    model, record = network
+    a = feedback(model, record).jacobians
+    whole = companions(a)[10]
+    past = np.random.default_rng(0).normal(size=(3, 2))
+    expected = [sum(a[10, i] @ past[i] for i in range(3)), past[0], past[1]]
+    np.testing.assert_allclose(whole @ past.ravel(), np.ravel(expected), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "poles",
+    [
+        [0.9],
+        [0.9, 0.5],
+        [0.99 * np.exp(0.3j), 0.99 * np.exp(-0.3j)],
+        [0.9, 0.9],
+        [0.9999 * np.exp(0.01j), 0.9999 * np.exp(-0.01j)],
+        [0.98 * np.exp(0.5j), 0.98 * np.exp(-0.5j), 0.9 * np.exp(1j), 0.9 * np.exp(-1j), 0.9, 0.8, 0.5, -0.6],
+        [0.9 * np.exp(0.4j * k) for k in range(-7, 8)],
+    ],
+)
+def test_poles_of_linear_models(poles):
+    """No norm has a rate below the radius; the one that is found comes close and forgets the start as it says."""
+    model = linear(poles)
+    record = driven(model, noise(400))
+    found, contracts = feedback(model, record), contraction(model, record)
+    radius = max(np.abs(poles))
+    assert found.largest == pytest.approx(radius, abs=1e-6) and found.median == pytest.approx(radius, abs=1e-6)
+    assert found.share_above_one == 0
+    assert radius - 1e-6 <= contracts.rate <= radius**0.93 < 1
+    assert contracts.share == 1 and contracts.bound == pytest.approx(radius, abs=1e-6)
+    a, t = companions(found.jacobians)[0], np.linalg.cholesky(contracts.metric).T
+    assert np.linalg.norm(t @ a @ np.linalg.inv(t), 2) == pytest.approx(contracts.rate, rel=1e-4)
+    for steps in (1, 10, 50):
+        power = np.linalg.norm(np.linalg.matrix_power(a, steps), 2)
+        assert power <= 1.001 * contracts.overshoot * contracts.rate**steps
+
+
+def test_a_normal_matrix_needs_no_other_norm():
+    """A rotation, shrunk by 0.9: its norm is its spectral radius."""
+    model = model_of(BOTH, [0.9 * np.cos(1), -0.9 * np.sin(1), 0.9 * np.sin(1), 0.9 * np.cos(1), 1.0], ("p", "q"))
+    record = driven(model, noise(300))
+    contracts = contraction(model, record)
+    assert contracts.bound == pytest.approx(0.9) and 0.9 - 1e-9 <= contracts.rate < 0.905
+
+
+def test_an_unstable_linear_model():
+    model = linear([1.02, 0.5])
+    record = driven(model, noise(60))
+    found = stability(model, record)
+    assert found.feedback.largest == pytest.approx(1.02) and found.feedback.share_above_one == 1
+    assert found.contraction.rate >= 1.02 - 1e-6 and found.contraction.share == 0
+    assert len(found.warnings) == 2
+    assert "radius is above 1 at 100 %" in found.warnings[0] and "At 100 % of the 58" in found.warnings[1]
+
+
+def test_a_pole_at_one_is_not_above():
+    model = linear([1.0, 1.0])
+    found = feedback(model, driven(model, noise(60)))
+    assert found.share_above_one == 0
+
+
+def test_scalar_nonlinear():
+    """y = 0.9 tanh(y) + u: |A| = 0.9/cosh², at most 0.9, and its largest where y is closest to 0."""
+    model = model_of([Term("a", "tanh(y[k-1])"), Term("b", "u[k-1]")], [0.9, 1.0])
+    record = driven(model, noise(500))
+    y = record.experiments[0].outputs[:-1, 0]
+    found, contracts = feedback(model, record), contraction(model, record, box=100)
+    np.testing.assert_allclose(found.radius, 0.9 / np.cosh(y) ** 2, rtol=1e-9, atol=1e-12)
+    assert found.worst.row == np.argmin(np.abs(y)) + 1
+    assert found.worst.regressor["y[k-1]"] == y[found.worst.row - 1]
+    assert contracts.rate == pytest.approx(0.9) and contracts.samples == 599
+    assert contracts.overshoot == 1
+
+
+def test_a_steep_scalar():
+    """2 tanh(y) is steep near 0 only: the share of points that contract is that of |y| > arcosh √2."""
+    model = model_of([Term("a", "tanh(y[k-1])"), Term("b", "u[k-1]")], [2.0, 1.0])
+    record = driven(model, noise(500))
+    y = record.experiments[0].outputs[:-1, 0]
+    found = stability(model, record)
+    expected = np.mean(np.abs(y) > np.arccosh(np.sqrt(2)))
+    assert found.contraction.share == pytest.approx(expected) and 0 < expected < 1
+    assert found.feedback.share_above_one == pytest.approx(1 - expected)
+    assert found.contraction.rate == pytest.approx(found.feedback.largest)
+    assert found.contraction.worst.row == found.feedback.worst.row
+    assert found.diverges_at is None
+    assert f"At {100 * (1 - expected):.3g} % of the 499 sampled points" in found.text
+
+
+def test_one_metric_for_several_matrices():
+    """Switching between matrices that share a norm by construction: S A S⁻¹ with ‖A‖ = 0.95."""
+    rng = np.random.default_rng(4)
+    s = np.linalg.qr(rng.normal(size=(4, 4)))[0] @ np.diag([1, 3, 10, 30]) @ np.linalg.qr(rng.normal(size=(4, 4)))[0]
+    a = rng.normal(size=(300, 4, 4))
+    a = np.linalg.inv(s) @ (0.95 * a / np.linalg.norm(a, 2, axis=(1, 2))[:, None, None]) @ s
+    assert np.linalg.norm(a, 2, axis=(1, 2)).max() > 3
+    assert module._sizes(module._best_metric(a), a).max() < 0.97
+
+
+def test_some_matrices_that_cannot_contract_do_not_spoil_the_rest():
+    rng = np.random.default_rng(5)
+    s = np.diag([1.0, 4.0, 20.0])
+    a = rng.normal(size=(400, 3, 3))
+    a = 0.9 * a / np.linalg.norm(a, 2, axis=(1, 2))[:, None, None]
+    a[:8] *= 3.0
+    a = np.linalg.inv(s) @ a @ s
+    unstable = np.mean(np.abs(np.linalg.eigvals(a)).max(axis=1) > 1)
+    assert np.mean(module._sizes(module._best_metric(a), a) < 1) >= 0.98 and unstable > 0
+
+
+def test_slope_of_the_search():
+    rng = np.random.default_rng(6)
+    a = rng.normal(size=(20, 3, 3))
+    before = np.log(np.linalg.norm(a, 2, axis=(1, 2)).max())
+    y = module._descend(a, 20.0)
+    assert np.log(module._sizes(y, a).max()) < before
+
+
+def test_duffing_diverges_at_a_known_factor(duffing):
+    model, record = duffing
+    factor = divergence_scaling(model, record)
+    (e,) = record.experiments
+    mean = e.inputs.mean()
+
+    def diverges(s):
+        scaled = Record.from_arrays(mean + s * (e.inputs - mean), e.outputs)
+        return model.simulate(scaled).trajectories[0].diverged is not None
+
+    assert diverges(factor) and not diverges(factor / 1.05)
+    assert 1.5 < factor < 10
+    assert divergence_scaling(model, record, largest=1.2) is None
+
+
+def test_a_threshold_that_is_known():
+    """y = 0.5 y + 10 max(y − 10, 0) + u settles at 2 u up to 10; u = 3 ± 1 may be scaled to 3 ± 2, and no farther."""
+    model = model_of([Term("c", "y[k-1]"), Term("a", "max(y[k-1] - 10, 0)"), Term("b", "u[k-1]")], [0.5, 10.0, 1.0])
+    u = 3 + np.tile(np.repeat([1.0, -1.0], 50), 4)
+    assert 2 < divergence_scaling(model, driven(model, u)) <= 2.1
+
+
+def test_small_margin_warns(duffing):
+    model, record = duffing
+    factor = divergence_scaling(model, record)
+    (e,) = record.experiments
+    hot = Record.from_arrays((e.inputs - e.inputs.mean()) * factor / 1.3, e.outputs)
+    found = stability(model, hot)
+    assert 1 < found.diverges_at < 1.5
+    assert any("leaves all bounds" in line for line in found.warnings)
+
+
+def test_a_run_that_diverges(duffing):
+    model, record = duffing
+    (e,) = record.experiments
+    wild = Record.from_arrays(20 * e.inputs, e.outputs)
+    (trajectory,) = model.simulate(wild).trajectories
+    row = trajectory.diverged[0]
+    found = stability(model, wild)
+    assert found.feedback.steps == row - 2 + 1 and found.feedback.points.row[-1] == row
+    assert found.feedback.diverged == (f"y at experiment 0, row {row}",)
+    assert 0 < found.diverges_at < 1
+    assert found.text.count("diverges") == 1 and f"row {row}" in found.warnings[0]
+    json.dumps(found.as_dict(), allow_nan=False)
+
+
+def test_a_run_that_overflows():
+    """Squares leave double precision within a few steps, and with the input at rest too."""
+    model = model_of([Term("a", "y[k-1]**2")], [1.0], largest=1.0)
+    record = Record.from_arrays(np.zeros(40), np.full(40, 10.0))
+    found = stability(model, record)
+    assert found.diverges_at == 0.0 and found.feedback.steps == 3
+    np.testing.assert_allclose(found.feedback.radius, [20.0, 200.0, 20000.0])
+    json.dumps(found.as_dict(), allow_nan=False)
+
+
+def test_without_feedback():
+    model = model_of([Term("a", "sin(u[k])"), Term("b", "u[k-2]")], [1.0, 2.0])
+    record = Record.from_arrays(noise(50), noise(50, 2))
+    found = stability(model, record)
+    assert found.feedback is None and found.contraction is None and found.diverges_at is None
+    assert feedback(model, record) is None and contraction(model, record) is None
+    assert "uses no past outputs: its free run cannot diverge" in found.text and found.warnings == ()
+    assert found.lipschitz.gradient == pytest.approx(np.hypot(1, 2), rel=1e-2)
+    json.dumps(found.as_dict(), allow_nan=False)
+
+
+def test_two_experiments(duffing):
+    model, record = duffing
+    (e,) = record.experiments
+    quiet = Record.from_arrays(0.01 * e.inputs[:100], 0.01 * e.outputs[:100])
+    both = Record.join([quiet, record])
+    found, alone = feedback(model, both), feedback(model, record)
+    assert found.steps == 98 + 2998
+    np.testing.assert_array_equal(found.jacobians[98:], alone.jacobians)
+    np.testing.assert_array_equal(found.points.experiment, np.repeat([0, 1], [98, 2998]))
+    worst = contraction(model, both).worst
+    assert worst.experiment == 1 and worst.where == f"experiment 1, row {worst.row}"
+    wild = Record.join([record, Record.from_arrays(20 * e.inputs, e.outputs)])
+    assert feedback(model, wild).diverged[0].startswith("y at experiment 1, row ")
+
+
+def test_samples_are_bounded_and_the_same(duffing, monkeypatch):
+    model, record = duffing
+    first, again = (contraction(model, record, box=50) for _ in range(2))
+    assert first.rate == again.rate and (first.metric == again.metric).all()
+    assert 2000 <= first.samples <= 2050
+    monkeypatch.setattr(module, "_STEPS", 500)
+    found = feedback(model, record)
+    assert len(found.radius) == 500 and found.steps == 2998
+    assert found.points.row[0] == 2 and found.points.row[-1] == 2999
+
+
+def test_a_long_past_is_not_looked_at():
+    model = model_of([Term("a", "y[k-201]"), Term("b", "u[k-1]")], [0.5, 1.0])
+    record = Record.from_arrays(noise(300), noise(300, 2))
+    with pytest.raises(InputError, match="too few"):
+        stability(model, Record.from_arrays(noise(100), noise(100)))
+    found = stability(model, record)
+    assert found.contraction is None and found.feedback.largest is None and found.feedback.skipped == 0
+    assert any("more than 200 past outputs" in line for line in found.warnings)
+    json.dumps(found.as_dict(), allow_nan=False)
+
+
+def test_points_without_a_derivative():
+    """√|y| has none at y = 0, where this run stays for its first steps."""
+    model = model_of([Term("a", "sqrt(abs(y[k-1]))"), Term("b", "u[k-1]")], [0.1, 1.0])
+    u = np.concatenate([np.zeros(5), 2 + 0.1 * noise(100)])
+    found = stability(model, driven(model, u))
+    assert found.feedback.skipped == 6 and len(found.feedback.radius) == 98
+    assert any("no finite derivative" in line for line in found.warnings)
+    json.dumps(found.as_dict(), allow_nan=False)
+
+
+def test_lipschitz_of_known_gradients():
+    """g = a y₁ y₂ + b u: ∂g/∂x = (a y₂, a y₁, b); ∂φ/∂x = [[y₂, y₁, 0], [0, 0, 1]]."""
+    model = model_of([Term("a", "y[k-1]*y[k-2]"), Term("b", "u[k-1]")], [0.5, 3.0])
+    u, y = noise(200), 5 * noise(200, 2)
+    found = lipschitz(model, Record.from_arrays(u, y))
+    y1, y2, u1 = y[1:-1], y[:-2], u[1:-1]
+    size = np.sqrt(0.25 * (y1**2 + y2**2) + 9)
+    assert found.gradient == pytest.approx(size.max()) and found.rows == 198
+    scaled = np.sqrt(0.25 * ((y2 * y1.std()) ** 2 + (y1 * y2.std()) ** 2) + (3 * u1.std()) ** 2) / y.std()
+    assert found.gradient_scaled == pytest.approx(scaled.max()) and found.worst.row == scaled.argmax() + 2
+    assert found.phi == pytest.approx(np.sqrt(y1**2 + y2**2 + 1).max())
+    rms = [np.sqrt(np.mean((y1 * y2) ** 2)), np.sqrt(np.mean(u1**2))]
+    phi = np.sqrt(((y2 * y1.std()) ** 2 + (y1 * y2.std()) ** 2) / rms[0] ** 2 + (u1.std() / rms[1]) ** 2)
+    assert found.phi_scaled == pytest.approx(phi.max()) and found.phi_worst.row == phi.argmax() + 2
+
+
+def test_lipschitz_says_nothing_about_the_free_run():
+    """y_k = 2 y_{k−1} has a bounded gradient, and its free run diverges."""
+    model = model_of([Term("a", "y[k-1]")], [2.0])
+    record = Record.from_arrays(noise(100), noise(100))
+    found = stability(model, record)
+    assert found.lipschitz.gradient == pytest.approx(2) and found.feedback.diverged
+    assert "says nothing about the free run" in found.text
+
+
+def test_scales_do_not_depend_on_units(duffing):
+    """Output and input in thousandths: radii, rate, share and the scaled gradient stay."""
+    model, record = duffing
+    (e,) = record.experiments
+    small = model_of(DUFFING, [1.6, -0.8, -0.05e6, 0.2], largest=3e-3)
+    other = Record.from_arrays(1e-3 * e.inputs, 1e-3 * e.outputs)
+    one, two = stability(model, record), stability(small, other)
+    assert two.feedback.largest == pytest.approx(one.feedback.largest)
+    assert two.contraction.share == pytest.approx(one.contraction.share, abs=0.02)
+    assert two.diverges_at == pytest.approx(one.diverges_at)
+    assert two.lipschitz.gradient_scaled == pytest.approx(one.lipschitz.gradient_scaled)
+    assert two.lipschitz.phi_scaled == pytest.approx(one.lipschitz.phi_scaled)
+
+
+def test_a_model_from_elsewhere_by_differences(duffing):
+    """The same oscillator as a plain function that JAX cannot differentiate."""
+    model, record = duffing
+
+    def outside(x):
+        return 1.6 * x[:, 0] - 0.8 * x[:, 1] - 0.05 * x[:, 0] ** 3 + 0.2 * x[:, 2]
+
+    split = orthogonalize(record, Baseline.from_terms([DUFFING[0]]), outside, lags=Lags(na=2, nb=1)).model
+    short = record.rows(None, 300)
+    found, expected = feedback(split, short), feedback(model, short)
+    np.testing.assert_allclose(found.jacobians, expected.jacobians, atol=1e-5)
+
+
+def test_saved_and_loaded(network, tmp_path):
+    model, record = network
+    save(model, tmp_path / "model")
+    before, after = stability(model, record), stability(load(tmp_path / "model"), record)
+    assert before.as_dict() == after.as_dict() and before.text == after.text
+
+
+def test_as_dict_is_plain(network):
+    model, record = network
+    found = stability(model, record)
+    plain = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    assert plain == found.as_dict()
+    assert plain["feedback"]["largest"] == found.feedback.largest and "jacobians" not in plain["feedback"]
+    assert np.shape(plain["contraction"]["metric"]) == (6, 6)
+    assert set(plain["lipschitz"]["worst"]["regressor"]) == {str(lag) for lag in model.form.layout}
+
+
+def test_channels_by_name(network):
+    model, record = network
+    (e,) = record.experiments
+    turned = Record.from_arrays(e.inputs, e.outputs[:, ::-1], outputs=["q", "p"])
+    assert stability(model, turned).as_dict() == stability(model, record).as_dict()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"box": -1}, "`box` must be a whole number, 0 or more; got -1"),
+        ({"largest": 1.0}, "`largest` must be a factor above 1 and at most 10000; got 1.0"),
+        ({"largest": 1e5}, "`largest` must be a factor above 1"),
+        ({"largest": float("nan")}, "`largest` must be a positive number"),
+    ],
+)
+def test_arguments_refused(duffing, arguments, message):
+    with pytest.raises(InputError, match=message):
+        stability(*duffing, **arguments)
+
+
+def test_records_refused(duffing):
+    model, record = duffing
+    with pytest.raises(InputError, match="`along` must be one of simulation, measured; got 'both'"):
+        feedback(model, record, along="both")
+    with pytest.raises(InputError, match="lacks the output y"):
+        stability(model, Record.from_arrays(noise(50)))
+    with pytest.raises(InputError, match="no measured outputs to start from"):
+        divergence_scaling(model, Record.from_arrays(noise(50)))
