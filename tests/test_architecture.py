@@ -50,6 +50,7 @@ LAYERS = (
     "physical",
     "residuals",
     "model",
+    "uncertainty",
     "splitting",
     "stability",
     "result",

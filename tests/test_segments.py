@@ -81,8 +81,9 @@ def case(name):
     form = Form(posed.baseline, posed.features, posed.layout, posed.outputs, bound)
     w = np.zeros(0) if bound is None else np.asarray(bound.init(jax.random.key(1))) + 0.1
     c = 0.4 * rng.normal(size=len(posed.baseline.names))
-    empty = np.zeros(0)
-    scaling = (empty, empty, np.zeros(ny)) if bound is None else (rng.normal(size=nz), 1 + rng.random(nz), 0.5 * (1 + rng.random(ny)))  # fmt: skip
+    scaling = (np.zeros(0), np.zeros(0), np.zeros(ny))
+    if bound is not None:
+        scaling = (rng.normal(size=nz), 1 + rng.random(nz), 0.5 * (1 + rng.random(ny)))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(orthaug.segments, "_CHUNK", 9)
         segments = lay_segments(posed.record, form, SEGMENT, WASHOUT)

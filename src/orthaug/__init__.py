@@ -49,6 +49,7 @@ _HOME = {
     "PhysicalParameter": "physics",
     "PhysicsMap": "physics",
     "Suspect": "suspects",
+    "prediction_std": "uncertainty",
     "diagnose": "diagnosis",
     "load": "storage",
     "save": "storage",
@@ -101,6 +102,7 @@ if TYPE_CHECKING:
     from orthaug.structures import Orthogonal as Orthogonal
     from orthaug.structures import OrthogonalPenalty as OrthogonalPenalty
     from orthaug.suspects import Suspect as Suspect
+    from orthaug.uncertainty import prediction_std as prediction_std
 
 
 def __getattr__(name: str) -> Any:

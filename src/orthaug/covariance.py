@@ -52,6 +52,22 @@ def theta_covariance(projection: Projection, weight: Vector, noise: Matrix, fixe
     return covariance
 
 
+def column_units(gram: Matrix, nt: int) -> Vector:
+    """One over the norm of each column, θ first; learner columns that are rounding beside the largest stay small."""
+    size = np.sqrt(np.maximum(np.diag(gram), 0.0))
+    size[nt:] = np.maximum(size[nt:], np.sqrt(np.finfo(float).eps) * size[nt:].max(initial=0.0))
+    return 1 / np.where(size > 1e-150, size, 1.0)
+
+
+def pseudo_inverse(gram: Matrix, nt: int) -> Matrix:
+    """Inverse of the Gram matrix of `[S_c S_w]` on the directions that the data see."""
+    unit = column_units(gram, nt)
+    values, vectors = np.linalg.eigh(gram * np.outer(unit, unit))
+    kept = values > len(gram) * np.finfo(float).eps * values.max(initial=0.0)
+    half = unit[:, None] * vectors[:, kept]
+    return (half / values[kept]) @ half.T
+
+
 @dataclass(frozen=True, eq=False)
 class Joint:
     """Cov of all that training estimated, p = (c, w): `σ² M⁻¹` with `M = G + ridge` on the weights.
@@ -71,11 +87,7 @@ class Joint:
         nw = len(self.gram) - self.nt
         prior = self.ridge * np.concatenate([np.zeros(self.nt), np.ones(nw)])
         matrix = self.gram + np.diag(prior)
-        size = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-        unit = 1 / np.where(size > 1e-150, size, 1.0)
-        values, vectors = np.linalg.eigh(matrix * np.outer(unit, unit))
-        kept = values > len(matrix) * np.finfo(float).eps * values.max(initial=0.0)
-        reach = ((k * unit) @ vectors[:, kept]) / values[kept] @ vectors[:, kept].T * unit
+        reach = k @ pseudo_inverse(matrix, self.nt)
         variance = float(np.trace(self.middle) / max(np.trace(self.gram), 1e-300))
         return reach @ (self.middle + variance * np.diag(prior)) @ reach.T
 
@@ -90,8 +102,7 @@ def theta_block(information: Matrix, ridge: float, nt: int, fixed: Collection[in
     covariance = np.full((nt, nt), np.nan)
     if not np.isfinite(information).all():
         return covariance
-    size = np.sqrt(np.maximum(np.diag(information), 0.0))
-    unit = 1 / np.where(size > 1e-150, size, 1.0)
+    unit = column_units(information, nt)
     scaled = information * np.outer(unit, unit)
     inner = scaled[nt:, nt:] + ridge * np.diag(unit[nt:] ** 2)
     values, vectors = np.linalg.eigh(inner)

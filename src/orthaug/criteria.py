@@ -170,6 +170,30 @@ def mixed_gram(bound: Bound, w: Float[Array, "nw"], chunks: Chunks, mix: Float[A
     return row_sum(one_chunk, chunks)
 
 
+@partial(jax.jit, static_argnames="bound")
+def projected_gram(
+    bound: Bound, w: Float[Array, "nw"], chunks: Chunks, mix: Float[Array, "ny ny"]
+) -> Float[Array, "n n"]:
+    """Gram matrix of `[Q P⊥J]`, outputs multiplied by `mix`; J is projected twice, so that Q and it are orthogonal."""
+
+    def projected(chunk: Chunks, overlaps: tuple[Any, ...]) -> tuple[Any, Any]:
+        q = jnp.moveaxis(chunk.q, 1, 0)  # (nt, ny, m)
+        jacobian = bound.jacobian(w, chunk.z, chunk.gain)[1]
+        for overlap in overlaps:
+            jacobian = jacobian - jnp.einsum("tw,tom->wom", overlap, q)
+        return q, jacobian
+
+    def columns(chunk: Chunks) -> Float[Array, "n n"]:
+        mixed = jnp.einsum("oi,nim->nom", mix, jnp.concatenate(projected(chunk, overlaps)))
+        return gram(mixed.reshape(len(mixed), -1))
+
+    overlaps: tuple[Any, ...] = ()
+    for _ in range(2):
+        before = overlaps
+        overlaps = (*before, row_sum(lambda chunk, o=before: jnp.einsum("tom,wom->tw", *projected(chunk, o)), chunks))
+    return row_sum(columns, chunks)
+
+
 class Physics(NamedTuple):
     """θ as an unknown beside w: coordinates `q = start + basis v` in whitened rows, and the structure's rows."""
 

@@ -21,6 +21,7 @@ from orthaug.physical import PhysicalEstimate, profile, solve
 from orthaug.physics import PhysicsMap
 from orthaug.problem import Problem
 from orthaug.splitting import MeasureSplit, split_under
+from orthaug.uncertainty import joint_covariance, robust_covariance
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -175,6 +176,26 @@ class Estimate:
             measure=found,
             warnings=(*(w for w in self.warnings if "not unique" not in w), *found.warnings),
         )
+
+    def joint_covariance(self, convention: str = "calibrated") -> Matrix:
+        """Cov of θ̂ and the weights from the raw `[Φ P⊥J]`, (nθ + nw)²; convention "paper" for eq:cov_approx / N."""
+        return joint_covariance(self.problem, self.model, convention)
+
+    def robust(self, lags: int | None = None) -> Estimate:
+        """The same with standard errors of θ that hold for coloured and uneven noise (Newey-West).
+
+        Raises:
+            InputError: θ that is not `Φ⁺Y`: of another structure or measure, at a bound, or trained on the free run.
+        """
+        plain = self.covariance is not None and self.measure is None and isinstance(self.criterion, Prediction)
+        if not plain or self.at_bound:
+            raise InputError(
+                "robust standard errors are those of θ = Φ⁺Y: an orthogonal structure under the training measure, "
+                "one step ahead, with no parameter at a bound."
+            )
+        trajectories = self.model.predict(self.problem.record).trajectories
+        residual = np.concatenate([(t.measured - t.model)[t.start :] for t in trajectories])  # type: ignore[operator]
+        return replace(self, covariance=robust_covariance(self.problem, residual, self.effective_weights, lags))
 
     def physical(self, physics: PhysicsMap) -> PhysicalEstimate:
         """The physical parameters that θ̂ is made of, with intervals by the delta method."""

@@ -14,12 +14,13 @@ import numpy as np
 from orthaug._arrays import Matrix, Vector
 from orthaug._jax import jnp
 from orthaug.covariance import Joint
+from orthaug.criteria import share_of
 from orthaug.errors import InputError
 from orthaug.excitation import excitation, require_rank
-from orthaug.gram import chunk_shape, in_chunks
 from orthaug.measures import Measure, Points, Support
 from orthaug.model import Model
 from orthaug.projection import Projection
+from orthaug.uncertainty import learner_chunks
 
 SUPPORTED = 0.9  # share of a measure within reach of the data, below which it is warned of
 
@@ -98,16 +99,10 @@ def split_under(measure: Measure, model: Model, support: Support, joint: Joint |
 
 def learner_slope(model: Model, points: Points, projection: Projection, unit: Matrix) -> Matrix:
     """Φ_μ⁺J_μ (nθ, nw), in one pass over the points."""
-    from orthaug.criteria import Chunks, share_of
-
     bound, numbers = model.form.bound, model.numbers
     nt = len(model.theta)
     if bound is None or not bound.size:
         return np.zeros((nt, 0))
-    shape = chunk_shape(len(points.x))
-    z = np.asarray(model.form.features.evaluate(points.x, model.form.layout, np))
-    scaled = (z - np.asarray(numbers.centre)) / np.asarray(numbers.halfwidth)
-    gain = unit * np.asarray(numbers.gain)
-    pieces = (in_chunks(scaled, shape, repeat=True), *(in_chunks(p, shape) for p in (projection.q, 0 * gain, gain)))
-    overlap = share_of(bound, jnp.asarray(numbers.weights), Chunks(*map(jnp.asarray, pieces)))
+    chunks = learner_chunks(model, points.x, projection.q, unit)
+    overlap = share_of(bound, jnp.asarray(numbers.weights), chunks)
     return projection.from_coordinates(np.asarray(overlap.jacobian))
