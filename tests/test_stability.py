@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 from orthaug import stability as module
 from orthaug.baseline import Baseline, Term
@@ -203,14 +204,29 @@ def test_a_steep_scalar():
     assert f"At {100 * (1 - expected):.3g} % of the 499 sampled points" in found.text
 
 
-def test_one_metric_for_several_matrices():
-    """Switching between matrices that share a norm by construction: S A S⁻¹ with ‖A‖ = 0.95."""
+@pytest.mark.parametrize("n", [2, 4, 8])
+def test_one_metric_for_several_matrices(n):
+    """Switching between matrices that share a norm by construction: S⁻¹ A S with ‖A‖ = 0.95."""
     rng = np.random.default_rng(4)
-    s = np.linalg.qr(rng.normal(size=(4, 4)))[0] @ np.diag([1, 3, 10, 30]) @ np.linalg.qr(rng.normal(size=(4, 4)))[0]
-    a = rng.normal(size=(300, 4, 4))
+    turns = [np.linalg.qr(rng.normal(size=(n, n)))[0] for _ in range(2)]
+    s = turns[0] @ np.diag(np.geomspace(1, 30, n)) @ turns[1]
+    a = rng.normal(size=(300, n, n))
     a = np.linalg.inv(s) @ (0.95 * a / np.linalg.norm(a, 2, axis=(1, 2))[:, None, None]) @ s
     assert np.linalg.norm(a, 2, axis=(1, 2)).max() > 3
     assert module._sizes(module._best_metric(a), a).max() < 0.97
+
+
+def test_the_least_rate_of_two_states():
+    """Against a search over all norms of two states, P = [[1, b], [b, c]], from many starts."""
+    a = np.zeros((200, 2, 2))
+    a[:, 0, 0], a[:, 0, 1], a[:, 1, 0] = np.random.default_rng(7).uniform(1.2, 1.6, 200), -0.8, 1.0
+
+    def rate(v):
+        return module._sizes(np.array([[1.0, v[0]], [0.0, np.exp(v[1])]]), a).max()
+
+    starts = [(b, c) for b in (-1.5, -0.5, 0.5) for c in (-2.0, -1.0, 0.0)]
+    least = min(minimize(rate, start, method="Nelder-Mead").fun for start in starts)
+    assert least - 1e-6 <= module._sizes(module._metric(a), a).max() <= 1.01 * least
 
 
 def test_some_matrices_that_cannot_contract_do_not_spoil_the_rest():

@@ -230,13 +230,29 @@ def split(
     typer.echo(_json(found) if as_json else runs.split_text(found))
 
 
+@app.command()
+def design(
+    spec: SpecPath,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="CSV file for the input.")],
+    as_json: AsJson = False,
+) -> None:
+    """An input within limits under which suspected terms and noise disturb the parameters least."""
+    from orthaug import designing, jobs, outcome, runs
+
+    job = jobs.open_job(spec, require_full_rank=False)
+    runs.check_output(out, *job.files)
+    found = designing.design(job)
+    designing.write(job, found, out)
+    typer.echo(_json(outcome.plain(found.as_dict())) if as_json else f"{designing.text(found)}\n\nwritten to {out}")
+
+
 def _unbuilt(name: str) -> None:
     @app.command(name, hidden=True, context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
     def refuse(context: typer.Context) -> None:
         raise InputError(f"`orthaug {name}` is not built yet in this version.")
 
 
-for _name in ("design", "export", "reproduce"):
+for _name in ("export", "reproduce"):
     _unbuilt(_name)
 
 

@@ -93,6 +93,11 @@ class Job:
         return training.iterations + (training.start_iterations if free_run else 0)
 
     @property
+    def files(self) -> tuple[Path, ...]:
+        """Every file that the job reads."""
+        return (self.path, *(self.path.parent / entry["file"] for part in self.parts for entry in part.files))
+
+    @property
     def used(self) -> tuple[Lag, ...]:
         """The raw lags that the model reads."""
         return used_lags(self.problem)

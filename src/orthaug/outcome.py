@@ -77,17 +77,19 @@ def fit_job(
         judged: whether to ask if the learner earns its place; `compare` asks for all structures together.
     """
     from orthaug.diagnosis import diagnose
+    from orthaug.stability import stability
 
     fit = run_fit(job, progress, kind=kind, alone=alone)
     warnings = [*job.warnings, *fit.warnings]
-    scores, responses, diagnosis, verdict, physical, bias = {}, None, None, None, None, None
+    scores, responses, diagnosis, verdict, physical, bias, steady = {}, None, None, None, None, None, None
     if fit.status.ok:
         physical = _physical(job, fit)
         warnings += physical.warnings if physical is not None else ()
         bias = suspected(job, fit.theta, _learned(job, fit))
         for part in job.parts:
             scores[part.name], responses = score_part(fit.model, part, warnings)
-        diagnosis = diagnose(fit)
+        diagnosis, steady = diagnose(fit), stability(fit.model, job.train.record)
+        warnings += steady.warnings
         warnings += diagnosis.warnings
         if judged and not alone and fit.model.form.bound is not None:
             verdict = judge_fit(job, fit)
@@ -121,6 +123,7 @@ def fit_job(
         "scores": scores,
         "bias": bias,
         "residuals": None if diagnosis is None else diagnosis.as_dict(),
+        "stability": None if steady is None else steady.as_dict(),
         "validation": None if verdict is None else verdict.as_dict(),
         "warnings": warnings,
     }
@@ -225,8 +228,7 @@ def check_output(folder: Path) -> None:
 
 def check_inputs_kept(job: Job, folder: Path) -> None:
     """Raise InputError where the result would take the place of a file that the job reads."""
-    files = [job.path, *(job.path.parent / entry["file"] for part in job.parts for entry in part.files)]
-    for file in files:
+    for file in job.files:
         if file.resolve().is_relative_to(folder.resolve()):
             raise InputError(f"{folder}: holds {file.name}, which this fit reads; give another folder.")
 

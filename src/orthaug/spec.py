@@ -134,6 +134,18 @@ class SuspectSection(Section):
     name: str | None = None
 
 
+class DesignSection(Section):
+    """An input to design, within limits."""
+
+    samples: Positive
+    amplitude: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+    input: str | None = None
+    rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    noise: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    condition: Annotated[float, Field(gt=1, allow_inf_nan=False)] = 1e3
+    seed: Count = 0
+
+
 class LearnerSection(Section):
     """The learned correction."""
 
@@ -200,6 +212,7 @@ class Spec(Section):
     baseline: BaselineSection
     physics: PhysicsSection | None = None
     suspects: list[SuspectSection] = []
+    design: DesignSection | None = None
     learner: LearnerSection = LearnerSection()
     structure: StructureSection = StructureSection()
     training: TrainingSection = TrainingSection()

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float, Int
-from scipy import linalg, optimize, special
+from scipy import linalg, optimize
 
 from orthaug._arrays import Matrix, Vector, check_choice, check_count, check_number
 from orthaug._jax import jax, jnp
@@ -363,15 +363,14 @@ def _best_metric(a: Float[np.ndarray, "m n n"]) -> Matrix:
 
 def _metric(a: Float[np.ndarray, "m n n"]) -> Matrix:
     """T (n, n) with a small largest `‖T A T⁻¹‖₂`, close to the least."""
-    n, bound, active = a.shape[1], np.abs(np.linalg.eigvals(a)).max(), np.zeros(len(a), dtype=bool)
+    n, bound, active = a.shape[1], np.abs(np.linalg.eigvals(a)).max(), _evenly(len(a), _ACTIVE)
     best = t = min([np.eye(n), *_lyapunov(a.mean(axis=0))], key=lambda t: _sizes(t, a).max())
     sizes, least = _sizes(t, a), max(_sizes(t, a).max(), 1e-9)
-    active[_evenly(len(a), _ACTIVE)] = True
-    for sharpness in (4, 4, 8, 8, 16, 16) if 1 < n <= _LARGEST_SEARCH else ():
+    for sharpness in (4, 8, 16, 32) if 1 < n <= _LARGEST_SEARCH else ():
         if (gap := np.log(least / max(bound, 1e-3 * least))) <= 0.06 * abs(np.log(least)):
             break  # the rest would cost overshoot
-        active[np.argsort(-sizes, kind="stable")[:_ACTIVE]] = True
-        t = _descend(t @ a[active] @ np.linalg.inv(t), sharpness * np.log(n * active.sum()) / gap) @ t
+        active = np.union1d(active, np.argsort(-sizes, kind="stable")[:_ACTIVE])
+        t = _descend(t @ a[active] @ np.linalg.inv(t), sharpness * np.log(n * len(active)) / gap) @ t
         sizes = _sizes(t := t / np.linalg.norm(t), a)
         best, least = (t, sizes.max()) if sizes.max() < least else (best, least)
     return best
@@ -390,7 +389,7 @@ def _lyapunov(mean: Matrix) -> Iterator[Matrix]:
 
 def _descend(a: Float[np.ndarray, "m n n"], sharpness: float) -> Matrix:
     """Y that lowers `log Σ σ^sharpness / sharpness`, over all singular values σ of all Y A Y⁻¹, from Y = I."""
-    n, outer = a.shape[1], partial(np.einsum, "mij,mj,mkj->ik", optimize=True)
+    n = a.shape[1]
 
     def value(flat: Vector) -> tuple[float, Vector]:
         y = flat.reshape(n, n)
@@ -399,9 +398,10 @@ def _descend(a: Float[np.ndarray, "m n n"], sharpness: float) -> Matrix:
         b = y @ a @ (inverse := np.linalg.inv(y))
         squares, v = np.linalg.eigh(b.swapaxes(1, 2) @ b)
         squares, u = np.maximum(squares, 1e-200), b @ v
-        total = special.logsumexp(logarithms := sharpness * np.log(squares) / 2)
+        total = float(np.logaddexp.reduce(logarithms := sharpness * np.log(squares) / 2, axis=None))
         weight = np.exp(logarithms - total)
-        slope = outer(u, weight / squares, u) - outer(v, weight, v)
+        both = np.concatenate([u, v]).swapaxes(0, 1).reshape(n, -1)  # Σ w (u uᵀ − v vᵀ)
+        slope = both * np.concatenate([weight / squares, -weight]).ravel() @ both.T
         return total / sharpness, (slope @ inverse.T).ravel()
 
     found = optimize.minimize(value, np.eye(n).ravel(), jac=True, method="L-BFGS-B", options={"maxiter": 30})
