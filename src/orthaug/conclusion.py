@@ -131,6 +131,11 @@ def _warnings(
             "the learner lies in the span of the physics (P⊥J = 0): there is nothing for it to learn that the "
             "physics does not express already. Give it another form or other inputs, or leave it out."
         )
+    if learned.free is not None and not np.isfinite(learned.free.mean_square):
+        found.append(
+            "the free run diverges over whole experiments of the training data, so it has no loss; train with longer "
+            "segments, or bound what makes it run away."
+        )
     if learned.elsewhere:
         found.append("no standard errors: the function was trained elsewhere.")
     elif not _unique(structure, learned):

@@ -29,6 +29,11 @@ class Prediction:
     def __post_init__(self) -> None:
         check_count(self.horizon, "horizon")
 
+    @property
+    def flown(self) -> Simulation | None:
+        """The free run that gives it: segments of `horizon` steps whose last one is scored; None for one step."""
+        return Simulation(self.horizon, self.horizon - 1, exact_start=True) if self.horizon > 1 else None
+
 
 @dataclass(frozen=True)
 class Simulation:
@@ -41,11 +46,13 @@ class Simulation:
         segment: steps of a segment; 0 for whole experiments.
         washout: leading steps of a segment that are not scored, until its start is forgotten.
         start_iterations: one-step iterations that training starts from.
+        exact_start: whether a segment starts exactly from what was measured; None for the rule above.
     """
 
     segment: int = 512
     washout: int = 40
     start_iterations: int = 20
+    exact_start: bool | None = None
 
     def __post_init__(self) -> None:
         for name in ("segment", "washout", "start_iterations"):
@@ -56,8 +63,15 @@ class Simulation:
             )
 
     @property
+    def flown(self) -> Simulation:
+        """Itself: the free run that training makes."""
+        return self
+
+    @property
     def estimates_pasts(self) -> bool:
         """Whether the outputs before a segment are unknowns."""
+        if self.exact_start is not None:
+            return not self.exact_start
         return self.washout > 0 or self.segment == 0
 
 

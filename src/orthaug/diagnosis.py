@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from orthaug._arrays import Vector
-from orthaug.criteria import Simulation
 from orthaug.model import Response
 from orthaug.parallel import one_blas_thread
 from orthaug.problem import Problem
@@ -62,7 +61,7 @@ class Diagnosis:
 
 def diagnose(fit: Estimate) -> Diagnosis:
     """Analyse the residuals of a fit on its training record."""
-    problem, model, simulated = fit.problem, fit.model, isinstance(fit.criterion, Simulation)
+    problem, model, simulated = fit.problem, fit.model, fit.criterion.flown is not None
     one_step = model.predict(problem.record)
     free_run = model.simulate(problem.record)
     tests = _tests(problem, one_step)

@@ -100,7 +100,7 @@ def estimate(
     """
     _check_arguments(record, baseline, lags, learner, structure, criterion, solver, initial, validation)
     _check_splittable(structure, baseline, learner)
-    flown = _free_run_of(criterion)
+    flown = criterion.flown is not None
     choices = _regularizations(regularization, validation)
     if ensemble and (restarts < 2 or initial is not None):
         raise InputError("an ensemble needs `restarts` of 2 or more to be the median of.")
@@ -108,20 +108,20 @@ def estimate(
     if seed + restarts >= 2**63:
         raise InputError(f"`seed` must be below 2**63; got {seed}.")
     if initial is not None:
-        task, w = _warm_start(record, baseline, lags, initial)
+        task, w, start = _warm_start(record, baseline, lags, initial)
         starts = [_Start(0, w, choice) for choice in choices]
-        place = FreeRun.of(task.problem, task, flown) if flown else task
+        place = FreeRun.of(task.problem, task, criterion, start) if flown else task
         return _train(place, starts, structure, solver, validation, progress)
     problem = pose(record, baseline, lags, None if learner is None else learner.inputs)
-    if learner is None and flown is None:
+    if learner is None and not flown:
         return conclude(problem, structure, nothing_learned(problem), Status("exact", 0, 0.0, np.nan))
     if learner is None:
-        place = FreeRun.of(problem, None, flown)
+        place = FreeRun.of(problem, None, criterion)
         return _train(place, [_Start(seed, np.zeros(0), "none")], structure, solver, validation, progress)
     task = Task.of(problem, learner)
     weights = {s: task.bound.init(jax.random.key(s)) for s in range(seed, seed + restarts)}
     starts = [_Start(s, w, choice) for choice in choices for s, w in weights.items()]
-    place = FreeRun.of(problem, task, flown) if flown else task
+    place = FreeRun.of(problem, task, criterion) if flown else task
     return _train(place, starts, structure, solver, validation, progress, ensemble)
 
 
@@ -140,13 +140,6 @@ def _check_splittable(structure: Structure, baseline: Baseline, learner: Learner
 def _splits(structure: Structure) -> bool:
     """Whether θ is split off under another measure than that of training."""
     return isinstance(structure, Orthogonal) and structure.measure != Training()
-
-
-def _free_run_of(criterion: Criterion) -> Simulation | None:
-    """The free run that a criterion trains on; h steps ahead are segments of h steps whose last one is scored."""
-    if isinstance(criterion, Simulation):
-        return criterion
-    return Simulation(criterion.horizon, criterion.horizon - 1) if criterion.horizon > 1 else None
 
 
 def orthogonalize(
@@ -176,8 +169,8 @@ def orthogonalize(
 
 def _warm_start(
     record: Record, baseline: Baseline, lags: Lags | None, initial: Estimate | Model
-) -> tuple[Task, Float[Array, "nw"]]:
-    """The task of going on from an earlier model's weights, in its scaling."""
+) -> tuple[Task, Float[Array, "nw"], Vector]:
+    """The task of going on from an earlier model's weights, in its scaling; and the model's c."""
     model = initial.model if isinstance(initial, Estimate) else initial
     bound, numbers = model.form.bound, model.numbers
     if numbers.tilt is not None:
@@ -188,7 +181,8 @@ def _warm_start(
     if len(problem.outputs) != bound.ny:
         raise InputError(f"`initial` has {bound.ny} outputs, the record {len(problem.outputs)}; fit anew.")
     scaling = Scaling(np.asarray(numbers.centre), np.asarray(numbers.halfwidth))
-    return Task.of(problem, bound.learner, scaling, np.asarray(numbers.gain)), jnp.asarray(numbers.weights)
+    task = Task.of(problem, bound.learner, scaling, np.asarray(numbers.gain))
+    return task, jnp.asarray(numbers.weights), model.theta - model.theta_aux
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,12 +215,13 @@ def _train(
 
         return task.run(solver, start.weights, structure, start.regularization, tell)  # type: ignore[arg-type]
 
+    criterion = task.declared if isinstance(task, FreeRun) else Prediction()
     runs = spread(one, list(enumerate(starts)))
     losses = [task.loss(run) for run in runs]
     concluded, errors = {}, [math.nan] * len(runs)
     if validation is not None:
         concluded = {i: _concluded(task, structure, run) for i, run in enumerate(runs)}
-        errors = [_validation_error(fit, validation, isinstance(task, FreeRun)) for fit in concluded.values()]
+        errors = [_validation_error(fit, validation, criterion) for fit in concluded.values()]
     ranking = np.array(losses if validation is None else errors)
     best = int(np.nanargmin(ranking)) if np.isfinite(ranking).any() else 0
     if ensemble:
@@ -248,7 +243,6 @@ def _train(
         for i, (start, run) in enumerate(zip(starts, runs, strict=True))
     )
     seconds = sum(run.seconds for run in runs)
-    criterion = task.criterion if isinstance(task, FreeRun) else Prediction()
     fit = replace(fit, criterion=criterion, restarts=restarts, status=replace(fit.status, seconds=seconds))
     split_off = isinstance(structure, Orthogonal) and _splits(structure) and fit.status.ok and task.bound is not None
     return fit.split(structure.measure) if split_off else fit  # type: ignore[attr-defined]
@@ -265,11 +259,12 @@ def _concluded(task: Task | FreeRun, structure: Structure, run: Any, members: Se
     return conclude(task.problem, structure, learned, Status(code, run.iterations, run.seconds, np.nan))
 
 
-def _validation_error(fit: Estimate, validation: Record, free_run: bool) -> float:
+def _validation_error(fit: Estimate, validation: Record, criterion: Criterion) -> float:
     """Mean squared error with each output in its training standard deviation; NaN without a model or a value."""
     if not fit.status.ok:
         return math.nan
-    response = fit.model.simulate(validation) if free_run else fit.model.predict(validation)
+    free_run = isinstance(criterion, Simulation)
+    response = fit.model.simulate(validation) if free_run else fit.model.predict(validation, criterion.horizon)
     rmse = response.scores().rmse
     return float(np.mean((rmse * fit.problem.weight) ** 2))
 
@@ -295,6 +290,10 @@ def _check_arguments(
     check_type(learner, Learner | None, "learner", "a learner such as MLP(), or None")
     check_type(structure, Structure, "structure", "a structure such as Orthogonal()")
     check_type(criterion, Criterion, "criterion", "Prediction(…) or Simulation(…)")
+    if criterion.flown is not None and not isinstance(solver, LevenbergMarquardt):
+        raise InputError(
+            "only `LevenbergMarquardt` trains on a free run or more than one step ahead; take that solver."
+        )
     check_type(solver, Solver, "solver", "a solver such as LevenbergMarquardt()")
     check_type(initial, Estimate | Model | None, "initial", "an Estimate, a Model or None")
     check_type(validation, Record | None, "validation", "a Record or None")

@@ -12,7 +12,7 @@ import numpy as np
 
 from orthaug._arrays import Matrix, Vector, check_type
 from orthaug.covariance import interval
-from orthaug.criteria import Criterion, Prediction, Simulation
+from orthaug.criteria import Criterion, Prediction
 from orthaug.errors import InputError
 from orthaug.excitation import Excitation
 from orthaug.measures import Measure, Support, Training
@@ -114,7 +114,7 @@ class Estimate:
     @property
     def one_step_theta(self) -> Vector | None:
         """Φ⁺Y (nθ,), what one-step least squares gives, where θ was trained on something else; None otherwise."""
-        if not isinstance(self.criterion, Simulation):
+        if self.criterion.flown is None:
             return None
         return self.problem.projection.solve(self.problem.whitened_target)
 

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from orthaug._arrays import Matrix, Vector
 from orthaug._jax import jnp
 from orthaug.covariance import noise_covariance, theta_block
-from orthaug.criteria import Simulation
+from orthaug.criteria import Criterion, Prediction, Simulation
 from orthaug.learners import Bound
 from orthaug.pasts import Pasts
 from orthaug.predictor import Form, Numbers
@@ -30,6 +30,9 @@ from orthaug.structures import Elimination, Orthogonal, Structure, eliminate
 from orthaug.training import FreeStatistics, Learned, Task
 
 _RUNAWAY = 1e6  # mean square in deviations of the output: a free run beyond it has diverged
+_LARGEST_ERROR = 1e120
+_COLOURED_STEPS = 256  # shorter segments do not show how long the errors remember
+_COLOUR_ROWS = 4096  # of each experiment, which show it instead
 _SHORTEST = 4  # steps of a segment
 
 
@@ -42,19 +45,31 @@ class FreeRun:
     form: Form
     segments: Segments
     whole: Segments
-    """The whole experiments, over which runs are compared."""
+    """What runs are compared over: whole experiments; for a prediction h steps ahead its own segments."""
+    colour: Segments | None
+    """What the colour of the errors is taken from, where segments are too short to show it."""
     rms: float
+    declared: Criterion
     criterion: Simulation
+    warm: Vector | None = None
+    """c of an earlier model, with whose weights training starts."""
 
     @classmethod
-    def of(cls, problem: Problem, task: Task | None, criterion: Simulation) -> FreeRun:
+    def of(cls, problem: Problem, task: Task | None, declared: Criterion, warm: Vector | None = None) -> FreeRun:
+        """Lay the problem's record out as a criterion of several steps declares."""
+        criterion = declared.flown
+        assert criterion is not None, "one step ahead is `Task`'s"
         bound = None if task is None else task.bound
         form = Form(problem.baseline, problem.features, problem.layout, problem.outputs, bound)
         segments = lay_segments(problem.record, form, criterion.segment, criterion.washout)
         residual = problem.projection.orthogonal_part(problem.whitened_target)
         rms = task.rms if task is not None else max(float(np.sqrt(np.mean(residual**2))), 1e-10)
-        whole = segments if not criterion.segment else lay_segments(problem.record, form, 0, criterion.washout)
-        return cls(problem, task, form, segments, whole, rms, criterion)
+        own = not criterion.segment or isinstance(declared, Prediction)
+        whole = segments if own else lay_segments(problem.record, form, 0, criterion.washout)
+        short = segments.scored.shape[1] < _COLOURED_STEPS <= max(len(e) for e in problem.record.experiments)
+        cut = replace(problem.record, experiments=tuple(e.rows(0, _COLOUR_ROWS) for e in problem.record.experiments))
+        colour = lay_segments(cut, form, 0, criterion.washout) if short and isinstance(declared, Simulation) else None
+        return cls(problem, task, form, segments, whole, colour, rms, declared, criterion, warm)
 
     def numbers(self, c: Vector, w: Any, tilt: Any = None) -> Numbers:
         """The model's numbers before the split."""
@@ -92,11 +107,13 @@ class FreeRun:
             begun, seconds = first.iterations, first.seconds
             places.append(objective.start(np.asarray(first.w), first))
             ridge = first.ridge
+        if self.warm is not None and not objective.follows:
+            places.append(np.concatenate([self.warm, np.asarray(w)]))
         losses = [objective.loss(p) for p in places]
         if not np.isfinite(losses).any() and self.segments.scored.shape[1] > _SHORTEST:
             shorter = self._shorter().run(solver, w, structure, regularization, progress)
             places, losses = [shorter.found.p], [objective.loss(shorter.found.p)]
-            begun, seconds = shorter.iterations, shorter.seconds
+            begun, seconds = begun + shorter.iterations, seconds + shorter.seconds
 
         def tell(iteration: int, loss: float) -> None:
             if progress is not None:
@@ -265,9 +282,18 @@ class Objective:
     def samples(self) -> tuple[float, float]:
         """Number of residuals less the physics' own parameters, and the share of them that is independent."""
         nt, ny = len(self.free_run.problem.baseline.names), len(self.weight)
-        moved = np.moveaxis(self.errors, 1, -1).swapaxes(1, 2)  # (k, m, ny, T)
+        errors = self.errors if self.free_run.colour is None else self._long_errors()
+        moved = np.moveaxis(errors, 1, -1).swapaxes(1, 2)  # (k, m, ny, T)
         shares = [independent_share(moved[:, :, i].reshape(-1, moved.shape[-1])) for i in range(ny)]
         return self.free_run.segments.count * ny - nt, float(np.mean(shares))
+
+    def _long_errors(self) -> Any:
+        """Errors at the last linearisation over stretches that are long enough to show their colour."""
+        run, nt = self.free_run, len(self.free_run.problem.baseline.names)
+        assert self._anchor is not None and run.colour is not None
+        numbers = run.numbers(self._anchor[1][:nt], self._anchor[1][nt:])
+        errors = run._errors(numbers, run.colour.past, run.colour)
+        return errors if np.abs(errors).max() < _LARGEST_ERROR else self.errors
 
     @property
     def _largest(self) -> float:
@@ -347,7 +373,8 @@ class Objective:
         ny, count = len(self.weight), self.free_run.segments.count
         used = (len(self.free_run.problem.baseline.names) + found.effective) / ny
         errors = np.moveaxis(self.errors, 2, -1).reshape(-1, ny)
-        return noise_covariance(errors, np.full(ny, count - used)) if np.isfinite(errors).all() else None
+        sane = np.abs(errors).max(initial=0.0) < _LARGEST_ERROR  # whose squares still add up
+        return noise_covariance(errors, np.full(ny, count - used)) if sane else None
 
     def _linearise(self, c: Vector, w: Vector) -> tuple[Matrix, Vector]:
         return self.pasts.eliminate(self._sensitivity(c, w, self.weight), self.weight)

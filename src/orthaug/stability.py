@@ -23,6 +23,7 @@ from orthaug._jax import jax, jnp
 from orthaug.errors import InputError
 from orthaug.learners import External
 from orthaug.model import Model
+from orthaug.parallel import one_blas_thread
 from orthaug.predictor import Form, Numbers, parts
 from orthaug.record import Record
 from orthaug.regressors import lag_matrix
@@ -130,21 +131,11 @@ class Stability:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain content for JSON, without what is there for every step; never NaN or infinity."""
-
-        def plain(items: list[tuple[str, Any]]) -> dict[str, Any]:
-            kept = {name: value for name, value in items if name not in _PER_STEP}
-            return {
-                name: np.asarray(v).tolist() if isinstance(v, tuple | np.ndarray) else v for name, v in kept.items()
-            }
-
-        return asdict(self, dict_factory=plain)
+        return asdict(self, dict_factory=_plain)
 
 
 def stability(model: Model, record: Record, *, box: int = 0, largest: float = 1024.0) -> Stability:
-    """All checks of a model on a record, with a text that says what they mean.
-
-    `box` is that of `contraction`, `largest` that of `divergence_scaling`, and so are the errors.
-    """
+    """All checks of a model on a record, with a text that says what they mean; arguments and errors as of each."""
     gradients, found = lipschitz(model, record), feedback(model, record)
     contracts, factor = contraction(model, record, box=box, along=found), divergence_scaling(model, record, largest)
     checks = Stability(found, contracts, factor, float(largest), gradients, (), "")
@@ -167,7 +158,7 @@ def feedback(model: Model, record: Record, *, along: str = "simulation") -> Feed
         return None
     every, unit, diverged = _visited(model, record, free)
     size = model.form.memory * len(model.outputs)
-    some = every.take(_evenly(len(every.x), 0 if size > _LONGEST_STATE else min(_STEPS, _WORK / size**3)))
+    some = every.take(_evenly(len(every.x), 0 if size > _LONGEST_STATE else min(_STEPS, int(_WORK / size**3))))
     points, jacobians, radius = _linearised(model, some)
     largest, worst = _worst(model, record, points, radius)
     median, share = (float(np.median(radius)), float(np.mean(radius > 1 + 1e-6))) if worst else (None, None)
@@ -175,6 +166,7 @@ def feedback(model: Model, record: Record, *, along: str = "simulation") -> Feed
     return Feedback(points, jacobians, radius, unit, largest, median, share, worst, len(every.x), skipped, diverged)
 
 
+@one_blas_thread()
 def contraction(model: Model, record: Record, *, box: int = 0, along: Feedback | None = None) -> Contraction | None:
     """The quadratic norm in which the free run contracts on as many of at most 2000 sampled points as was reached.
 
@@ -339,9 +331,9 @@ def _positive(scale: Vector) -> Vector:
     return np.where(np.isfinite(scale) & (scale > 0), scale, 1.0)
 
 
-def _evenly(count: int, most: float) -> Int[np.ndarray, "m"]:
+def _evenly(count: int, most: int) -> Int[np.ndarray, "m"]:
     """At most `most` of `count` indices, spread evenly."""
-    return np.arange(count) if count <= most else np.linspace(0, count - 1, int(most)).round().astype(int)
+    return np.arange(count) if count <= most else np.linspace(0, count - 1, most).round().astype(int)
 
 
 def _sizes(t: Matrix, a: Float[np.ndarray, "m n n"]) -> Vector:
@@ -419,6 +411,12 @@ def _worst(model: Model, record: Record, points: Points, values: Vector) -> tupl
     if number < 0:
         return size, Place(None, None, "a point off the trajectory", regressor)
     return size, Place(number, row, f"experiment {number}, {record.experiments[number].where(row)}", regressor)
+
+
+def _plain(items: list[tuple[str, Any]]) -> dict[str, Any]:
+    return {
+        k: np.asarray(v).tolist() if isinstance(v, tuple | np.ndarray) else v for k, v in items if k not in _PER_STEP
+    }
 
 
 def _sentences(given: Stability) -> Iterator[tuple[str, bool]]:

@@ -12,12 +12,14 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import scipy.linalg
+from jaxtyping import Bool
 
 from orthaug._arrays import Matrix, Vector
 from orthaug.solvers.levenberg_marquardt import CONVERGED, NO_DESCENT, NON_FINITE, RUNNING, Progress
 
 _FIRST_DAMPING = 1e-3
 _LARGEST_DAMPING = 1e16
+_SETTLED = 0.1  # of the objective: a step that lowers it by less belongs to the end of a run
 _NO_CORRELATION = 0.05  # below it a correlation of the errors does not count
 _SMALLEST_CURVATURE = 1e-14  # of the largest: what a direction that does nothing is damped with
 
@@ -83,13 +85,14 @@ def minimise(
     hessian, gradient = objective.normal(p)
     if not np.isfinite(hessian).all():
         return Outcome(p, np.eye(len(p)), loss, ridge, 0.0, 0, NON_FINITE, time.perf_counter() - began)
+    coloured = False  # the colour of the errors counts once they no longer fall fast: before, it is that of the misfit
     if evidence:
-        ridge = _evidence(objective, p, hessian, loss, ridge, physics)
+        ridge = _evidence(objective, p, hessian, loss, ridge, physics, coloured)
     damping, growth, small, accepted, code, done = _FIRST_DAMPING, 2.0, 0, 0, RUNNING, 0
     while code == RUNNING and done < iterations:
         downhill = gradient - ridge * penalty * p
         step, expected = _step(hessian + ridge * np.diag(penalty), downhill, damping, p, lower, upper)
-        trial = objective.loss(p + step) if step.any() else np.nan
+        trial = objective.loss(p + step) if np.isfinite(step).all() and step.any() else np.nan
         done += 1
         before = loss + ridge * float(penalty @ p**2)
         after = trial + ridge * float(penalty @ (p + step) ** 2)
@@ -100,13 +103,15 @@ def minimise(
             gain = (before - after) / expected if expected > 0 else 1.0
             damping, growth = damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), 2.0
             small = small + 1 if before - after < tolerance * before else 0
+            coloured = coloured or before - after < _SETTLED * before
             if evidence:
-                ridge = _evidence(objective, p, hessian, loss, ridge, physics)
+                ridge = _evidence(objective, p, hessian, loss, ridge, physics, coloured)
             code = CONVERGED if small >= 2 else RUNNING
         else:
             damping, growth = damping * growth, 2 * growth
             if damping > _LARGEST_DAMPING or not step.any():
-                code = CONVERGED if accepted or _level(hessian, downhill, before) else NO_DESCENT
+                level = _level(hessian, downhill, before, _held(p, downhill, lower, upper))
+                code = CONVERGED if accepted or level else NO_DESCENT
         if progress is not None:
             progress(done, loss)
     seconds = time.perf_counter() - began
@@ -117,26 +122,33 @@ def _step(
     hessian: Matrix, downhill: Vector, damping: float, p: Vector, lower: Vector, upper: Vector
 ) -> tuple[Vector, float]:
     """The damped step inside the bounds, and the decrease that the quadratic model expects of it."""
-    held = ((p <= lower) & (downhill < 0)) | ((p >= upper) & (downhill > 0))
-    free = np.flatnonzero(~held)
+    free = np.flatnonzero(~_held(p, downhill, lower, upper))
     curvature = np.diag(hessian)[free]
     scale = np.maximum(curvature, _SMALLEST_CURVATURE * curvature.max(initial=0.0))
     scale = np.where(scale > 0, scale, 1.0)
     unit = 1 / np.sqrt(scale)  # solved with a unit diagonal: columns of very different size keep their digits
     matrix = hessian[np.ix_(free, free)] * np.outer(unit, unit) + damping * np.eye(len(free))
     step = np.zeros(len(p))
+    if not len(free):
+        return step, 0.0
     try:
         factor = scipy.linalg.cho_factor(matrix, check_finite=False)
         step[free] = unit * scipy.linalg.cho_solve(factor, unit * downhill[free], check_finite=False)
     except np.linalg.LinAlgError:  # curvature lost to rounding: more damping mends it
-        return step, 0.0
+        return np.full(len(p), np.nan), 0.0
     step = np.clip(p + step, lower, upper) - p
     return step, float(2 * step @ downhill - step @ hessian @ step)
 
 
-def _level(hessian: Matrix, downhill: Vector, objective: float) -> bool:
-    """Residual and Jacobian are orthogonal to rounding: the start is a minimum."""
-    return bool(np.all(np.abs(downhill) <= 1e-7 * np.sqrt(np.maximum(np.diag(hessian), 0.0) * objective)))
+def _held(p: Vector, downhill: Vector, lower: Vector, upper: Vector) -> Bool[np.ndarray, "n"]:
+    """Which entries stand at a bound that the descent would leave."""
+    return ((p <= lower) & (downhill < 0)) | ((p >= upper) & (downhill > 0))
+
+
+def _level(hessian: Matrix, downhill: Vector, objective: float, held: Bool[np.ndarray, "n"]) -> bool:
+    """Residual and Jacobian are orthogonal to rounding in every free entry: the start is a minimum."""
+    flat = np.abs(downhill) <= 1e-7 * np.sqrt(np.maximum(np.diag(hessian), 0.0) * objective)
+    return bool(np.all(flat | held))
 
 
 def weights_hessian(hessian: Matrix, physics: int) -> Matrix:
@@ -157,13 +169,16 @@ def effective_weights(hessian: Matrix, ridge: float, physics: int) -> float:
     return float(np.sum(np.where(values > floor, values / (np.abs(values) + ridge), 0.0)))
 
 
-def _evidence(objective: Objective, p: Vector, hessian: Matrix, loss: float, ridge: float, physics: int) -> float:
+def _evidence(
+    objective: Objective, p: Vector, hessian: Matrix, loss: float, ridge: float, physics: int, coloured: bool
+) -> float:
     """MacKay's fixed point `α = γσ²/(κ‖w‖²)`, κ the share of the residuals that is independent.
 
     Residuals of a free run are coloured: N of them say as much as κN independent ones, which divides the weight
     of the data against the prior.
     """
     samples, share = objective.samples()
+    share = share if coloured else 1.0
     effective = effective_weights(hessian, ridge, physics)
     variance = loss / max(samples - effective / share, 1.0)
     size = float(np.sum(p[physics:] ** 2))
