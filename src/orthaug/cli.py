@@ -6,7 +6,7 @@ import json
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,6 +15,7 @@ import typer
 import typer.core
 
 from orthaug import __version__
+from orthaug._arrays import check_choice
 from orthaug.errors import InputError, TrainingError
 
 if TYPE_CHECKING:
@@ -246,13 +247,34 @@ def design(
     typer.echo(_json(outcome.plain(found.as_dict())) if as_json else f"{designing.text(found)}\n\nwritten to {out}")
 
 
+@app.command()
+def reproduce(
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="One study; all without it.")] = None,
+    out: OutFolder = None,
+    pipeline: Annotated[str, typer.Option("--pipeline", metavar="ours|paper", help="Who trains.")] = "ours",
+    small: Annotated[bool, typer.Option("--small", help="The reduced size that the tests run.")] = False,
+) -> None:
+    """The paper's figures and tables, each number beside the published one; goes on where it was interrupted."""
+    from orthaug import reproduction
+
+    folder = out or Path("orthaug-out/reproduction")
+    reproduction.check_output(folder)
+    entries = reproduction.chosen(name)
+    check_choice(pipeline, reproduction.PIPELINES, "--pipeline")
+    _prepare_jax()
+    with _study_progress() as progress:
+        found = reproduction.reproduce(entries, pipeline=pipeline, small=small, progress=progress)
+    reproduction.write(found, folder, pipeline)
+    typer.echo(f"{reproduction.text(found)}\n\nwritten to {folder}/index.html")
+
+
 def _unbuilt(name: str) -> None:
     @app.command(name, hidden=True, context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
     def refuse(context: typer.Context) -> None:
         raise InputError(f"`orthaug {name}` is not built yet in this version.")
 
 
-for _name in ("export", "reproduce"):
+for _name in ("export",):
     _unbuilt(_name)
 
 
@@ -300,6 +322,30 @@ def _progress(runs: int, iterations: int, wanted: bool = True) -> Iterator[Progr
             raise KeyboardInterrupt(reached) from None
         if interrupted.is_set():
             raise KeyboardInterrupt("the scoring of the model")
+
+
+@contextmanager
+def _study_progress() -> Iterator[Callable[[str, int, int], None]]:
+    """A bar per study on standard error where that is a terminal; Ctrl-C stops after the run at hand."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with (
+        _deferred_interrupt() as interrupted,
+        Progress(*columns, console=console, disable=not console.is_terminal) as bar,
+    ):
+        tasks: dict[str, Any] = {}
+
+        def tell(title: str, done: int, total: int) -> None:
+            if title not in tasks:
+                tasks[title] = bar.add_task(title, total=total)
+            bar.update(tasks[title], completed=done)
+            if interrupted.is_set():
+                raise KeyboardInterrupt(f"'{title}', {done} of {total} runs done and kept for the next time")
+
+        yield tell
 
 
 @contextmanager

@@ -30,11 +30,14 @@ class Stopped(Exception):
     """Another run failed, or the user pressed Ctrl-C: this run's result is no longer wanted."""
 
 
-def spread(function: Callable[[Item, Callable[[], None]], Result], items: Sequence[Item]) -> list[Result]:
+def spread(
+    function: Callable[[Item, Callable[[], None]], Result], items: Sequence[Item], workers: int | None = None
+) -> list[Result]:
     """`[function(item, check) for item in items]`, several at a time.
 
     Args:
         function: calls `check()` now and then, which raises `Stopped` once the results are not wanted.
+        workers: how many at a time; by default the machine's cores.
     """
     stop = threading.Event()
 
@@ -42,7 +45,7 @@ def spread(function: Callable[[Item, Callable[[], None]], Result], items: Sequen
         if stop.is_set():
             raise Stopped
 
-    workers = min(len(items), os.cpu_count() or 1)
+    workers = min(len(items), workers or os.cpu_count() or 1)
     if workers <= 1:
         with one_blas_thread():
             return [function(item, check) for item in items]

@@ -443,7 +443,7 @@ def _sentences(given: Stability) -> Iterator[tuple[str, bool]]:
     else:
         share = f"{100 * (1 - contracts.share):.3g} % of the {contracts.samples} sampled points"
         worst = f"worst at {contracts.worst}, rate {contracts.rate:.4g}"
-        yield f"At {share} the free run does not contract in the best metric that was found, {worst}.", True
+        yield f"At {share} the free run does not contract in the best metric that was found, {worst}.", False
     stays, times = ("stays within", given.searched) if factor is None else ("leaves", factor)
     bounds = f"{stays} all bounds with the inputs' deviations from their means {times:.4g} times as large"
     yield f"The free run {bounds}.", factor is not None and factor < 1.5

@@ -1,0 +1,287 @@
+"""What residuals say about the noise: the verdicts on systems whose noise is known, and what their texts tell."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+
+from orthaug import synthetic
+from orthaug.baseline import Baseline, Term
+from orthaug.criteria import Prediction, Simulation
+from orthaug.diagnosis import diagnose
+from orthaug.estimation import estimate
+from orthaug.learners import MLP
+from orthaug.record import Record
+from orthaug.solvers import LevenbergMarquardt
+from orthaug.structures import Additive
+
+PHYSICS = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("g", "u[k-1]")])
+EVIDENCE = {"learner": MLP(hidden=(8,)), "regularization": "evidence", "solver": LevenbergMarquardt(100)}
+MISSING = {
+    "cubic": lambda y, u, k: -0.02 * y[k - 1] ** 3,
+    "lag of u": lambda y, u, k: 0.5 * u[k - 2],
+    "lag of y": lambda y, u, k: -0.25 * y[k - 3],
+    "cubic of u": lambda y, u, k: 0.2 * u[k - 1] ** 3,
+}
+
+
+def second_order(seed, rows=800, equation=0.0, sensor=0.0, missing=None, hold=1):
+    """A second-order system under white noise of deviation 1, after its start; noise in the equation or the sensor."""
+    rng = np.random.default_rng([7, seed])
+    u = np.repeat(rng.normal(size=rows // hold + 60), hold)[: rows + 50]
+    e, y = equation * rng.normal(size=rows + 50), np.zeros(rows + 50)
+    for k in range(3, rows + 50):
+        y[k] = 1.5 * y[k - 1] - 0.7 * y[k - 2] + u[k - 1] + e[k]
+        y[k] += MISSING[missing](y, u, k) if missing else 0.0
+    return Record.from_arrays(u[50:], (y + sensor * rng.normal(size=rows + 50))[50:], sampling_time=0.1)
+
+
+@cache
+def spring(rows, seed):
+    """A mass-spring-damper by backward Euler at 2 ms, measured with 30 dB of noise."""
+    m, c, k, step = 1.0, 100.0, 1000.0, 0.002
+    gamma = m + c * step + k * step**2
+    rng = np.random.default_rng(seed)
+    u, y = rng.normal(0, 100, rows), np.zeros(rows)
+    for i in range(2, rows):
+        y[i] = ((2 * m + c * step) * y[i - 1] - m * y[i - 2] + step**2 * u[i - 1]) / gamma
+    return Record.from_arrays(u, y + rng.normal(0, y.std() * 10**-1.5, rows), sampling_time=step)
+
+
+def of(record, physics=PHYSICS, **options):
+    """The diagnosis of a fit, of the physics alone unless told otherwise, which must be JSON without NaN."""
+    found = diagnose(estimate(record, physics, **{"learner": None, **options}))
+    assert json.loads(json.dumps(found.as_dict(), allow_nan=False))["verdict"] == found.verdict
+    return found
+
+
+# --- the verdicts
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_white_noise_on_a_static_map(seed):
+    u, e = np.random.default_rng(seed).normal(size=(2, 400))
+    found = of(Record.from_arrays(u, 2 * u + 0.1 * e), Baseline.from_terms([Term("gain", "u[k]")]))
+    assert (found.verdict, found.warnings, found.free_run, found.ratio) == ("white", (), None, None)
+    assert "residual is white: the intervals hold" in found.text
+
+
+def test_a_missing_square_of_a_static_map_is_unmodelled():
+    """The residual of independent samples is white whatever is missing: it is curved over the input."""
+    example = synthetic.static(1, noise=True)
+    found = of(example.train, example.baseline)
+    assert found.one_step[0].curved_regressors == ("u[k]",)
+    assert found.verdict == "unmodelled" and "curved over u[k]" in found.text
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.1, 1.0])
+@pytest.mark.parametrize("seed", [0, 1, 3])
+def test_equation_noise(seed, noise):
+    found = of(second_order(seed, equation=noise))
+    assert (found.verdict, found.warnings) == ("equation_noise", ())
+    assert found.one_step[0].white and not found.free_run[0].white and found.ratio > 2
+    assert "the noise enters the equation" in found.text and "precise" not in found.text
+
+
+def test_equation_noise_with_a_learner():
+    assert of(second_order(0, equation=0.1), **EVIDENCE).verdict == "equation_noise"
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_sensor_noise(seed):
+    found = of(second_order(seed, sensor=0.3))
+    assert found.verdict == "sensor_noise" and found.ratio < 1
+
+
+@pytest.mark.parametrize(("rows", "seed"), [(4000, 0), (4000, 1), (4000, 8), (6000, 2), (10000, 0), (10000, 1)])
+def test_sensor_noise_of_the_mass_spring_damper(rows, seed):
+    assert of(spring(rows, seed)).verdict == "sensor_noise"
+
+
+@pytest.mark.parametrize(("rows", "seed"), [(4000, 0), (4000, 2), (4000, 5), (6000, 1), (10000, 0), (10000, 1)])
+def test_sensor_noise_of_the_mass_spring_damper_with_a_learner(rows, seed):
+    assert of(spring(rows, seed), **EVIDENCE).verdict == "sensor_noise"
+
+
+@pytest.mark.parametrize("missing", MISSING)
+@pytest.mark.parametrize("seed", range(3))
+def test_what_the_physics_lacks_is_unmodelled(missing, seed):
+    found = of(second_order(seed, equation=0.1, missing=missing))
+    assert (found.verdict, found.noise_in_lags) == ("unmodelled", None)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_missing_cubic_under_a_held_input_is_unmodelled(seed):
+    assert of(second_order(seed, equation=0.02, missing="cubic", hold=20)).verdict == "unmodelled"
+
+
+def test_a_learner_that_finds_the_cubic_leaves_the_equation_noise():
+    given = {"learner": MLP(hidden=(8,)), "solver": LevenbergMarquardt(60)}
+    assert of(second_order(0, 1500, equation=0.1, missing="cubic"), **given).verdict == "equation_noise"
+
+
+# --- the texts
+
+
+@pytest.mark.parametrize("options", [{"sensor": 0.3}, {"equation": 0.1, "missing": "lag of u"}], ids=str)
+def test_the_text_names_the_largest_autocorrelation(options):
+    found = of(second_order(0, **options))
+    assert f"its largest autocorrelation is {found.one_step[0].largest_acf:.2f}" in found.text
+
+
+def test_the_text_names_the_input_that_is_followed_and_no_other():
+    rng = np.random.default_rng(0)
+    u, y = rng.normal(size=(900, 2)), np.zeros(900)
+    for k in range(2, 900):
+        y[k] = 0.8 * y[k - 1] + u[k - 1, 0] + u[k - 1, 1] + 0.5 * u[k - 2, 1] + 0.1 * rng.normal()
+    physics = Baseline.from_terms([Term("a", "y[k-1]"), Term("g", "u1[k-1]"), Term("h", "u2[k-1]")])
+    found = of(Record.from_arrays(u, y), physics)
+    assert found.verdict == "unmodelled"
+    assert "y still follows u2" in found.text and "u1" not in found.text
+
+
+def test_the_text_names_the_regressor_over_which_the_residual_is_curved():
+    found = of(second_order(0, equation=0.1, missing="cubic"))
+    assert "y[k-1]" in found.one_step[0].curved_regressors
+    assert "curved over y[k-1]" in found.text
+
+
+def test_an_unmodelled_residual_is_told_with_its_size_and_advice():
+    found = of(second_order(0, equation=0.1, missing="lag of u"))
+    share = 100 * found.one_step[0].rms / second_order(0, equation=0.1, missing="lag of u").experiments[0].outputs.std()
+    assert f"residual, {share:.2g} % of the output's deviation" in found.text
+    assert "more lags, other learner inputs or neurons" in found.text
+    assert any("coloured" in warning for warning in found.warnings)
+
+
+# --- the criterion that sensor noise asks for
+
+
+def test_one_step_with_sensor_noise_is_warned_and_told_the_criterion():
+    found = of(second_order(0, sensor=0.3))
+    (warning,) = found.warnings
+    assert "intervals do not cover" in warning and 'focus = "simulation"' in warning
+    assert 'train with focus = "simulation"' in found.text and "inconsistent" in found.text
+
+
+def test_sampling_too_fast_is_told():
+    found = of(spring(10000, 0))
+    assert found.noise_in_lags > 0.2 and "too fast for one-step estimation" in found.text
+
+
+def test_sampling_that_is_not_too_fast_is_not_blamed():
+    found = of(second_order(0, sensor=0.03))
+    assert found.verdict == "sensor_noise" and found.noise_in_lags < 0.05 and "too fast" not in found.text
+
+
+SIMULATED = {
+    "second order": lambda: of(second_order(0, sensor=0.3), criterion=Simulation(0, 40)),
+    "mass-spring-damper": lambda: of(spring(4000, 0), criterion=Simulation(0, 100)),
+    "in segments": lambda: of(spring(4000, 0), criterion=Simulation(512, 100)),
+}
+
+
+@pytest.mark.parametrize("given", SIMULATED)
+def test_trained_on_the_free_run_there_is_no_warning(given):
+    """The noise of the sensor is white in the free run, once its start is forgotten."""
+    found = SIMULATED[given]()
+    assert found.verdict == "sensor_noise" and found.warnings == ()
+    assert "simulation criterion suits" in found.text and "inconsistent" not in found.text
+
+
+@pytest.mark.parametrize("missing", ["lag of u", "cubic"])
+def test_trained_on_the_free_run_what_is_missing_is_no_sensor_noise(missing):
+    assert of(second_order(1, equation=0.1, missing=missing), criterion=Simulation(0, 40)).verdict == "unmodelled"
+
+
+def test_a_free_run_trained_on_equation_noise_is_told_of_the_one_step_criterion():
+    found = of(second_order(1, equation=0.1), criterion=Simulation(0, 40))
+    assert found.verdict == "equation_noise" and "The one-step criterion is the more precise one here" in found.text
+    (warning,) = found.warnings
+    assert "standard errors of θ" in warning and "errors of the free run are coloured" in warning
+
+
+def test_several_steps_ahead_count_as_trained_on_the_free_run():
+    found = of(second_order(0, sensor=0.3), criterion=Prediction(20))
+    assert found.verdict == "sensor_noise" and "inconsistent" not in found.text
+
+
+def test_without_standard_errors_nothing_is_said_about_intervals():
+    learned = {"learner": MLP(hidden=(3,)), "structure": Additive(), "solver": LevenbergMarquardt(10)}
+    found = of(second_order(0, sensor=0.3), **learned)
+    assert (found.verdict, found.warnings) == ("sensor_noise", ())
+
+
+@pytest.mark.parametrize("rows", [5, 12])
+def test_too_few_rows_to_test_are_not_called_white(rows):
+    fit = estimate(second_order(0, rows, equation=0.1), PHYSICS, learner=None)
+    found = diagnose(fit)
+    assert found.one_step[0].white is None  # not tested
+    assert "intervals hold" not in found.text
+
+
+# --- shapes of records
+
+
+def two_outputs(seed, equation=0.0, sensor=0.0, rows=900):
+    """y2 drives y1; returns the record."""
+    rng = np.random.default_rng(seed)
+    u, y, e = rng.normal(size=(rows, 2)), np.zeros((rows, 2)), rng.normal(size=(2, rows, 2))
+    for k in range(1, rows):
+        y[k, 0] = 0.8 * y[k - 1, 0] + 0.4 * y[k - 1, 1] + u[k - 1, 0]
+        y[k, 1] = 0.5 * y[k - 1, 1] + u[k - 1, 1]
+        y[k] += equation * e[0, k]
+    return Record.from_arrays(u, y + sensor * e[1])
+
+
+TWO = {
+    "a": Term("a", "y1[k-1]", output="y1"),
+    "b": Term("b", "y2[k-1]", output="y1"),
+    "c": Term("c", "u1[k-1]", output="y1"),
+    "d": Term("d", "y2[k-1]", output="y2"),
+    "e": Term("e", "u2[k-1]", output="y2"),
+}
+
+
+@pytest.mark.parametrize(("noise", "verdict"), [("equation", "equation_noise"), ("sensor", "sensor_noise")])
+def test_two_outputs(noise, verdict):
+    found = of(two_outputs(0, **{noise: 0.5}), Baseline.from_terms(list(TWO.values())))
+    assert found.verdict == verdict
+    assert [test.name for test in found.one_step] == [test.name for test in found.free_run] == ["y1", "y2"]
+
+
+def test_two_outputs_without_their_coupling_name_the_one_that_lacks_it():
+    physics = Baseline.from_terms([term for name, term in TWO.items() if name != "b"])
+    found = of(two_outputs(0, equation=0.1), physics)
+    assert found.verdict == "unmodelled"
+    assert "y1 still follows u2" in found.text and "y2 still follows" not in found.text
+
+
+@pytest.mark.parametrize(("noise", "verdict"), [("equation", "equation_noise"), ("sensor", "sensor_noise")])
+def test_several_experiments(noise, verdict):
+    lengths = (400, 40, 500, 7, 3)
+    found = of(Record.join([second_order(i, n, **{noise: 0.3}) for i, n in enumerate(lengths)]))
+    assert found.verdict == verdict
+    assert found.one_step[0].n == sum(n - 2 for n in lengths)
+
+
+def test_a_free_run_that_diverges():
+    """Feedback holds an unstable plant: a free run under the recorded input does not stay with it."""
+    rng = np.random.default_rng(0)
+    u, y = np.zeros(150), np.zeros(150)
+    for k in range(1, 150):
+        u[k - 1] = -1.7 * y[k - 1] + rng.normal()
+        y[k] = 2 * y[k - 1] + u[k - 1] + 0.1 * rng.normal()
+    found = of(Record.from_arrays(u, y), Baseline.from_terms([Term("a", "y[k-1]"), Term("g", "u[k-1]")]))
+    assert found.free_run is None and found.as_dict()["free_run"] is None and found.as_dict()["noise_in_lags"] is None
+    assert found.verdict == "equation_noise"
+
+
+def test_no_input():
+    e, y = np.random.default_rng(1).normal(size=600), np.zeros(600)
+    for k in range(2, 600):
+        y[k] = 1.5 * y[k - 1] - 0.7 * y[k - 2] + e[k]
+    assert of(Record.from_arrays(None, y), Baseline.from_terms(list(PHYSICS.terms[:2]))).verdict == "equation_noise"
