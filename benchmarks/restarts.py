@@ -12,7 +12,7 @@ from machine import alternate, describe
 
 from orthaug import MLP, LevenbergMarquardt, synthetic
 from orthaug._jax import jax, jnp
-from orthaug.criteria import Hold, Overlap, OneStep
+from orthaug.criteria import Hold, OneStep, Overlap
 from orthaug.problem import pose
 from orthaug.solvers.levenberg_marquardt import Options, _advance, _start
 from orthaug.training import Task

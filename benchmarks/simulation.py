@@ -1,4 +1,4 @@
-"""One iteration of free-run training (a trial, its sensitivities, the step) against one plain free run of the same segments.
+"""One iteration of free-run training (trial, sensitivities, step) against one plain free run of the same segments.
 
 Rows, lags and neurons are Silverbox's; both in the same process. Run: python benchmarks/simulation.py
 """

@@ -53,6 +53,10 @@ SHAPES = [((100,), 4, 2), ((103,), 3, 5), ((50, 60, 70), 4, 2), ((30,) * 8, 4, 2
 UNEVEN = [((100, 100, *(4,) * 50), 2, 3)]  # to even out the rows one experiment is not enough
 
 
+def short(value):
+    return str(value)[:24]
+
+
 def numbered(lengths):
     """Experiments whose input holds the experiment's number and whose output the row's."""
     parts = [Record.from_arrays(np.full(n, float(i)), np.arange(float(n))) for i, n in enumerate(lengths)]
@@ -67,7 +71,7 @@ def usable(record, start):
     return sum(max(len(e) - start, 0) for e in record.experiments)
 
 
-@pytest.mark.parametrize(("lengths", "blocks", "start"), SHAPES, ids=str)
+@pytest.mark.parametrize(("lengths", "blocks", "start"), SHAPES, ids=short)
 def test_every_row_is_held_out_once_in_contiguous_blocks(lengths, blocks, start):
     record = numbered(lengths)
     folds = blocked(record, blocks, start)
@@ -78,7 +82,7 @@ def test_every_row_is_held_out_once_in_contiguous_blocks(lengths, blocks, start)
     assert max(sizes) - min(sizes) <= 1
 
 
-@pytest.mark.parametrize(("lengths", "blocks", "start"), SHAPES + UNEVEN, ids=str)
+@pytest.mark.parametrize(("lengths", "blocks", "start"), SHAPES + UNEVEN, ids=short)
 def test_training_rows_keep_the_lag_length_away(lengths, blocks, start):
     """Neither a row nor any of its lags is shared by training and held-out rows."""
     for training, out in blocked(numbered(lengths), blocks, start):
@@ -86,7 +90,7 @@ def test_training_rows_keep_the_lag_length_away(lengths, blocks, start):
         assert min(nearest, default=math.inf) > start
 
 
-@pytest.mark.parametrize(("lengths", "blocks", "start"), SHAPES, ids=str)
+@pytest.mark.parametrize(("lengths", "blocks", "start"), SHAPES, ids=short)
 def test_training_experiments_are_unbroken(lengths, blocks, start):
     for training, _ in blocked(numbered(lengths), blocks, start):
         for experiment in training.experiments:
@@ -94,13 +98,13 @@ def test_training_experiments_are_unbroken(lengths, blocks, start):
             assert experiment.first_row == experiment.outputs[0, 0]
 
 
-@pytest.mark.parametrize(("lengths", "blocks", "start"), SHAPES + UNEVEN, ids=str)
+@pytest.mark.parametrize(("lengths", "blocks", "start"), SHAPES + UNEVEN, ids=short)
 def test_all_folds_have_as_many_usable_rows(lengths, blocks, start):
     assert len({usable(training, start) for training, _ in blocked(numbered(lengths), blocks, start)}) == 1
 
 
 @pytest.mark.parametrize(
-    ("lengths", "blocks", "start"), [((60,), 4, 2), ((200,), 1, 2), ((100,), 50, 0), ((4,) * 60, 4, 3)], ids=str
+    ("lengths", "blocks", "start"), [((60,), 4, 2), ((200,), 1, 2), ((100,), 50, 0), ((4,) * 60, 4, 3)], ids=short
 )
 def test_too_few_rows_for_the_blocks(lengths, blocks, start):
     rows = sum(lengths)
