@@ -132,17 +132,26 @@ def test_the_text_names_the_largest_autocorrelation(options):
     assert f"its largest autocorrelation is {found.one_step[0].largest_acf:.2f}" in found.text
 
 
-def test_the_text_names_the_inputs_that_are_followed():
+def two_inputs(own):
+    """The physics knows one lag of u1 and u2, the system has a second one of u2; `own` is the share of y[k-1]."""
     rng = np.random.default_rng(0)
     u, y = rng.normal(size=(900, 2)), np.zeros(900)
     for k in range(2, 900):
-        y[k] = u[k - 1, 0] + u[k - 1, 1] + 0.5 * u[k - 2, 1] + 0.1 * rng.normal()
+        y[k] = own * y[k - 1] + u[k - 1, 0] + u[k - 1, 1] + 0.5 * u[k - 2, 1] + 0.1 * rng.normal()
     physics = Baseline.from_terms([Term("a", "y[k-1]"), Term("g", "u1[k-1]"), Term("h", "u2[k-1]")])
-    found = of(Record.from_arrays(u, y), physics)
+    return of(Record.from_arrays(u, y), physics)
+
+
+def test_the_text_names_the_inputs_that_are_followed():
+    found = two_inputs(0.8)
     assert "u2" in found.one_step[0].correlated_inputs
-    assert found.verdict == "unmodelled"
     for name in ("u1", "u2"):
         assert (f"y still follows {name}" in found.text) == (name in found.one_step[0].correlated_inputs)
+
+
+def test_a_missing_lag_is_no_sensor_noise_where_the_output_hardly_feeds_back():
+    """The free run is then as good as the prediction, but what it leaves follows the input."""
+    assert two_inputs(0.0).verdict == "unmodelled"
 
 
 def test_the_text_names_the_regressor_over_which_the_residual_is_curved():

@@ -242,7 +242,7 @@ def test_the_fit_is_that_of_the_naive_rows(project):
 def test_the_warning_counts_what_is_left_out(project):
     expected = f"train: 10 rows have missing cells and are left out with all windows that touch them; {len(windows()[0])} "
     (warning,) = [text for text in fit(project)["warnings"] if "missing" in text]
-    assert warning.startswith(expected + "usable rows remain, in 6 stretches")
+    assert warning.startswith(expected + "usable rows remain, in 7 stretches")
     assert expected in run("check", project).out
 
 
@@ -275,7 +275,7 @@ def test_an_unknown_way_is_an_error(project):
 
 
 def test_no_stretch_is_long_enough(project):
-    write(project.parent / "run.csv", {k: "" for k in range(0, 99, 3)}, {})
+    write(project.parent / "run.csv", {k: "" for k in range(0, 100, 2)}, {})
     done = run("fit", project)
     assert done.code == 2 and one_line(done.err, "error: ", "run.csv", "too few", "at least 3")
 

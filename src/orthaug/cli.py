@@ -111,7 +111,11 @@ def demo(out: OutFolder = None) -> None:
 
 
 @app.command()
-def check(spec: SpecPath, as_json: AsJson = False) -> None:
+def check(
+    spec: SpecPath,
+    as_json: AsJson = False,
+    figure: Annotated[Path | None, typer.Option("--figure", metavar="PNG", help="Heat map of the biases.")] = None,
+) -> None:
     """Report excitation and identifiability; trains nothing."""
     from orthaug import jobs, outcome, report
     from orthaug.excitation import require_rank
@@ -119,6 +123,11 @@ def check(spec: SpecPath, as_json: AsJson = False) -> None:
     job = jobs.open_job(spec, require_full_rank=False)
     found = outcome.plain(outcome.check_report(job))
     typer.echo(_json(found) if as_json else report.check_text(found))
+    if figure is not None and found["bias"]:
+        from orthaug import plots, runs
+
+        runs.check_output(figure, *job.files)
+        plots.save(outcome.bias_heat_map(found["bias"]), figure)
     try:
         require_rank(job.problem.excitation, job.problem.rows.y.size)
     except InputError as error:

@@ -18,9 +18,11 @@ from orthaug.excitation import Excitation, identifiability
 from orthaug.folders import check_replaceable, whole_folder
 from orthaug.jobs import Job, LoadedPart, Progress, run_fit
 from orthaug.measures import Support
-from orthaug.suspicion import suspected
+from orthaug.suspicion import shares, suspected
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from orthaug.diagnosis import Diagnosis
     from orthaug.model import Model, Response
     from orthaug.physical import PhysicalEstimate
@@ -264,10 +266,23 @@ def fill_result(fitted: Fitted, folder: Path) -> None:
             if tests is not None:
                 title = f"{kind} residual on the training data, {fitted.fit.model.structure}"
                 drawn[f"residuals_{kind.replace('-', '_')}"] = plots.residual_analysis_figure(tests, title)
+    if fitted.result["bias"]:
+        drawn["bias"] = bias_heat_map(fitted.result["bias"])
     if fitted.fit.model.form.bound is not None:
         drawn["components"] = plots.components_figure(one_step, f"parts of the one-step prediction, {where}")
     for name, figure in drawn.items():
         plots.save(figure, folder / "figures" / f"{name}.png")
+
+
+def bias_heat_map(table: list[dict[str, Any]]) -> Figure:
+    """The suspects' biases as a picture."""
+    from orthaug import plots
+
+    biases = [shares(entry) for entry in table]
+    names = list(biases[0])
+    values = np.array([[np.nan if b[name] is None else b[name] for name in names] for b in biases], dtype=float)
+    title = "bias of each parameter [%] by terms that may be missing (without a guess: of 1 % of the output)"
+    return plots.bias_figure(names, [entry["name"] for entry in table], values, title)
 
 
 def plain(value: Any) -> Any:

@@ -112,6 +112,27 @@ def residual_analysis_figure(tests: Sequence[ResidualTest], title: str) -> Figur
     return figure
 
 
+def bias_figure(names: Sequence[str], suspects: Sequence[str], shares: np.ndarray, title: str) -> Figure:
+    """Heat map of the bias of each parameter by each suspect, in per cent; `shares` (n suspects, n parameters)."""
+    width, height = 2.6 + 0.8 * len(names) + 0.05 * max(map(len, suspects)), 1.2 + 0.28 * len(suspects)
+    figure = Figure(figsize=(max(width, _SIZE[0]), height), layout="constrained")
+    axis = figure.subplots()
+    signed = np.sign(shares) * np.log10(1 + np.abs(shares))  # biases of 0.1 % and of 100 % both show
+    reach = max(float(np.nanmax(np.abs(signed), initial=0.0)), 1e-12)
+    axis.imshow(signed, cmap="PuOr", vmin=-reach, vmax=reach, aspect="auto")
+    for i, j in np.ndindex(*shares.shape):
+        if np.isfinite(shares[i, j]):
+            dark = abs(signed[i, j]) > 0.6 * reach
+            color = "white" if dark else _BLACK
+            axis.text(j, i, f"{shares[i, j]:+.2g}", ha="center", va="center", fontsize=7, color=color)
+    axis.set_xticks(range(len(names)), names)
+    axis.set_yticks(range(len(suspects)), suspects, fontsize=8)
+    axis.tick_params(length=0)
+    axis.spines[:].set_visible(False)
+    figure.suptitle(title, fontsize=10)
+    return figure
+
+
 def comparison_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Scores and parameters of several ways of modelling, from the rows of a comparison.
 

@@ -40,16 +40,22 @@ class Study:
         one: takes one value of each axis as keyword arguments, gives a mapping of plain values: numbers, texts, lists.
         grid: axes by name, each with its values; all combinations run, the last axis fastest. Give the slow cases first.
         version: raise it when `one` computes something else, so that stored results no longer count.
+        where: of all combinations, those that run; takes what `one` takes. None for all.
+        workers: cases at a time; 1 for a study that measures time, None for the machine's cores.
     """
 
     name: str
     one: Callable[..., Mapping[str, Any]]
     grid: Mapping[str, Sequence[Any]]
     version: int = 1
+    where: Callable[..., bool] | None = None
+    workers: int | None = None
 
     def cases(self) -> list[Case]:
-        """Every combination, as keyword arguments."""
-        return [dict(zip(self.grid, values, strict=True)) for values in product(*self.grid.values())]
+        """Every combination that runs, as keyword arguments of plain values."""
+        axes = [[_value(self, axis, value) for value in values] for axis, values in self.grid.items()]
+        found = (dict(zip(self.grid, values, strict=True)) for values in product(*axes))
+        return [case for case in found if self.where is None or self.where(**case)]
 
     def key(self, case: Case) -> str:
         """What a stored result is found by: a hash of the study, its version, the arguments and the function's text."""
@@ -75,7 +81,7 @@ def run(
 
     Args:
         store: a folder that keeps each result as it is made; None to keep nothing.
-        workers: cases at a time; by default the machine's cores.
+        workers: cases at a time; by default the study's own number, or the machine's cores.
 
     Raises:
         InputError: a result that is not plain values; a store that cannot be written.
@@ -99,7 +105,7 @@ def run(
         if progress is not None:
             progress(done, len(cases))
 
-    spread(one, todo, workers)
+    spread(one, todo, study.workers if workers is None else workers)
     return pd.DataFrame([{**case, **(result or {})} for case, result in zip(cases, found, strict=True)])
 
 

@@ -71,7 +71,7 @@ def suspected(job: Job, theta: Vector | None = None, learned: Any = None) -> lis
     """The bias of every suspect under the spec's measure, for θ and, to first order, for the physical parameters.
 
     Args:
-        theta: θ̂ for relative biases and for dp/dθ; None for the initial values.
+        theta: θ̂ for relative biases and for dp/dθ; None for one-step least squares.
         learned: f at the measure's points (M, ny) after a fit, to tell how much of it a suspect explains.
     """
     problem = job.problem
@@ -84,6 +84,7 @@ def suspected(job: Job, theta: Vector | None = None, learned: Any = None) -> lis
     kept = [
         i for i in range(len(suspects)) if np.isfinite(deltas[i]).all() and np.ptp(deltas[i]) + abs(deltas[i].max())
     ]
+    theta = problem.projection.solve(problem.whitened_target) if theta is None else theta
     slopes = _slopes(job.physics, problem, theta)
     table = bias_table(
         Projection.factor(phi * gain[:, :, None]),
@@ -91,12 +92,35 @@ def suspected(job: Job, theta: Vector | None = None, learned: Any = None) -> lis
         [suspects[i] for i in kept],
         deltas[kept],
         gain=gain,
-        theta=_nonzero(problem.baseline.initial if theta is None else theta),
+        theta=theta,
         physical=None if slopes is None else slopes[0],
         learned=learned,
         certify=len(points.x) <= CERTIFIED_ROWS or bool(job.spec.suspects),
     )
-    return [entry.as_dict() | {"relative_physical_bias": _relative(entry, slopes)} for entry in table]
+    sizes = [float(np.sqrt(np.sum((deltas[i] * gain) ** 2))) for i in kept]
+    return [
+        entry.as_dict()
+        | {"relative_physical_bias": _relative(entry, slopes), "size": size}
+        | {"expected_physical_bias": _expected(entry, job.physics, problem, theta)}
+        for entry, size in zip(table, sizes, strict=True)
+    ]
+
+
+def _expected(
+    entry: SuspectedBias, physics: PhysicsMap | None, problem: Problem, theta: Vector
+) -> dict[str, dict[str, float | None]] | None:
+    """What the guessed coefficient does to each physical parameter: p of θ̂ less p without the bias."""
+    if physics is None or entry.expected is None:
+        return None
+    from orthaug.physical import solve
+
+    order = [problem.baseline.names.index(name) for name in physics.theta_names]
+    without = theta - np.array(entry.expected)
+    biased, true = (solve(physics, t[order], None, freedom=np.inf).value for t in (theta, without))
+    return {
+        name: {"bias": float(b - t), "relative": float((b - t) / t) if t else None}
+        for name, b, t in zip(physics.names, biased, true, strict=True)
+    }
 
 
 def _relative(entry: SuspectedBias, slopes: tuple[dict[str, Vector], Vector] | None) -> dict[str, float | None] | None:
@@ -106,22 +130,14 @@ def _relative(entry: SuspectedBias, slopes: tuple[dict[str, Vector], Vector] | N
     return {name: bias / p if p else None for (name, bias), p in zip(entry.physical, slopes[1], strict=True)}
 
 
-def _nonzero(theta: Vector) -> Vector | None:
-    return theta if np.any(theta) else None
-
-
-def _slopes(
-    physics: PhysicsMap | None, problem: Problem, theta: Vector | None
-) -> tuple[dict[str, Vector], Vector] | None:
+def _slopes(physics: PhysicsMap | None, problem: Problem, theta: Vector) -> tuple[dict[str, Vector], Vector] | None:
     """dp/dθ, in the order of the baseline's θ, at the p that θ gives; and that p."""
     if physics is None:
         return None
     from orthaug.physical import solve
 
     order = [problem.baseline.names.index(name) for name in physics.theta_names]
-    p = physics.initial
-    if theta is not None:
-        p = solve(physics, theta[order], None, freedom=np.inf).value
+    p = solve(physics, theta[order], None, freedom=np.inf).value
     inverse = np.linalg.pinv(physics.jacobian(p) / _size(physics, p)[0][:, None] * _size(physics, p)[1])
     inverse = inverse * _size(physics, p)[1][:, None] / _size(physics, p)[0]
     rows = np.zeros((len(p), len(problem.baseline.names)))
@@ -135,33 +151,37 @@ def _size(physics: PhysicsMap, p: Vector) -> tuple[Vector, Vector]:
     return np.where(theta > 0, theta, 1.0), np.where(p != 0, np.abs(p), 1.0)
 
 
-def text(table: Sequence[dict[str, Any]]) -> list[str]:
-    """The entries of result.json for a reader.
+def shares(entry: dict[str, Any]) -> dict[str, float | None]:
+    """The bias of every θ and physical parameter, in per cent of its value, by an entry of result.json.
 
-    Biases are per unit of the suspect's coefficient; where that is guessed, they are what it expects, in per cent of
-    each parameter.
+    It is what the guessed coefficient gives; without a guess, what the term gives where it makes up 1 % of the
+    outputs' deviation over the measure.
     """
+    coefficient = entry["coefficient"]
+    if coefficient is None:
+        coefficient = 0.01 / entry["size"] if entry["size"] else None
+    relative = {**(entry["relative_bias"] or {}), **(entry["relative_physical_bias"] or {})}
+    found = {name: None if v is None or coefficient is None else 100 * v * coefficient for name, v in relative.items()}
+    exact = {name: 100 * e["relative"] for name, e in (entry["expected_physical_bias"] or {}).items() if e["relative"]}
+    return found | exact
+
+
+def text(table: Sequence[dict[str, Any]]) -> list[str]:
+    """The entries of result.json for a reader, biases as `shares`."""
     if not table:
         return []
-    physical = table[0]["physical_bias"] or {}
-    names = [*table[0]["bias"], *physical]
-    rows = [["suspect", "cosine", *names, "no bias under some measure"]]
+    names = list(shares(table[0]))
+    rows = [["suspect", "size", *names, "cosine", "removable"]]
     for entry in table:
+        guess = entry["coefficient"]
         cosine = "–" if entry["cosine"] is None else f"{entry['cosine']:.3f}"
         verdict = entry["certificate"]["verdict"] if entry["certificate"] else None
         answer = {"unremovable": "no", "removable": "yes", "orthogonal": "yes"}.get(verdict, "–")
-        rows.append([entry["name"], cosine, *(_bias(entry, name) for name in names), answer])
+        size = "1 %" if guess is None else f"{100 * abs(guess) * entry['size']:.2g} %"
+        biases = ("–" if share is None else f"{share:+.2g} %" for share in shares(entry).values())
+        rows.append([entry["name"], size, *biases, cosine, answer])
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     return ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
-
-
-def _bias(entry: dict[str, Any], name: str) -> str:
-    kind = "relative_bias" if name in entry["bias"] else "relative_physical_bias"
-    relative, coefficient = (entry[kind] or {}).get(name), entry["coefficient"]
-    if relative is not None and coefficient is not None:
-        return f"{100 * relative * coefficient:+.3g} %"
-    per_unit = entry["bias"].get(name, (entry["physical_bias"] or {}).get(name))
-    return f"{per_unit:+.3g}"
 
 
 def check_suspects(job: Job) -> None:

@@ -1,0 +1,307 @@
+"""`fit` and `compare` on the free run: what result.json says of noise and learner, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_cli import RESULT_KEYS, finite_json, one_line, run, write_csv
+
+SPEC = """
+[data]
+sampling_time = 0.1
+inputs = ["u"]
+outputs = ["y"]
+train = { files = ["run.csv"] }
+[[baseline.terms]]
+parameter = "a"
+regressor = "y[k-1]"
+initial = 1.4
+[[baseline.terms]]
+parameter = "b"
+regressor = "y[k-2]"
+initial = -0.6
+[[baseline.terms]]
+parameter = "g"
+regressor = "u[k-1]"
+initial = 0.9
+"""
+ALONE = '[learner]\nkind = "none"\n'
+SMALL = "[learner]\nhidden = [4]\n"
+GREEDY = "[learner]\nhidden = [30]\n"
+FREE = '[training]\nfocus = "simulation"\nsegment = 64\nwashout = 8\nstart_iterations = 5\niterations = 25\n'
+QUICK = "[training]\niterations = 40\n"
+FAR = '[data.tests.far]\nfiles = ["far.csv"]\n'
+PARTS = ("physics_alone", "model")
+
+
+def system(seed, rows, *, square=0.0, equation=0.0, sensor=0.0, scale=1.0):
+    rng = np.random.default_rng([5, seed])
+    u, y, e = scale * rng.normal(size=rows), np.zeros(rows), rng.normal(size=(2, rows))
+    for k in range(2, rows):
+        y[k] = 1.5 * y[k - 1] - 0.7 * y[k - 2] + u[k - 1] + square * u[k - 1] ** 2 + equation * e[0, k]
+    return {"u": u, "y": y + sensor * e[1]}
+
+
+def project(folder, *sections, **signals) -> Path:
+    """A spec in `folder` with its training data; returns its path."""
+    folder.mkdir(exist_ok=True)
+    write_csv(folder / "run.csv", **(signals or system(0, 300, square=0.3, sensor=0.3)))
+    (folder / "plant.toml").write_text(SPEC + "".join(sections), encoding="utf-8")
+    return folder / "plant.toml"
+
+
+def fit(spec) -> dict:
+    """result.json of a fit that ends with exit code 0; it holds neither NaN nor Infinity."""
+    out = spec.parent / "out"
+    done = run("fit", spec, "--out", out, "--json")
+    assert (done.code, done.err) == (0, "")
+    assert finite_json(done.out) == finite_json((out / "result.json").read_text(encoding="utf-8"))
+    return finite_json(done.out)
+
+
+@pytest.fixture(scope="module")
+def free(tmp_path_factory) -> dict:
+    """The result of a learner trained on the free run, with evidence and restarts."""
+    more = 'restarts = 2\nregularization = "evidence"\n'
+    return fit(project(tmp_path_factory.mktemp("free") / "p", SMALL, FREE, more))
+
+
+# --- what a fit on the free run leaves
+
+
+def test_the_result_has_all_its_keys(free):
+    assert set(free) == RESULT_KEYS
+    assert [(r["seed"], r["regularization"]) for r in free["restarts"]] == [(0, "evidence"), (1, "evidence")]
+    assert sum(r["chosen"] for r in free["restarts"]) == 1
+    assert free["orthogonality_defect"] < 1e-12
+
+
+def test_theta_has_standard_errors(free):
+    for parameter in free["parameters"]:
+        assert parameter["std"] > 0
+        low, high = parameter["ci95"]
+        assert low < parameter["value"] < high
+        assert parameter["one_step"] != pytest.approx(parameter["value"], rel=1e-3)
+
+
+def test_the_noise_has_a_verdict_with_a_text(free):
+    assert free["residuals"]["verdict"] in ("white", "equation_noise", "sensor_noise", "unmodelled")
+    assert free["residuals"]["text"].endswith(".") and "inconsistent" not in free["residuals"]["text"]
+
+
+def test_the_learner_has_a_verdict_from_blocks(free):
+    """Without test parts, blocked cross-validation asks whether the learner earns its place."""
+    assert free["validation"]["verdict"] == "helps"
+    assert [trial["where"] for trial in free["validation"]["trials"]] == [f"block {i} of 4" for i in (1, 2, 3, 4)]
+    assert "4 blocks" in free["validation"]["text"]
+
+
+def test_the_free_run_is_better_than_after_one_step_training(free, tmp_path):
+    one_step = fit(project(tmp_path / "p", SMALL, QUICK, 'regularization = "evidence"\n'))
+    error = [result["scores"]["train"]["simulation"]["rmse"][0] for result in (free, one_step)]
+    assert error[0] < error[1]
+
+
+@pytest.mark.parametrize(
+    "training",
+    [
+        FREE.replace("segment = 64", "segment = 0"),
+        FREE.replace("washout = 8", "washout = 0"),
+        FREE.replace("start_iterations = 5", "start_iterations = 0"),
+        "[training]\nhorizon = 5\niterations = 20\n",
+        FREE + "ensemble = true\nrestarts = 3\n",
+    ],
+    ids=["whole", "no washout", "cold", "five steps", "ensemble"],
+)
+def test_ways_to_train_on_the_free_run(tmp_path, training):
+    result = fit(project(tmp_path / "p", SMALL, training, "[validation]\nblocks = 0\n"))
+    assert result["status"]["code"] in ("converged", "iteration_limit")
+    assert all(parameter["std"] > 0 for parameter in result["parameters"])
+    assert result["validation"] is None and result["residuals"]["verdict"]
+    assert result["scores"]["train"]["simulation"]["nrmse"][0] < 0.3
+
+
+def test_physics_alone_on_the_free_run(tmp_path):
+    result = fit(project(tmp_path / "p", ALONE, FREE, **system(0, 600, sensor=0.3)))
+    assert result["validation"] is None and result["residuals"]["verdict"] == "sensor_noise"
+    assert result["warnings"] == []
+    for parameter, truth in zip(result["parameters"], (1.5, -0.7, 1.0), strict=True):
+        assert abs(parameter["value"] - truth) < 4 * parameter["std"]
+
+
+def test_one_step_with_sensor_noise_is_told(tmp_path):
+    spec = project(tmp_path / "p", ALONE, **system(0, 600, sensor=0.3))
+    result = fit(spec)
+    assert result["residuals"]["verdict"] == "sensor_noise"
+    assert any("intervals do not cover" in text and 'focus = "simulation"' in text for text in result["warnings"])
+    printed = run("fit", spec, "--out", "again" if False else spec.parent / "out").out
+    assert result["residuals"]["text"] in printed and f"warning: {result['warnings'][0]}" in printed
+
+
+def test_the_verdicts_are_printed(tmp_path):
+    spec = project(tmp_path / "p", SMALL, QUICK, FAR, **system(0, 200, square=0.3, equation=0.1))
+    write_csv(spec.parent / "far.csv", **system(1, 100, square=0.3, equation=0.1))
+    result, printed = fit(spec), run("fit", spec, "--out", spec.parent / "out").out
+    for key in ("residuals", "validation"):
+        assert result[key]["text"] in printed
+
+
+# --- what is refused
+
+REFUSED = [
+    (FREE.replace("washout = 8", "washout = 64"), ["`training.washout`: found 64; expected less than the segment, 64"]),
+    (FREE.replace("washout = 8", "washout = 99"), ["`training.washout`: found 99"]),
+    (FREE + 'solver = "adam-lbfgs"\n', ["`training.solver`", "adam-lbfgs", "levenberg-marquardt"]),
+    ("[training]\nhorizon = 0\n", ["'training.horizon': found 0", "1"]),
+    ('[training]\nhorizon = 3\nsolver = "adam-lbfgs"\n', ["`training.solver`", "levenberg-marquardt"]),
+    ('[training]\nfocus = "free"\n', ["'training.focus': found \"free\"", "'prediction' or 'simulation'"]),
+    ("[training]\nsegments = 3\n", ["unknown key 'training.segments'", "did you mean 'segment'"]),
+    ("[training]\nsegment = -1\n", ["'training.segment': found -1"]),
+    ("[training]\nwashout = 2.5\n", ["'training.washout': found 2.5", "an integer"]),
+    ("[validation]\nblocks = 1\n", ["`validation.blocks`: found 1; expected 2 or more, or 0"]),
+    ("[validation]\nblocks = -2\n", ["'validation.blocks': found -2"]),
+    ("[validation]\nblock = 4\n", ["unknown key 'validation.block'", "did you mean 'blocks'"]),
+    (FREE.replace("segment = 64", "segment = 0").replace("washout = 8", "washout = 299"), ["washout"]),
+    (FREE.replace("segment = 64", "segment = 512").replace("washout = 8", "washout = 400"), ["washout"]),
+    ("[training]\nhorizon = 400\niterations = 5\n", ["horizon"]),
+]
+
+
+@pytest.mark.parametrize("command", ["fit", "compare"])
+@pytest.mark.parametrize(("training", "words"), REFUSED, ids=[words[0][:40] + str(i) for i, (_, words) in enumerate(REFUSED)])
+def test_refused(tmp_path, command, training, words):
+    """The last three leave nothing to score in 300 rows."""
+    if command == "compare" and words[0] in ("washout", "horizon"):
+        pytest.skip("as `fit`")
+    spec = project(tmp_path / "p", SMALL, training)
+    done = run(command, spec, "--out", tmp_path / "out")
+    assert (done.code, done.out) == (2, "")
+    assert one_line(done.err, "error: ", "plant.toml", *words)
+    assert not re.search(r"[?!]\.", done.err)
+    assert not (tmp_path / "out").exists()
+
+
+# --- verdicts on the learner
+
+
+@pytest.fixture(scope="module")
+def overfitted(tmp_path_factory):
+    """151 weights on 60 noisy rows of a linear system, tested far outside: the spec."""
+    spec = project(tmp_path_factory.mktemp("over") / "p", GREEDY, QUICK, FAR, **system(3, 60, equation=0.3))
+    write_csv(spec.parent / "far.csv", **system(4, 200, equation=0.3, scale=4.0))
+    return spec
+
+
+@pytest.fixture(scope="module")
+def diverged(overfitted) -> dict:
+    return fit(overfitted)
+
+
+def test_a_free_run_that_diverges_is_null_with_a_warning(diverged):
+    assert diverged["scores"]["tests.far"]["simulation"] == {"rmse": None, "nrmse": None, "fit": None}
+    assert diverged["scores"]["tests.far"]["prediction"]["rmse"][0] > 0
+    assert any(
+        re.match(r"tests\.far: the free run diverged in output 'y' at step \d+", text) for text in diverged["warnings"]
+    )
+
+
+def test_it_hurts_in_extrapolation(diverged):
+    verdict = diverged["validation"]
+    assert verdict["verdict"] == "hurts" and verdict["text"] in diverged["warnings"]
+    assert verdict["text"].startswith("The learner hurts in extrapolation") and "tests.far leaves" in verdict["text"]
+    (trial,) = verdict["trials"]
+    assert trial["where"] == "tests.far" and trial["model"] is None and 0 < trial["physics_alone"] < 1
+    assert {entry["regressor"] for entry in verdict["extrapolation"]} == {"y[k-1]", "u[k-1]"}
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("training", [QUICK, QUICK + 'regularization = "evidence"\n'], ids=["none", "evidence"])
+def test_what_is_worse_than_physics_alone_on_a_part_never_helps(tmp_path, seed, training):
+    spec = project(tmp_path / "p", GREEDY, training, FAR, **system(seed, 80, equation=0.3))
+    write_csv(spec.parent / "far.csv", **system(seed + 9, 150, equation=0.3, scale=3.0))
+    learned = fit(spec)
+    spec.write_text(SPEC + ALONE + FAR, encoding="utf-8")
+    alone, model = (r["scores"]["tests.far"]["simulation"]["nrmse"] for r in (fit(spec), learned))
+    worse = model is None or model[0] > alone[0]
+    assert not (worse and learned["validation"]["verdict"] == "helps")
+    assert learned["validation"]["trials"][0]["physics_alone"] == pytest.approx(alone[0])
+
+
+def test_a_learner_that_finds_the_square_helps(tmp_path):
+    spec = project(tmp_path / "p", SMALL, QUICK, FAR, "[validation]\nblocks = 3\n", **system(0, 300, square=0.3))
+    write_csv(spec.parent / "far.csv", **system(1, 150, square=0.3))
+    verdict = fit(spec)["validation"]
+    assert verdict["verdict"] == "helps"
+    assert [t["where"] for t in verdict["trials"]] == [f"block {i} of 3" for i in (1, 2, 3)] + ["tests.far"]
+    assert all(t["model"] < 0.5 * t["physics_alone"] for t in verdict["trials"])
+
+
+@pytest.mark.parametrize("blocks", ["", "[validation]\nblocks = 40\n"], ids=["few rows", "many blocks"])
+def test_a_record_too_short_for_blocks_is_told(tmp_path, blocks):
+    """No verdict, and a sentence that says why."""
+    rows = 300 if blocks else 60
+    result = fit(project(tmp_path / "p", SMALL, QUICK, blocks, **system(0, rows, equation=0.1)))
+    assert result["validation"] is None
+    assert any("too few" in text and "blocks" in text for text in result["warnings"])
+
+
+# --- compare
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
+    """The spec, the printed text and the rows of a comparison on the free run with a test part."""
+    spec = project(tmp_path_factory.mktemp("compare") / "p", SMALL, FREE.replace("= 25", "= 10"), FAR)
+    write_csv(spec.parent / "far.csv", **system(1, 150, square=0.3, sensor=0.3))
+    done = run("compare", spec, "--out", spec.parent / "out")
+    assert (done.code, done.err) == (0, "")
+    result = finite_json((spec.parent / "out" / "result.json").read_text(encoding="utf-8"))
+    return spec, done.out, {row["name"]: row for row in result["comparison"]}
+
+
+def test_compare_shows_the_verdicts_of_every_row(compared):
+    _, text, rows = compared
+    assert len(rows) == 5
+    for name, row in rows.items():
+        assert f"{name}: {row['residuals']['text']}" in text
+        if name == "physics alone":
+            assert row["validation"] is None
+        else:
+            assert f"{name}: {row['validation']['text']}" in text
+            wheres = [trial["where"] for trial in row["validation"]["trials"]]
+            assert wheres == ["block 1 of 4", "block 2 of 4", "block 3 of 4", "block 4 of 4", "tests.far"]
+
+
+def test_compare_shows_how_the_learner_weighs_against_the_physics(compared):
+    _, text, rows = compared
+    assert "‖F̃‖/‖Φθ̂‖" in text
+    assert rows["physics alone"]["learner_to_physics"] in (0, None)
+    assert 0 < rows["orthogonal"]["learner_to_physics"] < 1
+    assert f"{rows['orthogonal']['learner_to_physics']:.2g}" in text
+
+
+def test_all_rows_are_judged_against_the_same_physics_alone(compared):
+    _, _, rows = compared
+    alone = rows["physics alone"]["scores"]["tests.far"]["simulation"]["nrmse"][0]
+    for name, row in rows.items():
+        if row["validation"] is not None:
+            trial = row["validation"]["trials"][-1]
+            assert trial["physics_alone"] == pytest.approx(alone)
+            assert trial["model"] == pytest.approx(row["scores"]["tests.far"]["simulation"]["nrmse"][0]), name
+
+
+def test_no_blocks_switch_cross_validation_off(compared, tmp_path):
+    spec, _, _ = compared
+    quick = spec.read_text(encoding="utf-8").replace("iterations = 10", "iterations = 2")
+    other = spec.parent / "off.toml"
+    other.write_text(quick + "[validation]\nblocks = 0\n", encoding="utf-8")
+    rows = json.loads(run("compare", other, "--out", tmp_path / "out", "--json").out)["comparison"]
+    for row in rows[1:]:
+        assert [trial["where"] for trial in row["validation"]["trials"]] == ["tests.far"]
+    other.write_text(quick.replace(FAR, "") + "[validation]\nblocks = 0\n", encoding="utf-8")
+    result = json.loads(run("fit", other, "--out", tmp_path / "fit", "--json").out)
+    assert result["validation"] is None
