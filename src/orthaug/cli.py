@@ -150,7 +150,7 @@ def fit(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False) -> None:
     if as_json:
         typer.echo(_json(fitted.result))
     else:
-        typer.echo(report.fit_text(fitted))
+        typer.echo(report.fit_text(fitted.fit, fitted.result))
         typer.echo(f"\nwritten to {folder}")
     if not fitted.fit.status.ok:
         raise TrainingError(f"{fitted.fit.status.message}. The account is in {folder / 'result.json'}.")

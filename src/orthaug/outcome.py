@@ -243,7 +243,7 @@ def write_result(fitted: Fitted, folder: Path) -> None:
 
 def fill_result(fitted: Fitted, folder: Path) -> None:
     """Write the files of a result into an existing folder."""
-    from orthaug import plots, storage
+    from orthaug import plots, report, storage
 
     text = json.dumps(fitted.result, indent=1, ensure_ascii=False, allow_nan=False)
     (folder / "result.json").write_text(text + "\n", encoding="utf-8")
@@ -272,6 +272,8 @@ def fill_result(fitted: Fitted, folder: Path) -> None:
         drawn["components"] = plots.components_figure(one_step, f"parts of the one-step prediction, {where}")
     for name, figure in drawn.items():
         plots.save(figure, folder / "figures" / f"{name}.png")
+    title = fitted.job.path.stem
+    (folder / "report.html").write_text(report.page(title, fitted.result, folder / "figures"), encoding="utf-8")
 
 
 def bias_heat_map(table: list[dict[str, Any]]) -> Figure:

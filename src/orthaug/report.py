@@ -1,26 +1,47 @@
-"""Results in words: what `orthaug check` and `orthaug fit` print."""
+"""Results in words and on a page: what `orthaug check` and `orthaug fit` print, and report.html."""
 
 from __future__ import annotations
 
+import base64
+import json
+from importlib.resources import files
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthaug import suspicion
 
 if TYPE_CHECKING:
-    from orthaug.outcome import Fitted
+    from orthaug.result import Estimate
 
 
-def fit_text(fitted: Fitted) -> str:
+def fit_text(fit: Estimate, result: dict[str, Any]) -> str:
     """Parameters, scores on every part, what the residual says, whether the learner earns its place, warnings."""
-    if not fitted.fit.status.ok:
+    if not fit.status.ok:
         return ""
-    result, blocks = fitted.result, [fitted.fit.summary().split("\nwarning: ")[0].rstrip().splitlines()]
+    blocks = [fit.summary().split("\nwarning: ")[0].rstrip().splitlines()]
     if result["physical_parameters"]:
         blocks.append(_physical_text(result))
-    blocks.append(_scores_text(fitted))
+    blocks.append(_scores_text(fit, result))
     told = [found["text"] for found in (result["residuals"], result["validation"]) if found]
     blocks += [told, [f"warning: {text}" for text in dict.fromkeys(result["warnings"]) if text not in told]]
     return "\n\n".join("\n".join(lines) for lines in blocks if lines)
+
+
+def page(name: str, result: dict[str, Any], figures: Path) -> str:
+    """One HTML file of a result, with the figures of a folder inside; it needs no network."""
+    import jinja2
+
+    source = files("orthaug").joinpath("templates/report.html").read_text(encoding="utf-8")
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+    parts = {"train": result["data"]["train"], **result["data"].get("tests", {})}
+    return environment.from_string(source).render(
+        name=name,
+        result=result,
+        figures={p.stem: base64.b64encode(p.read_bytes()).decode() for p in sorted(figures.glob("*.png"))},
+        spec=json.dumps(result["spec"], indent=1, ensure_ascii=False),
+        data=parts.items(),
+        number=lambda value, digits=6: "–" if value is None else f"{value:.{digits}g}",
+    )
 
 
 def _physical_text(result: dict[str, Any]) -> list[str]:
@@ -70,11 +91,11 @@ def check_text(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _scores_text(fitted: Fitted) -> list[str]:
+def _scores_text(fit: Estimate, result: dict[str, Any]) -> list[str]:
     """The scores as a table, one line per part, kind and output."""
     rows = []
-    outputs = fitted.job.problem.record.outputs
-    for part, kinds in fitted.result["scores"].items():
+    outputs = fit.model.outputs
+    for part, kinds in result["scores"].items():
         for kind, entry in kinds.items():
             for i, channel in enumerate(outputs):
                 cells = [entry[key][i] if entry[key] is not None else None for key in ("rmse", "nrmse", "fit")]
