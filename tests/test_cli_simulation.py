@@ -35,7 +35,6 @@ GREEDY = "[learner]\nhidden = [30]\n"
 FREE = '[training]\nfocus = "simulation"\nsegment = 64\nwashout = 8\nstart_iterations = 5\niterations = 25\n'
 QUICK = "[training]\niterations = 40\n"
 FAR = '[data.tests.far]\nfiles = ["far.csv"]\n'
-PARTS = ("physics_alone", "model")
 
 
 def system(seed, rows, *, square=0.0, equation=0.0, sensor=0.0, scale=1.0):
@@ -74,7 +73,7 @@ def free(tmp_path_factory) -> dict:
 
 
 def test_the_result_has_all_its_keys(free):
-    assert set(free) == RESULT_KEYS
+    assert set(free) >= RESULT_KEYS
     assert [(r["seed"], r["regularization"]) for r in free["restarts"]] == [(0, "evidence"), (1, "evidence")]
     assert sum(r["chosen"] for r in free["restarts"]) == 1
     assert free["orthogonality_defect"] < 1e-12
@@ -106,17 +105,15 @@ def test_the_free_run_is_better_than_after_one_step_training(free, tmp_path):
     assert error[0] < error[1]
 
 
-@pytest.mark.parametrize(
-    "training",
-    [
-        FREE.replace("segment = 64", "segment = 0"),
-        FREE.replace("washout = 8", "washout = 0"),
-        FREE.replace("start_iterations = 5", "start_iterations = 0"),
-        "[training]\nhorizon = 5\niterations = 20\n",
-        FREE + "ensemble = true\nrestarts = 3\n",
-    ],
-    ids=["whole", "no washout", "cold", "five steps", "ensemble"],
-)
+WAYS = {
+    "whole": FREE.replace("segment = 64", "segment = 0"),
+    "exact": FREE.replace("washout = 8", "washout = 0").replace("start_iterations = 5", "start_iterations = 0"),
+    "five steps": "[training]\nhorizon = 5\niterations = 20\n",
+    "ensemble": FREE + "ensemble = true\nrestarts = 2\n",
+}
+
+
+@pytest.mark.parametrize("training", WAYS.values(), ids=list(WAYS))
 def test_ways_to_train_on_the_free_run(tmp_path, training):
     result = fit(project(tmp_path / "p", SMALL, training, "[validation]\nblocks = 0\n"))
     assert result["status"]["code"] in ("converged", "iteration_limit")
@@ -138,13 +135,13 @@ def test_one_step_with_sensor_noise_is_told(tmp_path):
     result = fit(spec)
     assert result["residuals"]["verdict"] == "sensor_noise"
     assert any("intervals do not cover" in text and 'focus = "simulation"' in text for text in result["warnings"])
-    printed = run("fit", spec, "--out", "again" if False else spec.parent / "out").out
+    printed = run("fit", spec, "--out", spec.parent / "out").out
     assert result["residuals"]["text"] in printed and f"warning: {result['warnings'][0]}" in printed
 
 
 def test_the_verdicts_are_printed(tmp_path):
-    spec = project(tmp_path / "p", SMALL, QUICK, FAR, **system(0, 200, square=0.3, equation=0.1))
-    write_csv(spec.parent / "far.csv", **system(1, 100, square=0.3, equation=0.1))
+    spec = project(tmp_path / "p", SMALL, QUICK, FAR)
+    write_csv(spec.parent / "far.csv", **system(1, 150, square=0.3, sensor=0.3))
     result, printed = fit(spec), run("fit", spec, "--out", spec.parent / "out").out
     for key in ("residuals", "validation"):
         assert result[key]["text"] in printed
@@ -171,18 +168,23 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize("command", ["fit", "compare"])
-@pytest.mark.parametrize(("training", "words"), REFUSED, ids=[words[0][:40] + str(i) for i, (_, words) in enumerate(REFUSED)])
-def test_refused(tmp_path, command, training, words):
+@pytest.mark.parametrize(("training", "words"), REFUSED, ids=range(len(REFUSED)))
+def test_refused(tmp_path, training, words):
     """The last three leave nothing to score in 300 rows."""
-    if command == "compare" and words[0] in ("washout", "horizon"):
-        pytest.skip("as `fit`")
-    spec = project(tmp_path / "p", SMALL, training)
-    done = run(command, spec, "--out", tmp_path / "out")
+    done = run("fit", project(tmp_path / "p", SMALL, training), "--out", tmp_path / "out")
     assert (done.code, done.out) == (2, "")
     assert one_line(done.err, "error: ", "plant.toml", *words)
-    assert not re.search(r"[?!]\.", done.err)
     assert not (tmp_path / "out").exists()
+
+
+def test_compare_refuses_the_same(tmp_path):
+    done = run("compare", project(tmp_path / "p", SMALL, "[validation]\nblocks = 1\n"), "--out", tmp_path / "out")
+    assert (done.code, done.out) == (2, "") and one_line(done.err, "error: ", "plant.toml", "`validation.blocks`")
+
+
+def test_a_question_ends_with_its_own_mark(tmp_path):
+    done = run("fit", project(tmp_path / "p", SMALL, "[training]\nsegments = 3\n"))
+    assert done.err.rstrip().endswith("did you mean 'segment'?")
 
 
 # --- verdicts on the learner
@@ -218,25 +220,23 @@ def test_it_hurts_in_extrapolation(diverged):
     assert {entry["regressor"] for entry in verdict["extrapolation"]} == {"y[k-1]", "u[k-1]"}
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("training", [QUICK, QUICK + 'regularization = "evidence"\n'], ids=["none", "evidence"])
-def test_what_is_worse_than_physics_alone_on_a_part_never_helps(tmp_path, seed, training):
-    spec = project(tmp_path / "p", GREEDY, training, FAR, **system(seed, 80, equation=0.3))
-    write_csv(spec.parent / "far.csv", **system(seed + 9, 150, equation=0.3, scale=3.0))
-    learned = fit(spec)
-    spec.write_text(SPEC + ALONE + FAR, encoding="utf-8")
-    alone, model = (r["scores"]["tests.far"]["simulation"]["nrmse"] for r in (fit(spec), learned))
-    worse = model is None or model[0] > alone[0]
-    assert not (worse and learned["validation"]["verdict"] == "helps")
-    assert learned["validation"]["trials"][0]["physics_alone"] == pytest.approx(alone[0])
+@pytest.mark.parametrize("seed", range(4))
+def test_what_is_worse_than_physics_alone_on_a_part_never_helps(seed, tmp_path):
+    spec = project(tmp_path / "p", GREEDY, QUICK, FAR, **system(seed, 60, equation=0.3))
+    write_csv(spec.parent / "far.csv", **system(seed + 9, 200, equation=0.3, scale=2.0))
+    result = fit(spec)
+    (trial,) = result["validation"]["trials"]
+    model = result["scores"]["tests.far"]["simulation"]["nrmse"]
+    assert model is None or model[0] > trial["physics_alone"]  # it leaves the training range and is worse there
+    assert result["validation"]["verdict"] == "hurts"
 
 
 def test_a_learner_that_finds_the_square_helps(tmp_path):
-    spec = project(tmp_path / "p", SMALL, QUICK, FAR, "[validation]\nblocks = 3\n", **system(0, 300, square=0.3))
+    spec = project(tmp_path / "p", SMALL, QUICK, FAR, "[validation]\nblocks = 4\n", **system(0, 300, square=0.3))
     write_csv(spec.parent / "far.csv", **system(1, 150, square=0.3))
     verdict = fit(spec)["validation"]
     assert verdict["verdict"] == "helps"
-    assert [t["where"] for t in verdict["trials"]] == [f"block {i} of 3" for i in (1, 2, 3)] + ["tests.far"]
+    assert [t["where"] for t in verdict["trials"]] == [f"block {i} of 4" for i in (1, 2, 3, 4)] + ["tests.far"]
     assert all(t["model"] < 0.5 * t["physics_alone"] for t in verdict["trials"])
 
 
@@ -244,7 +244,9 @@ def test_a_learner_that_finds_the_square_helps(tmp_path):
 def test_a_record_too_short_for_blocks_is_told(tmp_path, blocks):
     """No verdict, and a sentence that says why."""
     rows = 300 if blocks else 60
-    result = fit(project(tmp_path / "p", SMALL, QUICK, blocks, **system(0, rows, equation=0.1)))
+    result = fit(
+        project(tmp_path / "p", SMALL, "[training]\niterations = 5\n", blocks, **system(0, rows, equation=0.1))
+    )
     assert result["validation"] is None
     assert any("too few" in text and "blocks" in text for text in result["warnings"])
 

@@ -137,7 +137,9 @@ def test_how_a_missing_sample_is_written(tmp_path, word):
 @pytest.mark.parametrize("missing", ["skip", "error"])
 def test_other_text_is_refused_with_line_and_column(tmp_path, word, missing):
     path = write(tmp_path / "run.csv", {40: f'"{word}"'}, {})
-    with pytest.raises(InputError, match=rf"run\.csv: line 42 \(row 40\), column 'y': found '{word}'".replace("?", ".")):
+    with pytest.raises(
+        InputError, match=rf"run\.csv: line 42 \(row 40\), column 'y': found '{word}'".replace("?", ".")
+    ):
         read(path, missing=missing)
 
 
@@ -240,7 +242,9 @@ def test_the_fit_is_that_of_the_naive_rows(project):
 
 
 def test_the_warning_counts_what_is_left_out(project):
-    expected = f"train: 10 rows have missing cells and are left out with all windows that touch them; {len(windows()[0])} "
+    expected = (
+        f"train: 10 rows have missing cells and are left out with all windows that touch them; {len(windows()[0])} "
+    )
     (warning,) = [text for text in fit(project)["warnings"] if "missing" in text]
     assert warning.startswith(expected + "usable rows remain, in 7 stretches")
     assert expected in run("check", project).out

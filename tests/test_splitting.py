@@ -58,7 +58,7 @@ def two():
 def curve():
     """The paper's static set 1 with 30 dB noise, briefly trained."""
     example = static(1, noise=True)
-    return estimate(example.train, example.baseline, learner=NET, solver=QUICK)
+    return estimate(example.train, example.baseline, learner=NET, solver=QUICK, regularization=1e-4)
 
 
 def naive(model, x, weight) -> np.ndarray:
@@ -167,7 +167,7 @@ def test_the_rest_is_orthogonal_under_the_measure(fit, measure):
 def test_under_the_training_measure_nothing_changes(fit):
     again = fit.split(Training())
     np.testing.assert_allclose(again.theta, fit.theta, rtol=1e-12)
-    np.testing.assert_allclose(again.covariance, fit.covariance, rtol=1e-8)
+    np.testing.assert_allclose(again.covariance, fit.covariance, rtol=1e-6)
     np.testing.assert_allclose(fit.split(Symmetrized()).split(Training()).theta, fit.theta, rtol=1e-12)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from orthaug.design import Design, design_input
 from orthaug.errors import InputError
+from orthaug.folders import whole_file
 from orthaug.jobs import Job
 from orthaug.suspicion import declared
 
@@ -56,16 +56,9 @@ def write(job: Job, found: Design, out: Path) -> None:
     chosen = job.spec.design.input or names[0]
     time = np.arange(len(found.signal)) * job.problem.record.sampling_time
     columns = {"time": time} | {name: found.signal if name == chosen else 0.0 * found.signal for name in names}
-    partial = out.with_name(f".{out.name}.partial")
-    try:
-        table = np.column_stack(list(columns.values()))
+    table = np.column_stack(list(columns.values()))
+    with whole_file(out) as partial:
         np.savetxt(partial, table, fmt="%.17g", delimiter=",", header=",".join(columns), comments="")
-        partial.replace(out)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written ({error.strerror or error}).") from None
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
 
 
 def text(found: Design, shown: int = 8) -> str:

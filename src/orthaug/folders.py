@@ -1,11 +1,11 @@
-"""Folders that appear whole or not at all: written beside their place, then renamed."""
+"""Folders and files that appear whole or not at all: written beside their place, then renamed."""
 
 from __future__ import annotations
 
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from orthaug.errors import InputError
@@ -71,3 +71,21 @@ def _put_in_place(partial: Path, folder: Path) -> None:
 
 def _nearest_ancestor(folder: Path) -> Path:
     return next(parent for parent in folder.absolute().parents if parent.exists())
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A file beside `path` that takes its place at the end, and vanishes on any exception.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        yield partial
+        partial.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error}).") from None
+    finally:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)

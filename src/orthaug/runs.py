@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,6 +13,7 @@ import numpy as np
 from orthaug import __version__
 from orthaug._arrays import check_choice
 from orthaug.errors import InputError
+from orthaug.folders import whole_file
 from orthaug.measures import Measure, Support, Symmetrized, Training, Uniform
 from orthaug.readers import read_record, read_samples
 from orthaug.record import Record
@@ -216,12 +216,5 @@ def write_csv(response: Response, out: Path | None) -> None:
     if out is None:
         frame.to_csv(sys.stdout, index=False)
         return
-    partial = out.with_name(f".{out.name}.partial")
-    try:
+    with whole_file(out) as partial:
         frame.to_csv(partial, index=False)
-        partial.replace(out)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written ({error.strerror or error}).") from None
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)

@@ -38,7 +38,7 @@ class Study:
     Args:
         name: of its folder in a store.
         one: takes one value of each axis as keyword arguments, gives a mapping of plain values: numbers, texts, lists.
-        grid: axes by name, each with its values; all combinations run, the last axis fastest. Give the slow cases first.
+        grid: axes by name, each with its values; all combinations run, the last axis fastest. Slow cases go first.
         version: raise it when `one` computes something else, so that stored results no longer count.
         where: of all combinations, those that run; takes what `one` takes. None for all.
         workers: cases at a time; 1 for a study that measures time, None for the machine's cores.

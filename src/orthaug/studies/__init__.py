@@ -1,49 +1,35 @@
-"""The paper's figures and tables, one file each: what is run, what is drawn, what is compared with the published numbers."""
+"""The paper's figures and tables, one file each: what is run, drawn, and compared with the published numbers."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
-from orthaug.study import Study
+from orthaug.studies.entry import Finding, Reproduction
 
-if TYPE_CHECKING:
-    import pandas as pd
-    from matplotlib.figure import Figure
-
-
-class Finding(NamedTuple):
-    """A quantity beside what is published and what the published scripts gave when they were run."""
-
-    quantity: str
-    published: str
-    scripts: str
-    ours: str
-    met: bool
-    verdict: str
-    """One sentence where they differ; short where they agree."""
-
-
-@dataclass(frozen=True)
-class Reproduction:
-    """One entry of `orthaug reproduce`.
-
-    `study(pipeline, small)` declares the runs: pipeline "ours" or "paper"; `small` for a reduced size that tests can run.
-    `figures(table)` draws, by file name; `findings(table)` compares. `text` says what is shown.
-    """
-
-    name: str
-    title: str
-    text: str
-    study: Callable[[str, bool], Study]
-    figures: Callable[[pd.DataFrame], Mapping[str, Figure]]
-    findings: Callable[[pd.DataFrame], list[Finding]]
+__all__ = ["Finding", "Reproduction", "catalogue"]
 
 
 def catalogue() -> dict[str, Reproduction]:
     """All of them, in the paper's order."""
-    from orthaug.studies import static_errors
+    from orthaug.studies import (
+        consistency,
+        covariance,
+        coverage,
+        data_length,
+        regularization_weight,
+        solver_times,
+        static_errors,
+        static_noise,
+    )
 
-    found: list[Any] = [static_errors]
+    found: list[Any] = [
+        static_errors,
+        data_length,
+        static_noise,
+        covariance,
+        consistency,
+        regularization_weight,
+        coverage,
+        solver_times,
+    ]
     return {module.REPRODUCTION.name: module.REPRODUCTION for module in found}

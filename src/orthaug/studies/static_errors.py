@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
-from matplotlib.figure import Figure
 
 from orthaug.estimation import estimate
 from orthaug.measures import Uniform
-from orthaug.studies import Finding, Reproduction
 from orthaug.studies.common import COLOURS, LABELS, MARKERS, STRUCTURES, legend, panels, solver, span
+from orthaug.studies.entry import Finding, Reproduction
 from orthaug.study import Study
 from orthaug.synthetic import static
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
 
 SCRIPTS = {  # mean test RMSE and mean ‖θ* − θ̂‖ of the published scripts
     (1, "orthogonal"): (1.47e-4, 3.8e-6),
@@ -173,9 +175,9 @@ def _why(structure: str, data_set: int) -> str:
 REPRODUCTION = Reproduction(
     "static_errors",
     "Static example without noise",
-    "Ten initial weights on each of the three data sets. Both structures predict alike; θ of the additive one depends on the "
-    "initial weights, θ of the orthogonal one does not, and on sets 2 and 3 it errs by what the measure leaves correlated: "
-    "split under the uniform measure on [−0.6, 0.6], the same fits err by a thousandth of that.",
+    "Ten initial weights on each of the three data sets. Both structures predict alike; θ of the additive one depends "
+    "on the initial weights, θ of the orthogonal one does not, and on sets 2 and 3 it errs by what the measure leaves "
+    "correlated: split under the uniform measure on [−0.6, 0.6], the same fits err by a thousandth of that.",
     study,
     figures,
     findings,
