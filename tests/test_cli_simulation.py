@@ -62,6 +62,13 @@ def fit(spec) -> dict:
     return finite_json(done.out)
 
 
+def printed_fit(spec) -> tuple[str, dict]:
+    """What a fit prints, and its result.json."""
+    done = run("fit", spec, "--out", spec.parent / "out")
+    assert (done.code, done.err) == (0, "")
+    return done.out, finite_json((spec.parent / "out" / "result.json").read_text(encoding="utf-8"))
+
+
 @pytest.fixture(scope="module")
 def free(tmp_path_factory) -> dict:
     """The result of a learner trained on the free run, with evidence and restarts."""
@@ -100,7 +107,7 @@ def test_the_learner_has_a_verdict_from_blocks(free):
 
 
 def test_the_free_run_is_better_than_after_one_step_training(free, tmp_path):
-    one_step = fit(project(tmp_path / "p", SMALL, QUICK, 'regularization = "evidence"\n'))
+    one_step = fit(project(tmp_path / "p", SMALL, QUICK, "[validation]\nblocks = 0\n"))
     error = [result["scores"]["train"]["simulation"]["rmse"][0] for result in (free, one_step)]
     assert error[0] < error[1]
 
@@ -132,17 +139,16 @@ def test_physics_alone_on_the_free_run(tmp_path):
 
 def test_one_step_with_sensor_noise_is_told(tmp_path):
     spec = project(tmp_path / "p", ALONE, **system(0, 600, sensor=0.3))
-    result = fit(spec)
+    printed, result = printed_fit(spec)
     assert result["residuals"]["verdict"] == "sensor_noise"
     assert any("intervals do not cover" in text and 'focus = "simulation"' in text for text in result["warnings"])
-    printed = run("fit", spec, "--out", spec.parent / "out").out
     assert result["residuals"]["text"] in printed and f"warning: {result['warnings'][0]}" in printed
 
 
 def test_the_verdicts_are_printed(tmp_path):
     spec = project(tmp_path / "p", SMALL, QUICK, FAR)
     write_csv(spec.parent / "far.csv", **system(1, 150, square=0.3, sensor=0.3))
-    result, printed = fit(spec), run("fit", spec, "--out", spec.parent / "out").out
+    printed, result = printed_fit(spec)
     for key in ("residuals", "validation"):
         assert result[key]["text"] in printed
 
@@ -220,7 +226,7 @@ def test_it_hurts_in_extrapolation(diverged):
     assert {entry["regressor"] for entry in verdict["extrapolation"]} == {"y[k-1]", "u[k-1]"}
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_what_is_worse_than_physics_alone_on_a_part_never_helps(seed, tmp_path):
     spec = project(tmp_path / "p", GREEDY, QUICK, FAR, **system(seed, 60, equation=0.3))
     write_csv(spec.parent / "far.csv", **system(seed + 9, 200, equation=0.3, scale=2.0))

@@ -19,7 +19,9 @@ Y = RNG.normal(size=400)
 def support(na=0, nb=1, nk=0, used=None, u=U) -> Support:
     """A record of one input and one output; the model reads the lags numbered `used` of the layout, all by default."""
     layout = Lags(na, nb, nk).layout(["y"], ["u"])
-    return Support(Record.from_arrays(u, Y[: len(u)]), layout, layout if used is None else tuple(layout[i] for i in used))
+    return Support(
+        Record.from_arrays(u, Y[: len(u)]), layout, layout if used is None else tuple(layout[i] for i in used)
+    )
 
 
 ONE = support()

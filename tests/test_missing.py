@@ -281,7 +281,7 @@ def test_an_unknown_way_is_an_error(project):
 def test_no_stretch_is_long_enough(project):
     write(project.parent / "run.csv", {k: "" for k in range(0, 100, 2)}, {})
     done = run("fit", project)
-    assert done.code == 2 and one_line(done.err, "error: ", "run.csv", "too few", "at least 3")
+    assert done.code == 2 and one_line(done.err, "error: ", "run.csv", "too few", "the first 2")
 
 
 TEST_PART = '[data.tests.other]\nfiles = ["other.csv"]\n{more}[[baseline.terms]]'

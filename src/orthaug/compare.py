@@ -40,6 +40,7 @@ class Comparison:
 
     job: Job
     fitted: dict[str, Fitted]
+    verdicts: dict[str, Verdict]
     result: dict[str, Any]
 
 
@@ -76,7 +77,7 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress | None = No
         "left_out": left_out,
         "warnings": list(job.warnings),
     }
-    return Comparison(job, fitted, plain(result))
+    return Comparison(job, fitted, verdicts, plain(result))
 
 
 def _verdicts(job: Job, fitted: dict[str, Fitted]) -> dict[str, Verdict]:
@@ -130,9 +131,11 @@ def text(found: Comparison) -> str:
     lines = [*_table(first), "", *_table(second)]
     if found.result["chosen"]:
         lines += ["", "* lowest one-step error on the validation part"]
-    for key in ("residuals", "validation"):
-        told = [f"{row['name']}: {row[key]['text']}" for row in rows if row[key] is not None]
-        lines += ["", *told] if told else []
+    told = [f"{row['name']}: {row['residuals']['text']}" for row in rows if row["residuals"] is not None]
+    lines += ["", *told] if told else []
+    told = [f"{kind}: {verdict.summary}" for kind, verdict in found.verdicts.items()]
+    beyond = dict.fromkeys(f"{e}." for verdict in found.verdicts.values() for e in verdict.extrapolation)
+    lines += ["", *told, *beyond] if told else []
     lines.append("")
     lines += [f"left out: {kind}: {why}" for kind, why in found.result["left_out"].items()]
     common = found.result["warnings"]

@@ -40,13 +40,24 @@ class LoadedPart:
 
     def without_short(self, first: int) -> LoadedPart:
         """Without stretches between missing samples that are too short for a row after the first `first`."""
-        record = self.record.without_short(first)
+        record = self.record
         if not record.missing:
             return self
-        usable = sum(max(0, len(experiment) - first) for experiment in record.experiments)
+        pairs = zip(record.experiments, self.skips, strict=True)
+        long = tuple(e for e, skip in pairs if len(e) > max(first, skip))
+        if not long:
+            most = max(len(e) for e in record.experiments)
+            raise InputError(
+                f"{record.experiments[0].source}: data.{self.name}: the longest stretch between missing samples has "
+                f"{_count(most, 'row')}, too few: the first "
+                f"{max(first, self.skip)} are lags or skipped."
+            )
+        record = replace(record, experiments=long)
+        usable = sum(len(experiment) - first for experiment in record.experiments)
+        lost = "row has missing cells and is" if record.missing == 1 else "rows have missing cells and are"
         gaps = (
-            f"{self.name}: {record.missing} rows have missing cells and are left out with all windows that touch them; "
-            f"{usable} usable rows remain, in {len(record.experiments)} stretches."
+            f"{self.name}: {record.missing} {lost} left out with all windows that touch them; "
+            f"{_count(usable, 'usable row')} remain, in {_count(len(record.experiments), 'stretch', 'stretches')}."
         )
         return replace(self, record=record, gaps=gaps)
 
@@ -132,6 +143,7 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
         train, validation, *tests = (p and p.without_short(largest_lag(layout)) for p in (train, validation, *tests))
         problem = pose(train.record, baseline, lags, learner_inputs, require_full_rank=require_full_rank)
         problem.feature_rows()
+        _check_segments(spec, problem)
         section = spec.structure.measure
         measure = measure_of(section.kind, [str(lag) for lag in used_lags(problem)], section, path.parent)
         measure.points(Support(train.record, problem.layout, used_lags(problem)))  # what is wrong with it shows here
@@ -147,6 +159,25 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
     warnings = [_thinned(name, part.every) for name, part in declared.items() if part and part.every > 1]
     warnings += [part.gaps for part in job.parts if part.gaps]
     return replace(job, warnings=tuple(warnings))
+
+
+def _count(number: int, one: str, more: str = "") -> str:
+    return f"{number} {one if number == 1 else more or one + 's'}"
+
+
+def _check_segments(spec: Spec, problem: Problem) -> None:
+    """Raise InputError where a free run would score nothing."""
+    training = spec.training
+    longest = max(len(e) for e in problem.record.experiments) - problem.rows.start
+    if training.focus == "simulation" and training.washout >= min(training.segment or longest, longest):
+        raise InputError(
+            f"'training.washout': found {training.washout}; expected less than the {longest} usable rows of the "
+            "longest experiment, or nothing is scored."
+        )
+    if training.focus == "prediction" and training.horizon > longest:
+        raise InputError(
+            f"'training.horizon': found {training.horizon}; the longest experiment has {longest} usable rows."
+        )
 
 
 def _thinned(name: str, every: int) -> str:

@@ -92,9 +92,16 @@ def fit_job(
             scores[part.name], responses = score_part(fit.model, part, warnings)
         diagnosis, steady = diagnose(fit), stability(fit.model, job.train.record)
         warnings += steady.warnings
-        warnings += diagnosis.warnings
+        if diagnosis is None:
+            warnings.append("the residual is not analysed: there are too few rows for that, or it is rounding only.")
+        warnings += diagnosis.warnings if diagnosis is not None else ()
         if judged and not alone and fit.model.form.bound is not None:
             verdict = judge_fit(job, fit)
+            if verdict is None and job.spec.validation.blocks != 0:
+                warnings.append(
+                    "whether the learner helps is not judged: no part is held out, and the training data are too short "
+                    "for blocked cross-validation."
+                )
             warnings += [verdict.text] if verdict is not None and verdict.code == "hurts" else []
     spec = job.spec.model_dump(mode="json", exclude_unset=True)
     status = fit.status

@@ -59,7 +59,7 @@ def read_record(
     wanted: list[str] = list(dict.fromkeys([*column_of.values(), *([time] if time else [])]))
     if not wanted:
         raise InputError("no channels are asked for; name inputs, outputs or both.")
-    table = _trim(read_table(path, wanted))
+    table = _trim(read_table(path, wanted), uneven=missing == "skip")
     total = len(next(iter(table.columns.values())))
     experiments, steps, recorded = [], [], 0
     for begin, end in _ranges(rows, total, path):
@@ -113,12 +113,12 @@ def read_samples(paths: Sequence[str | Path], lags: Sequence[str], *, rows: Any 
     return Samples({lag: values[:, j] for j, lag in enumerate(lags)}, weights)
 
 
-def _trim(table: Table) -> Table:
+def _trim(table: Table, *, uneven: bool = False) -> Table:
     """Without the rows at the end in which every used column is empty (blank lines, longer unused columns)."""
     longest = max(table.filled.values())
     if longest == 0:
         raise InputError(f"{table.path}: there are no data rows in {', '.join(table.columns)}.")
-    if len(set(table.filled.values())) > 1:
+    if len(set(table.filled.values())) > 1 and not uneven:
         listing = ", ".join(f"'{name}' {length}" for name, length in table.filled.items())
         raise InputError(
             f"{table.path}: the used columns have unequal lengths: {listing} rows. Give all the same length."

@@ -16,7 +16,8 @@ import jinja2
 import platformdirs
 
 from orthaug import __version__, plots
-from orthaug._arrays import check_choice
+from orthaug._arrays import check_choice, nearest
+from orthaug.errors import InputError
 from orthaug.folders import check_replaceable, whole_folder
 from orthaug.studies import Finding, Reproduction, catalogue
 from orthaug.studies.theory import THEORY
@@ -41,6 +42,7 @@ class Reproduced:
     figures: dict[str, Figure]
     findings: list[Finding]
     seconds: float
+    small: bool = False
 
 
 def chosen(name: str | None) -> list[Reproduction]:
@@ -50,7 +52,11 @@ def chosen(name: str | None) -> list[Reproduction]:
         InputError: no study of that name.
     """
     known = catalogue()
-    return list(known.values()) if name is None else [known[check_choice(name, known, "the study")]]
+    if name is None:
+        return list(known.values())
+    if name not in known:
+        raise InputError(f"there is no study '{name}'{nearest(name, known) or '.'} There are {', '.join(known)}.")
+    return [known[name]]
 
 
 def reproduce(
@@ -75,8 +81,8 @@ def reproduce(
         began = time.perf_counter()
         tell = None if progress is None else lambda done, total, e=entry: progress(e.title, done, total)
         table = run(entry.study(pipeline, small), store=store, progress=tell)
-        done = Reproduced(entry, table, dict(entry.figures(table)), entry.findings(table), time.perf_counter() - began)
-        found.append(done)
+        drawn, compared = dict(entry.figures(table)), entry.findings(table)
+        found.append(Reproduced(entry, table, drawn, compared, time.perf_counter() - began, small))
     return found
 
 
@@ -112,7 +118,7 @@ def as_rows(found: Sequence[Reproduced]) -> list[dict[str, Any]]:
 def text(found: Sequence[Reproduced]) -> str:
     """The table: quantity, published, the published scripts as measured, ours, verdict."""
     head = ("quantity", "published", "scripts", "ours", "", "verdict")
-    rows = [head]
+    rows: list[tuple[str, ...]] = [head]
     for finding in (finding for one in found for finding in one.findings):
         mark = "met" if finding.met else "NOT MET"
         rows.append((finding.quantity, finding.published, finding.scripts, finding.ours, mark, finding.verdict))
@@ -136,8 +142,15 @@ def _page(found: Sequence[Reproduced], pipeline: str) -> str:
         }
         for one in found
     ]
+    findings = [finding for one in found for finding in one.findings]
     return environment.from_string(source).render(
-        studies=studies, theory=THEORY, pipeline=pipeline, version=__version__
+        studies=studies,
+        theory=THEORY,
+        pipeline=pipeline,
+        version=__version__,
+        small=any(one.small for one in found),
+        compared=len(findings),
+        met=sum(finding.met for finding in findings),
     )
 
 

@@ -17,6 +17,7 @@ from orthaug._arrays import Matrix, Vector
 from orthaug._jax import jnp
 from orthaug.covariance import noise_covariance, theta_block
 from orthaug.criteria import Criterion, Prediction, Simulation
+from orthaug.errors import InputError
 from orthaug.learners import Bound
 from orthaug.pasts import Pasts
 from orthaug.predictor import Form, Numbers
@@ -59,6 +60,12 @@ class FreeRun:
         """Lay the problem's record out as a criterion of several steps declares."""
         criterion = declared.flown
         assert criterion is not None, "one step ahead is `Task`'s"
+        longest = max(len(e) for e in problem.record.experiments) - problem.rows.start
+        if criterion.washout >= longest:
+            raise InputError(
+                f"nothing is scored: the longest experiment has {longest} usable rows, and the first "
+                f"{criterion.washout} of a segment are washout; shorten it, or the horizon."
+            )
         bound = None if task is None else task.bound
         form = Form(problem.baseline, problem.features, problem.layout, problem.outputs, bound)
         segments = lay_segments(problem.record, form, criterion.segment, criterion.washout)

@@ -321,7 +321,8 @@ def load_spec(path: Path) -> Spec:
     try:
         return Spec.model_validate(content)
     except ValidationError as error:
-        raise InputError(f"{path}: {_first_message(error, content)}.") from None
+        message = _first_message(error, content)
+        raise InputError(f"{path}: {message}{'' if message.endswith('?') else '.'}") from None
 
 
 def _first_message(error: ValidationError, content: dict[str, Any]) -> str:

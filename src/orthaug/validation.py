@@ -53,12 +53,17 @@ class Extrapolation:
 
 @dataclass(frozen=True)
 class Verdict:
-    """`code` is helps, no_help or hurts; `text` says why. `trials` are the errors it rests on."""
+    """`code` is helps, no_help or hurts; `summary` says why. `trials` are the errors it rests on."""
 
     code: str
-    text: str
+    summary: str
     trials: tuple[Trial, ...]
     extrapolation: tuple[Extrapolation, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """Why, and where the training range is left."""
+        return " ".join([self.summary, *(f"{e}." for e in self.extrapolation)])
 
     def as_dict(self) -> dict[str, Any]:
         """Plain content for JSON."""
@@ -87,7 +92,8 @@ def free_run_error(model: Model, record: Record, skip: int | tuple[int, ...] = 0
     if any(trajectory.diverged for trajectory in response.trajectories):
         return math.inf
     scores = response.scores(skip)
-    relative = scores.nrmse if unit is None else scores.rmse / unit
+    relative = np.where(np.isfinite(scores.nrmse), scores.nrmse, scores.rmse * model.weight)
+    relative = relative if unit is None else scores.rmse / unit
     return float(np.sqrt(np.mean(relative**2))) if np.isfinite(relative).all() else math.inf
 
 
@@ -129,11 +135,14 @@ def blocked(record: Record, blocks: int, start: int) -> list[tuple[Record, Recor
 
 
 def _cut(experiments: list[Experiment], usable: int, start: int) -> tuple[Experiment, ...]:
-    """The experiments without the last rows of the longest, so that `usable` rows remain."""
-    surplus = sum(len(e) - start for e in experiments) - usable
-    longest = max(range(len(experiments)), key=lambda i: len(experiments[i]))
-    cut = experiments[longest].rows(0, len(experiments[longest]) - surplus)
-    return tuple(cut if i == longest else e for i, e in enumerate(experiments))
+    """The experiments without the last rows of the longest ones, so that `usable` rows remain."""
+    cut = list(experiments)
+    while (surplus := sum(len(e) - start for e in cut) - usable) > 0:
+        longest = max(range(len(cut)), key=lambda i: len(cut[i]))
+        length = len(cut[longest])
+        shorter = max(length - surplus, max((len(e) for e in cut if len(e) < length), default=start + 1), start + 1)
+        cut[longest] = cut[longest].rows(0, min(shorter, length - 1))
+    return tuple(e for e in cut if len(e) > start)
 
 
 def cross_validate(
@@ -181,8 +190,9 @@ def judge(trials: Sequence[Trial], extrapolation: Sequence[Extrapolation] = ()) 
     sentences, codes = [], []
     for where, group in groups:
         alone, model = (math.sqrt(sum(getattr(t, k) ** 2 for t in group) / len(group)) for k in ("alone", "model"))
-        code = _compare(alone, model)
-        told = f"free-run NRMSE {_shown(model)} with the learner, {_shown(alone)} with physics alone"
+        ran_away = any(math.isinf(t.model) and not math.isinf(t.alone) for t in group)
+        code = "hurts" if ran_away else _compare(alone, model)
+        told = _told(alone, model)
         if len(group) > 1:
             told = f"In {where} ({len(group)} blocks, {sum(t.model < t.alone for t in group)} of them better): {told}"
         else:
@@ -198,8 +208,17 @@ def judge(trials: Sequence[Trial], extrapolation: Sequence[Extrapolation] = ()) 
         "hurts": "The learner hurts in extrapolation" if beyond else "The learner hurts",
     }[worst]
     reasons = sentences if worst == "helps" else [s for s, c in zip(sentences, codes, strict=True) if c != "helps"]
-    text = ". ".join([opening, *reasons, *map(str, extrapolation)])
-    return Verdict(worst, f"{text}.", tuple(trials), tuple(extrapolation))
+    text = ". ".join([opening, *reasons]) + "."
+    return Verdict(worst, text, tuple(trials), tuple(extrapolation))
+
+
+def _told(alone: float, model: float) -> str:
+    """Both errors in words."""
+    errors = {"with the learner": model, "with physics alone": alone}
+    if not any(map(math.isinf, errors.values())):
+        return f"free-run NRMSE {model:.4g} with the learner, {alone:.4g} with physics alone"
+    told = (f"diverges {who}" if math.isinf(e) else f"has an NRMSE of {e:.4g} {who}" for who, e in errors.items())
+    return f"the free run {' and '.join(told)}"
 
 
 def _compare(alone: float, model: float) -> str:
@@ -229,10 +248,6 @@ def dominance(fit: Estimate) -> float | None:
     learner = math.sqrt(sum(float(np.nansum(t.learner**2)) for t in parts))
     physics = math.sqrt(sum(float(np.nansum(t.baseline**2)) for t in parts))
     return learner / physics if physics > 0 else None
-
-
-def _shown(value: float) -> str:
-    return "without bound (it diverges)" if math.isinf(value) else f"{value:.4g}"
 
 
 def _finite(value: float) -> float | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,6 +14,9 @@ from orthaug.record import Record
 from orthaug.solvers import AdamLBFGS, LevenbergMarquardt
 from orthaug.structures import Additive, Orthogonal
 from orthaug.synthetic import NOISE_30_DB, Example, static
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # Okabe-Ito, told apart by every reader; each structure keeps its colour and marker in all figures
 COLOURS = {
@@ -56,6 +59,11 @@ def drawn(data_set: int, *, samples: int = 1024, draw: int = 0, noise: bool = Fa
     return Example(Record.from_arrays(u, y), example.test, example.baseline, example.theta)
 
 
+def pick(table: pd.DataFrame, rows: Any) -> pd.DataFrame:
+    """Rows of a table, in the table's order."""
+    return table.loc[rows]
+
+
 def slope(samples: Any, errors: Any) -> float:
     """The exponent p of errors ∝ Nᵖ, by least squares over logarithms."""
     return float(np.polyfit(np.log(np.asarray(samples, dtype=float)), np.log(np.asarray(errors, dtype=float)), 1)[0])
@@ -68,7 +76,7 @@ def panels(count: int, *, width: float = 7.0, height: float = 2.8, sharey: bool 
     for axis in axes:
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)
-        axis.tick_params(labelsize=8)
+        axis.tick_params(which="both", labelsize=8)
     return figure, axes
 
 

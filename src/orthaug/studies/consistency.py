@@ -23,7 +23,7 @@ LARGEST_TRAINED = 65_536  # the orthogonal structure under the training measure 
 
 
 def one(data_set: int, samples: int, curve: str, run: int, pipeline: str) -> dict[str, Any]:
-    """θ's error and, under the uniform measure, the price of it in standard error; each run has its record and start."""
+    """θ's error and, under the uniform measure, its price in standard error; each run has its record and start."""
     example = drawn(data_set, samples=samples, draw=run, noise=True)
     price = None
     if curve == "orthogonal":
@@ -31,7 +31,8 @@ def one(data_set: int, samples: int, curve: str, run: int, pipeline: str) -> dic
     else:
         # evidence for the uniform measure, which looks at the learner; the additive structure as published
         prior = "evidence" if curve == "uniform" and pipeline != "paper" else "none"
-        options = {"solver": solver(pipeline, "static", 100), "regularization": prior, "seed": run}
+        iterations = 100 if samples < 10_000 else 50
+        options = {"solver": solver(pipeline, "static", iterations), "regularization": prior, "seed": run}
         if curve == "additive":
             options["structure"] = Additive()
         fit = estimate(example.train, example.baseline, **options)
@@ -44,7 +45,7 @@ def one(data_set: int, samples: int, curve: str, run: int, pipeline: str) -> dic
 def _runs(data_set: int, samples: int, curve: str, run: int, pipeline: str) -> bool:
     if curve == "additive":
         return data_set == 1 and samples <= LARGEST_TRAINED
-    return curve == "orthogonal" or (samples <= LARGEST_TRAINED and (data_set, run % 2) != (3, 1))
+    return curve == "orthogonal" or samples <= LARGEST_TRAINED
 
 
 def study(pipeline: str, small: bool) -> Study:
@@ -119,8 +120,8 @@ REPRODUCTION = Reproduction(
     "Error of θ against N, with noise",
     "Ten runs for each N, each with its own record and initial weights (run 0 has the paper's record), bars of two "
     "standard deviations. The paper varies the initial weights only, which moves the additive structure alone. θ under "
-    f"the training measure is least squares and needs no learner; trained curves end at N = {LARGEST_TRAINED}. Under the "
-    "uniform measure the learner is trained with evidence regularization by our solver, without any by the paper's.",
+    f"the training measure is least squares and needs no learner; trained curves end at N = {LARGEST_TRAINED}. Under "
+    "the uniform measure our solver trains with evidence regularization, the paper's without any.",
     study,
     figures,
     findings,

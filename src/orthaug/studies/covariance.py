@@ -1,4 +1,4 @@
-"""Sect. 5.1: the asymptotic covariance matrix of θ and the learner's weights, its zero blocks in black (thm:zero_cov)."""
+"""Sect. 5.1: the asymptotic covariance matrix of θ and the learner's weights, zeros in black (thm:zero_cov)."""
 
 from __future__ import annotations
 
@@ -73,9 +73,7 @@ def findings(table: pd.DataFrame) -> list[Finding]:
         "because the weights are over-parametrised"
     )
     ratio = np.array([np.array(p) / np.array(c) for p, c in zip(table.std_paper, table["std"], strict=True)])
-    factor = (
-        "the paper's middle term has a factor 2 that cancels in its source (Ljung 1999), less the degrees of freedom"
-    )
+    factor = "√2: the factor 2 of eq:cov_approx cancels in its source (Ljung 1999); the rest is degrees of freedom"
     return [
         Finding(f"{across}: largest correlation", "0", "–", f"{correlation:.1e}", bool(correlation < ZERO), why),
         Finding(
@@ -100,8 +98,8 @@ def findings(table: pd.DataFrame) -> list[Finding]:
 REPRODUCTION = Reproduction(
     "covariance",
     "The asymptotic covariance matrix",
-    "eq:cov_approx of the orthogonal structure on data set 1 with 30 dB of noise, for 2 + 49 parameters. The first two rows and "
-    "columns are θ: zero outside their own block.",
+    "eq:cov_approx of the orthogonal structure on data set 1 with 30 dB of noise, for 2 + 49 parameters. The first two "
+    "rows and columns are θ: zero outside their own block.",
     study,
     figures,
     findings,

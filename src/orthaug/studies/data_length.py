@@ -71,7 +71,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Figure]:
             label = "orthogonal, training measure" if measure == "training" else ""
             bars(axis, found.samples, found["mean"], 2 * found["std"], name, label=label)
         own = table[(table.data_set == data_set) & (table.measure == "training") & (table.draw == 0)]
-        own = own.sort_values("samples")
+        own = own.iloc[own.samples.argsort()]
         axis.plot(
             own.samples, own.theta_error, ":", color=COLOURS["orthogonal"], linewidth=1.0, label="the paper's record"
         )
@@ -118,9 +118,9 @@ def findings(table: pd.DataFrame) -> list[Finding]:
 REPRODUCTION = Reproduction(
     "data_length",
     "Error of θ against N, without noise",
-    "Ten records for each N (the paper shows one, dotted), bars of two standard deviations over them. θ under the training "
-    "measure is least squares whatever the learner does, so those runs have no learner; only the uniform measure needs "
-    f"training, on up to {LARGEST_TRAINED} samples of {TRAINED_DRAWS} records.",
+    "Ten records for each N (the paper shows one, dotted), bars of two standard deviations over them. θ under the "
+    "training measure is least squares whatever the learner does, so those runs have no learner; only the uniform "
+    f"measure needs training, on up to {LARGEST_TRAINED} samples of {TRAINED_DRAWS} records.",
     study,
     figures,
     findings,

@@ -9,7 +9,7 @@ import numpy as np
 
 from orthaug.estimation import estimate
 from orthaug.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
-from orthaug.studies.common import COLOURS, LABELS, bars, legend, panels, solver, span
+from orthaug.studies.common import COLOURS, LABELS, bars, legend, panels, pick, solver, span
 from orthaug.studies.entry import Finding, Reproduction
 from orthaug.study import Study
 from orthaug.synthetic import mass_spring_damper
@@ -37,7 +37,7 @@ def one(structure: str, weight: float, seed: int, pipeline: str) -> dict[str, An
     """One start: θ, its relative error, test RMSE one step ahead and in free run [mm]."""
     example = mass_spring_damper()
     chosen = Orthogonal() if structure == "orthogonal" else PENALTIES[structure](weight) if weight else Additive()
-    options = {"structure": chosen, "solver": solver(pipeline, "mass_spring_damper", 150), "seed": seed}
+    options = {"structure": chosen, "solver": solver(pipeline, "mass_spring_damper", 100), "seed": seed}
     fit = estimate(example.train, example.baseline, **options)
     return {
         "theta": fit.theta,
@@ -64,12 +64,11 @@ def study(pipeline: str, small: bool) -> Study:
 
 
 def _of(table: pd.DataFrame, structure: str, weight: float | None = None) -> pd.DataFrame:
-    """A structure's rows; those without a weight belong to both penalties."""
+    """A structure's rows; those of the weight 0 belong to both penalties."""
+    kept = table.structure == structure
     if structure == "baseline-penalty":
-        rows = table[(table.structure == structure) | ((table.structure != "orthogonal") & (table.weight == 0))]
-    else:
-        rows = table[table.structure == structure]
-    return rows if weight is None else rows[rows.weight == weight]
+        kept |= (table.structure == "orthogonal-penalty") & (table.weight == 0)
+    return pick(table, kept if weight is None else kept & (table.weight == weight))
 
 
 def figures(table: pd.DataFrame) -> Mapping[str, Figure]:
@@ -89,11 +88,11 @@ def figures(table: pd.DataFrame) -> Mapping[str, Figure]:
 
 def _panel(axis: Axes, table: pd.DataFrame, quantity: str) -> None:
     positive = table.weight[table.weight > 0]
-    zero = positive.min() / 10  # where a logarithmic axis shows the weight 0
-    band = _of(table, "orthogonal")[quantity]
-    low, high = band.mean() - band.std(), band.mean() + band.std()
-    axis.axhspan(low, high, color=COLOURS["orthogonal"], alpha=0.2, linewidth=0)
-    axis.axhline(band.mean(), color=COLOURS["orthogonal"], linewidth=1.2, label=LABELS["orthogonal"])
+    zero = positive.min() / 100  # where a logarithmic axis shows the weight 0
+    band = np.array(_of(table, "orthogonal")[quantity])
+    middle, reach = float(band.mean()), float(band.std(ddof=1))
+    axis.axhspan(middle - reach, middle + reach, color=COLOURS["orthogonal"], alpha=0.2, linewidth=0)
+    axis.axhline(middle, color=COLOURS["orthogonal"], linewidth=1.2, label=LABELS["orthogonal"])
     for k, structure in enumerate(PENALTIES):
         found = _of(table, structure).groupby("weight")[quantity].agg(["mean", "std"]).reset_index()
         place = found.weight.where(found.weight > 0, zero) * 1.25 ** (k - 0.5)
@@ -139,6 +138,7 @@ def findings(table: pd.DataFrame) -> list[Finding]:
     met = bool(rows.theta_error.max() > 2 * LEAST_SQUARES)
     quantity = "λ = 0, the additive structure: relative error of θ"
     found.append(Finding(quantity, "not unique", "–", span(rows.theta_error), met, "a lottery over starts"))
+    found += _prices(table)
     for structure, values in SCRIPTS.items():
         for weight, scripts in values.items():
             rows = _of(table, structure, weight)
@@ -149,6 +149,22 @@ def findings(table: pd.DataFrame) -> list[Finding]:
     return found
 
 
+def _prices(table: pd.DataFrame) -> list[Finding]:
+    """What a penalty costs in test RMSE."""
+    own = _of(table, "orthogonal").one_step.mean()
+    penalty = _of(table, "orthogonal-penalty")
+    ratio = float(penalty.one_step[penalty.weight > 0].mean() / own)
+    baseline = _of(table, "baseline-penalty").groupby("weight").one_step.mean()
+    large = float(baseline.iloc[-1] / baseline.iloc[1])
+    same = "no price: every structure spans the same functions (F2), so once trained they predict alike"
+    quantity = "one-step test RMSE of the orthogonal penalty over the orthogonal structure's"
+    quantity_large = "one-step test RMSE of the baseline penalty, largest over smallest weight"
+    return [
+        Finding(quantity, "slightly above 1", "1.5 to 2.5", f"{ratio:.2f}", bool(0.7 < ratio < 1.6), same),
+        Finding(quantity_large, "above 1", "2.1", f"{large:.2f}", bool(0.7 < large < 1.6), same),
+    ]
+
+
 def _beside_scripts(structure: str, errors: pd.Series, scripts: float) -> tuple[bool, str]:
     limit = LEAST_SQUARES if structure == "orthogonal-penalty" else START
     if abs(errors.mean() / scripts - 1) < 0.1:
@@ -157,7 +173,7 @@ def _beside_scripts(structure: str, errors: pd.Series, scripts: float) -> tuple[
     if nearer:
         return (
             True,
-            "nearer the limit: at the minimum any weight decides θ; the scripts' scatter is unfinished training",
+            "nearer the limit, which is where training ends; the scripts' scatter is unfinished training",
         )
     return bool(errors.min() <= scripts <= errors.max()), "training is not finished: θ still depends on the start"
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from orthaug.estimation import estimate
 from orthaug.measures import Uniform
-from orthaug.studies.common import COLOURS, LABELS, MARKERS, STRUCTURES, legend, panels, solver, span
+from orthaug.studies.common import COLOURS, LABELS, MARKERS, STRUCTURES, legend, panels, pick, solver, span
 from orthaug.studies.entry import Finding, Reproduction
 from orthaug.study import Study
 from orthaug.synthetic import static
@@ -67,19 +67,24 @@ def _errors(table: pd.DataFrame) -> Figure:
     for axis, (column, label) in zip(axes, columns, strict=True):
         for i, structure in enumerate(STRUCTURES):
             rows = table[table.structure == structure]
-            place = rows.data_set + 0.2 * (i - 0.5)
+            place = rows.data_set + 0.22 * (i - 1)
             axis.plot(
                 place, rows[column], MARKERS[structure], color=COLOURS[structure], alpha=0.6, label=LABELS[structure]
             )
         if column == "theta_error":
             rows = table[table.structure == "orthogonal"]
             style = {"color": COLOURS["uniform"], "alpha": 0.6, "label": LABELS["uniform"]}
-            axis.plot(rows.data_set + 0.3, rows.uniform_error, MARKERS["uniform"], **style)
+            axis.plot(rows.data_set + 0.22, rows.uniform_error, MARKERS["uniform"], **style)
+        for i, structure in enumerate(STRUCTURES):
+            means = [SCRIPTS[data_set, structure][column == "theta_error"] for data_set in (1, 2, 3)]
+            style = {"color": COLOURS[structure], "markersize": 13, "label": f"scripts' mean, {LABELS[structure]}"}
+            axis.plot(np.arange(1, 4) + 0.22 * (i - 1), means, "_", **style)
         axis.set_yscale("log")
         axis.set_xticks((1, 2, 3))
+        axis.set_xlim(0.5, 3.5)
         axis.set_xlabel("data set")
         axis.set_ylabel(label)
-    legend(figure, axes[1])
+    legend(figure, axes[1], ncols=3)
     return figure
 
 
@@ -90,8 +95,8 @@ def _theta(table: pd.DataFrame) -> Figure:
             theta = np.array(rows[rows.structure == structure].theta.tolist())
             axis.plot(*theta.T, MARKERS[structure], color=COLOURS[structure], alpha=0.7, label=LABELS[structure])
         uniform = np.array(rows[rows.structure == "orthogonal"].theta_uniform.tolist())
-        axis.plot(*uniform.T, MARKERS["uniform"], color=COLOURS["uniform"], markersize=5, label=LABELS["uniform"])
-        axis.plot(1.0, 0.1, "+", color=COLOURS["truth"], markersize=13, label="truth")
+        axis.plot(*uniform.T, MARKERS["uniform"], color=COLOURS["uniform"], markersize=4, label=LABELS["uniform"])
+        axis.plot(1.0, 0.1, "+", color=COLOURS["truth"], markersize=16, label="truth")
         axis.set_title(f"data set {data_set}", fontsize=9)
         axis.set_xlabel("θ₁")
     axes[0].set_ylabel("θ₃")
@@ -117,7 +122,7 @@ def _learner(table: pd.DataFrame) -> Figure:
         axis.set_title(LABELS[structure], fontsize=9)
     axes[0].set_ylabel("learner's part of y")
     axes[0].sharey(axes[1])
-    legend(figure, axes[0])
+    legend(figure, axes)
     return figure
 
 
@@ -125,7 +130,7 @@ def findings(table: pd.DataFrame) -> list[Finding]:
     """Every mean of the reference beside ours."""
     found = []
     for (data_set, structure), (rmse, error) in SCRIPTS.items():
-        rows = table[(table.data_set == data_set) & (table.structure == structure)]
+        rows = pick(table, (table.data_set == data_set) & (table.structure == structure))
         where = f"set {data_set}, no noise, {structure}"
         better = bool(rows.test_rmse.mean() <= rmse)
         why = "better: trained to the end" if better else "not reached"

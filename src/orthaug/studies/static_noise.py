@@ -58,14 +58,15 @@ def figures(table: pd.DataFrame) -> Mapping[str, Figure]:
                 axis.plot(place, rows[quantity], MARKERS[structure], **style)
         for structure in STRUCTURES:
             published = TABLE[structure][column]
-            label = f"published, {LABELS[structure]}"
+            label = f"in the paper's table, {LABELS[structure]}"
             axis.axhline(published, linestyle="--", linewidth=0.9, color=COLOURS[structure], label=label)
         axis.set_yscale("log")
-        axis.set_xticks(range(len(kinds)), [f"regularization: {kind}" for kind in kinds])
+        axis.set_xticks(range(len(kinds)), kinds)
+        axis.set_xlabel("regularization")
         axis.set_xlim(-0.6, len(kinds) - 0.4)
     axes[0].set_ylabel("test RMSE of y")
     axes[1].set_ylabel("‖θ* − θ̂‖")
-    legend(figure, axes)
+    legend(figure, axes, ncols=2)
     return {"errors": figure}
 
 
@@ -97,8 +98,9 @@ def _why_rmse(kind: str, structure: str) -> str:
     if kind == "evidence":
         return "evidence leaves the learner few effective weights, so it follows the noise less than without"
     return (
-        f"the published number is a sum of squared errors, which the scripts print ({squares:.3g} when run again); as RMSE "
-        "ours is higher because normalised training goes on into the noise, where the scripts stop early"
+        "the published number is a sum of squared errors, which is what the scripts print "
+        f"({squares:.3g} when run again); as RMSE ours is higher because normalised training goes on into the noise, "
+        "where the scripts stop early"
     )
 
 
