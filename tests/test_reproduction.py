@@ -128,7 +128,7 @@ def test_the_full_size_is_larger_and_holds_the_reduced_axes(name, pipeline):
 @pytest.mark.parametrize("name", NAMES)
 def test_findings_are_sentences_without_holes(found, name):
     one = next(o for o in found if o.entry.name == name)
-    assert len(one.findings) >= 3 and one.figures and one.entry.text.endswith(".")
+    assert len(one.findings) >= 2 and one.figures and one.entry.text.endswith(".")
     for finding in one.findings:
         assert all(isinstance(part, str) and part for part in finding[:4]) and finding.verdict, finding
         assert isinstance(finding.met, bool)

@@ -233,7 +233,7 @@ from orthaug.study import Study, run
 
 def one(seed):
     time.sleep(0.05)
-    sys.stdout.write(f"{seed}\n")
+    sys.stdout.write(f"{seed}\\n")
     sys.stdout.flush()
     return {"value": [seed] * 200}
 

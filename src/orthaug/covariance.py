@@ -52,6 +52,9 @@ def theta_covariance(projection: Projection, weight: Vector, noise: Matrix, fixe
     return covariance
 
 
+_ROUNDING = 1e-13  # of the largest eigenvalue of a Gram matrix with unit columns: what is below is rounding
+
+
 def column_units(gram: Matrix, nt: int) -> Vector:
     """One over the norm of each column, θ first; learner columns that are rounding beside the largest stay small."""
     size = np.sqrt(np.maximum(np.diag(gram), 0.0))
@@ -59,13 +62,15 @@ def column_units(gram: Matrix, nt: int) -> Vector:
     return 1 / np.where(size > 1e-150, size, 1.0)
 
 
-def pseudo_inverse(gram: Matrix, nt: int) -> Matrix:
-    """Inverse of the Gram matrix of `[S_c S_w]` on the directions that the data see."""
+def half_inverse(gram: Matrix, nt: int) -> Float[np.ndarray, "n r"]:
+    """H with `H Hᵀ` the inverse of the Gram matrix of `[S_c S_w]` on the directions that the data see.
+
+    Products with the inverse are formed from H on both sides: the inverse itself has entries up to 1e13.
+    """
     unit = column_units(gram, nt)
     values, vectors = np.linalg.eigh(gram * np.outer(unit, unit))
-    kept = values > len(gram) * np.finfo(float).eps * values.max(initial=0.0)
-    half = unit[:, None] * vectors[:, kept]
-    return (half / values[kept]) @ half.T
+    kept = values > _ROUNDING * values.max(initial=0.0)
+    return unit[:, None] * vectors[:, kept] / np.sqrt(values[kept])
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,14 +87,22 @@ class Joint:
     """ΣψᵀΣ_eψ in whitened outputs, `σ² G` for one output."""
     nt: int
 
-    def of(self, k: Float[np.ndarray, "m n"]) -> Matrix:
-        """Cov of `K p`, (m, m): `K M⁻¹ (ΣψᵀΣ_eψ + σ² ridge) M⁻¹ Kᵀ`, the ridge counted as the prior it is."""
+    def root(self) -> Float[np.ndarray, "n r"]:
+        """S with `Cov p = S Sᵀ = M⁻¹ (ΣψᵀΣ_eψ + σ² ridge) M⁻¹`, the ridge counted as the prior that it is.
+
+        Variances are then sums of squares, which no rounding makes negative.
+        """
         nw = len(self.gram) - self.nt
         prior = self.ridge * np.concatenate([np.zeros(self.nt), np.ones(nw)])
-        matrix = self.gram + np.diag(prior)
-        reach = k @ pseudo_inverse(matrix, self.nt)
+        half = half_inverse(self.gram + np.diag(prior), self.nt)
         variance = float(np.trace(self.middle) / max(np.trace(self.gram), 1e-300))
-        return reach @ (self.middle + variance * np.diag(prior)) @ reach.T
+        values, vectors = np.linalg.eigh(half.T @ (self.middle + variance * np.diag(prior)) @ half)
+        return half @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+
+    def of(self, k: Float[np.ndarray, "m n"]) -> Matrix:
+        """Cov of `K p`, (m, m)."""
+        reach = k @ self.root()
+        return reach @ reach.T
 
 
 def theta_block(information: Matrix, ridge: float, nt: int, fixed: Collection[int] = ()) -> Matrix:

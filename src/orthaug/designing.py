@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from orthaug._arrays import check_choice
 from orthaug.design import Design, design_input
 from orthaug.errors import InputError
 from orthaug.folders import whole_file
@@ -42,11 +43,15 @@ def design(job: Job) -> Design:
             noise=tuple(residual.std(axis=0)) if section.noise is None else section.noise,
             theta=given if np.all(given) else theta,
             condition=section.condition,
-            channel=section.input,
+            channel=_input(section.input, [channel.name for channel in problem.record.inputs]),
             seed=section.seed,
         )
     except InputError as error:
         raise InputError(f"{job.path}: design: {error}") from None
+
+
+def _input(name: str | None, known: list[str]) -> str | None:
+    return None if name is None else check_choice(name, known, "`input`")
 
 
 def write(job: Job, found: Design, out: Path) -> None:

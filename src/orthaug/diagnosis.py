@@ -27,7 +27,7 @@ _PRACTICALLY_WHITE = 0.05  # correlations below this are no matter, however sure
 _AS_GOOD = 1.05  # free-run error / one-step error up to which measured lags add nothing
 _TOLD = 5  # findings that a text lists at most
 _SHARE = 0.01  # of the residual's variance: what a regressor explains of it counts from there
-_ROUNDING = 1e-12  # of the output's deviation: a residual that says nothing
+_ROUNDING = 1e-14  # of the output's deviation: a residual that says nothing
 _TOO_FAST = 0.05  # noise variance / smallest variance among the lagged outputs
 
 _COLOURED = "standard errors of θ are those of a white residual, but the {what} coloured: take them for a rough guide."

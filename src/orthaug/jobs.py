@@ -8,11 +8,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from orthaug.errors import InputError
+from orthaug.excitation import excitation
 from orthaug.expressions import Lag
 from orthaug.measures import Measure, Support, Symmetrized, Training, Uniform
 from orthaug.physics import PhysicsMap, with_initial
 from orthaug.problem import Problem, check_defined, pose, regressor_of
+from orthaug.projection import Projection
 from orthaug.readers import read_record, read_samples
 from orthaug.record import Record, check_channels, same_step
 from orthaug.regressors import largest_lag
@@ -146,9 +150,9 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
         _check_segments(spec, problem)
         section = spec.structure.measure
         measure = measure_of(section.kind, [str(lag) for lag in used_lags(problem)], section, path.parent)
-        measure.points(Support(train.record, problem.layout, used_lags(problem)))  # what is wrong with it shows here
+        _check_measure(measure, problem, require_full_rank)
         job = Job(path, spec, train, validation, tuple(tests), problem, measure, physics, ())
-        check_suspects(job)
+        check_suspects(spec.suspects, problem)
         for part in job.parts:
             _check_scorable(part, problem.rows.start, train.record.sampling_time)
             check_defined(problem, part.record)
@@ -205,6 +209,22 @@ def measure_of(kind: str, lags: Sequence[str], section: MeasureSection, folder: 
     if kind == "uniform":
         return Uniform({lag: tuple(limits) for lag, limits in section.box.items()})
     return Symmetrized() if kind == "symmetrized" else Training()
+
+
+def _check_measure(measure: Measure, problem: Problem, require_full_rank: bool) -> None:
+    """Raise InputError for a measure that does not fit, or under which the physics is rank-deficient."""
+    points = measure.points(Support(problem.record, problem.layout, used_lags(problem)))
+    if isinstance(measure, Training) or not require_full_rank or not problem.baseline.names:
+        return
+    with np.errstate(all="ignore"):
+        phi = np.asarray(problem.baseline.phi(points.x, problem.layout, problem.outputs, np))
+    weighted = phi * (np.sqrt(points.weight)[:, None] * problem.weight)[:, :, None]
+    if not np.isfinite(weighted).all():
+        raise InputError(f"the physics is not finite on all points of the {measure.name} measure; narrow it.")
+    found = excitation(Projection.factor(weighted).r, problem.baseline.names)
+    if not found.full_rank:
+        groups = "; ".join(", ".join(group) for group in found.collinear)
+        raise InputError(f"under the {measure.name} measure the physics cannot tell {groups} apart; widen or move it.")
 
 
 def used_lags(problem: Problem) -> tuple[Lag, ...]:

@@ -19,10 +19,10 @@ from orthaug.expressions import Lag
 from orthaug.record import Record
 from orthaug.regressors import Layout, lag_matrix, largest_lag, stack_rows
 
-_NODES = (1 << 18, 512, 64)  # of the rule for one, two and three coordinates, in each of them
+_NODES = (1 << 20, 512, 64)  # of the rule for one, two and three coordinates, in each of them
 _PANEL = 8  # Gauss-Legendre nodes of a panel
 _QUASI_RANDOM = 1 << 17  # points for more coordinates, doubled by their mirror images
-_NEIGHBOURS = 20_000  # training points at most that the reach of the data is taken from
+_NEIGHBOURS = 20_000  # points at most, of the data and of the measure, by which the reach of the data is judged
 
 
 class Points(NamedTuple):
@@ -63,7 +63,9 @@ class Support:
 
         tree = scipy.spatial.cKDTree(known)
         reach = 2 * np.quantile(tree.query(known, k=2)[0][:, 1], 0.99)
-        return float(np.sum(points.weight[tree.query(points.x[:, columns] / unit)[0] <= reach]))
+        some = slice(None, None, -(-len(points.x) // _NEIGHBOURS))
+        weight = points.weight[some] / points.weight[some].sum()
+        return float(np.sum(weight[tree.query(points.x[some][:, columns] / unit)[0] <= reach]))
 
 
 @runtime_checkable
@@ -145,7 +147,10 @@ class Samples:
         missing = [str(lag) for lag in support.used if lag not in named]
         if missing:
             raise InputError(f"the samples lack {', '.join(missing)}; give a column for every raw lag that is used.")
-        values = {lag: np.asarray(self.columns[text], dtype=float) for lag, text in named.items()}
+        try:
+            values = {lag: np.asarray(self.columns[text], dtype=float) for lag, text in named.items()}
+        except (TypeError, ValueError):
+            raise InputError("the samples' columns must be numbers.") from None
         lengths = {str(lag): v.shape for lag, v in values.items()}
         if len(set(lengths.values())) > 1 or any(len(shape) != 1 for shape in lengths.values()):
             raise InputError(f"the samples' columns differ in shape: {lengths}; give one vector of a length for each.")

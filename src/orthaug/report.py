@@ -83,8 +83,8 @@ def check_text(report: dict[str, Any]) -> str:
     if report["bias"]:
         lines += [
             "",
-            "What would bias the parameters if it is missing, of a size in per cent of the output's deviation",
-            "(1 % where nothing is guessed), and whether some weighting of these points could remove the bias:",
+            "Bias of each parameter if a term is missing from the physics. Size: its share of the output's deviation,",
+            "1 % where no coefficient is given. Removable: whether some weighting of these points leaves no bias.",
             *suspicion.text(report["bias"]),
         ]
     lines += [f"warning: {text}" for text in report["warnings"]]

@@ -162,10 +162,12 @@ class Estimate:
                 "leave; drop the bounds, or keep the training measure."
             )
         support = Support(self.problem.record, self.problem.layout, self.model.form.used)
-        found, training = (split_under(m, self.model, support, self.model.joint) for m in (measure, Training()))
-        if found.covariance is not None and training.covariance is not None:
+        found, joint = split_under(measure, self.model, support, self.model.joint), self.model.joint
+        if found.covariance is not None:
+            training = self.covariance if self.measure is None else None
+            training = split_under(Training(), self.model, support, joint).covariance if training is None else training
             with np.errstate(all="ignore"):
-                price = np.sqrt(np.diag(found.covariance) / np.diag(training.covariance))
+                price = np.sqrt(np.diag(found.covariance) / np.diag(training))
             found = replace(found, price=price)
         numbers = self.model.numbers._replace(theta=found.theta, theta_aux=found.theta_aux)
         return replace(
@@ -179,6 +181,8 @@ class Estimate:
 
     def joint_covariance(self, convention: str = "calibrated") -> Matrix:
         """Cov of θ̂ and the weights from the raw `[Φ P⊥J]`, (nθ + nw)²; convention "paper" for eq:cov_approx / N."""
+        if self.criterion.flown is not None or self.model.gram is None:
+            raise InputError("the joint covariance is that of a one-step fit with statistics of its own.")
         return joint_covariance(self.problem, self.model, convention)
 
     def robust(self, lags: int | None = None) -> Estimate:

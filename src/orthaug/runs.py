@@ -101,7 +101,7 @@ def read_rows(text: str | None) -> tuple[int, int] | None:
     if text is None:
         return None
     start, _, stop = text.partition(":")
-    if not (start.isdigit() and stop.isdigit()):
+    if not (start.isdecimal() and stop.isdecimal() and text.isascii()):
         raise InputError(f"--rows: found '{text}'; expected a half-open range of rows such as 0:1000.")
     return int(start), int(stop)
 
@@ -113,10 +113,14 @@ def read_measure(kind: str, run: Run, box: Sequence[str], samples: Path | None) 
         InputError: an unknown kind, a box that is not `lag=low:high`, samples without a file.
     """
     check_choice(kind, ("training", "symmetrized", "uniform", "samples"), "--measure")
+    if samples is not None and kind != "samples":
+        raise InputError(f"--samples: belongs to --measure samples; found --measure {kind}.")
     if kind == "samples":
         if samples is None:
             raise InputError("--samples is missing; give the CSV file that holds the points of the samples measure.")
         return read_samples([samples], [str(lag) for lag in run.model.form.used])
+    if box and kind != "uniform":
+        raise InputError(f"--box: belongs to --measure uniform; found --measure {kind}.")
     if kind != "uniform":
         return Symmetrized() if kind == "symmetrized" else Training()
     limits = {}
@@ -128,6 +132,8 @@ def read_measure(kind: str, run: Run, box: Sequence[str], samples: Path | None) 
             equals = ""
         if not equals:
             raise InputError(f"--box: found '{text}'; expected a raw lag and its limits, such as 'u[k]=-0.6:0.6'.")
+        if lag.strip() in limits:
+            raise InputError(f"--box: {lag.strip()} is given twice.")
         limits[lag.strip()] = (low, high)
     return Uniform(limits)
 

@@ -45,7 +45,7 @@ class MeasureSplit:
         told = f"{self.name}, {self.points} points, {100 * self.support:.0f} % of it within reach of the data"
         if self.price is None or not np.isfinite(self.price).all():
             return told
-        return f"{told}; standard errors {', '.join(f'{r:.2f}' for r in self.price)} times the training measure's"
+        return f"{told}; standard errors {', '.join(f'{r:.3g}' for r in self.price)} times the training measure's"
 
     def as_dict(self) -> dict[str, Any]:
         """What result.json tells of the measure."""
@@ -93,7 +93,8 @@ def split_under(measure: Measure, model: Model, support: Support, joint: Joint |
     defect = float(np.linalg.norm(projection.coordinates(rest)) / size) if 0 < size < np.inf else None
     share = support.share(points)
     reach = f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the training data"
-    warnings = (f"{reach}: elsewhere θ rests on how the learner extrapolates.",) if share < SUPPORTED else ()
+    learns = form.bound is not None
+    warnings = (f"{reach}: elsewhere θ rests on how the learner extrapolates.",) if share < SUPPORTED and learns else ()
     return MeasureSplit(measure.name, theta, aux, covariance, defect, share, len(points.x), found.condition, warnings)
 
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from orthaug._arrays import Vector
 from orthaug.bias import SuspectedBias, bias_table
-from orthaug.errors import InputError
 from orthaug.measures import Support
 from orthaug.physics import PhysicsMap
 from orthaug.problem import Problem
@@ -75,6 +74,8 @@ def suspected(job: Job, theta: Vector | None = None, learned: Any = None) -> lis
         learned: f at the measure's points (M, ny) after a fit, to tell how much of it a suspect explains.
     """
     problem = job.problem
+    if not problem.baseline.names:
+        return []
     points = job.measure.points(Support(job.train.record, problem.layout, job.used))
     suspects = declared(job.spec.suspects, problem) if job.spec.suspects else usual(problem)
     gain = np.sqrt(points.weight)[:, None] * problem.weight
@@ -184,10 +185,6 @@ def text(table: Sequence[dict[str, Any]]) -> list[str]:
     return ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
-def check_suspects(job: Job) -> None:
-    """Raise InputError for suspects that cannot be read, before anything is trained."""
-    for suspect in declared(job.spec.suspects, job.problem):
-        try:
-            suspect_columns([suspect], job.problem.rows.x[:1], job.problem.layout, job.problem.outputs)
-        except InputError as error:
-            raise InputError(f"suspect '{suspect.name}': {error}") from None
+def check_suspects(sections: Sequence[SuspectSection], problem: Problem) -> None:
+    """Raise InputError for suspects that cannot be read, or have no value on some training row."""
+    suspect_columns(declared(sections, problem), problem.rows.x, problem.layout, problem.outputs)

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float
 
-from orthaug._arrays import Matrix, check_choice
+from orthaug._arrays import Matrix, check_choice, check_count
 from orthaug._jax import jax, jnp
-from orthaug.covariance import pseudo_inverse
+from orthaug.covariance import half_inverse
 from orthaug.criteria import Chunks, projected_gram
 from orthaug.errors import InputError
 from orthaug.gram import chunk_shape, from_chunks, in_chunks
@@ -56,8 +56,8 @@ def joint_covariance(problem: Problem, model: Model, convention: str = "calibrat
     change = np.eye(len(outer))
     change[:nt, :nt] = projection.r / projection.scale
     outer, middle = (change.T @ found @ change for found in (outer, middle))
-    inverse = pseudo_inverse(outer, nt)
-    return (2.0 if convention == "paper" else 1.0) * inverse @ middle @ inverse
+    half = half_inverse(outer, nt)
+    return (2.0 if convention == "paper" else 1.0) * half @ (half.T @ middle @ half) @ half.T
 
 
 def _raw(model: Model, chunks: Chunks, mix: Matrix) -> Matrix:
@@ -94,14 +94,14 @@ def prediction_std(model: Model, record: Record) -> list[Matrix]:
         raise InputError(
             "the model has no statistics to take standard errors from (an ensemble, or trained elsewhere)."
         )
-    covariance = joint.of(np.eye(len(joint.gram)))
+    root = jnp.asarray(joint.root())
     record = model.fitting(record, need_outputs=True)
     found = []
     for experiment in record.experiments:
         x = lag_matrix(experiment, model.form.layout, record, model.form.start)
         shape = chunk_shape(len(x))
         chunks = jnp.asarray(in_chunks(x, shape, repeat=True))
-        variance = np.asarray(_variances(model.form, model.numbers, chunks, jnp.asarray(covariance)))
+        variance = np.asarray(_variances(model.form, model.numbers, chunks, root))
         values = np.full((len(experiment), len(model.outputs)), np.nan)
         values[model.form.start :] = np.sqrt(np.maximum(from_chunks(variance, len(x)), 0.0))
         found.append(values)
@@ -110,7 +110,7 @@ def prediction_std(model: Model, record: Record) -> list[Matrix]:
 
 @partial(jax.jit, static_argnames="form")
 def _variances(
-    form: Form, numbers: Numbers, x: Float[Array, "k nx m"], covariance: Float[Array, "n n"]
+    form: Form, numbers: Numbers, x: Float[Array, "k nx m"], root: Float[Array, "n r"]
 ) -> Float[Array, "k ny m"]:
     def one_chunk(rows: Any) -> Any:
         phi = jax.vmap(lambda row: form.baseline.phi(row, form.layout, form.outputs, jnp), -1, -1)(rows)
@@ -120,7 +120,7 @@ def _variances(
             z = ((z - numbers.centre) / numbers.halfwidth).T
             gain = jnp.broadcast_to(numbers.gain[:, None], (len(form.outputs), rows.shape[-1]))
             columns = jnp.concatenate([columns, form.bound.jacobian(numbers.weights, z, gain)[1]])
-        return jnp.einsum("nom,np,pom->om", columns, covariance, columns, optimize="optimal")
+        return jnp.sum(jnp.einsum("nom,nr->rom", columns, root) ** 2, axis=0)
 
     return jax.lax.map(one_chunk, x)
 
@@ -132,6 +132,8 @@ def newey_west(scores: Sequence[Float[np.ndarray, "N nt"]], lags: int | None = N
         scores: of every experiment, (N_i, nt).
         lags: how many; default `⌊4 (N/100)^(2/9)⌋`.
     """
+    if lags is not None:
+        check_count(lags, "lags", least=0)
     total = sum(len(s) for s in scores)
     reach = int(4 * (total / 100) ** (2 / 9)) if lags is None else lags
     found = sum(s.T @ s for s in scores)

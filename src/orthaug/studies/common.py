@@ -37,6 +37,7 @@ LABELS = {
 }
 STRUCTURES = {"orthogonal": Orthogonal(), "additive": Additive()}
 PIPELINES = {"static": (500, 1000), "mass_spring_damper": (2500, 500)}  # the paper's Adam and L-BFGS iterations
+LARGEST_TRAINED = {"ours": 65_536, "paper": 16_384}  # samples up to which a learner is trained: the run is to end
 _NODES = np.polynomial.legendre.leggauss(64)
 UNIFORM = Samples({"u[k]": 0.6 * _NODES[0]}, weights=_NODES[1], name="uniform")
 """Uniform on [−0.6, 0.6]: `measures.Uniform` with fewer nodes, which changes no digit shown and is quicker."""

@@ -25,8 +25,9 @@ def one(seed: int, pipeline: str) -> dict[str, Any]:
     example = static(1, noise=True)
     fit = estimate(example.train, example.baseline, solver=solver(pipeline, "static"), seed=seed)
     matrix = fit.joint_covariance("paper") * len(fit.problem.rows)
-    nt, deviation = len(fit.theta), np.sqrt(np.diag(matrix))
-    correlation = np.abs(matrix) / np.outer(deviation, deviation)
+    nt, deviation = len(fit.theta), np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    product = np.outer(deviation, deviation)  # 0 for a weight that the data do not see
+    correlation = np.abs(matrix) / np.where(product > 0, product, np.inf)
     return {
         "covariance": np.abs(matrix),
         "correlation": correlation,
