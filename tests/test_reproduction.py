@@ -167,7 +167,7 @@ def test_what_no_sample_size_excuses_is_met(found, name, start):
 def test_the_text_has_a_line_per_finding(found):
     lines = text(found).splitlines()
     assert len(lines) == 1 + len(as_rows(found))
-    assert all("  met  " in line or "  NOT MET  " in line for line in lines[1:])
+    assert all("  met  " in line or "  differs  " in line for line in lines[1:])
 
 
 class Tags(HTMLParser):

@@ -186,7 +186,7 @@ def test_an_additive_fit_splits_to_least_squares():
 def test_a_split_says_what_it_is(curve):
     found = curve.split(WIDE)
     assert (found.model.structure, found.model.measure, found.measure.name) == ("orthogonal", "uniform", "uniform")
-    assert "measure     uniform, 262144 points, 100 % of it within reach" in found.summary()
+    assert "measure     uniform, 1048576 points, 100 % of it within reach" in found.summary()
     assert found.measure.as_dict()["kind"] == "uniform" and found.warnings == curve.warnings
 
 

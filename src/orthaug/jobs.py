@@ -150,7 +150,7 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
         _check_segments(spec, problem)
         section = spec.structure.measure
         measure = measure_of(section.kind, [str(lag) for lag in used_lags(problem)], section, path.parent)
-        _check_measure(measure, problem, require_full_rank)
+        _check_measure(measure, problem)
         job = Job(path, spec, train, validation, tuple(tests), problem, measure, physics, ())
         check_suspects(spec.suspects, problem)
         for part in job.parts:
@@ -211,10 +211,10 @@ def measure_of(kind: str, lags: Sequence[str], section: MeasureSection, folder: 
     return Symmetrized() if kind == "symmetrized" else Training()
 
 
-def _check_measure(measure: Measure, problem: Problem, require_full_rank: bool) -> None:
+def _check_measure(measure: Measure, problem: Problem) -> None:
     """Raise InputError for a measure that does not fit, or under which the physics is rank-deficient."""
     points = measure.points(Support(problem.record, problem.layout, used_lags(problem)))
-    if isinstance(measure, Training) or not require_full_rank or not problem.baseline.names:
+    if isinstance(measure, Training) or not problem.excitation.full_rank or not problem.baseline.names:
         return
     with np.errstate(all="ignore"):
         phi = np.asarray(problem.baseline.phi(points.x, problem.layout, problem.outputs, np))

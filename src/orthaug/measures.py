@@ -143,14 +143,18 @@ class Samples:
     name: str = "samples"
 
     def points(self, support: Support) -> Points:
-        named = {_lag_of(text, support): text for text in self.columns}
-        missing = [str(lag) for lag in support.used if lag not in named]
+        values: dict[Lag, Vector] = {}
+        for text, column in self.columns.items():
+            lag = _lag_of(text, support)
+            if lag in values:
+                raise InputError(f"the samples give {lag} twice; one column for each lag.")
+            try:
+                values[lag] = np.asarray(column, dtype=float)
+            except (TypeError, ValueError):
+                raise InputError(f"the samples' column {lag} must be numbers.") from None
+        missing = [str(lag) for lag in support.used if lag not in values]
         if missing:
             raise InputError(f"the samples lack {', '.join(missing)}; give a column for every raw lag that is used.")
-        try:
-            values = {lag: np.asarray(self.columns[text], dtype=float) for lag, text in named.items()}
-        except (TypeError, ValueError):
-            raise InputError("the samples' columns must be numbers.") from None
         lengths = {str(lag): v.shape for lag, v in values.items()}
         if len(set(lengths.values())) > 1 or any(len(shape) != 1 for shape in lengths.values()):
             raise InputError(f"the samples' columns differ in shape: {lengths}; give one vector of a length for each.")

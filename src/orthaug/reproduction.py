@@ -120,7 +120,7 @@ def text(found: Sequence[Reproduced]) -> str:
     head = ("quantity", "published", "scripts", "ours", "", "verdict")
     rows: list[tuple[str, ...]] = [head]
     for finding in (finding for one in found for finding in one.findings):
-        mark = "met" if finding.met else "NOT MET"
+        mark = "met" if finding.met else "differs"
         rows.append((finding.quantity, finding.published, finding.scripts, finding.ours, mark, finding.verdict))
     widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
     return "\n".join("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows)

@@ -169,6 +169,8 @@ class Estimate:
             with np.errstate(all="ignore"):
                 price = np.sqrt(np.diag(found.covariance) / np.diag(training))
             found = replace(found, price=price)
+        ensemble = found.covariance is None and self.model.numbers.tilt is not None
+        unknown = ("no standard errors after a split: an ensemble has no gradient in its weights.",) if ensemble else ()
         numbers = self.model.numbers._replace(theta=found.theta, theta_aux=found.theta_aux)
         return replace(
             self,
@@ -176,12 +178,12 @@ class Estimate:
             covariance=found.covariance,
             defect=found.defect,
             measure=found,
-            warnings=(*(w for w in self.warnings if "not unique" not in w), *found.warnings),
+            warnings=(*(w for w in self.warnings if "not unique" not in w), *found.warnings, *unknown),
         )
 
     def joint_covariance(self, convention: str = "calibrated") -> Matrix:
         """Cov of θ̂ and the weights from the raw `[Φ P⊥J]`, (nθ + nw)²; convention "paper" for eq:cov_approx / N."""
-        if self.criterion.flown is not None or self.model.gram is None:
+        if self.criterion.flown is not None or (self.model.gram is None and self.model.numbers.tilt is None):
             raise InputError("the joint covariance is that of a one-step fit with statistics of its own.")
         return joint_covariance(self.problem, self.model, convention)
 

@@ -145,6 +145,10 @@ def split(run: Run, measure: Measure) -> dict[str, Any]:
     from orthaug.splitting import split_under
 
     model = run.model
+    parameters = model.form.baseline.parameters
+    stands = [p.name for p, value in zip(parameters, model.theta, strict=True) if value in (p.min, p.max)]
+    if stands:
+        raise InputError(f"{', '.join(stands)} stands at a bound, which a split would leave; fit without the bound.")
     support = Support(run.model.fitting(run.record, need_outputs=True), model.form.layout, model.form.used)
     found = split_under(measure, model, support, model.joint)
     std = None if found.covariance is None else np.sqrt(np.diag(found.covariance))

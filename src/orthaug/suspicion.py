@@ -82,9 +82,8 @@ def suspected(job: Job, theta: Vector | None = None, learned: Any = None) -> lis
     with np.errstate(all="ignore"):
         phi = np.asarray(problem.baseline.phi(points.x, problem.layout, problem.outputs, np))
         deltas = suspect_columns(suspects, points.x, problem.layout, problem.outputs)
-    kept = [
-        i for i in range(len(suspects)) if np.isfinite(deltas[i]).all() and np.ptp(deltas[i]) + abs(deltas[i].max())
-    ]
+    wanted = bool(job.spec.suspects)  # of the usual ones, those that have an effect
+    kept = [i for i in range(len(suspects)) if wanted or np.any(deltas[i])]
     theta = problem.projection.solve(problem.whitened_target) if theta is None else theta
     slopes = _slopes(job.physics, problem, theta)
     table = bias_table(

@@ -82,7 +82,7 @@ def findings(table: pd.DataFrame) -> list[Finding]:
             "all",
             "–",
             f"{share:.0f} % (largest entry, median over starts: {largest:.1e})",
-            bool(correlation < ZERO),
+            bool(share == 100),
             why,
         ),
         Finding(

@@ -78,7 +78,7 @@ def findings(table: pd.DataFrame) -> list[Finding]:
             rows = table[(table.structure == structure) & (table.regularization == kind)]
             rmse, error, scripts_rmse, scripts_error, _ = TABLE[structure]
             where = f"set 1, 30 dB, {structure}, regularization {kind}"
-            met = bool(rows.test_rmse.mean() < 1.5 * scripts_rmse)
+            met = bool(rows.test_rmse.mean() < 1.1 * scripts_rmse)
             texts = (f"{rmse:.3g}", f"{scripts_rmse:.3g}", span(rows.test_rmse))
             found.append(Finding(f"{where}: test RMSE", *texts, met, _why_rmse(kind, structure)))
             if structure == "orthogonal":
@@ -86,7 +86,7 @@ def findings(table: pd.DataFrame) -> list[Finding]:
                 why = "exact least squares for every start; the scripts end within 1e-6 of it"
                 texts = (f"{error:.2g}", f"{scripts_error:.5g}", f"{rows.theta_error.mean():.5g}")
             else:
-                met = bool(rows.theta_error.mean() > 10 * LEAST_SQUARES)
+                met = bool(rows.theta_error.min() <= error <= rows.theta_error.max())
                 why = "a lottery over starts, as published; the farther it is trained into the noise, the wider"
                 texts = (f"{error:.4g}", f"{scripts_error:.5g}", span(rows.theta_error))
             found.append(Finding(f"{where}: ‖θ* − θ̂‖", *texts, met, why))
