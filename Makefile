@@ -17,8 +17,8 @@ setup: $(STAMP)  ## make the environment .venv (the others do it when it is need
 demo: $(STAMP)  ## fit the built-in mass-spring-damper example
 	@$(BIN)/orthaug demo
 
-test: $(STAMP)  ## run the whole test suite
-	@$(BIN)/python -m pytest -q
+test: $(STAMP)  ## run the whole test suite, a file at a time on every core
+	@$(BIN)/python -m pytest -q -n auto --dist loadfile
 
 check: $(STAMP)  ## ruff, pyright and the architecture test
 	@$(BIN)/ruff check .

@@ -78,7 +78,7 @@ def text(found: Design, shown: int = 8) -> str:
         "",
         "what was tried, relative errors of θ:",
     ]
-    rows = [("signal", "error", "bias", "std", "condition")]
+    rows: list[tuple[str, ...]] = [("signal", "error", "bias", "std", "condition")]
     for one in found.candidates[:shown]:
         rows.append((one.name, *(f"{v:.4g}" for v in (np.sqrt(one.cost), one.bias, one.std, one.condition))))
     widths = [max(len(row[i]) for row in rows) for i in range(5)]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float
 
-from orthaug._arrays import check_choice, check_count, check_type
+from orthaug._arrays import Vector, check_choice, check_count, check_type
 from orthaug._jax import jax, jnp
 from orthaug.baseline import Baseline
 from orthaug.conclusion import conclude, nothing_learned

@@ -144,14 +144,16 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
     lags = spec.lag_orders() if spec.learner.kind != "none" else None
     try:
         layout, _ = regressor_of(baseline, lags, learner_inputs, tuple(spec.data.outputs), tuple(spec.data.inputs))
-        train, validation, *tests = (p and p.without_short(largest_lag(layout)) for p in (train, validation, *tests))
+        first = largest_lag(layout)
+        train, tests = train.without_short(first), tuple(part.without_short(first) for part in tests)
+        validation = validation.without_short(first) if validation else None
         problem = pose(train.record, baseline, lags, learner_inputs, require_full_rank=require_full_rank)
         problem.feature_rows()
         _check_segments(spec, problem)
         section = spec.structure.measure
         measure = measure_of(section.kind, [str(lag) for lag in used_lags(problem)], section, path.parent)
         _check_measure(measure, problem)
-        job = Job(path, spec, train, validation, tuple(tests), problem, measure, physics, ())
+        job = Job(path, spec, train, validation, tests, problem, measure, physics, ())
         check_suspects(spec.suspects, problem)
         for part in job.parts:
             _check_scorable(part, problem.rows.start, train.record.sampling_time)

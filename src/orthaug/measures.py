@@ -59,9 +59,9 @@ class Support:
         known = np.unique(x[:: -(-len(x) // _NEIGHBOURS)] / unit, axis=0)
         if len(known) < 2:
             return float(np.sum(points.weight[(points.x[:, columns] / unit == known).all(axis=1)]))
-        import scipy.spatial  # slow to import, and few runs need it
+        from scipy.spatial import KDTree  # slow to import, and few runs need it
 
-        tree = scipy.spatial.cKDTree(known)
+        tree = KDTree(known)
         reach = 2 * np.quantile(tree.query(known, k=2)[0][:, 1], 0.99)
         some = slice(None, None, -(-len(points.x) // _NEIGHBOURS))
         weight = points.weight[some] / points.weight[some].sum()

@@ -193,7 +193,7 @@ def _physical(job: Job, fit: Estimate) -> PhysicalEstimate | None:
 def _physical_rows(job: Job, found: PhysicalEstimate, fit: Estimate) -> list[dict[str, Any]]:
     """The physical parameters as result.json lists them, with profile intervals where the spec asks for them."""
     rows = found.as_rows()
-    if job.spec.physics is None or not job.spec.physics.profile or found.covariance is None:
+    if job.physics is None or job.spec.physics is None or not job.spec.physics.profile or found.covariance is None:
         return rows
     for row in rows:
         low, high = fit.physical_profile(job.physics, row["name"])

@@ -167,7 +167,7 @@ class Estimate:
             training = self.covariance if self.measure is None else None
             training = split_under(Training(), self.model, support, joint).covariance if training is None else training
             with np.errstate(all="ignore"):
-                price = np.sqrt(np.diag(found.covariance) / np.diag(training))
+                price = np.sqrt(np.diag(found.covariance) / np.diag(np.asarray(training)))
             found = replace(found, price=price)
         ensemble = found.covariance is None and self.model.numbers.tilt is not None
         unknown = ("no standard errors after a split: an ensemble has no gradient in its weights.",) if ensemble else ()

@@ -90,9 +90,10 @@ def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | Non
         check_readable(path)
     loaded = load(model)
     step = None if loaded.time_column else loaded.sampling_time
-    channels = {"inputs": loaded.inputs, "outputs": loaded.outputs}
-    time = loaded.time_column
-    records = [read_record(path, sampling_time=step, time=time, rows=rows, **channels) for path in data]
+    inputs, outputs, time = loaded.inputs, loaded.outputs, loaded.time_column
+    records = [
+        read_record(path, inputs=inputs, outputs=outputs, sampling_time=step, time=time, rows=rows) for path in data
+    ]
     return Run(loaded, Record.join(records), data[0])
 
 

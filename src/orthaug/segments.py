@@ -152,5 +152,6 @@ def _derivatives(form: Form, numbers: Numbers, past: Any, inputs: Any) -> tuple[
         to_c, to_leaves, to_past = pullback(seed)
         slopes.append(jnp.concatenate([to_c, *(jnp.ravel(leaf) for leaf in to_leaves)]))
         feedback.append(jnp.stack([to_past[lag - 1, output] for lag, output in form.fed_back] or [jnp.zeros(())]))
-    flat = (jnp.where(jnp.isfinite(d), d, 0.0) for d in (jnp.stack(slopes), jnp.stack(feedback)))
-    return value, *flat  # a kink without a derivative, such as sqrt(max(y, 0)) at 0, counts as flat
+    # a kink without a derivative, such as sqrt(max(y, 0)) at 0, counts as flat
+    slope, back = (jnp.where(jnp.isfinite(d), d, 0.0) for d in (jnp.stack(slopes), jnp.stack(feedback)))
+    return value, slope, back

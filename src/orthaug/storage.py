@@ -176,7 +176,7 @@ def _rebuild(
     )
     return Model(
         form=form,
-        numbers=Numbers(**{name: arrays.get(f"numbers.{name}") for name in Numbers._fields}),
+        numbers=Numbers(**{name: arrays.get(f"numbers.{name}") for name in Numbers._fields}),  # type: ignore[arg-type]
         outputs=outputs,
         inputs=inputs_,
         sampling_time=float(declared["sampling_time"]),

@@ -38,7 +38,8 @@ def declared(sections: Sequence[SuspectSection], problem: Problem) -> tuple[Susp
         width = section.width
         if width is None and section.kind in _WIDTHS and section.on is not None:
             width = data_width(section.on, problem.rows.x, problem.layout, constants)
-        output = section.output if section.output is not None or len(problem.outputs) > 1 else problem.outputs[0]
+        only = problem.outputs[0] if len(problem.outputs) == 1 else None
+        output = section.output if section.output is not None else only
         options = {"width": width, "output": output, "coefficient": section.coefficient, "name": section.name}
         found.append(Suspect.of(section.kind, section.on, constants=constants, **options))
     return tuple(found)
@@ -176,7 +177,7 @@ def text(table: Sequence[dict[str, Any]]) -> list[str]:
         guess = entry["coefficient"]
         cosine = "–" if entry["cosine"] is None else f"{entry['cosine']:.3f}"
         verdict = entry["certificate"]["verdict"] if entry["certificate"] else None
-        answer = {"unremovable": "no", "removable": "yes", "orthogonal": "yes"}.get(verdict, "–")
+        answer = {"unremovable": "no", "removable": "yes", "orthogonal": "yes"}.get(str(verdict), "–")
         size = "1 %" if guess is None else f"{100 * abs(guess) * entry['size']:.2g} %"
         biases = ("–" if share is None else f"{share:+.2g} %" for share in shares(entry).values())
         rows.append([entry["name"], size, *biases, cosine, answer])
