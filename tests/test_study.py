@@ -131,7 +131,9 @@ def test_without_a_store_nothing_is_kept(tmp_path, monkeypatch):
     assert len(calls) == 12 and not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("value", [object(), {"a": 1}, 1j, {1, 2}, [1, object()], lambda: 0], ids=str, ids=lambda value: type(value).__name__)
+@pytest.mark.parametrize(
+    "value", [object(), {"a": 1}, 1j, {1, 2}, [1, object()], lambda: 0], ids=lambda value: type(value).__name__
+)
 def test_results_must_be_plain(tmp_path, value):
     with pytest.raises(InputError, match=r"study 's': 'bad' is a .*; expected numbers, texts or lists"):
         run(Study("s", lambda: {"bad": value}, {}), store=tmp_path)
