@@ -23,7 +23,7 @@ EVIDENCE = {"learner": MLP(hidden=(8,)), "regularization": "evidence", "solver":
 MISSING = {
     "cubic": lambda y, u, k: -0.02 * y[k - 1] ** 3,
     "lag of u": lambda y, u, k: 0.5 * u[k - 2],
-    "lag of y": lambda y, u, k: -0.25 * y[k - 3],
+    "lag of y": lambda y, u, k: 0.15 * y[k - 3],
     "cubic of u": lambda y, u, k: 0.2 * u[k - 1] ** 3,
 }
 

@@ -354,20 +354,6 @@ def test_values_that_contradict_each_other(tmp_path, old, new, message):
     assert re.search(message, refused(tmp_path, edited(FULL, old, new)))
 
 
-UNBUILT = [
-    ("[physics.parameters]\nm = { initial = 1.0 }\n", r"\[physics\]"),
-    ("[structure.measure]\nkind = 'uniform'\n", 'structure.measure.kind = "uniform"'),
-    ("[structure.measure]\nkind = 'symmetrized'\n", 'structure.measure.kind = "symmetrized"'),
-    ("[structure.measure]\nkind = 'samples'\nfiles = ['grid.csv']\n", 'structure.measure.kind = "samples"'),
-    ("[training]\nfocus = 'simulation'\n", 'training.focus = "simulation"'),
-]
-
-
-@pytest.mark.parametrize(("text", "what"), UNBUILT)
-def test_parts_that_are_not_built_yet(tmp_path, text, what):
-    assert re.search(f"{what} is not built yet in this version; leave it out", refused(tmp_path, LEAST + text))
-
-
 EXPRESSIONS = [
     ("", "baseline term 'a': An expression is empty"),
     ("y[k-1", "baseline term 'a': 'y.k-1' is not an expression"),

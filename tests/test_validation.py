@@ -123,7 +123,11 @@ def test_the_table_of_a_fit(project):
     assert result["data"]["validation"][0] | {"sha256": ""} == {"file": "valid.csv", "sha256": "", "rows": 80}
     assert list(result["scores"]) == ["train", "validation", "tests.steps"]
     assert result["scores"]["validation"]["prediction"]["rmse"][0] > 0
-    assert result["validation"] is None  # the verdict on the learner, not this part
+    assert result["validation"]["verdict"] in (
+        "helps",
+        "no_help",
+        "hurts",
+    )  # on the learner
     table = result["restarts"]
     assert [(r["seed"], r["regularization"]) for r in table] == [
         (5, "none"),

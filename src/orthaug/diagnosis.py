@@ -24,6 +24,7 @@ from orthaug.result import Estimate
 
 LAGS = 25  # as MATLAB's `resid`
 _PRACTICALLY_WHITE = 0.05  # correlations below this are no matter, however sure a long record makes them
+_LITTLE_COLOUR = 0.2  # of a free run's errors that are noise, beside a start from noisy lags and a fit of finite length
 _AS_GOOD = 1.05  # free-run error / one-step error up to which measured lags add nothing
 _TOLD = 5  # findings that a text lists at most
 _SHARE = 0.01  # of the residual's variance: what a regressor explains of it counts from there
@@ -124,7 +125,7 @@ def _misfits(test: ResidualTest) -> list[str]:
 def _accounts(problem: Problem, free_run: Response, skip: int) -> bool:
     """Whether the errors of a free run look like noise on a sensor: white enough, and not following the inputs."""
     tests = _tests(problem, free_run, skip)
-    return all(_is_white(test, 2 * _PRACTICALLY_WHITE) and not _follows(test, 2 * _PRACTICALLY_WHITE) for test in tests)
+    return all(_is_white(test, _LITTLE_COLOUR) and not _follows(test, 2 * _PRACTICALLY_WHITE) for test in tests)
 
 
 def _physics_flown(fit: Estimate) -> list[tuple[Response, int]]:

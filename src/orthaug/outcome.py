@@ -99,8 +99,8 @@ def fit_job(
             verdict = judge_fit(job, fit)
             if verdict is None and job.spec.validation.blocks != 0:
                 warnings.append(
-                    "whether the learner helps is not judged: no part is held out, and the training data are too short "
-                    "for blocked cross-validation."
+                    "whether the learner helps is not judged: no part is held out, and the training data have too few "
+                    "rows for cross-validation in so many blocks."
                 )
             warnings += [verdict.text] if verdict is not None and verdict.code == "hurts" else []
     spec = job.spec.model_dump(mode="json", exclude_unset=True)
