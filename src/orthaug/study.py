@@ -16,6 +16,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -58,9 +59,19 @@ class Study:
         return [case for case in found if self.where is None or self.where(**case)]
 
     def key(self, case: Case) -> str:
-        """What a stored result is found by: a hash of the study, its version, the arguments and the function's text."""
+        """What a stored result is found by: a hash of study, version, arguments, function and this package's code."""
         declared = {"study": self.name, "version": self.version, "case": case, "code": _text(self.one)}
+        declared["orthaug"] = _sources()
         return hashlib.sha256(json.dumps(declared, sort_keys=True).encode()).hexdigest()[:24]
+
+
+@cache
+def _sources() -> str:
+    """A digest of this package's own code: results of an older one do not count."""
+    found = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        found.update(path.read_bytes())
+    return found.hexdigest()
 
 
 def _text(function: Callable[..., Any]) -> str:
