@@ -700,7 +700,7 @@ ARGUMENTS = [
     (["compare", "plant.toml", "--out", "x", "--model", "theirs"], ["theirs", "no saved model there"]),
     (["design", "plant.toml"], ["Missing option", "--out"]),
     (["export", "out", "--to", "c"], ["export", "not built yet"]),
-    (["reproduce", "static_eror"], ["the study", "static_errors"]),
+    (["reproduce", "static_eror"], ["no study", "static_errors"]),
     (["fit", "plant.toml", "--out", "run.csv"], ["run.csv", "not a folder"]),
     (["fit", "plant.toml", "--out", "run.csv/out"], ["run.csv/out", "cannot be written", "is not a folder"]),
     (["fit", "plant.toml", "--out", "theirs"], ["theirs", "not an orthaug result"]),
