@@ -99,8 +99,7 @@ def _middle(learned: Learned, noise: Matrix | None, weight: Vector) -> Matrix | 
     whitened = noise * np.outer(weight, weight)
     if len(weight) == 1:
         return whitened[0, 0] * learned.gram
-    singular = np.linalg.eigvalsh(whitened).min() <= 0
-    return None if learned.middle is None or singular else learned.middle(whitened)
+    return None if learned.middle is None else learned.middle(whitened)
 
 
 def _unique(structure: Structure, learned: Learned) -> bool:

@@ -33,6 +33,18 @@ def noise_covariance(residual: Float[np.ndarray, "N ny"], freedom: Vector) -> Ma
     return residual.T @ residual / np.sqrt(np.outer(freedom, freedom))
 
 
+def whitening(noise: Matrix) -> Matrix | None:
+    """W with `W Σ Wᵀ = I` (ny, ny); None for a covariance that is singular, as of outputs without errors."""
+    values = np.linalg.eigvalsh(noise)
+    return np.linalg.inv(np.linalg.cholesky(noise)) if values[0] > 1e-12 * values[-1] else None
+
+
+def mixing(noise: Matrix) -> Matrix:
+    """M with `MᵀM = Σ` (ny, ny), also of a singular covariance."""
+    values, vectors = np.linalg.eigh(noise)
+    return (vectors * np.sqrt(np.maximum(values, 0.0))).T
+
+
 def theta_covariance(projection: Projection, weight: Vector, noise: Matrix, fixed: Collection[int] = ()) -> Matrix:
     """Cov θ̂ (nθ, nθ) of θ̂ = Φ⁺Y. For one output this is the textbook s²(ΦᵀΦ)⁻¹.
 

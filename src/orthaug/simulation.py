@@ -8,6 +8,7 @@ exact. Where θ has bounds, it is the unknown itself and `c = θ − Φ⁺F(w)` 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,17 +16,17 @@ from jaxtyping import Float
 
 from orthaug._arrays import Matrix, Vector
 from orthaug._jax import jnp
-from orthaug.covariance import noise_covariance, theta_block
-from orthaug.criteria import Criterion, Prediction, Simulation
+from orthaug.covariance import noise_covariance, theta_block, whitening
+from orthaug.criteria import Criterion, Simulation
 from orthaug.errors import InputError
 from orthaug.learners import Bound
 from orthaug.pasts import Pasts
 from orthaug.predictor import Form, Numbers
 from orthaug.problem import Problem
 from orthaug.regressors import Scaling
-from orthaug.segments import Segments, Sensitivity, lay_segments, respond, sensitivity
+from orthaug.segments import Segments, lay_segments, respond, sensitivity
 from orthaug.solvers import LevenbergMarquardt
-from orthaug.solvers.levenberg_marquardt import NON_FINITE, Progress, Run
+from orthaug.solvers.levenberg_marquardt import NON_FINITE, Progress
 from orthaug.solvers.output_error import Outcome, independent_share, minimise
 from orthaug.structures import Elimination, Orthogonal, Structure, eliminate
 from orthaug.training import FreeStatistics, Learned, Task
@@ -71,11 +72,12 @@ class FreeRun:
         segments = lay_segments(problem.record, form, criterion.segment, criterion.washout)
         residual = problem.projection.orthogonal_part(problem.whitened_target)
         rms = task.rms if task is not None else max(float(np.sqrt(np.mean(residual**2))), 1e-10)
-        own = not criterion.segment or isinstance(declared, Prediction)
-        whole = segments if own else lay_segments(problem.record, form, 0, criterion.washout)
-        short = segments.scored.shape[1] < _COLOURED_STEPS <= max(len(e) for e in problem.record.experiments)
-        cut = replace(problem.record, experiments=tuple(e.rows(0, _COLOUR_ROWS) for e in problem.record.experiments))
-        colour = lay_segments(cut, form, 0, criterion.washout) if short and isinstance(declared, Simulation) else None
+        whole, colour = segments, None
+        if isinstance(declared, Simulation) and criterion.segment:
+            whole = lay_segments(problem.record, form, 0, criterion.washout)
+            if segments.scored.shape[1] < _COLOURED_STEPS <= longest:
+                first = tuple(e.rows(0, _COLOUR_ROWS) for e in problem.record.experiments)
+                colour = lay_segments(replace(problem.record, experiments=first), form, 0, criterion.washout)
         return cls(problem, task, form, segments, whole, colour, rms, declared, criterion, warm)
 
     def numbers(self, c: Vector, w: Any, tilt: Any = None) -> Numbers:
@@ -105,14 +107,14 @@ class FreeRun:
         a good one-step predictor may run away.
         """
         objective = Objective.of(self, structure)
-        places, begun, seconds = [objective.start(np.asarray(w), None)], 0, 0.0
+        places, begun, seconds = [objective.start(np.asarray(w))], 0, 0.0
         evidence = regularization == "evidence"
         ridge = 1.0 if evidence else 0.0 if regularization == "none" else float(regularization)
         if self.task is not None and self.criterion.start_iterations:
             short = LevenbergMarquardt(self.criterion.start_iterations, solver.tolerance)
             first = self.task.run(short, w, structure, regularization, progress)
             begun, seconds = first.iterations, first.seconds
-            places.append(objective.start(np.asarray(first.w), first))
+            places.append(objective.start(np.asarray(first.w)))
             ridge = first.ridge
         if self.warm is not None and not objective.follows:
             places.append(np.concatenate([self.warm, np.asarray(w)]))
@@ -127,7 +129,7 @@ class FreeRun:
                 progress(begun + iteration, loss * self.rms**2 / (self.segments.count * len(self.form.outputs)))
 
         found = objective.minimise(places[int(np.argmin(losses))], solver, ridge, evidence, tell)
-        _, c, w = objective.place(found.p)
+        _, c, w = objective.end
         iterations, seconds = begun + found.iterations, seconds + found.seconds
         return Flight(w, c, objective, found, found.code, self.mean_square(c, w), iterations, seconds)
 
@@ -158,9 +160,9 @@ class FreeRun:
             unit=self.unit,
             values=np.zeros_like(self.problem.target) if self.task is None else self.task.values(flight.w),
             effective=flight.found.effective,
-            gram=flight.objective.gram(flight.found),
+            gram=flight.objective.gram,
             ridge=flight.found.ridge * self.rms**2,
-            middle=lambda noise: flight.objective.middle(flight.found, noise),
+            middle=flight.objective.middle,
             code=flight.code,
             iterations=flight.iterations,
             seconds=flight.seconds,
@@ -207,7 +209,9 @@ class Objective:
     weight: Matrix
     pasts: Pasts
     errors: Any = None
-    """Of the last `loss`, (k, T, ny, m)."""
+    """Of the last `loss`, (k, T, ny, m); after `minimise` those of its end."""
+    end: tuple[Vector, Vector, Vector] = (np.zeros(0),) * 3
+    """(unknown θ, c, w) where `minimise` ended."""
     _flown: tuple[float, Any] = (np.inf, None)
     """Loss and pasts of the last `loss`."""
     _anchor: tuple[float, Vector] | None = None
@@ -225,7 +229,7 @@ class Objective:
     def follows(self) -> bool:
         return self.orthogonal and self.elimination.bounded and self.free_run.task is not None
 
-    def start(self, w: Vector, run: Run | None) -> Vector:
+    def start(self, w: Vector) -> Vector:
         """p of the one-step θ for the weights w."""
         problem, task = self.free_run.problem, self.free_run.task
         values = np.zeros_like(problem.target) if task is None else task.values(w) * problem.weight
@@ -323,10 +327,10 @@ class Objective:
         if ny > 1 and found.code != NON_FINITE:
             self._settle(found.p)
             noise = self._noise(found)
-            if noise is not None:
-                white = self.weight @ noise @ self.weight.T  # the ridge keeps its place beside rows of the same size
-                scale = np.sqrt(np.trace(white) / ny)
-                self.weight, self._anchor = scale * np.linalg.inv(np.linalg.cholesky(noise)), None
+            white = None if noise is None else whitening(noise)
+            if noise is not None and white is not None:
+                size = np.trace(self.weight @ noise @ self.weight.T) / ny  # so that the ridge keeps its place
+                self.weight, self._anchor = np.sqrt(size) * white, None
                 done = found.iterations
                 again = minimise(
                     self,
@@ -342,24 +346,29 @@ class Objective:
 
     def _settle(self, p: Vector) -> None:
         """The errors of p itself, where the last trial was another."""
-        _, c, w = self.place(p)
-        self.errors = self.free_run.errors(c, w, self.pasts.values)
+        self.end = self.place(p)
+        self.errors = self.free_run.errors(*self.end[1:], self.pasts.values)
 
-    def gram(self, found: Outcome) -> Matrix:
-        """Gram matrix of ∂ŷ/∂(c, w) as trained, rows times `weight`, in whitened outputs (nθ + nw)²."""
-        _, c, w = self.place(found.p)
-        return self._linearise(c, w)[0] * self.free_run.rms**2
+    @cached_property
+    def information(self) -> Matrix:
+        """SᵀS of (c, w) where training ended, rows times `weight`, the pasts eliminated (nθ + nw)²."""
+        return self._linearise(*self.end[1:])[0]
 
-    def middle(self, found: Outcome, noise: Matrix) -> Matrix:
+    @property
+    def gram(self) -> Matrix:
+        """The same in whitened outputs."""
+        return self.information * self.free_run.rms**2
+
+    def middle(self, noise: Matrix) -> Matrix:
         """ΣψᵀΣ_eψ of the rows of `gram`, which are white where `weight` made them so."""
-        whitening = self.weight / self.free_run.problem.weight  # of errors in whitened outputs
-        white = whitening @ noise @ whitening.T * self.free_run.rms**2
-        return self.gram(found) * float(np.trace(white)) / len(white)
+        change = self.weight / self.free_run.problem.weight  # of errors in whitened outputs
+        white = change @ noise @ change.T * self.free_run.rms**2
+        return self.gram * float(np.trace(white)) / len(white)
 
     def statistics(self, flight: Flight) -> FreeStatistics:
         """Noise covariance of the free run and Cov θ̂ from its sensitivities."""
         found = flight.found
-        theta, c, w = self.place(found.p)
+        theta, _, w = self.end
         nt = len(theta)
         freedom = self.free_run.segments.count - (nt + found.effective) / len(self.weight)
         noise = self._noise(found)
@@ -367,7 +376,7 @@ class Objective:
         at_bound = {i: float(value) for i, value in enumerate(theta) if value in (sides[0][i], sides[1][i])}
         covariance = None
         if noise is not None:
-            information, _ = self._linearise(c, w)
+            information = self.information
             if self.orthogonal and self.free_run.task is not None:
                 change = self._change(w)
                 information = change.T @ information @ change
@@ -384,12 +393,9 @@ class Objective:
         return noise_covariance(errors, np.full(ny, count - used)) if sane else None
 
     def _linearise(self, c: Vector, w: Vector) -> tuple[Matrix, Vector]:
-        return self.pasts.eliminate(self._sensitivity(c, w, self.weight), self.weight)
-
-    def _sensitivity(self, c: Vector, w: Vector, weight: Matrix) -> Sensitivity:
-        run = self.free_run
-        past = jnp.asarray(self.pasts.values)
-        return sensitivity(run.form, run.numbers(c, w), run.segments, past, jnp.asarray(weight))
+        run, past = self.free_run, jnp.asarray(self.pasts.values)
+        found = sensitivity(run.form, run.numbers(c, w), run.segments, past, jnp.asarray(self.weight))
+        return self.pasts.eliminate(found, self.weight)
 
     def _share(self, w: Vector) -> Vector:
         """QᵀF (nθ,) at the measured regressors, in whitened outputs."""

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from orthaug._arrays import Matrix, Vector
 from orthaug._jax import jax, jnp
+from orthaug.covariance import mixing
 from orthaug.criteria import Chunks, Hold, Joint, OneStep, Overlap, Physics, linearise, mixed_gram, share_of
 from orthaug.errors import InputError
 from orthaug.gram import chunk_shape, from_chunks, in_chunks
@@ -260,8 +261,7 @@ class Task:
     def middle(self, w: Any, noise: Matrix) -> Matrix:
         """ΣψᵀΣ_eψ of `[Φ J]` for the noise covariance of whitened outputs; one pass over the rows."""
         projection = self.problem.projection
-        mix = jnp.asarray(np.linalg.cholesky(noise).T)
-        found = np.asarray(mixed_gram(self.bound, jnp.asarray(w), self.chunks, mix))
+        found = np.asarray(mixed_gram(self.bound, jnp.asarray(w), self.chunks, jnp.asarray(mixing(noise))))
         nt = len(projection.scale)
         change = np.eye(len(found)) * self.rms
         change[:nt, :nt] = projection.r / projection.scale

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from orthaug._arrays import Matrix, check_choice, check_count
 from orthaug._jax import jax, jnp
-from orthaug.covariance import half_inverse
+from orthaug.covariance import half_inverse, mixing
 from orthaug.criteria import Chunks, projected_gram
 from orthaug.errors import InputError
 from orthaug.gram import chunk_shape, from_chunks, in_chunks
@@ -51,8 +51,7 @@ def joint_covariance(problem: Problem, model: Model, convention: str = "calibrat
     projection, nt, ny = problem.projection, len(problem.baseline.names), len(problem.outputs)
     chunks = learner_chunks(model, problem.rows.x, problem.projection.q, problem.weight)
     whitened = noise * np.outer(problem.weight, problem.weight)
-    root = np.linalg.cholesky(whitened + 0.0).T
-    outer, middle = (_raw(model, chunks, np.asarray(mix)) for mix in (np.eye(ny), root))
+    outer, middle = (_raw(model, chunks, mix) for mix in (np.eye(ny), mixing(whitened)))
     change = np.eye(len(outer))
     change[:nt, :nt] = projection.r / projection.scale
     outer, middle = (change.T @ found @ change for found in (outer, middle))
