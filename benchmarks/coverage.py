@@ -19,7 +19,7 @@ from machine import describe
 from scipy.signal import lfilter
 
 import orthaug as oa
-from orthaug.covariance import interval
+from orthaug.inference.covariance import interval
 
 TRUE, TS = np.array([1.0, 100.0, 1000.0]), 0.01  # m, c, k of the mass-spring-damper, and its sampling time
 LABELS = ("θ1, θ3, training", "θ1, θ3, uniform", "θ1, θ3, paper's convention", "200 predictions, mean")

@@ -9,11 +9,11 @@ import numpy as np
 from machine import describe, median_seconds
 
 from orthaug import MLP, Baseline, LevenbergMarquardt, Record, Term
-from orthaug._jax import jax
-from orthaug.parallel import one_blas_thread
-from orthaug.problem import pose
-from orthaug.regressors import Lags
-from orthaug.training import Task
+from orthaug._base.jax import jax
+from orthaug._base.parallel import one_blas_thread
+from orthaug.data.regressors import Lags
+from orthaug.fitting.one_step import Task
+from orthaug.physics.problem import pose
 
 CASES = (  # rows, lags, neurons, weights, iterations per timing, repeats, allowed ratio
     (10_000, Lags(na=2, nb=1, nk=1), 16, 81, 20, 15, 1.5),

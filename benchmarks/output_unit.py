@@ -12,10 +12,10 @@ import numpy as np
 from machine import describe
 
 import orthaug as oa
-from orthaug import synthetic
-from orthaug._jax import jax
-from orthaug.problem import pose
-from orthaug.training import OUTPUT_UNIT, Task
+from orthaug._base.jax import jax
+from orthaug.fitting.one_step import OUTPUT_UNIT, Task
+from orthaug.physics.problem import pose
+from orthaug.studies import synthetic
 
 UNITS = (1, 3, 10, 30, 100)
 

@@ -10,12 +10,14 @@ from concurrent.futures import ThreadPoolExecutor
 
 from machine import alternate, describe
 
-from orthaug import MLP, LevenbergMarquardt, synthetic
-from orthaug._jax import jax, jnp
-from orthaug.criteria import Hold, OneStep, Overlap
-from orthaug.problem import pose
-from orthaug.solvers.levenberg_marquardt import Options, _advance, _start
-from orthaug.training import Task
+from orthaug import MLP, LevenbergMarquardt
+from orthaug._base.jax import jax, jnp
+from orthaug.fitting.normal_equations import Hold, OneStep
+from orthaug.fitting.one_step import Task
+from orthaug.fitting.solvers.levenberg_marquardt import Options, _advance, _start
+from orthaug.models.rows import Overlap
+from orthaug.physics.problem import pose
+from orthaug.studies import synthetic
 
 SEEDS, ITERATIONS = range(4), 100
 

@@ -9,12 +9,12 @@ import numpy as np
 from machine import describe, median_seconds
 
 from orthaug import MLP, Baseline, LevenbergMarquardt, Orthogonal, Record, Simulation, Term
-from orthaug._jax import jax, jnp
-from orthaug.parallel import one_blas_thread
-from orthaug.problem import pose
-from orthaug.segments import respond
-from orthaug.simulation import FreeRun
-from orthaug.training import Task
+from orthaug._base.jax import jax, jnp
+from orthaug._base.parallel import one_blas_thread
+from orthaug.fitting.free_run import FreeRun
+from orthaug.fitting.one_step import Task
+from orthaug.fitting.segments import respond
+from orthaug.physics.problem import pose
 
 ROWS, REPEATS, SHORT, LONG = 65_062, 9, 5, 25
 TERMS = ("y[k-1]", "y[k-2]", "u[k]", "u[k-1]", "u[k-2]", "1")

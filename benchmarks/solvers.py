@@ -8,11 +8,12 @@ from __future__ import annotations
 import numpy as np
 from machine import alternate, describe
 
-from orthaug import MLP, AdamLBFGS, LevenbergMarquardt, Orthogonal, synthetic
-from orthaug._jax import jax
-from orthaug.parallel import one_blas_thread
-from orthaug.problem import pose
-from orthaug.training import Task
+from orthaug import MLP, AdamLBFGS, LevenbergMarquardt, Orthogonal
+from orthaug._base.jax import jax
+from orthaug._base.parallel import one_blas_thread
+from orthaug.fitting.one_step import Task
+from orthaug.physics.problem import pose
+from orthaug.studies import synthetic
 
 SEEDS = range(3)
 CASES = (

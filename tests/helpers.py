@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from orthaug._jax import jax, jnp
-from orthaug.criteria import Chunks, Hold, OneStep, Overlap
-from orthaug.gram import chunk_shape, in_chunks
-from orthaug.learners import Bound, Learner
+from orthaug._base.jax import jax, jnp
+from orthaug.fitting.normal_equations import Hold, OneStep
+from orthaug.models.learners import Bound, Learner
+from orthaug.models.rows import Chunks, Overlap, chunk_shape, in_chunks
 
 
 class Problem(NamedTuple):

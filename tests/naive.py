@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from orthaug.learners import MLP
-from orthaug.model import Model
-from orthaug.record import Experiment, Record
+from orthaug.data.record import Experiment, Record
+from orthaug.models.learners import MLP
+from orthaug.models.model import Model
 
 FUNCTIONS = {name: getattr(np, name) for name in ("sin", "cos", "exp", "abs", "sign", "tanh")}
 

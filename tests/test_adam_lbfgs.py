@@ -7,16 +7,17 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from orthaug._jax import jax, jnp
-from orthaug.baseline import Baseline, Term
-from orthaug.errors import InputError
-from orthaug.estimation import estimate
-from orthaug.learners import MLP, Function
-from orthaug.problem import pose
-from orthaug.record import Record
-from orthaug.solvers import AdamLBFGS, adam_lbfgs
-from orthaug.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
-from orthaug.training import Task
+from orthaug._base.errors import InputError
+from orthaug._base.jax import jax, jnp
+from orthaug.data.record import Record
+from orthaug.fitting.estimation import estimate
+from orthaug.fitting.one_step import Task
+from orthaug.fitting.solvers import adam_lbfgs
+from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
+from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
+from orthaug.models.learners import MLP, Function
+from orthaug.physics.baseline import Baseline, Term
+from orthaug.physics.problem import pose
 
 STRUCTURES = (Orthogonal(), Additive(), OrthogonalPenalty(0.5), BaselinePenalty(0.5))
 LINEAR = Function(lambda w, z: w @ jnp.stack([z[0] ** 2, z[1] ** 2]), lambda key: 0.1 * jnp.ones((1, 2)))

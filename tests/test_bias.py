@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orthaug.bias import Certificate, bias_table, find_certificate
-from orthaug.errors import InputError, RankError
-from orthaug.problem import pose
-from orthaug.projection import Projection
-from orthaug.record import Record
-from orthaug.suspects import Suspect, data_width, suspect_columns
-from orthaug.synthetic import MassSpringDamper, mass_spring_damper, static
+from orthaug._base.errors import InputError, RankError
+from orthaug.analysis.bias import Certificate, bias_table, find_certificate
+from orthaug.analysis.suspects import Suspect, data_width, suspect_columns
+from orthaug.data.record import Record
+from orthaug.physics.problem import pose
+from orthaug.physics.projection import Projection
+from orthaug.studies.synthetic import MassSpringDamper, mass_spring_damper, static
 
 TS = {"Ts": 0.01}
 VELOCITY = "(position[k-1] - position[k-2])/Ts"
@@ -206,10 +206,10 @@ def test_a_hundred_thousand_rows(nearly):
 
 
 def test_a_numerical_failure_is_a_verdict(monkeypatch):
-    monkeypatch.setattr("orthaug.bias.linprog", lambda *_, **__: SimpleNamespace(x=None))
+    monkeypatch.setattr("orthaug.analysis.bias.linprog", lambda *_, **__: SimpleNamespace(x=None))
     assert single([V], V**3).verdict == "undecided"
     # A program that keeps returning a direction that its own rows forbid must not go on for ever.
-    monkeypatch.setattr("orthaug.bias.linprog", lambda *_, **__: SimpleNamespace(x=np.ones(1)))
+    monkeypatch.setattr("orthaug.analysis.bias.linprog", lambda *_, **__: SimpleNamespace(x=np.ones(1)))
     assert single([V], V**3 - 0.25 * V).verdict == "undecided"
 
 

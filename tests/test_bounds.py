@@ -9,15 +9,16 @@ import pytest
 import scipy.optimize
 from test_cli import run
 
-from orthaug._jax import jnp
-from orthaug.baseline import Baseline, Term
-from orthaug.errors import InputError
-from orthaug.estimation import estimate
-from orthaug.learners import MLP, Function
-from orthaug.record import Record
-from orthaug.solvers import AdamLBFGS, LevenbergMarquardt
-from orthaug.spec import load_spec
-from orthaug.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
+from orthaug._base.errors import InputError
+from orthaug._base.jax import jnp
+from orthaug.commands.spec import load_spec
+from orthaug.data.record import Record
+from orthaug.fitting.estimation import estimate
+from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
+from orthaug.models.learners import MLP, Function
+from orthaug.physics.baseline import Baseline, Term
 
 NAMES, INITIAL, ROWS = ("a", "b", "c"), np.array([0.9, -0.4, 0.2]), 90
 LM, GRADIENT = LevenbergMarquardt(60, tolerance=1e-14), AdamLBFGS(20, 400)

@@ -16,10 +16,10 @@ import pandas as pd
 import pytest
 
 import orthaug
-from orthaug import cli
-from orthaug.readers import read_record
-from orthaug.solvers import levenberg_marquardt
-from orthaug.storage import load
+from orthaug.commands import cli
+from orthaug.data.readers import read_record
+from orthaug.fitting.solvers import levenberg_marquardt
+from orthaug.models.storage import load
 
 LevenbergMarquardt = levenberg_marquardt.LevenbergMarquardt
 
@@ -498,7 +498,7 @@ def test_ctrl_c_while_the_result_is_written(project, monkeypatch):
     def fail(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("orthaug.plots.save", fail)
+    monkeypatch.setattr("orthaug.reports.plots.save", fail)
     before = listing(project.parent)
     done = run("fit", project, "--out", "out")
     assert done.code == 130

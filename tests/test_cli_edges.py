@@ -17,7 +17,7 @@ import pytest
 from test_cli import MLP as NETWORK
 from test_cli import SPEC, make_project, one_line, run, signals, write_csv
 
-from orthaug.storage import load
+from orthaug.models.storage import load
 
 
 @pytest.fixture

@@ -11,15 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orthaug._jax import jax, jnp
-from orthaug.baseline import Baseline, Term
-from orthaug.estimation import estimate, orthogonalize
-from orthaug.learners import MLP, EquinoxModule, Function
-from orthaug.record import Record
-from orthaug.regressors import Lags
-from orthaug.result import MESSAGES
-from orthaug.solvers import LevenbergMarquardt
-from orthaug.structures import Additive, Orthogonal
+from orthaug._base.jax import jax, jnp
+from orthaug.data.record import Record
+from orthaug.data.regressors import Lags
+from orthaug.fitting.estimation import estimate, orthogonalize
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.status import MESSAGES
+from orthaug.fitting.structures import Additive, Orthogonal
+from orthaug.models.learners import MLP, EquinoxModule, Function
+from orthaug.physics.baseline import Baseline, Term
 
 REGRESSORS = {
     1: ("y[k-1]", "u[k]", "u[k-1]", "1", "y[k-1]**3", "sin(2*u[k])", "y[k-1]*u[k-1]", "abs(u[k])"),

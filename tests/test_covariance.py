@@ -9,13 +9,13 @@ import pandas as pd
 import pytest
 import scipy.stats
 
-from orthaug.baseline import Baseline, Term
-from orthaug.covariance import interval, noise_covariance
-from orthaug.estimation import estimate
-from orthaug.learners import MLP
-from orthaug.record import Record
-from orthaug.solvers import LevenbergMarquardt
-from orthaug.synthetic import NOISE_30_DB, static
+from orthaug.data.record import Record
+from orthaug.fitting.estimation import estimate
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.inference.covariance import interval, noise_covariance
+from orthaug.models.learners import MLP
+from orthaug.physics.baseline import Baseline, Term
+from orthaug.studies.synthetic import NOISE_30_DB, static
 
 ROWS = 60
 U = np.random.default_rng(0).normal(size=(ROWS, 3)) * [1.0, 1e-3, 50.0]

@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 from helpers import problem
 
-from orthaug._jax import jax, jnp
-from orthaug.baseline import Baseline, Term
-from orthaug.criteria import Hold, Overlap
-from orthaug.learners import MLP, Function
-from orthaug.problem import pose
-from orthaug.record import Record
-from orthaug.solvers.levenberg_marquardt import CONVERGED, LevenbergMarquardt
-from orthaug.training import Task
+from orthaug._base.jax import jax, jnp
+from orthaug.data.record import Record
+from orthaug.fitting.normal_equations import Hold
+from orthaug.fitting.one_step import Task
+from orthaug.fitting.solvers.levenberg_marquardt import CONVERGED, LevenbergMarquardt
+from orthaug.models.learners import MLP, Function
+from orthaug.models.rows import Overlap
+from orthaug.physics.baseline import Baseline, Term
+from orthaug.physics.problem import pose
 
 CASES = [(ny, nt) for ny in (1, 2) for nt in (0, 1, 3)]
 

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orthaug import signals
-from orthaug.baseline import Baseline, Term
-from orthaug.bias import bias_table
-from orthaug.design import Design, design_input
-from orthaug.errors import InputError
-from orthaug.problem import pose
-from orthaug.record import Record
-from orthaug.suspects import Suspect, suspect_columns
-from orthaug.synthetic import MassSpringDamper, mass_spring_damper
+from orthaug._base.errors import InputError
+from orthaug.analysis import signals
+from orthaug.analysis.bias import bias_table
+from orthaug.analysis.design import Design, design_input
+from orthaug.analysis.suspects import Suspect, suspect_columns
+from orthaug.data.record import Record
+from orthaug.physics.baseline import Baseline, Term
+from orthaug.physics.problem import pose
+from orthaug.studies.synthetic import MassSpringDamper, mass_spring_damper
 
 SYSTEM = MassSpringDamper()
 THETA = SYSTEM.paper_theta()

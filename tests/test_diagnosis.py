@@ -8,15 +8,15 @@ from functools import cache
 import numpy as np
 import pytest
 
-from orthaug import synthetic
-from orthaug.baseline import Baseline, Term
-from orthaug.criteria import Prediction, Simulation
-from orthaug.diagnosis import diagnose
-from orthaug.estimation import estimate
-from orthaug.learners import MLP
-from orthaug.record import Record
-from orthaug.solvers import LevenbergMarquardt
-from orthaug.structures import Additive
+from orthaug.analysis.diagnosis import diagnose
+from orthaug.data.record import Record
+from orthaug.fitting.criteria import Prediction, Simulation
+from orthaug.fitting.estimation import estimate
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.structures import Additive
+from orthaug.models.learners import MLP
+from orthaug.physics.baseline import Baseline, Term
+from orthaug.studies import synthetic
 
 PHYSICS = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("g", "u[k-1]")])
 EVIDENCE = {"learner": MLP(hidden=(8,)), "regularization": "evidence", "solver": LevenbergMarquardt(100)}

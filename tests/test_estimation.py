@@ -6,15 +6,15 @@ import naive
 import numpy as np
 import pytest
 
-from orthaug._jax import jax, jnp
-from orthaug.baseline import Baseline, Parameter, Term
-from orthaug.errors import InputError, RankError
-from orthaug.estimation import estimate, orthogonalize
-from orthaug.learners import MLP, Function
-from orthaug.record import Channel, Record
-from orthaug.regressors import Lags
-from orthaug.solvers import LevenbergMarquardt
-from orthaug.structures import Additive
+from orthaug._base.errors import InputError, RankError
+from orthaug._base.jax import jax, jnp
+from orthaug.data.record import Channel, Record
+from orthaug.data.regressors import Lags
+from orthaug.fitting.estimation import estimate, orthogonalize
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.structures import Additive
+from orthaug.models.learners import MLP, Function
+from orthaug.physics.baseline import Baseline, Parameter, Term
 
 LINEAR = MLP(hidden=())
 NETWORK = MLP(hidden=(4,))

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthaug.baseline import Baseline, Term
-from orthaug.errors import InputError, RankError
-from orthaug.excitation import excitation, identifiability, require_rank
-from orthaug.expressions import Lag
-from orthaug.problem import pose
-from orthaug.projection import Projection
-from orthaug.record import Record
+from orthaug._base.errors import InputError, RankError
+from orthaug.data.expressions import Lag
+from orthaug.data.record import Record
+from orthaug.physics.baseline import Baseline, Term
+from orthaug.physics.excitation import excitation, identifiability, require_rank
+from orthaug.physics.problem import pose
+from orthaug.physics.projection import Projection
 
 A, B, C, D = np.random.default_rng(5).normal(size=(4, 30))
 

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from orthaug._jax import jax, jnp
-from orthaug.errors import InputError
-from orthaug.expressions import FUNCTIONS, Lag, parse
+from orthaug._base.errors import InputError
+from orthaug._base.jax import jax, jnp
+from orthaug.data.expressions import FUNCTIONS, Lag, parse
 
 Y1, Y2, U0, U3 = Lag("y", 1), Lag("y", 2), Lag("u", 0), Lag("u", 3)
 POINT = {Y1: 0.7, Y2: -1.3, U0: 2.5, U3: 0.2}

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from orthaug.errors import InputError
-from orthaug.folders import check_replaceable, whole_folder
+from orthaug._base.errors import InputError
+from orthaug._base.folders import check_replaceable, whole_folder
 
 
 def is_ours(folder: Path) -> bool:
@@ -136,7 +136,7 @@ def test_a_parent_that_cannot_be_written(tmp_path, monkeypatch):
     def refuse(*_, **__):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("orthaug.folders.tempfile.mkdtemp", refuse)
+    monkeypatch.setattr("orthaug._base.folders.tempfile.mkdtemp", refuse)
     with pytest.raises(InputError, match=r"out: cannot be written \(Permission denied in "):
         write(tmp_path / "out")
     assert listing(tmp_path) == []

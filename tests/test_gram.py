@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthaug._jax import jax, jnp
-from orthaug.gram import CHUNK_ROWS, chunk_shape, from_chunks, gram, in_chunks, row_sum
+from orthaug._base.jax import jax, jnp
+from orthaug.models.rows import CHUNK_ROWS, chunk_shape, from_chunks, gram, in_chunks, row_sum
 
 AWKWARD = [1, 7, 8, 9, 63, 64, 65, 127, 128, 129, 200]
 

@@ -8,9 +8,9 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from orthaug._jax import jax, jnp
-from orthaug.errors import InputError
-from orthaug.learners import ACTIVATIONS, MLP, Bound, EquinoxModule, External, Function
+from orthaug._base.errors import InputError
+from orthaug._base.jax import jax, jnp
+from orthaug.models.learners import ACTIVATIONS, MLP, Bound, EquinoxModule, External, Function
 
 KEY = jax.random.key(7)
 

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from helpers import linear_columns, problem
 
-from orthaug._jax import jax, jnp
-from orthaug.criteria import Normal, Overlap
-from orthaug.learners import MLP, Function
-from orthaug.solvers import LevenbergMarquardt
-from orthaug.solvers import levenberg_marquardt as lm
+from orthaug._base.jax import jax, jnp
+from orthaug.fitting.normal_equations import Normal
+from orthaug.fitting.solvers import levenberg_marquardt as lm
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.models.learners import MLP, Function
+from orthaug.models.rows import Overlap
 
 ROWS = 150
 SAMPLES = ROWS - 2  # less the physics' own two parameters

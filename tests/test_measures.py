@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import scipy.integrate
 
-from orthaug.errors import InputError
-from orthaug.measures import Measure, Samples, Support, Symmetrized, Training, Uniform, Weighted
-from orthaug.record import Record
-from orthaug.regressors import Lags, largest_lag
+from orthaug._base.errors import InputError
+from orthaug.data.record import Record
+from orthaug.data.regressors import Lags, largest_lag
+from orthaug.inference.measures import Measure, Samples, Support, Symmetrized, Training, Uniform, Weighted
 
 RNG = np.random.default_rng(0)
 U = 0.3 * RNG.normal(size=400)

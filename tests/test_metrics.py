@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthaug.metrics import scores
+from orthaug.models.response import scores
 
 
 def test_scores_are_their_formulas():

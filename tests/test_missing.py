@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from test_cli import finite_json, one_line, run
 
-from orthaug.baseline import Baseline, Term
-from orthaug.errors import InputError
-from orthaug.estimation import estimate
-from orthaug.problem import pose
-from orthaug.readers import read_record
-from orthaug.storage import load
+from orthaug._base.errors import InputError
+from orthaug.data.readers import read_record
+from orthaug.fitting.estimation import estimate
+from orthaug.models.storage import load
+from orthaug.physics.baseline import Baseline, Term
+from orthaug.physics.problem import pose
 
 PHYSICS = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("g", "u[k-1]")])
 GAPS = {8: "", 20: "NaN", 21: "NA", 23: "", 50: "null", 60: "", 61: "", 62: ""}  # of y; 22 and 24…49 stay

@@ -6,13 +6,13 @@ import naive
 import numpy as np
 import pytest
 
-from orthaug.baseline import Baseline, Term
-from orthaug.errors import InputError
-from orthaug.estimation import estimate
-from orthaug.learners import MLP
-from orthaug.record import Channel, Record
-from orthaug.regressors import Lags
-from orthaug.solvers import LevenbergMarquardt
+from orthaug._base.errors import InputError
+from orthaug.data.record import Channel, Record
+from orthaug.data.regressors import Lags
+from orthaug.fitting.estimation import estimate
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.models.learners import MLP
+from orthaug.physics.baseline import Baseline, Term
 
 FEW = LevenbergMarquardt(iterations=5)
 NETWORK = MLP(hidden=(3,))

@@ -10,8 +10,8 @@ import pytest
 import scipy.optimize
 import scipy.signal
 
-from orthaug.solvers.levenberg_marquardt import CONVERGED, NO_DESCENT, NON_FINITE, RUNNING
-from orthaug.solvers.output_error import Objective, independent_share, minimise
+from orthaug.fitting.solvers.levenberg_marquardt import CONVERGED, NO_DESCENT, NON_FINITE, RUNNING
+from orthaug.fitting.solvers.output_error import Objective, independent_share, minimise
 
 
 @dataclass

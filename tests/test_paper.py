@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthaug.baseline import Baseline, Term
-from orthaug.estimation import estimate
-from orthaug.learners import MLP
-from orthaug.record import Record
-from orthaug.solvers import LevenbergMarquardt
-from orthaug.structures import Additive
-from orthaug.synthetic import mass_spring_damper, static
+from orthaug.data.record import Record
+from orthaug.fitting.estimation import estimate
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.structures import Additive
+from orthaug.models.learners import MLP
+from orthaug.physics.baseline import Baseline, Term
+from orthaug.studies.synthetic import mass_spring_damper, static
 
 SEEDS = range(10)
 LEARNERS = [

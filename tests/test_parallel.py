@@ -11,13 +11,14 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from orthaug import parallel
-from orthaug.baseline import Baseline, Term
-from orthaug.estimation import estimate
-from orthaug.learners import MLP
-from orthaug.parallel import Stopped, spread
-from orthaug.record import Record
-from orthaug.solvers import AdamLBFGS, LevenbergMarquardt
+from orthaug._base import parallel
+from orthaug._base.parallel import Stopped, spread
+from orthaug.data.record import Record
+from orthaug.fitting.estimation import estimate
+from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.models.learners import MLP
+from orthaug.physics.baseline import Baseline, Term
 
 
 @pytest.fixture

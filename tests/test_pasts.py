@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from test_segments import CASES, OUTPUTS, assert_close, case, dense, found_of
 
-from orthaug.pasts import Pasts
+from orthaug.fitting.pasts import Pasts
 
 FED_BACK = [name for name in CASES if name != "no feedback"]
 

@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthaug.estimation import estimate
-from orthaug.learners import MLP
-from orthaug.solvers import AdamLBFGS, LevenbergMarquardt
-from orthaug.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
-from orthaug.synthetic import mass_spring_damper
+from orthaug.fitting.estimation import estimate
+from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
+from orthaug.models.learners import MLP
+from orthaug.studies.synthetic import mass_spring_damper
 
 PIPELINE = AdamLBFGS(adam_iterations=2500, lbfgs_iterations=500)
 SHORT = LevenbergMarquardt(iterations=30)

@@ -13,13 +13,13 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthaug._jax import jax, jnp
-from orthaug.baseline import Baseline, Term
-from orthaug.covariance import interval
-from orthaug.errors import InputError
-from orthaug.expressions import FUNCTIONS, Expression
-from orthaug.physical import profile, solve
-from orthaug.physics import PhysicalParameter, PhysicsMap, check_baseline, with_initial
+from orthaug._base.errors import InputError
+from orthaug._base.jax import jax, jnp
+from orthaug.data.expressions import FUNCTIONS, Expression
+from orthaug.inference.covariance import interval
+from orthaug.inference.physical import profile, solve
+from orthaug.physics.baseline import Baseline, Term
+from orthaug.physics.parameters import PhysicalParameter, PhysicsMap, check_baseline, with_initial
 
 GAMMA = "(m + cd*Ts + ks*Ts**2)"
 EULER = {"theta1": f"(2*m + cd*Ts) / {GAMMA}", "theta2": f"-m / {GAMMA}", "theta3": f"Ts**2 / {GAMMA}"}

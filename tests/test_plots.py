@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from orthaug import plots
-from orthaug.model import Response, Trajectory
-from orthaug.record import Channel
+from orthaug.data.record import Channel
+from orthaug.models.response import Response, Trajectory
+from orthaug.reports import plots
 
 CHANNELS = (Channel("position", "m"), Channel("angle"))
 

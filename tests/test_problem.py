@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthaug._jax import jnp
-from orthaug.baseline import Baseline, Term
-from orthaug.errors import InputError, RankError
-from orthaug.problem import pose
-from orthaug.record import Record
-from orthaug.regressors import Lags
+from orthaug._base.errors import InputError, RankError
+from orthaug._base.jax import jnp
+from orthaug.data.record import Record
+from orthaug.data.regressors import Lags
+from orthaug.physics.baseline import Baseline, Term
+from orthaug.physics.problem import pose
 
 RNG = np.random.default_rng(0)
 U, Y = RNG.uniform(0.5, 2.0, (2, 20))

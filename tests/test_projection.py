@@ -13,10 +13,10 @@ import scipy.linalg
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthaug.baseline import Baseline, Term
-from orthaug.projection import Projection
-from orthaug.record import Record
-from orthaug.regressors import in_order, stack_rows
+from orthaug.data.record import Record
+from orthaug.data.regressors import in_order, stack_rows
+from orthaug.physics.baseline import Baseline, Term
+from orthaug.physics.projection import Projection
 
 POLYNOMIAL = ["1", "x[k]", "x[k]**2", "x[k]**3", "x[k]**4", "x[k]**5"]
 NIST = {

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthaug.errors import InputError
-from orthaug.readers import read_record
-from orthaug.record import Channel
+from orthaug._base.errors import InputError
+from orthaug.data.readers import read_record
+from orthaug.data.record import Channel
 
 CONTENT = "t,u,y\n" + "".join(f"{k / 10},{k},{10 * k}\n" for k in range(10))
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthaug.errors import InputError
-from orthaug.record import Channel, Experiment, Record, same_step
+from orthaug._base.errors import InputError
+from orthaug.data.record import Channel, Experiment, Record, same_step
 
 STEPS = np.arange(6.0)
 

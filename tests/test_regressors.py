@@ -7,11 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthaug._jax import jnp
-from orthaug.errors import InputError
-from orthaug.expressions import Lag, parse
-from orthaug.record import Record
-from orthaug.regressors import Features, Lags, Scaling, in_order, lag_matrix, largest_lag, stack_rows
+from orthaug._base.errors import InputError
+from orthaug._base.jax import jnp
+from orthaug.data.expressions import Lag, parse
+from orthaug.data.record import Record
+from orthaug.data.regressors import Features, Lags, in_order, lag_matrix, largest_lag, stack_rows
+from orthaug.models.learners import Scaling
 
 
 def names(layout) -> list[str]:

@@ -23,11 +23,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthaug.errors import InputError
-from orthaug.reproduction import Reproduced, as_rows, chosen, is_reproduction, reproduce, text, write
-from orthaug.studies import Finding, catalogue
+from orthaug._base.errors import InputError
+from orthaug.studies.catalogue import catalogue
+from orthaug.studies.entry import Finding
+from orthaug.studies.reproduction import Reproduced, as_rows, chosen, is_reproduction, reproduce, text, write
+from orthaug.studies.study import run
 from orthaug.studies.theory import THEORY
-from orthaug.study import run
 
 REFERENCES = Path(__file__).parent / "references" / "studies.json"
 NAMES = (

@@ -10,8 +10,8 @@ import scipy.stats
 from scipy.signal import lfilter
 from threadpoolctl import threadpool_limits
 
-from orthaug.errors import InputError
-from orthaug.residuals import (
+from orthaug._base.errors import InputError
+from orthaug.analysis.residuals import (
     against_input,
     against_regressor,
     analyse,

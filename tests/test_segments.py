@@ -11,17 +11,17 @@ import naive
 import numpy as np
 import pytest
 
-import orthaug.segments
-from orthaug._jax import jax, jnp
-from orthaug.baseline import Baseline, Term
-from orthaug.estimation import estimate
-from orthaug.learners import MLP, Bound
-from orthaug.predictor import Form, Numbers
-from orthaug.problem import pose
-from orthaug.record import Record
-from orthaug.regressors import Lags
-from orthaug.segments import Segments, lay_segments, respond, sensitivity
-from orthaug.solvers import LevenbergMarquardt
+import orthaug.fitting.segments
+from orthaug._base.jax import jax, jnp
+from orthaug.data.record import Record
+from orthaug.data.regressors import Lags
+from orthaug.fitting.estimation import estimate
+from orthaug.fitting.segments import Segments, lay_segments, respond, sensitivity
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.models.learners import MLP, Bound
+from orthaug.models.predictor import Form, Numbers
+from orthaug.physics.baseline import Baseline, Term
+from orthaug.physics.problem import pose
 
 SEGMENT, WASHOUT, LENGTHS = 7, 3, (23, 9, 30)
 NETWORK = MLP(hidden=(2,))

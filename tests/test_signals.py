@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import qmc
 
-from orthaug.errors import InputError
-from orthaug.signals import (
+from orthaug._base.errors import InputError
+from orthaug.analysis.signals import (
     binary_pattern,
     crest_factor,
     fill_distance,

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from orthaug import cli
+from orthaug.commands import cli
 
 SPEC = """
 [data]

@@ -9,18 +9,19 @@ import pytest
 import scipy.optimize
 import scipy.signal
 
-from orthaug._jax import jax, jnp
-from orthaug.baseline import Baseline, Term
-from orthaug.criteria import Prediction, Simulation
-from orthaug.errors import InputError
-from orthaug.estimation import estimate
-from orthaug.learners import MLP
-from orthaug.record import Record
-from orthaug.segments import respond
-from orthaug.simulation import FreeRun
-from orthaug.solvers import AdamLBFGS, LevenbergMarquardt
-from orthaug.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
-from orthaug.training import Task
+from orthaug._base.errors import InputError
+from orthaug._base.jax import jax, jnp
+from orthaug.data.record import Record
+from orthaug.fitting.criteria import Prediction, Simulation
+from orthaug.fitting.estimation import estimate
+from orthaug.fitting.free_run import FreeRun
+from orthaug.fitting.one_step import Task
+from orthaug.fitting.segments import respond
+from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
+from orthaug.models.learners import MLP
+from orthaug.physics.baseline import Baseline, Term
 
 STRUCTURES = (Orthogonal(), Additive(), OrthogonalPenalty(1.0), BaselinePenalty(1.0))
 LM, FREE, NETWORK = LevenbergMarquardt(40), Simulation(64, 8, 10), MLP(hidden=(3,))

@@ -8,12 +8,12 @@ from typing import get_args
 
 import pytest
 
-from orthaug.baseline import Parameter, Term
-from orthaug.errors import InputError
-from orthaug.learners import ACTIVATIONS
-from orthaug.record import Channel
-from orthaug.regressors import Lags
-from orthaug.spec import LearnerSection, load_spec
+from orthaug._base.errors import InputError
+from orthaug.commands.spec import LearnerSection, load_spec
+from orthaug.data.record import Channel
+from orthaug.data.regressors import Lags
+from orthaug.models.learners import ACTIVATIONS
+from orthaug.physics.baseline import Parameter, Term
 
 LEAST = """
 [data]

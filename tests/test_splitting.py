@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from test_cli import run
 
-from orthaug.baseline import Baseline, Term
-from orthaug.criteria import Simulation
-from orthaug.errors import InputError, RankError
-from orthaug.estimation import estimate, orthogonalize
-from orthaug.learners import MLP
-from orthaug.measures import Samples, Symmetrized, Training, Uniform, Weighted
-from orthaug.record import Record
-from orthaug.regressors import Lags
-from orthaug.solvers import LevenbergMarquardt
-from orthaug.storage import load, save
-from orthaug.structures import Additive, Orthogonal
-from orthaug.synthetic import static
+from orthaug._base.errors import InputError, RankError
+from orthaug.data.record import Record
+from orthaug.data.regressors import Lags
+from orthaug.fitting.criteria import Simulation
+from orthaug.fitting.estimation import estimate, orthogonalize
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.structures import Additive, Orthogonal
+from orthaug.inference.measures import Samples, Symmetrized, Training, Uniform, Weighted
+from orthaug.models.learners import MLP
+from orthaug.models.storage import load, save
+from orthaug.physics.baseline import Baseline, Term
+from orthaug.studies.synthetic import static
 
 QUICK = LevenbergMarquardt(iterations=15)
 WIDE = Uniform({"u[k]": (-0.6, 0.6)})

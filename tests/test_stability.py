@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from orthaug import stability as module
-from orthaug.baseline import Baseline, Term
-from orthaug.errors import InputError
-from orthaug.estimation import estimate, orthogonalize
-from orthaug.learners import MLP
-from orthaug.model import Model
-from orthaug.record import Record
-from orthaug.regressors import Lags
-from orthaug.solvers import LevenbergMarquardt
-from orthaug.stability import companions, contraction, divergence_scaling, feedback, lipschitz, stability
-from orthaug.storage import load, save
+from orthaug._base.errors import InputError
+from orthaug.analysis import stability as module
+from orthaug.analysis.stability import companions, contraction, divergence_scaling, feedback, lipschitz, stability
+from orthaug.data.record import Record
+from orthaug.data.regressors import Lags
+from orthaug.fitting.estimation import estimate, orthogonalize
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.models.learners import MLP
+from orthaug.models.model import Model
+from orthaug.models.storage import load, save
+from orthaug.physics.baseline import Baseline, Term
 
 FEW = LevenbergMarquardt(iterations=5)
 

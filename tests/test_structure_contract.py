@@ -7,17 +7,18 @@ from functools import lru_cache, partial
 import numpy as np
 import pytest
 
-from orthaug._jax import jax, jnp
-from orthaug.baseline import Baseline, Term
-from orthaug.estimation import estimate
-from orthaug.learners import MLP
-from orthaug.problem import pose
-from orthaug.record import Record
-from orthaug.regressors import Lags
-from orthaug.result import MESSAGES
-from orthaug.solvers import AdamLBFGS, LevenbergMarquardt
-from orthaug.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
-from orthaug.training import Task
+from orthaug._base.jax import jax, jnp
+from orthaug.data.record import Record
+from orthaug.data.regressors import Lags
+from orthaug.fitting.estimation import estimate
+from orthaug.fitting.one_step import Task
+from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.status import MESSAGES
+from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
+from orthaug.models.learners import MLP
+from orthaug.physics.baseline import Baseline, Term
+from orthaug.physics.problem import pose
 
 STRUCTURES = (Orthogonal(), Additive(), OrthogonalPenalty(3.0), BaselinePenalty(20.0))
 INITIAL = {"a": 0.5, "b": -0.8}

@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from orthaug._jax import jnp
-from orthaug.baseline import Baseline, Term
-from orthaug.errors import InputError
-from orthaug.estimation import estimate
-from orthaug.learners import Function
-from orthaug.record import Record
-from orthaug.solvers import LevenbergMarquardt
-from orthaug.structures import (
+from orthaug._base.errors import InputError
+from orthaug._base.jax import jnp
+from orthaug.data.record import Record
+from orthaug.fitting.estimation import estimate
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.structures import (
     Additive,
     BaselinePenalty,
     Elimination,
@@ -25,6 +23,8 @@ from orthaug.structures import (
     Structure,
     eliminate,
 )
+from orthaug.models.learners import Function
+from orthaug.physics.baseline import Baseline, Term
 
 ALL = (Orthogonal(), Additive(), OrthogonalPenalty(0.3), BaselinePenalty(0.3))
 NAMES, INITIAL = ("a", "b", "c"), np.array([0.5, -2.0, 4.0])

@@ -14,8 +14,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from orthaug.errors import InputError
-from orthaug.study import Study, columns, run
+from orthaug._base.errors import InputError
+from orthaug.studies.study import Study, columns, run
 
 GRID = {"level": [0.1, 0.3], "seed": range(3)}
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthaug.errors import InputError
-from orthaug.expressions import Lag, parse
-from orthaug.suspects import KINDS, Suspect, data_width, suspect_columns
-from orthaug.synthetic import MassSpringDamper
+from orthaug._base.errors import InputError
+from orthaug.analysis.suspects import KINDS, Suspect, data_width, suspect_columns
+from orthaug.data.expressions import Lag, parse
+from orthaug.studies.synthetic import MassSpringDamper
 
 LAYOUT = (Lag("y", 1), Lag("y", 2), Lag("u", 1))
 X = np.random.default_rng(1).normal(size=(50, 3)) * [0.005, 0.005, 100.0]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthaug.errors import InputError
-from orthaug.record import Record
-from orthaug.synthetic import MassSpringDamper, mass_spring_damper, static
+from orthaug._base.errors import InputError
+from orthaug.data.record import Record
+from orthaug.studies.synthetic import MassSpringDamper, mass_spring_damper, static
 
 
 def signals(record: Record) -> tuple[np.ndarray, np.ndarray]:

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthaug.errors import InputError
-from orthaug.tables import check_readable, has_column, read_table
+from orthaug._base.errors import InputError
+from orthaug.data.tables import check_readable, has_column, read_table
 
 
 def put(folder: Path, name: str, content: str | bytes) -> Path:

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthaug._jax import jax, jnp
-from orthaug.baseline import Baseline, Term
-from orthaug.gram import from_chunks
-from orthaug.learners import MLP
-from orthaug.problem import pose
-from orthaug.record import Record
-from orthaug.regressors import Lags, Scaling
-from orthaug.solvers import LevenbergMarquardt
-from orthaug.structures import Orthogonal, OrthogonalPenalty
-from orthaug.synthetic import mass_spring_damper
-from orthaug.training import OUTPUT_UNIT, Task
+from orthaug._base.jax import jax, jnp
+from orthaug.data.record import Record
+from orthaug.data.regressors import Lags
+from orthaug.fitting.one_step import OUTPUT_UNIT, Task
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.structures import Orthogonal, OrthogonalPenalty
+from orthaug.models.learners import MLP, Scaling
+from orthaug.models.rows import from_chunks
+from orthaug.physics.baseline import Baseline, Term
+from orthaug.physics.problem import pose
+from orthaug.studies.synthetic import mass_spring_damper
 
 TERMS = [Term("a", "y1[k-1]", output="y1"), Term("b", "u[k]", output="y2"), Term("a", "u[k-1]", output="y2")]
 

@@ -7,19 +7,19 @@ from functools import cache
 import numpy as np
 import pytest
 
-from orthaug._jax import jax, jnp
-from orthaug.baseline import Baseline, Term
-from orthaug.covariance import interval
-from orthaug.criteria import Simulation
-from orthaug.errors import InputError
-from orthaug.estimation import estimate, orthogonalize
-from orthaug.learners import MLP, Function
-from orthaug.measures import Samples, Training, Uniform
-from orthaug.record import Record
-from orthaug.solvers import LevenbergMarquardt
-from orthaug.structures import Additive, OrthogonalPenalty
-from orthaug.synthetic import NOISE_30_DB, static
-from orthaug.uncertainty import newey_west, prediction_std
+from orthaug._base.errors import InputError
+from orthaug._base.jax import jax, jnp
+from orthaug.data.record import Record
+from orthaug.fitting.criteria import Simulation
+from orthaug.fitting.estimation import estimate, orthogonalize
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.structures import Additive, OrthogonalPenalty
+from orthaug.inference.covariance import interval
+from orthaug.inference.intervals import newey_west, prediction_std
+from orthaug.inference.measures import Samples, Training, Uniform
+from orthaug.models.learners import MLP, Function
+from orthaug.physics.baseline import Baseline, Term
+from orthaug.studies.synthetic import NOISE_30_DB, static
 
 RIDGE = 1e-4
 NODE, SHARE = np.polynomial.legendre.leggauss(200)

@@ -10,11 +10,11 @@ from test_cli import MLP as NETWORK
 from test_cli import SPEC, make_project, one_line, run, signals, write_csv
 from test_parallel import PHYSICS, record_of
 
-from orthaug.errors import InputError
-from orthaug.estimation import estimate
-from orthaug.learners import MLP
-from orthaug.solvers import LevenbergMarquardt
-from orthaug.storage import load
+from orthaug._base.errors import InputError
+from orthaug.fitting.estimation import estimate
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.models.learners import MLP
+from orthaug.models.storage import load
 
 TRAIN, VALIDATION = record_of(0, rows=60), record_of(1, rows=90)
 OPTIONS = {"learner": MLP(hidden=(8,)), "solver": LevenbergMarquardt(iterations=60)}

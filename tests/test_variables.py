@@ -12,9 +12,9 @@ import scipy.io
 import scipy.sparse
 from test_cli import run, signals
 
-from orthaug.errors import InputError
-from orthaug.tables import has_column
-from orthaug.variables import read_variables
+from orthaug._base.errors import InputError
+from orthaug.data.tables import has_column
+from orthaug.data.variables import read_variables
 
 h5py = pytest.importorskip("h5py")
 
@@ -144,7 +144,7 @@ def test_datasets_of_hdf5_by_their_path(tmp_path, name):
 @pytest.mark.parametrize("kind", [float, int, bool])
 def test_cells_of_excel(tmp_path, kind):
     path = put_excel(tmp_path / "run.xlsx", u=np.array([1, 0, 1], dtype=kind))
-    from orthaug.tables import read_table
+    from orthaug.data.tables import read_table
 
     found = read_table(path, ("u",)).columns["u"]
     assert found.dtype == np.float64 and found.tolist() == [1.0, 0.0, 1.0]

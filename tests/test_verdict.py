@@ -9,14 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orthaug.baseline import Baseline, Term
-from orthaug.errors import InputError
-from orthaug.estimation import estimate
-from orthaug.learners import MLP
-from orthaug.record import Record
-from orthaug.regressors import Lags
-from orthaug.solvers import LevenbergMarquardt
-from orthaug.validation import (
+from orthaug._base.errors import InputError
+from orthaug.analysis.validation import (
     Extrapolation,
     Trial,
     blocked,
@@ -27,6 +21,12 @@ from orthaug.validation import (
     judge,
     trial_on,
 )
+from orthaug.data.record import Record
+from orthaug.data.regressors import Lags
+from orthaug.fitting.estimation import estimate
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.models.learners import MLP
+from orthaug.physics.baseline import Baseline, Term
 
 PHYSICS = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("g", "u[k-1]")])
 BEYOND = Extrapolation("tests.far", "u[k-1]", (-1.0, 1.0), (-2.5, 2.0), 0.25)

@@ -1,35 +1,5 @@
-"""The paper's figures and tables, one file each: what is run, drawn, and compared with the published numbers."""
+"""Declared runs over grids and seeds, and the paper's own."""
 
-from __future__ import annotations
+import lazy_loader
 
-from typing import Any
-
-from orthaug.studies.entry import Finding, Reproduction
-
-__all__ = ["Finding", "Reproduction", "catalogue"]
-
-
-def catalogue() -> dict[str, Reproduction]:
-    """All of them, in the paper's order."""
-    from orthaug.studies import (
-        consistency,
-        covariance,
-        coverage,
-        data_length,
-        regularization_weight,
-        solver_times,
-        static_errors,
-        static_noise,
-    )
-
-    found: list[Any] = [
-        static_errors,
-        data_length,
-        static_noise,
-        covariance,
-        consistency,
-        regularization_weight,
-        coverage,
-        solver_times,
-    ]
-    return {module.REPRODUCTION.name: module.REPRODUCTION for module in found}
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

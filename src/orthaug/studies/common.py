@@ -9,11 +9,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from orthaug.measures import Samples
-from orthaug.record import Record
-from orthaug.solvers import AdamLBFGS, LevenbergMarquardt
-from orthaug.structures import Additive, Orthogonal
-from orthaug.synthetic import NOISE_30_DB, Example, static
+from orthaug.data.record import Record
+from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.structures import Additive, Orthogonal
+from orthaug.inference.measures import Samples
+from orthaug.studies.synthetic import NOISE_30_DB, Example, static
 
 if TYPE_CHECKING:
     import pandas as pd

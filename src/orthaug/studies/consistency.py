@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orthaug.estimation import estimate
-from orthaug.structures import Additive
+from orthaug.fitting.estimation import estimate
+from orthaug.fitting.structures import Additive
 from orthaug.studies.common import LARGEST_TRAINED, UNIFORM, bars, drawn, legend, panels, slope, solver, span
 from orthaug.studies.data_length import limit
 from orthaug.studies.entry import Finding, Reproduction
-from orthaug.study import Study
+from orthaug.studies.study import Study
 
 if TYPE_CHECKING:
     import pandas as pd

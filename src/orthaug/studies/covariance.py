@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orthaug.estimation import estimate
+from orthaug.fitting.estimation import estimate
 from orthaug.studies.common import panels, solver
 from orthaug.studies.entry import Finding, Reproduction
-from orthaug.study import Study
-from orthaug.synthetic import static
+from orthaug.studies.study import Study
+from orthaug.studies.synthetic import static
 
 if TYPE_CHECKING:
     import pandas as pd

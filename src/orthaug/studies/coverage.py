@@ -8,20 +8,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orthaug.covariance import interval
-from orthaug.estimation import estimate
-from orthaug.record import Record
-from orthaug.solvers import LevenbergMarquardt
+from orthaug.data.record import Record
+from orthaug.fitting.estimation import estimate
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.inference.covariance import interval
 from orthaug.studies.common import COLOURS, UNIFORM, legend, panels
 from orthaug.studies.entry import Finding, Reproduction
-from orthaug.study import Study
-from orthaug.synthetic import NOISE_30_DB, static
+from orthaug.studies.study import Study
+from orthaug.studies.synthetic import NOISE_30_DB, static
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-    from orthaug.result import Estimate
+    from orthaug.fitting.estimates import Estimate
 
 RIDGE = 1e-4
 KINDS = {"training": "training measure", "paper": "the paper's convention", "uniform": "uniform measure"}

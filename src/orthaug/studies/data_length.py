@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orthaug.estimation import estimate
+from orthaug.fitting.estimation import estimate
 from orthaug.studies.common import COLOURS, LARGEST_TRAINED, UNIFORM, bars, drawn, legend, panels, slope, solver
 from orthaug.studies.entry import Finding, Reproduction
-from orthaug.study import Study
+from orthaug.studies.study import Study
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
-from orthaug.study import Study
+from orthaug.studies.study import Study
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orthaug.estimation import estimate
-from orthaug.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
+from orthaug.fitting.estimation import estimate
+from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
 from orthaug.studies.common import COLOURS, LABELS, bars, legend, panels, pick, solver, span
 from orthaug.studies.entry import Finding, Reproduction
-from orthaug.study import Study
-from orthaug.synthetic import mass_spring_damper
+from orthaug.studies.study import Study
+from orthaug.studies.synthetic import mass_spring_damper
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -7,16 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orthaug._jax import jax
-from orthaug.learners import MLP
-from orthaug.problem import pose
-from orthaug.solvers import AdamLBFGS, LevenbergMarquardt
-from orthaug.structures import Orthogonal
+from orthaug._base.jax import jax
+from orthaug.fitting.one_step import Task
+from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.structures import Orthogonal
+from orthaug.models.learners import MLP
+from orthaug.physics.problem import pose
 from orthaug.studies.common import PIPELINES, legend, panels, pick
 from orthaug.studies.entry import Finding, Reproduction
-from orthaug.study import Study
-from orthaug.synthetic import mass_spring_damper, static
-from orthaug.training import Task
+from orthaug.studies.study import Study
+from orthaug.studies.synthetic import mass_spring_damper, static
 
 if TYPE_CHECKING:
     import pandas as pd

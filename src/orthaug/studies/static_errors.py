@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orthaug.estimation import estimate
-from orthaug.measures import Uniform
+from orthaug.fitting.estimation import estimate
+from orthaug.inference.measures import Uniform
 from orthaug.studies.common import COLOURS, LABELS, MARKERS, STRUCTURES, legend, panels, pick, solver, span
 from orthaug.studies.entry import Finding, Reproduction
-from orthaug.study import Study
-from orthaug.synthetic import static
+from orthaug.studies.study import Study
+from orthaug.studies.synthetic import static
 
 if TYPE_CHECKING:
     import pandas as pd

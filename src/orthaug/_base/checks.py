@@ -1,0 +1,89 @@
+"""Array types with their shapes, and the checks of arguments at the public edge."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._base.errors import InputError
+
+Vector = Float[np.ndarray, "_"]
+Matrix = Float[np.ndarray, "_ _"]
+
+
+def as_signal(values: Any, name: str) -> Matrix:
+    """Samples as a float matrix (N, channels); a vector is one channel.
+
+    Raises:
+        InputError: not numeric, more than two axes, or a cell that is not finite (named by its row).
+    """
+    try:
+        array = np.asarray(values)
+        if np.iscomplexobj(array):
+            raise InputError(f"`{name}` is complex; expected real numbers.")
+        array = np.array(array, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"`{name}` is not an array of numbers: {error}.") from None
+    if array.ndim == 1:
+        array = array[:, None]
+    if array.ndim != 2:
+        raise InputError(f"`{name}` has {array.ndim} axes; expected (samples,) or (samples, channels).")
+    bad = np.argwhere(~np.isfinite(array))
+    if bad.size:
+        row, column = bad[0]
+        raise InputError(
+            f"`{name}` is not finite at row {row}, channel {column}: found {array[row, column]}. "
+            "Remove the row or split the experiment there."
+        )
+    return array
+
+
+def check_unique(names: Iterable[str], what: str) -> None:
+    """Raise InputError where a name stands twice."""
+    seen: set[str] = set()
+    for name in names:
+        if name in seen:
+            raise InputError(f"{what} '{name}' is given twice; names must differ.")
+        seen.add(name)
+
+
+def check_choice(value: str, choices: Iterable[str], what: str) -> str:
+    """Return `value` if it is one of `choices`, otherwise raise InputError naming them."""
+    choices = tuple(choices)
+    if value not in choices:
+        raise InputError(f"{what} must be one of {', '.join(choices)}; got '{value}'.")
+    return value
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """`, did you mean 'x'?` for the closest known name, or nothing."""
+    known = list(known)
+    close = [k for k in known if k.lower().startswith(name.lower())] or difflib.get_close_matches(name, known, n=1)
+    return f", did you mean '{close[0]}'?" if close else ""
+
+
+def check_count(value: Any, name: str, least: int = 1) -> int:
+    """Return `value` if it is a whole number of at least `least`, otherwise raise InputError."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise InputError(f"`{name}` must be a whole number, {least} or more; got {value!r}.")
+    return int(value)
+
+
+def check_number(value: Any, name: str, *, positive: bool = False) -> float:
+    """Return `value` if it is a finite number, 0 or more (above 0 if `positive`), otherwise raise InputError."""
+    number = not isinstance(value, bool) and isinstance(value, int | float | np.number) and bool(np.isfinite(value))
+    if not number or value < 0 or (positive and value == 0):
+        raise InputError(
+            f"`{name}` must be {'a positive number' if positive else 'a number, 0 or more'}; got {value!r}."
+        )
+    return float(value)
+
+
+def check_type(value: Any, kinds: Any, name: str, wanted: str) -> None:
+    """Raise InputError unless `value` is an instance of `kinds` (a class itself is none)."""
+    if isinstance(value, type) or not isinstance(value, kinds):
+        raise InputError(f"`{name}` must be {wanted}; got {value!r}.")

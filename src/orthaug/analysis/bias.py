@@ -1,0 +1,312 @@
+"""What unmodelled terms do to θ: bias per unit of each suspect, and whether any measure can remove it (F3).
+
+With the truth `Y = Φθ* + Δ + E` (`eq:data_gen_sys_reformed_vect`) the estimate under a measure μ errs by
+`θ̂ − θ* = Φ_μ⁺(Δ_μ − ε_μ)` (eq:error_val and fact F3), ε the misfit of the whole model. Here Φ_μ and Δ_μ are the
+rows multiplied by the square root of their weight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import linprog
+
+from orthaug._base.checks import Matrix, Vector, check_unique
+from orthaug._base.errors import InputError
+from orthaug.analysis.suspects import Suspect
+from orthaug.physics.excitation import excitation, require_rank
+from orthaug.physics.projection import Projection
+
+NEGLIGIBLE = 1e-12  # rows whose ‖φᵀδ‖ is below this share of the largest ‖φ‖‖δ‖: only weights of 1e12 could use them
+SMALLEST_COSINE = 1e-6  # between Φa and Δ; below it the optimum of the linear program counts as zero
+VIOLATION = 1e-9  # of (φᵀa)δ, rows and a of unit length; the linear program itself is solved to 1e-10
+WORKING_SET = 1000  # rows of the first linear program, and the most that are added at a time
+MOST_ROUNDS = 50
+IN_SPAN = 1e-10  # ‖P⊥Δ‖/‖Δ‖ below which Δ counts as physics
+
+Verdict = Literal["unremovable", "removable", "undecided", "orthogonal"]
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Whether a measure on the given points can make φ and δ orthogonal.
+
+    By Stiemke's lemma exactly one of the two holds: positive weights on all points with `Σ μ_k φ_kᵀδ_k = 0`
+    (`removable`), or a direction a with `(φ_kᵀa)δ_k ≥ 0` on all points and `> 0` on some (`unremovable`).
+    `undecided` is a numerical failure; `orthogonal` means that `φ_kᵀδ_k` is zero on every point.
+
+    `direction` (nt,) is a in the units of θ, `Φa` of root mean square 1; `shares` (nt,) is the same with the
+    columns of Φ scaled to root mean square 1 and the largest entry 1, to read. `cosine` is that between Φa and Δ,
+    `positive` the fraction of points where `(φᵀa)δ > 0`: a measure on the rest alone is not excluded.
+    """
+
+    verdict: Verdict
+    direction: tuple[float, ...] | None = None
+    shares: tuple[float, ...] | None = None
+    cosine: float | None = None
+    positive: float | None = None
+
+
+@dataclass(frozen=True)
+class SuspectedBias:
+    """What a suspect does to θ if it is there, per unit of its coefficient.
+
+    `bias` (nt,) is `Φ_μ⁺Δ_μ`, in the unit of θ per unit of the coefficient; `relative` the same divided by θ
+    (None where θ is 0); `physical` the same for physical parameters, to first order; `expected` is `bias` times the
+    guessed coefficient. `cosine` is `‖QᵀΔ‖/‖Δ‖` in [0, 1], 0 where the paper's `cond:special_PE` holds: None for
+    Δ = 0. `explained` is the squared cosine between P⊥Δ and the learner's values, and `found` the coefficient
+    with which P⊥Δ fits them best: both None without a learner, or where Δ lies in the span of Φ.
+    """
+
+    suspect: Suspect
+    names: tuple[str, ...]
+    bias: tuple[float, ...]
+    relative: tuple[float | None, ...] | None
+    expected: tuple[float, ...] | None
+    physical: tuple[tuple[str, float], ...] | None
+    cosine: float | None
+    explained: float | None
+    found: float | None
+    certificate: Certificate | None
+
+    @property
+    def sentence(self) -> str:
+        """The certificate in words; empty where none was sought."""
+        found = self.certificate
+        if found is None:
+            return ""
+        if found.verdict == "orthogonal":
+            return f"{self.suspect.name}: φᵀδ is zero on all of these points, so that it biases nothing there."
+        if found.verdict == "removable":
+            return f"{self.suspect.name}: some weighting of these points leaves θ unbiased."
+        if found.verdict == "undecided":
+            return f"{self.suspect.name}: whether a weighting of these points leaves θ unbiased could not be decided."
+        assert found.shares is not None and found.positive is not None
+        terms = [
+            f"{share:+.3g} {name}" for share, name in zip(found.shares, self.names, strict=True) if abs(share) > 5e-3
+        ]
+        return (
+            f"{self.suspect.name}: no weighting of these points leaves θ unbiased if it counts any of the "
+            f"{100 * found.positive:.3g} % where (φᵀa)δ is positive, for it is nowhere negative; "
+            f"a = {' '.join(terms)} (columns scaled to root mean square 1). Only the least bias can be asked for."
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain numbers, text and None, for JSON."""
+        found = self.certificate
+
+        def by_name(values: tuple[float | None, ...] | None) -> dict[str, float | None] | None:
+            return None if values is None else dict(zip(self.names, values, strict=True))
+
+        return {
+            "name": self.suspect.name,
+            "expression": self.suspect.expression,
+            "output": self.suspect.output,
+            "coefficient": self.suspect.coefficient,
+            "bias": by_name(self.bias),
+            "relative_bias": by_name(self.relative),
+            "expected_bias": by_name(self.expected),
+            "physical_bias": None if self.physical is None else dict(self.physical),
+            "cosine": self.cosine,
+            "explained": self.explained,
+            "coefficient_found": self.found,
+            "certificate": None
+            if found is None
+            else {
+                "verdict": found.verdict,
+                "direction": by_name(found.direction),
+                "shares": by_name(found.shares),
+                "cosine": found.cosine,
+                "positive": found.positive,
+                "sentence": self.sentence,
+            },
+        }
+
+
+def bias_table(
+    projection: Projection,
+    names: Sequence[str],
+    suspects: Sequence[Suspect],
+    deltas: Float[np.ndarray, "ns N ny"],
+    *,
+    gain: np.ndarray | float = 1.0,
+    theta: Vector | None = None,
+    physical: Mapping[str, Sequence[float] | Vector] | None = None,
+    learned: Matrix | None = None,
+    certify: bool = True,
+) -> tuple[SuspectedBias, ...]:
+    """One `SuspectedBias` for each suspect, under the measure that `projection` was made with.
+
+    Args:
+        projection: of the rows of φ multiplied by `gain`.
+        names: the nt parameters.
+        suspects: their forms; `deltas` (ns, N, ny) their values, as `suspects.suspect_columns` gives them.
+        gain: what the rows of φ were multiplied by: 1/standard deviation of the outputs (ny,), times the square
+            root of the measure's weights (N, 1); any shape that broadcasts to (N, ny).
+        theta: θ (nt,), for relative biases.
+        physical: a row of dp/dθ (nt,) for each physical parameter p, by name.
+        learned: the learner's values (N, ny) in the outputs' units, projected or not.
+        certify: search for certificates, a linear program per suspect.
+
+    Raises:
+        InputError: shapes that do not fit, values that are not finite, suspects of one name; RankError for
+            physics that the points do not determine.
+    """
+    names = tuple(names)
+    if not names:
+        raise InputError("the physics has no parameters; there is nothing that a suspect could bias.")
+    _check_shapes(projection, names, suspects, deltas, theta, physical, learned)
+    gain = _row_gain(gain, deltas.shape[1:])
+    require_rank(excitation(projection.r, names), projection.q.shape[0] * projection.q.shape[1])
+    tilde = None if learned is None else projection.orthogonal_part(np.asarray(learned) * gain)
+    entries = []
+    for suspect, delta in zip(suspects, deltas, strict=True):
+        if not np.all(np.isfinite(delta)):
+            raise InputError(f"suspect '{suspect.name}' is not finite on every row.")
+        weighted = delta * gain
+        bias = projection.solve(weighted)
+        cosine, explained, found = _overlaps(projection, weighted, tilde)
+        entries.append(
+            SuspectedBias(
+                suspect,
+                names,
+                _numbers(bias),
+                None if theta is None else tuple(float(b / t) if t else None for b, t in zip(bias, theta, strict=True)),
+                None if suspect.coefficient is None else _numbers(suspect.coefficient * bias),
+                None if physical is None else tuple((p, float(np.dot(row, bias))) for p, row in physical.items()),
+                cosine,
+                explained,
+                found,
+                find_certificate(projection, weighted) if certify else None,
+            )
+        )
+    return tuple(entries)
+
+
+def _overlaps(
+    projection: Projection, delta: Matrix, tilde: Matrix | None
+) -> tuple[float | None, float | None, float | None]:
+    """cos(Δ, span Φ); R² of the learner's P⊥F on P⊥Δ; the coefficient of that fit."""
+    size = np.abs(delta).max(initial=0.0)
+    if size == 0:
+        return None, None, None
+    unit = delta / size  # squares of the smallest numbers would be lost
+    norm = np.linalg.norm(unit)
+    cosine = float(min(np.linalg.norm(projection.coordinates(unit)) / norm, 1.0))
+    rest = projection.orthogonal_part(unit)
+    left = np.linalg.norm(rest)
+    if tilde is None or not np.any(tilde) or left < IN_SPAN * norm:
+        return cosine, None, None
+    product = float(np.vdot(rest, tilde)) / left
+    explained = (product / float(np.linalg.norm(tilde))) ** 2
+    return cosine, float(min(explained, 1.0)), float(product / left / size)
+
+
+def find_certificate(projection: Projection, delta: Float[np.ndarray, "N ny"]) -> Certificate:
+    """Maximise `Σ (φᵀa)δ` subject to `(φᵀa)δ ≥ 0` on every point and `|a| ≤ 1`; F3.
+
+    In the coordinates of Q, so that neither units nor conditioning of Φ matter; a row of several outputs counts
+    the sum over them, weighted as in `projection`. The linear program is solved on a working set, to which the
+    most violated rows are added until there are none: the optimum of a subset bounds that of all.
+
+    Args:
+        projection: of the weighted rows of φ.
+        delta: δ weighted alike, (N, ny).
+    """
+    size = np.abs(delta).max(initial=0.0)
+    delta = delta / size if size > 0 else delta  # squares of the smallest numbers would be lost
+    products = np.einsum("kon,ko->kn", projection.q, delta)
+    lengths = np.linalg.norm(products, axis=1)
+    largest = (np.linalg.norm(projection.q, axis=2) * np.abs(delta)).max(initial=0.0)
+    kept = lengths > NEGLIGIBLE * largest
+    if not kept.any():
+        return Certificate("orthogonal")
+    rows = products[kept] / lengths[kept, None]
+    objective = products.sum(axis=0) / np.linalg.norm(delta)
+    chosen = np.unique(np.linspace(0, len(rows) - 1, min(WORKING_SET, len(rows))).astype(int))
+    for _ in range(MOST_ROUNDS):
+        solved = linprog(
+            -objective,
+            A_ub=-rows[chosen],
+            b_ub=np.zeros(len(chosen)),
+            bounds=(-1, 1),
+            method="highs",
+            options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
+        )
+        if solved.x is None:
+            return Certificate("undecided")
+        a = solved.x
+        # A ray that exists reaches the box; one that does not is only the program's own tolerance.
+        if np.abs(a).max() < 0.5 or objective @ a < SMALLEST_COSINE * np.linalg.norm(a):
+            return Certificate("removable")
+        a = a / np.linalg.norm(a)
+        margin = rows @ a
+        violated = np.flatnonzero(margin < -VIOLATION)
+        if not violated.size:
+            return _certificate(projection, a, float(objective @ a), margin, len(products))
+        worst = violated[np.argsort(margin[violated])[:WORKING_SET]]
+        grown = np.union1d(chosen, worst)
+        if len(grown) == len(chosen):
+            break
+        chosen = grown
+    return Certificate("undecided")
+
+
+def _certificate(projection: Projection, a: Vector, cosine: float, margin: Vector, points: int) -> Certificate:
+    direction = projection.from_coordinates(a) * np.sqrt(points)  # ‖Qa‖ = 1, so Φa has root mean square 1
+    sizes = np.sqrt(np.square(projection.phi * projection.scale).sum(axis=(0, 1))) / projection.scale
+    shares = direction * sizes
+    return Certificate(
+        "unremovable",
+        _numbers(direction),
+        _numbers(shares / np.abs(shares).max()),
+        cosine,
+        float(np.sum(margin > VIOLATION) / points),
+    )
+
+
+def _numbers(values: Vector) -> tuple[float, ...]:
+    return tuple(float(v) for v in values)
+
+
+def _row_gain(gain: np.ndarray | float, shape: tuple[int, ...]) -> np.ndarray:
+    """`gain` broadcast to (N, ny)."""
+    gain = np.asarray(gain, dtype=float)
+    try:
+        gain = np.broadcast_to(gain, shape)
+    except ValueError:
+        raise InputError(f"`gain` has shape {gain.shape}, which does not fit rows of shape {shape}.") from None
+    if not np.all(np.isfinite(gain)) or np.any(gain < 0):
+        raise InputError("`gain` must be finite and nowhere negative.")
+    return gain
+
+
+def _check_shapes(
+    projection: Projection,
+    names: tuple[str, ...],
+    suspects: Sequence[Suspect],
+    deltas: np.ndarray,
+    theta: Vector | None,
+    physical: Mapping[str, Sequence[float] | Vector] | None,
+    learned: Matrix | None,
+) -> None:
+    rows, ny, nt = projection.q.shape
+    check_unique((suspect.name for suspect in suspects), "suspect")
+    wanted: list[tuple[str, Any, tuple[int, ...]]] = [
+        ("names", names, (nt,)),
+        ("deltas", deltas, (len(suspects), rows, ny)),
+    ]
+    if theta is not None:
+        wanted.append(("theta", theta, (nt,)))
+    if learned is not None:
+        wanted.append(("learned", learned, (rows, ny)))
+    wanted += [(f"physical['{name}']", row, (nt,)) for name, row in (physical or {}).items()]
+    for what, values, shape in wanted:
+        if np.shape(values) != shape:
+            raise InputError(f"`{what}` has shape {np.shape(values)}; expected {shape}.")
+        if what not in ("names", "deltas") and not np.all(np.isfinite(values)):
+            raise InputError(f"`{what}` must be finite numbers.")

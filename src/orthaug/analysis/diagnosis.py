@@ -1,0 +1,246 @@
+"""What the residual says about the noise, and which criterion the data ask for (DESIGN F7).
+
+Noise in the equation leaves a white one-step residual. Noise on the measured output leaves a coloured one, makes
+one-step least squares inconsistent, and lets a free run explain the data as well as a prediction from measured lags.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import Vector
+from orthaug._base.parallel import one_blas_thread
+from orthaug.analysis.residuals import ResidualTest, analyse
+from orthaug.data.regressors import Lags, stack_rows
+from orthaug.fitting.criteria import Simulation
+from orthaug.fitting.estimates import Estimate
+from orthaug.fitting.estimation import estimate
+from orthaug.models.response import Response
+from orthaug.physics.problem import Problem
+
+LAGS = 25  # as MATLAB's `resid`
+_PRACTICALLY_WHITE = 0.05  # correlations below this are no matter, however sure a long record makes them
+_LITTLE_COLOUR = 0.2  # of a free run's errors that are noise, beside a start from noisy lags and a fit of finite length
+_AS_GOOD = 1.05  # free-run error / one-step error up to which measured lags add nothing
+_TOLD = 5  # findings that a text lists at most
+_SHARE = 0.01  # of the residual's variance: what a regressor explains of it counts from there
+_ROUNDING = 1e-14  # of the output's deviation: a residual that says nothing
+_TOO_FAST = 0.05  # noise variance / smallest variance among the lagged outputs
+
+_COLOURED = "standard errors of θ are those of a white residual, but the {what} coloured: take them for a rough guide."
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """`verdict` is white, equation_noise, sensor_noise or unmodelled; `text` says why and what to do.
+
+    `one_step` and `free_run` are the tests of the two residuals per output. `ratio` is the free run's RMS error against
+    the one-step error, `noise_in_lags` the share of noise in the least excited direction of the lagged outputs.
+    """
+
+    verdict: str
+    text: str
+    one_step: tuple[ResidualTest, ...]
+    free_run: tuple[ResidualTest, ...] | None
+    ratio: float | None
+    noise_in_lags: float | None
+    warnings: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain content for JSON."""
+        return {
+            "verdict": self.verdict,
+            "text": self.text,
+            "one_step": [test.as_dict() for test in self.one_step],
+            "free_run": None if self.free_run is None else [test.as_dict() for test in self.free_run],
+            "free_run_to_one_step": self.ratio,
+            "noise_in_lags": self.noise_in_lags,
+        }
+
+
+def diagnose(fit: Estimate) -> Diagnosis | None:
+    """Analyse the residuals of a fit on its training data; None where they cannot be tested.
+
+    A one-step fit whose residual is coloured is set beside the free run of the physics alone, trained on it: that is
+    what sensor noise asks for, and it does not suffer from the bias of the fit in question.
+    """
+    problem, model, simulated = fit.problem, fit.model, fit.criterion.flown is not None
+    skip = fit.criterion.washout if isinstance(fit.criterion, Simulation) else 0
+    one_step, free_run = model.predict(problem.record), model.simulate(problem.record)
+    tests = _tests(problem, one_step)
+    if any(test.white is None for test in tests) or np.all(_errors(one_step) * problem.weight < _ROUNDING):
+        return None
+    white = all(_is_white(test, _PRACTICALLY_WHITE) for test in tests)
+    complete = white and not any(_misfits(test) for test in tests)
+    if not model.form.memory:
+        return _static(fit, tests, white, complete)
+    flown = [(free_run, skip)] if not any(t.diverged for t in free_run.trajectories) else []
+    free_tests = _tests(problem, free_run, skip) if flown else None
+    if not simulated and not white:
+        flown += _physics_flown(fit)
+    ratios = [_ratio(run, one_step, first) for run, first in flown]
+    good = [
+        r
+        for r, (run, first) in zip(ratios, flown, strict=True)
+        if r and r < _AS_GOOD and _accounts(problem, run, first)
+    ]
+    sensor = not white and bool(good)
+    ratio = min(good) if sensor else ratios[0] if ratios else None
+    noise = _noise_in_lags(problem, ratio, one_step) if sensor else None
+    free_white = free_tests is not None and all(_is_white(test, _PRACTICALLY_WHITE) for test in free_tests)
+    verdict = ("white" if free_white else "equation_noise") if complete else "sensor_noise" if sensor else "unmodelled"
+    text, warnings = _words(verdict, fit, tests, ratio, noise, simulated)
+    if fit.std is not None and not warnings and not (free_white if simulated else white):
+        warnings = (_COLOURED.format(what="errors of the free run are" if simulated else "one-step residual is"),)
+    return Diagnosis(verdict, text, tests, free_tests, ratio, noise, warnings)
+
+
+def _static(fit: Estimate, tests: tuple[ResidualTest, ...], white: bool, complete: bool) -> Diagnosis:
+    text, warnings = _words("white" if complete else "unmodelled", fit, tests, None, None, False)
+    if fit.std is not None and not white:
+        warnings = (_COLOURED.format(what="one-step residual is"),)
+    return Diagnosis("white" if complete else "unmodelled", text, tests, None, None, None, warnings)
+
+
+def _is_white(test: ResidualTest, small: float) -> bool:
+    """White by Ljung-Box, or with correlations too small to matter."""
+    return test.white is not False or test.largest_acf is None or test.largest_acf < small
+
+
+def _follows(test: ResidualTest, small: float) -> list[str]:
+    """Inputs that the residual follows, surely and by enough to matter."""
+    return [name for name in test.correlated_inputs if (t := test.cross[name]) and abs(t.largest) > small]
+
+
+def _misfits(test: ResidualTest) -> list[str]:
+    """Inputs and regressors that the residual still follows."""
+    curved = [name for name in test.curved_regressors if (t := test.regressors[name]) and t.share > _SHARE]
+    return _follows(test, _PRACTICALLY_WHITE) + curved
+
+
+def _accounts(problem: Problem, free_run: Response, skip: int) -> bool:
+    """Whether the errors of a free run look like noise on a sensor: white enough, and not following the inputs."""
+    tests = _tests(problem, free_run, skip)
+    return all(_is_white(test, _LITTLE_COLOUR) and not _follows(test, 2 * _PRACTICALLY_WHITE) for test in tests)
+
+
+def _physics_flown(fit: Estimate) -> list[tuple[Response, int]]:
+    """The free run of the physics alone, trained on the free run; with the rows to skip."""
+    problem, criterion = fit.problem, Simulation()
+    longest = max(len(e) for e in problem.record.experiments) - fit.model.form.start
+    if longest <= 2 * criterion.washout:
+        criterion = Simulation(segment=0, washout=0)
+    found = estimate(problem.record, problem.baseline, lags=_lags_of(fit), learner=None, criterion=criterion)
+    if not found.status.ok:
+        return []
+    run = found.model.simulate(problem.record)
+    return [] if any(t.diverged for t in run.trajectories) else [(run, criterion.washout)]
+
+
+def _lags_of(fit: Estimate) -> Lags | None:
+    """The lags that a baseline function needs; terms know their own."""
+    if fit.problem.baseline.function is None:
+        return None
+    layout, outputs = fit.problem.layout, fit.problem.outputs
+    reach = {name: [lag.lag for lag in layout if lag.channel == name] for name in dict.fromkeys(c for c, _ in layout)}
+    inputs = [c.name for c in fit.problem.record.inputs]
+    return Lags(
+        na=[len(reach.get(name, [])) for name in outputs],
+        nb=[len(reach.get(name, [])) for name in inputs],
+        nk=[min(reach.get(name, [0])) for name in inputs],
+    )
+
+
+def _tests(problem: Problem, response: Response, skip: int = 0) -> tuple[ResidualTest, ...]:
+    """The tests of measured minus model on every usable row after the first `skip`."""
+    record, layout = problem.record, problem.layout
+    residuals, inputs, regressors = [], [], []
+    for experiment, trajectory in zip(record.experiments, response.trajectories, strict=True):
+        first = trajectory.start
+        residuals.append((experiment.outputs - trajectory.model)[first:][skip:])
+        inputs.append(experiment.inputs[first:][skip:])
+        alone = replace(record, experiments=(experiment,))
+        regressors.append(stack_rows(alone, layout).x[skip:])
+    names = ([c.name for c in record.outputs], [c.name for c in record.inputs], [str(lag) for lag in layout])
+    with one_blas_thread():
+        return analyse(residuals, inputs, regressors, *names, lags=LAGS)
+
+
+def _errors(response: Response, skip: int = 0) -> Vector:
+    """RMS error of every output over the rows with a value, without the first `skip` of them."""
+    pieces = [(t.measured - t.model)[t.start :][skip:] for t in response.trajectories]  # type: ignore[operator]
+    with np.errstate(all="ignore"):
+        return np.sqrt(np.mean(np.concatenate(pieces) ** 2, axis=0))
+
+
+def _ratio(free_run: Response, one_step: Response, skip: int) -> float | None:
+    """Geometric mean over outputs of the free run's RMS error against the one-step error."""
+    free, one = _errors(free_run, skip), _errors(one_step, skip)
+    if not (np.isfinite(free).all() and np.all(one > 0) and np.all(free > 0)):
+        return None
+    return float(np.exp(np.mean(np.log(free / one))))
+
+
+def _noise_in_lags(problem: Problem, ratio: float | None, one_step: Response) -> float | None:
+    """Noise variance against the smallest variance among the lagged outputs that the other regressors do not explain.
+
+    It is the share by which one-step least squares shrinks what it estimates in that direction.
+    """
+    own = [j for j, lag in enumerate(problem.layout) if lag.channel in problem.outputs]
+    others = [j for j in range(len(problem.layout)) if j not in own]
+    noise = (_errors(one_step) * (ratio or 1.0)) ** 2
+    channel = [problem.outputs.index(problem.layout[j].channel) for j in own]
+    x = problem.rows.x - problem.rows.x.mean(axis=0)
+    lagged = x[:, own] / np.sqrt(noise[channel])
+    rest = x[:, others]
+    if others:
+        lagged = lagged - rest @ np.linalg.lstsq(rest, lagged, rcond=None)[0]
+    smallest = float(np.linalg.eigvalsh(lagged.T @ lagged / len(lagged)).min())
+    return 1.0 / smallest if smallest > 1.0 else 1.0
+
+
+def _words(
+    verdict: str,
+    fit: Estimate,
+    tests: Sequence[ResidualTest],
+    ratio: float | None,
+    noise: float | None,
+    simulated: bool,
+) -> tuple[str, tuple[str, ...]]:
+    """The text of a verdict, and the warnings that intervals of θ must carry."""
+    if verdict == "white":
+        return "The one-step residual is white: the intervals hold, and no criterion is better than this one.", ()
+    if verdict == "equation_noise":
+        asked = " The one-step criterion is the more precise one here." if simulated else ""
+        return f"The one-step residual is white, the free run's is not: the noise enters the equation.{asked}", ()
+    colour = max((t.largest_acf or 0.0) for t in tests)
+    if verdict == "sensor_noise":
+        closer = "as close" if ratio is None or ratio > 0.95 else f"{1 / ratio:.1f} times closer"
+        own = "the free run is" if simulated else "the physics trained on the free run comes"
+        found = f"its largest autocorrelation is {colour:.2f}, and {own} {closer} without measured lags"
+        text = f"The one-step residual is coloured: {found}. That is noise on the measured output"
+        if simulated:
+            return f"{text}, which the simulation criterion suits.", ()
+        text += '. One-step estimates of θ are then inconsistent: train with focus = "simulation"'
+        if noise is not None and noise > _TOO_FAST:
+            text += (
+                f". The noise is {100 * noise:.0f} % of what tells the lagged outputs apart: the sampling is too fast "
+                "for one-step estimation"
+            )
+        warning = "noise on the measured output biases the one-step θ, and its intervals do not cover that bias: "
+        return f"{text}.", (f'{warning}train with focus = "simulation".',) if fit.std is not None else ()
+    told = [f"its largest autocorrelation is {colour:.2f}"]
+    for test in tests:
+        told += [f"the residual of {test.name} still follows {name}" for name in test.correlated_inputs]
+        told += [f"the residual of {test.name} is curved over {name}" for name in test.curved_regressors]
+    told = [*told[:_TOLD], *(["and more"] if len(told) > _TOLD else [])]
+    share = max((t.rms or 0.0) * w for t, w in zip(tests, fit.problem.weight, strict=True))
+    text = (
+        f"The one-step residual, {100 * share:.2g} % of the output's deviation, is not noise alone: {'; '.join(told)}. "
+        "Dynamics or nonlinearity are missing, or the noise is coloured. Try more lags, other learner inputs or neurons"
+    )
+    return f"{text}.", ()

@@ -1,0 +1,240 @@
+"""Suspected unmodelled terms δ(x): friction, drag, hardening and the like, as expressions of raw lags.
+
+They are the "suspected unmodeled terms" of the paper's remark after `cond:special_PE`: what the physics
+leaves out by intention, known in form though not in size.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._base.checks import Matrix, check_number, check_unique, nearest
+from orthaug._base.errors import InputError
+from orthaug.data.expressions import Expression, Lag, is_name, parse
+from orthaug.data.regressors import Layout
+
+
+class _Kind(NamedTuple):
+    """How a kind writes its expression: `text(x, w)` of the channel expression x and the width w."""
+
+    text: Callable[[str, str], str]
+    width: bool = False
+
+
+def _clip(x: str, w: str) -> str:
+    return f"max(min({x}, {w}), -{w})"
+
+
+# (x) is in parentheses wherever an operator touches it; function arguments need none.
+_KINDS = {
+    "coulomb": _Kind(lambda x, w: f"sign({x})"),
+    "stribeck": _Kind(lambda x, w: f"sign({x})*exp(-abs({x})/{w})", width=True),
+    "stribeck_gauss": _Kind(lambda x, w: f"sign({x})*exp(-(({x})/{w})**2)", width=True),
+    "quadratic_drag": _Kind(lambda x, w: f"({x})*abs({x})"),
+    "cubic": _Kind(lambda x, w: f"({x})**3"),
+    "dead_zone": _Kind(lambda x, w: f"({x}) - {_clip(x, w)}", width=True),
+    "saturation": _Kind(_clip, width=True),
+    "offset": _Kind(lambda x, w: "1"),
+    "expression": _Kind(lambda x, w: x),
+}
+KINDS = tuple(_KINDS)
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A suspected term `coefficient * expression` of one output; make one of a known kind with `of`.
+
+    `expression` is in `orthaug.expressions`' language and may use the names in `constants` (kept as sorted
+    pairs). `coefficient` is a guess of its size, in the output's unit per unit of the expression, None where
+    there is none. `output` may be left out where there is only one.
+
+    Raises:
+        InputError: an expression that is not arithmetic on lagged channels, a name or a number that is none.
+
+    Examples:
+        >>> Suspect("drag", "v[k-1]*abs(v[k-1])", coefficient=-0.1).lags
+        (Lag(channel='v', lag=1),)
+    """
+
+    name: str
+    expression: str
+    output: str | None = None
+    coefficient: float | None = None
+    constants: Mapping[str, float] | tuple[tuple[str, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name.strip() or not self.name.isprintable():
+            raise InputError(f"{self.name!r} cannot name a suspect; use visible characters on one line.")
+        if self.output is not None and not isinstance(self.output, str):
+            raise InputError(f"suspect '{self.name}': `output` must be the name of a channel; got {self.output!r}.")
+        constants = _checked_constants(dict(self.constants), self.name)
+        if self.coefficient is not None and not _is_number(self.coefficient):
+            raise InputError(f"suspect '{self.name}': `coefficient` must be a finite number; got {self.coefficient!r}.")
+        object.__setattr__(self, "constants", constants)
+        _ = self.parsed
+
+    @classmethod
+    def of(
+        cls,
+        kind: str,
+        on: str | None = None,
+        *,
+        width: float | None = None,
+        output: str | None = None,
+        coefficient: float | None = None,
+        name: str | None = None,
+        constants: Mapping[str, float] | None = None,
+    ) -> Suspect:
+        """A suspect of a known kind, applied to the channel expression x = `on`.
+
+        | kind | δ | width |
+        |---|---|---|
+        | `coulomb` | sign(x) | |
+        | `stribeck` | sign(x) exp(−abs(x)/width), the paper's decay from static to Coulomb friction | v_S |
+        | `stribeck_gauss` | sign(x) exp(−(x/width)²) | v_S |
+        | `quadratic_drag` | x abs(x) | |
+        | `cubic` | x³ | |
+        | `dead_zone` | x − clip(x, −width, width) | half of the zone |
+        | `saturation` | clip(x, −width, width) | the limit |
+        | `offset` | 1, no `on` | |
+        | `expression` | x itself | |
+
+        Args:
+            kind: one of `KINDS`.
+            on: any expression, such as `"v[k-1]"` or `"(y[k-1] - y[k-2])/Ts"`.
+            width: in the unit of x, positive; `data_width` suggests one from data.
+            output, coefficient, constants: as in `Suspect`.
+            name: default the kind with its arguments, such as `coulomb(v[k-1])`.
+
+        Raises:
+            InputError: an unknown kind, an argument that is missing, that the kind does not take, or that
+                does not parse.
+
+        Examples:
+            >>> Suspect.of("dead_zone", on="u[k-1]", width=0.5).expression
+            '(u[k-1]) - max(min(u[k-1], 0.5), -0.5)'
+        """
+        if kind not in _KINDS:
+            raise InputError(
+                f"unknown kind of suspect '{kind}'{nearest(str(kind), KINDS)}; known are {', '.join(KINDS)}."
+            )
+        if kind == "offset" and on is not None:
+            raise InputError(f"an offset is the same everywhere and takes no `on`; got {on!r}.")
+        if kind != "offset":
+            if on is None:
+                raise InputError(f"a suspect of kind {kind} needs `on`, an expression such as v[k-1].")
+            parse(on, constants)  # alone, so that a stray parenthesis cannot change what the kind wraps around it
+            on = " ".join(on.split())
+        if _KINDS[kind].width and width is None:
+            raise InputError(f"a suspect of kind {kind} needs `width`, in the unit of {on}; data_width suggests one.")
+        if width is not None and not _KINDS[kind].width:
+            raise InputError(f"a suspect of kind {kind} takes no `width`; got {width!r}.")
+        w = "" if width is None else repr(check_number(width, "width", positive=True))
+        text = _KINDS[kind].text(on or "", w)
+        arguments = ", ".join(part for part in (on, w) if part)
+        label = text if kind == "expression" else f"{kind}({arguments})" if arguments else kind
+        return cls(label if name is None else name, text, output, coefficient, constants or ())
+
+    @property
+    def parsed(self) -> Expression:
+        """The expression, parsed."""
+        try:
+            return parse(self.expression, dict(self.constants))
+        except InputError as error:
+            raise InputError(f"suspect '{self.name}': {error}") from None
+
+    @property
+    def lags(self) -> tuple[Lag, ...]:
+        """The raw lags that it reads."""
+        return self.parsed.lags
+
+    def values(self, x: Matrix, layout: Layout, outputs: Sequence[str]) -> Matrix:
+        """δ(x) (N, ny) for a coefficient of 1: the expression in its output's column, zero in the others.
+
+        Args:
+            x: regressors (N, nx) in the order of `layout`.
+            outputs: names of the ny outputs.
+
+        Raises:
+            InputError: lags that the layout lacks, an output that is missing or unknown, a value that is not finite.
+        """
+        values = np.zeros((len(x), len(outputs)))
+        with np.errstate(all="ignore"):
+            column = _evaluate(self.parsed, x, layout, f"suspect '{self.name}'")
+        bad = np.flatnonzero(~np.isfinite(column))
+        if bad.size:
+            raise InputError(
+                f"suspect '{self.name}' = {self.expression} is not finite at row {bad[0]} of the regressor."
+            )
+        values[:, self._column_of(outputs)] = column
+        return values
+
+    def _column_of(self, outputs: Sequence[str]) -> int:
+        known = ", ".join(outputs)
+        if self.output is None:
+            if len(outputs) != 1:
+                raise InputError(f"suspect '{self.name}': `output` is missing; one of {known}.")
+            return 0
+        if self.output not in outputs:
+            hint = nearest(self.output, outputs)
+            raise InputError(f"suspect '{self.name}': unknown output '{self.output}'{hint}; known are {known}.")
+        return list(outputs).index(self.output)
+
+
+def suspect_columns(
+    suspects: Sequence[Suspect], x: Matrix, layout: Layout, outputs: Sequence[str]
+) -> Float[np.ndarray, "ns N ny"]:
+    """δ(x) of every suspect for a coefficient of 1, (ns, N, ny), in each output's unit per unit of coefficient.
+
+    Raises:
+        InputError: two suspects of one name; as `Suspect.values`.
+    """
+    check_unique((suspect.name for suspect in suspects), "suspect")
+    columns = [suspect.values(x, layout, outputs) for suspect in suspects]
+    return np.stack(columns) if columns else np.zeros((0, len(x), len(outputs)))
+
+
+def data_width(on: str, x: Matrix, layout: Layout, constants: Mapping[str, float] | None = None) -> float:
+    """A width from the data's own scale: the median of |x| where x is not zero, in the unit of `on`.
+
+    Half of the moving samples then lie inside a dead zone, a saturation or a Stribeck peak, so that the
+    data show both sides of it.
+
+    Raises:
+        InputError: an expression that does not parse, that is not finite, or that is zero on all rows.
+    """
+    with np.errstate(all="ignore"):
+        size = np.abs(_evaluate(parse(on, constants), x, layout, f"'{on}'"))
+    if not np.all(np.isfinite(size)):
+        raise InputError(f"'{on}' is not finite at row {np.flatnonzero(~np.isfinite(size))[0]} of the regressor.")
+    if not np.any(size > 0):
+        raise InputError(f"'{on}' is zero on all rows; the data give no width. State one.")
+    return float(np.median(size[size > 0]))
+
+
+def _evaluate(expression: Expression, x: Matrix, layout: Layout, what: str) -> np.ndarray:
+    missing = [str(lag) for lag in expression.lags if lag not in layout]
+    if missing:
+        held = ", ".join(map(str, layout))
+        raise InputError(f"{what} reads {', '.join(missing)}, which the regressor does not hold; it holds {held}.")
+    values = expression.evaluate({lag: x[:, j] for j, lag in enumerate(layout)}, np)
+    return np.broadcast_to(np.asarray(values, dtype=float), (len(x),))
+
+
+def _checked_constants(constants: Mapping[str, float], suspect: str) -> tuple[tuple[str, float], ...]:
+    for name, value in constants.items():
+        if not isinstance(name, str) or not is_name(name):
+            raise InputError(f"suspect '{suspect}': {name!r} cannot name a constant.")
+        if not _is_number(value):
+            raise InputError(f"suspect '{suspect}': the constant '{name}' must be a finite number; got {value!r}.")
+    return tuple(sorted((name, float(value)) for name, value in constants.items()))
+
+
+def _is_number(value: Any) -> bool:
+    return not isinstance(value, bool) and isinstance(value, int | float | np.number) and math.isfinite(value)

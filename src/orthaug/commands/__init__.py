@@ -1,0 +1,1 @@
+"""The command line: a spec in, a result folder out."""

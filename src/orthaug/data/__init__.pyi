@@ -1,0 +1,5 @@
+from .readers import read_record as read_record
+from .record import Channel as Channel
+from .record import Experiment as Experiment
+from .record import Record as Record
+from .regressors import Lags as Lags

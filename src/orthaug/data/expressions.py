@@ -1,0 +1,226 @@
+"""Expressions of lagged signals, such as `"sign(v[k-1])*v[k-1]**2"`: a whitelisted parser, no `eval`.
+
+Python's own grammar reads the text into a syntax tree; every node that is not on the list below is
+refused by name, so an expression can only do arithmetic. The same tree is evaluated with NumPy on
+whole records and with JAX inside a compiled free run.
+"""
+
+from __future__ import annotations
+
+import ast
+import keyword
+import math
+import unicodedata
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+from orthaug._base.checks import nearest
+from orthaug._base.errors import InputError
+
+
+class Lag(NamedTuple):
+    """One raw entry of the regressor: a channel and how many samples back, `force[k-1]`."""
+
+    channel: str
+    lag: int
+
+    def __str__(self) -> str:
+        return f"{self.channel}[k-{self.lag}]" if self.lag else f"{self.channel}[k]"
+
+
+FUNCTIONS = ("sin", "cos", "tan", "exp", "log", "sqrt", "abs", "sign", "tanh", "min", "max")
+RESERVED = frozenset((*FUNCTIONS, "k"))
+LARGEST_LAG = 100_000  # more is a mistake, and would fill the memory
+_MAX_LENGTH = 500  # characters; a longer expression is a mistake, and messages stay readable
+_BINARY = {
+    ast.Add: lambda a, b: a + b,
+    ast.Sub: lambda a, b: a - b,
+    ast.Mult: lambda a, b: a * b,
+    ast.Div: lambda a, b: a / b,
+    ast.Pow: lambda a, b: a**b,
+}
+_ALLOWED = "channels at a lag such as y[k-1], numbers, constants, + - * / ** ( ) and " + ", ".join(FUNCTIONS)
+
+
+@dataclass(frozen=True)
+class Expression:
+    """A parsed expression; equal and hashable by its text and the constants it uses.
+
+    Examples:
+        >>> expression = parse("2*force[k-1] - offset", {"offset": 1.0})
+        >>> [str(lag) for lag in expression.lags]
+        ['force[k-1]']
+        >>> import numpy as np
+        >>> float(expression.evaluate({Lag("force", 1): 3.0}, np))
+        5.0
+    """
+
+    text: str
+    constants: tuple[tuple[str, float], ...] = ()
+
+    def __str__(self) -> str:
+        return self.text
+
+    @cached_property
+    def _tree(self) -> ast.expr:
+        return ast.parse(self.text, mode="eval").body
+
+    @cached_property
+    def lags(self) -> tuple[Lag, ...]:
+        """The raw lags that the expression reads, in order of first appearance."""
+        nodes = [node for node in ast.walk(self._tree) if isinstance(node, ast.Subscript)]
+        nodes.sort(key=lambda node: node.col_offset)  # `walk` goes level by level
+        return tuple(dict.fromkeys(_lag(node, self.text) for node in nodes))
+
+    def evaluate(self, columns: Mapping[Lag, Any], xp: Any) -> Any:
+        """Value for `columns[lag]` (scalars or arrays of one shape), computed by `xp` (numpy or jax.numpy)."""
+        return _evaluate(self._tree, columns, dict(self.constants), xp, self.text)
+
+
+def is_name(name: str) -> bool:
+    """Whether expressions can use `name`: Python reads an identifier in its normal form only."""
+    return (
+        name.isidentifier()
+        and not keyword.iskeyword(name)
+        and name not in RESERVED
+        and unicodedata.normalize("NFKC", name) == name
+    )
+
+
+def parse(text: str, constants: Mapping[str, float] | None = None) -> Expression:
+    """Read `text`; `constants` are the names it may use besides channels and functions.
+
+    Raises:
+        InputError: anything that is not arithmetic on lagged channels, with the offending piece named.
+    """
+    constants = dict(constants or {})
+    if not isinstance(text, str):
+        raise InputError(f"an expression must be text such as 'y[k-1]'; got {text!r}.")
+    text = " ".join(text.split())
+    if not text:
+        raise InputError("An expression is empty; write for example y[k-1], or 1 for an offset.")
+    if "#" in text:
+        raise InputError(f"'{text[:_MAX_LENGTH]}': '#' is not allowed in an expression; allowed are {_ALLOWED}.")
+    if len(text) > _MAX_LENGTH:
+        raise InputError(f"An expression has {len(text)} characters; at most {_MAX_LENGTH} are read.")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Python's own remarks about text that is refused below
+            tree = ast.parse(text, mode="eval").body
+        used: set[str] = set()
+        _check(tree, text, constants, used)
+    except (SyntaxError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        reason = getattr(error, "msg", str(error))
+        raise InputError(f"'{text}' is not an expression ({reason}); allowed are {_ALLOWED}.") from None
+    except (RecursionError, MemoryError):
+        raise InputError(f"'{text[:40]}…' is nested too deeply; write it in simpler terms.") from None
+    return Expression(text, tuple((name, float(constants[name])) for name in sorted(used)))
+
+
+def _check(node: ast.AST, text: str, constants: Mapping[str, float], used: set[str]) -> None:
+    """Walk the tree once; raise InputError at the first node that is not on the list."""
+    if isinstance(node, ast.Constant):
+        if isinstance(node.value, bool) or not isinstance(node.value, int | float):
+            raise InputError(f"'{text}': {node.value!r} is not a number.")
+        try:
+            finite = math.isfinite(float(node.value))
+        except OverflowError:
+            finite = False
+        if not finite:
+            raise InputError(f"'{text}' holds a number too large for double precision.")
+    elif isinstance(node, ast.Name):
+        if node.id not in constants:
+            raise InputError(_unknown_name(node.id, text, constants))
+        used.add(node.id)
+    elif isinstance(node, ast.Subscript):
+        _lag(node, text)
+    elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.UAdd | ast.USub):
+        _check(node.operand, text, constants, used)
+    elif isinstance(node, ast.BinOp) and type(node.op) in _BINARY:
+        _check(node.left, text, constants, used)
+        _check(node.right, text, constants, used)
+    elif isinstance(node, ast.Call):
+        _check_call(node, text)
+        for argument in node.args:
+            _check(argument, text, constants, used)
+    else:
+        what = ast.unparse(node) if isinstance(node, ast.expr) else type(node).__name__
+        raise InputError(f"'{text}': '{what}' is not allowed in an expression; allowed are {_ALLOWED}.")
+
+
+def _check_call(node: ast.Call, text: str) -> None:
+    name = node.func.id if isinstance(node.func, ast.Name) else None
+    if name is None or node.keywords or any(isinstance(a, ast.Starred) for a in node.args):
+        raise InputError(f"'{text}': '{ast.unparse(node)}' is not allowed; functions are {', '.join(FUNCTIONS)}.")
+    if name not in FUNCTIONS:
+        raise InputError(
+            f"'{text}': unknown function '{name}'{nearest(name, FUNCTIONS)}; known are {', '.join(FUNCTIONS)}."
+        )
+    wanted = "two or more arguments" if name in ("min", "max") else "one argument"
+    if (len(node.args) < 2) if name in ("min", "max") else (len(node.args) != 1):
+        raise InputError(f"'{text}': {name} takes {wanted}, got {len(node.args)}.")
+
+
+def _lag(node: ast.Subscript, text: str) -> Lag:
+    """The raw lag that `name[k]` or `name[k-3]` stands for."""
+    piece = ast.unparse(node)
+    if not isinstance(node.value, ast.Name):
+        raise InputError(f"'{text}': '{piece}' is not a channel at a lag such as y[k-1].")
+    name, index = node.value.id, node.slice
+    if isinstance(index, ast.Name) and index.id == "k":
+        return Lag(name, 0)
+    if (
+        isinstance(index, ast.BinOp)
+        and isinstance(index.left, ast.Name)
+        and index.left.id == "k"
+        and isinstance(index.op, ast.Sub | ast.Add)
+        and isinstance(index.right, ast.Constant)
+        and type(index.right.value) is int
+    ):
+        if isinstance(index.op, ast.Add) and index.right.value > 0:
+            raise InputError(f"'{text}': '{piece}' looks ahead; a regressor uses {name}[k] or earlier samples.")
+        if index.right.value > LARGEST_LAG:
+            raise InputError(f"'{text}': '{piece}' reaches too far back; lags up to {LARGEST_LAG} are read.")
+        return Lag(name, index.right.value)
+    raise InputError(f"'{text}': the index of '{piece}' must be k or k-1, k-2, … with a whole number.")
+
+
+def _evaluate(node: ast.expr, columns: Mapping[Lag, Any], constants: Mapping[str, float], xp: Any, text: str) -> Any:
+    if isinstance(node, ast.Constant):
+        return float(node.value)  # type: ignore[arg-type]  (checked by `parse`)
+    if isinstance(node, ast.Name):
+        return constants[node.id]
+    if isinstance(node, ast.Subscript):
+        return columns[_lag(node, text)]
+    if isinstance(node, ast.UnaryOp):
+        value = _evaluate(node.operand, columns, constants, xp, text)
+        return -value if isinstance(node.op, ast.USub) else value
+    if isinstance(node, ast.BinOp):
+        left = xp.asarray(_evaluate(node.left, columns, constants, xp, text), dtype=float)
+        right = _evaluate(node.right, columns, constants, xp, text)
+        if isinstance(node.op, ast.Pow) and isinstance(right, float) and right.is_integer():
+            right = int(right)  # repeated multiplication, fast in a free run
+        return _BINARY[type(node.op)](left, right)
+    assert isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+    arguments = [_evaluate(argument, columns, constants, xp, text) for argument in node.args]
+    if node.func.id in ("min", "max"):
+        pick = xp.minimum if node.func.id == "min" else xp.maximum
+        value = arguments[0]
+        for other in arguments[1:]:
+            value = pick(value, other)
+        return value
+    return getattr(xp, node.func.id)(arguments[0])
+
+
+def _unknown_name(name: str, text: str, constants: Mapping[str, float]) -> str:
+    if name == "k":
+        return f"'{text}': k is the time index and cannot stand alone; write a channel at a lag, y[k-1]."
+    if name in FUNCTIONS:
+        return f"'{text}': {name} is a function; write {name}(…)."
+    hint = nearest(name, constants) or f"; a channel needs its lag, {name}[k-1]"
+    return f"'{text}': unknown constant '{name}'{hint}."

@@ -1,0 +1,193 @@
+"""Records from files: rows, ranges and sampling time of named channels.
+
+Rows count from 0 behind the header; messages name the file's own line, column and what stands there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import Vector, check_choice
+from orthaug._base.errors import InputError
+from orthaug.data.record import Channel, Experiment, Record, same_step
+from orthaug.data.tables import Table, check_readable, has_column, read_table
+
+RowRange = tuple[int, int] | list[int]
+_MISSING = ("", "nan", "na", "n/a", "null", "none")  # how files write a sample that is not there
+
+
+def read_record(
+    path: str | Path,
+    *,
+    inputs: Sequence[str | Channel] = (),
+    outputs: Sequence[str | Channel] = (),
+    sampling_time: float | None = None,
+    time: str | None = None,
+    rows: RowRange | Sequence[RowRange] | None = None,
+    every: int = 1,
+    columns: Mapping[str, str] | None = None,
+    missing: str = "error",
+) -> Record:
+    """Read one file; several row ranges are experiments of their own.
+
+    Args:
+        path: `.csv`, `.tsv`, `.parquet` or `.npz`.
+        inputs, outputs: channel names, or `Channel`s with column, unit, scale and offset.
+        sampling_time: seconds between rows; or `time`, the column that holds the instants.
+        rows: half-open range `(start, stop)` of data rows, or several; None for all.
+        every: keep each n-th row (no filter); the sampling time is multiplied.
+        columns: this file's column for a channel, `{"position": "yVal"}`.
+        missing: "error", or "skip" to leave out rows with empty or NaN cells: what lies between them is an experiment
+            of its own, so that no lag reaches across a gap.
+
+    Raises:
+        InputError: no such file, wrong type, missing columns, cells that are empty or no finite numbers.
+    """
+    path = Path(path)
+    channels = [[c if isinstance(c, Channel) else Channel(c) for c in group] for group in (inputs, outputs)]
+    column_of = {c.name: (columns or {}).get(c.name, c.file_column) for group in channels for c in group}
+    if sampling_time is not None and time is not None:
+        raise InputError("give `sampling_time` or `time`, not both.")
+    if isinstance(every, bool) or not isinstance(every, int | np.integer) or every < 1:
+        raise InputError(f"`every` must be a whole number, 1 or more; got {every}.")
+    wanted: list[str] = list(dict.fromkeys([*column_of.values(), *([time] if time else [])]))
+    if not wanted:
+        raise InputError("no channels are asked for; name inputs, outputs or both.")
+    table = _trim(read_table(path, wanted), uneven=missing == "skip")
+    total = len(next(iter(table.columns.values())))
+    experiments, steps, recorded = [], [], 0
+    for begin, end in _ranges(rows, total, path):
+        recorded += len(range(begin, end, every))
+        for start, stop in _stretches(table, wanted, begin, end, every, missing):
+            pick = slice(start, stop, every)
+            signals = [
+                np.stack([c.scale * table.columns[column_of[c.name]][pick] + c.offset for c in group], axis=-1)
+                if group
+                else np.empty((len(range(start, stop, every)), 0))
+                for group in channels
+            ]
+            began = float(table.columns[time][start]) if time else 0.0
+            place = (str(path), start, every, table.first_line, began, (start - begin) // every)
+            experiments.append(Experiment(signals[0], signals[1], *place))
+            if time and (stop - start > 1 or missing == "error"):
+                steps.append(_uniform_step(table, time, start, stop))
+    if time and not steps:
+        raise InputError(f"{path}: no two rows without missing cells follow each other; the sampling time is unknown.")
+    step = steps[0] if time else (1.0 if sampling_time is None else sampling_time)
+    for other in steps:
+        if not same_step(other, step):
+            raise InputError(
+                f"{path}: column '{time}' steps by {step:g} s in one row range and by {other:g} s in another."
+            )
+    left_out = recorded - sum(len(experiment) for experiment in experiments)
+    return Record(tuple(channels[0]), tuple(channels[1]), step * every, tuple(experiments), time, left_out)
+
+
+def read_samples(
+    paths: Sequence[str | Path], lags: Sequence[str], *, rows: Any = None, every: int = 1
+) -> tuple[dict[str, Vector], Vector | None]:
+    """Points from files: a column per raw lag, named as in expressions, and their `weight` where there is one.
+
+    Raises:
+        InputError: no such file, missing columns, cells that are no finite numbers.
+    """
+    pieces, weighted = [], None
+    for path in map(Path, paths):
+        check_readable(path)
+        own = has_column(path, "weight")
+        if weighted not in (None, own):
+            raise InputError(f"{path}: some files of the samples have a column 'weight' and some have not.")
+        weighted = own
+        names = [*lags, *(["weight"] if own else [])]
+        table = _trim(read_table(path, names))
+        total = len(table.columns[names[0]])
+        for start, stop in _ranges(rows, total, path):
+            _check_cells(table, names, start, stop)
+            pieces.append(np.stack([table.columns[name][start:stop:every] for name in names], axis=-1))
+    values = np.concatenate(pieces)
+    weights = values[:, -1] if weighted else None
+    return {lag: values[:, j] for j, lag in enumerate(lags)}, weights
+
+
+def _trim(table: Table, *, uneven: bool = False) -> Table:
+    """Without the rows at the end in which every used column is empty (blank lines, longer unused columns)."""
+    longest = max(table.filled.values())
+    if longest == 0:
+        raise InputError(f"{table.path}: there are no data rows in {', '.join(table.columns)}.")
+    if len(set(table.filled.values())) > 1 and not uneven:
+        listing = ", ".join(f"'{name}' {length}" for name, length in table.filled.items())
+        raise InputError(
+            f"{table.path}: the used columns have unequal lengths: {listing} rows. Give all the same length."
+        )
+    return replace(table, columns={name: values[:longest] for name, values in table.columns.items()})
+
+
+def _ranges(rows: RowRange | Sequence[RowRange] | None, total: int, path: Path) -> list[tuple[int, int]]:
+    """Half-open ranges of rows, each checked against the file."""
+    if rows is None:
+        return [(0, total)]
+    pairs: list = [rows] if all(isinstance(entry, int | np.integer) for entry in rows) else list(rows)
+    for pair in pairs:
+        if len(pair) != 2 or not 0 <= pair[0] < pair[1]:
+            raise InputError(f"{path}: rows {list(pair)} is no half-open range [start, stop] with 0 ≤ start < stop.")
+        if pair[1] > total:
+            raise InputError(f"{path}: rows {list(pair)} reaches past the end; the file has {total} data rows.")
+    ordered = sorted((int(start), int(stop)) for start, stop in pairs)
+    for before, after in zip(ordered, ordered[1:], strict=False):
+        if after[0] < before[1]:
+            raise InputError(
+                f"{path}: the row ranges {list(before)} and {list(after)} overlap; samples would count twice."
+            )
+    return [(int(start), int(stop)) for start, stop in pairs]
+
+
+def _stretches(
+    table: Table, columns: Sequence[str], begin: int, end: int, every: int, missing: str
+) -> list[tuple[int, int]]:
+    """Half-open row ranges without missing cells; the whole range where missing cells are errors."""
+    check_choice(missing, ("error", "skip"), "`missing`")
+    if missing == "error":
+        _check_cells(table, columns, begin, end)
+        return [(begin, end)]
+    kept = np.arange(begin, end, every)
+    there = np.all([np.isfinite(table.columns[name][kept]) for name in columns], axis=0)
+    for row in kept[~there]:
+        for name in columns:
+            if not np.isfinite(table.columns[name][row]) and table.cell(name, row).strip().lower() not in _MISSING:
+                _check_cells(table, [name], row, row + 1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int)))
+    if not len(edges):
+        raise InputError(f"{table.path}: every row from {begin} to {end - 1} has a missing cell; nothing is left.")
+    return [(int(kept[a]), int(kept[b - 1]) + 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _check_cells(table: Table, columns: Sequence[str], start: int, stop: int) -> None:
+    for name in columns:
+        bad = np.flatnonzero(~np.isfinite(table.columns[name][start:stop]))
+        if bad.size:
+            row = start + int(bad[0])
+            found = table.cell(name, row)
+            what = f"found '{found}'" if found else "the cell is empty"
+            raise InputError(f"{table.path}: {table.where(row)}, column '{name}': {what}; expected a finite number.")
+
+
+def _uniform_step(table: Table, time: str, start: int, stop: int) -> float:
+    """Mean step of the time column, checked to be even enough that no sample is missing."""
+    instants = table.columns[time][start:stop]
+    if len(instants) < 2:
+        raise InputError(f"{table.path}: one row is too few to tell the sampling time from column '{time}'.")
+    steps = np.diff(instants)
+    mean = float(steps.mean())
+    odd = np.flatnonzero(np.abs(steps - mean) > 0.5 * abs(mean)) if mean > 0 else np.array([0])
+    if odd.size:
+        row = start + int(odd[0]) + 1
+        raise InputError(
+            f"{table.path}: {table.where(row)}, column '{time}': a step of {steps[odd[0]]:g} s where {mean:g} s is the "
+            "mean; expected evenly sampled, rising time. Resample, or take row ranges without gaps."
+        )
+    return mean

@@ -1,0 +1,237 @@
+"""Measured records: one or more experiments of inputs and outputs at one sampling time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import Matrix, as_signal, check_unique
+from orthaug._base.errors import InputError
+from orthaug.data.expressions import RESERVED, is_name
+
+_LONGEST_STEP = 1e12  # s; a longer one overflows somewhere in a time axis
+
+
+def same_step(one: float, other: float) -> bool:
+    """Whether two sampling times are the same to 0.1 %, as logged time columns are."""
+    return bool(np.isclose(one, other, rtol=1e-3, atol=0.0))
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A named signal with its unit, and how files hold it: `value = scale * cell + offset` of `column`."""
+
+    name: str
+    unit: str = ""
+    column: str = ""
+    scale: float = 1.0
+    offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not is_name(self.name):
+            raise InputError(
+                f"'{self.name}' cannot name a channel; use letters, digits and underscores, "
+                f"not starting with a digit, and none of {', '.join(sorted(RESERVED))}."
+            )
+
+        if not (np.isfinite(self.scale) and self.scale != 0 and np.isfinite(self.offset)):
+            raise InputError(
+                f"channel '{self.name}': `scale` must be finite and not 0, `offset` finite; "
+                f"got {self.scale} and {self.offset}."
+            )
+
+    @property
+    def file_column(self) -> str:
+        """The column of a file that holds it; by default the one of its name."""
+        return self.column or self.name
+
+    @property
+    def label(self) -> str:
+        """`name [unit]`, as it stands at an axis."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+
+def check_channels(inputs: Sequence[Channel], outputs: Sequence[Channel]) -> None:
+    """Raise InputError for a name that stands twice, or an output whose name tables of results need."""
+    check_unique((channel.name for channel in (*inputs, *outputs)), "channel")
+    derived = [f"{c.name}_{part}" for c in outputs for part in ("model", "baseline", "learner")]
+    for channel in outputs:
+        if channel.name in ("time", *derived):
+            raise InputError(f"an output cannot be called '{channel.name}': results have a column of that name.")
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """One uninterrupted run: `inputs` (N, nu) and `outputs` (N, ny), row k taken at the same instant.
+
+    `source`, `first_row`, `stride` and `first_line` (the file's line of its row 0) say where a row came from, for
+    messages; `start_time` [s] is the instant of the first row. A stretch between missing samples begins `offset` rows
+    into the recording it is a part of.
+    """
+
+    inputs: Matrix
+    outputs: Matrix
+    source: str = ""
+    first_row: int = 0
+    stride: int = 1
+    first_line: int | None = None
+    start_time: float = 0.0
+    offset: int = 0
+
+    def __len__(self) -> int:
+        return len(self.inputs)
+
+    def where(self, row: int) -> str:
+        """`run.csv: line 17 (row 15)` for a row of this experiment, as much of it as is known."""
+        row = self.first_row + self.stride * row
+        place = f"row {row}" if self.first_line is None else f"line {self.first_line + row} (row {row})"
+        return f"{self.source}: {place}" if self.source else place
+
+    def rows(self, start: int | None, stop: int | None) -> Experiment:
+        """The half-open range of rows `[start, stop)` as an experiment of its own."""
+        first = self.first_row + self.stride * range(len(self))[start:stop].start
+        return replace(self, inputs=self.inputs[start:stop], outputs=self.outputs[start:stop], first_row=first)
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """Experiments that share channels and sampling time; lags never reach across experiments.
+
+    `sampling_time` is in seconds. `outputs` is empty for a record that only carries inputs (something
+    to simulate), and `inputs` is empty for an autonomous system.
+
+    Examples:
+        >>> import numpy as np
+        >>> record = Record.from_arrays(u=np.arange(5.0), y=np.ones(5), sampling_time=0.1, inputs=["force"])
+        >>> record
+        Record(1 experiment, 5 samples, Ts = 0.1 s, inputs: force; outputs: y)
+        >>> [len(part) for part in record.split(0.6)]
+        [3, 2]
+    """
+
+    inputs: tuple[Channel, ...]
+    outputs: tuple[Channel, ...]
+    sampling_time: float
+    experiments: tuple[Experiment, ...]
+    time_column: str | None = None
+    missing: int = 0
+    """Rows that were left out because a sample was missing."""
+
+    def __post_init__(self) -> None:
+        check_channels(self.inputs, self.outputs)
+        if not 0 < self.sampling_time <= _LONGEST_STEP:
+            raise InputError(
+                f"the sampling time must be a positive number of seconds, at most {_LONGEST_STEP:g}; "
+                f"got {self.sampling_time}."
+            )
+        if not self.experiments:
+            raise InputError("a record needs at least one experiment; got none.")
+
+    @classmethod
+    def from_arrays(
+        cls,
+        u: Any = None,
+        y: Any = None,
+        *,
+        sampling_time: float = 1.0,
+        inputs: Sequence[str | Channel] | None = None,
+        outputs: Sequence[str | Channel] | None = None,
+        source: str = "",
+    ) -> Record:
+        """One experiment from arrays.
+
+        Args:
+            u: inputs, (N,) or (N, nu); None for none.
+            y: outputs, (N,) or (N, ny); None for a record to simulate.
+            sampling_time: seconds between rows.
+            inputs, outputs: names (or `Channel`s with units); default `u`, `y`, or `u1, u2, …`.
+            source: where it came from, for messages.
+
+        Raises:
+            InputError: lengths that differ, cells that are not finite, names that do not fit.
+        """
+        if u is None and y is None:
+            raise InputError("a record needs `u`, `y` or both; got neither.")
+        y_signal = None if y is None else as_signal(y, "y")
+        u_signal = None if u is None else as_signal(u, "u")
+        rows = len(u_signal) if u_signal is not None else len(y_signal)  # type: ignore[arg-type]
+        u_signal = np.empty((rows, 0)) if u_signal is None else u_signal
+        y_signal = np.empty((rows, 0)) if y_signal is None else y_signal
+        if len(u_signal) != len(y_signal):
+            raise InputError(
+                f"`y` has {len(y_signal)} rows but `u` has {len(u_signal)}. "
+                "Give both the same length, or drop the last rows."
+            )
+        return cls(
+            _channels(inputs, "u", u_signal.shape[1]),
+            _channels(outputs, "y", y_signal.shape[1]),
+            float(sampling_time),
+            (Experiment(u_signal, y_signal, source),),
+        )
+
+    @classmethod
+    def join(cls, records: Iterable[Record]) -> Record:
+        """One record of the experiments of several, kept apart."""
+        records = tuple(records)
+        if not records:
+            raise InputError("a record needs at least one experiment; got none.")
+        first = records[0]
+        for other in records[1:]:
+            if (other.inputs, other.outputs) != (first.inputs, first.outputs):
+                raise InputError(f"records with other channels cannot be joined: {first!r} and {other!r}.")
+            if not same_step(other.sampling_time, first.sampling_time):
+                raise InputError(
+                    f"{other.experiments[0].source or 'a record'}: sampled every {other.sampling_time:g} s, "
+                    f"{first.experiments[0].source or 'another'} every {first.sampling_time:g} s; resample one of them."
+                )
+        experiments = tuple(e for record in records for e in record.experiments)
+        return replace(first, experiments=experiments, missing=sum(record.missing for record in records))
+
+    def __len__(self) -> int:
+        return sum(len(experiment) for experiment in self.experiments)
+
+    def __repr__(self) -> str:
+        count = len(self.experiments)
+        names = "; ".join(
+            f"{kind}: {', '.join(channel.name for channel in channels) or 'none'}"
+            for kind, channels in (("inputs", self.inputs), ("outputs", self.outputs))
+        )
+        plural = "s" if count != 1 else ""
+        return f"Record({count} experiment{plural}, {len(self)} samples, Ts = {self.sampling_time:g} s, {names})"
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """Outputs first, then inputs: the order of the regressor."""
+        return self.outputs + self.inputs
+
+    def rows(self, start: int | None = None, stop: int | None = None) -> Record:
+        """The half-open range of rows `[start, stop)` of a single experiment."""
+        return replace(self, experiments=(self._only("rows").rows(start, stop),))
+
+    def split(self, fraction: float) -> tuple[Record, Record]:
+        """The first `fraction` of the rows of a single experiment, and the rest."""
+        if not 0 < fraction < 1:
+            raise InputError(f"`fraction` must lie between 0 and 1; got {fraction}.")
+        cut = round(fraction * len(self._only("split")))
+        return self.rows(None, cut), self.rows(cut, None)
+
+    def without_short(self, first: int) -> Record:
+        """Without stretches between missing samples that end before row `first`, as long as one is left."""
+        long = tuple(e for e in self.experiments if len(e) > first)
+        return replace(self, experiments=long) if self.missing and long else self
+
+    def _only(self, verb: str) -> Experiment:
+        if len(self.experiments) != 1:
+            raise InputError(f"`{verb}` needs a record of one experiment; this one has {len(self.experiments)}.")
+        return self.experiments[0]
+
+
+def _channels(given: Sequence[str | Channel] | None, default: str, count: int) -> tuple[Channel, ...]:
+    if given is None:
+        given = [default] if count == 1 else [f"{default}{i + 1}" for i in range(count)]
+    if len(given) != count:
+        raise InputError(f"{len(given)} names for {count} channels of `{default}`; give one name for each column.")
+    return tuple(name if isinstance(name, Channel) else Channel(name) for name in given)

@@ -1,0 +1,150 @@
+"""Regressors: which lags of which channels, their matrix over a record, and the learner's view of it.
+
+Order, everywhere: outputs in order, each k-1 … k-na; then inputs in order, each k-nk … k-nk-nb+1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import Matrix
+from orthaug._base.errors import InputError
+from orthaug.data.expressions import LARGEST_LAG, Expression, Lag
+from orthaug.data.record import Experiment, Record
+
+Layout = tuple[Lag, ...]
+
+
+@dataclass(frozen=True)
+class Lags:
+    """Orders as MATLAB means them: `y[k-1..k-na]` and `u[k-nk..k-nk-nb+1]`; one number, or one per channel.
+
+    The paper's `u_k … u_{k-n_b}` is `nk = 0, nb = n_b + 1`.
+
+    Examples:
+        >>> [str(lag) for lag in Lags(na=2, nb=1, nk=1).layout(["y"], ["u"])]
+        ['y[k-1]', 'y[k-2]', 'u[k-1]']
+    """
+
+    na: int | Sequence[int] = 0
+    nb: int | Sequence[int] = 0
+    nk: int | Sequence[int] = 1
+
+    def layout(self, outputs: Sequence[str], inputs: Sequence[str]) -> Layout:
+        """The raw lags in regressor order.
+
+        Raises:
+            InputError: negative orders, or as many numbers as there are no channels.
+        """
+        na = _per_channel(self.na, outputs, "na", "output")
+        nb = _per_channel(self.nb, inputs, "nb", "input")
+        nk = _per_channel(self.nk, inputs, "nk", "input")
+        past_outputs = [Lag(name, i) for name, n in zip(outputs, na, strict=True) for i in range(1, n + 1)]
+        past_inputs = [Lag(name, i) for name, n, d in zip(inputs, nb, nk, strict=True) for i in range(d, d + n)]
+        return (*past_outputs, *past_inputs)
+
+
+def _per_channel(value: int | Sequence[int], names: Sequence[str], key: str, kind: str) -> list[int]:
+    values = list(value) if isinstance(value, Sequence | np.ndarray) else [value] * len(names)
+    if len(values) != len(names):
+        raise InputError(
+            f"`{key}` has {len(values)} numbers but there are {len(names)} {kind}s; give one number, or one per {kind}."
+        )
+    if any(isinstance(v, bool) or not isinstance(v, int | np.integer) or v < 0 for v in values):
+        raise InputError(f"`{key}` must be whole numbers, 0 or more; got {value}.")
+    if any(v > LARGEST_LAG for v in values):
+        raise InputError(f"`{key}` must be at most {LARGEST_LAG}; got {value}.")
+    return [int(v) for v in values]
+
+
+def in_order(lags: Iterable[Lag], outputs: Sequence[str], inputs: Sequence[str]) -> Layout:
+    """The distinct lags in regressor order.
+
+    Raises:
+        InputError: an unknown channel, or an output at lag 0 (the model would look at what it predicts).
+    """
+    place = {name: i for i, name in enumerate((*outputs, *inputs))}
+    for lag in lags:
+        if lag.channel not in place:
+            raise InputError(f"'{lag}' uses the unknown channel '{lag.channel}'; known are {', '.join(place)}.")
+        if lag.lag == 0 and lag.channel in outputs:
+            raise InputError(
+                f"'{lag}' is the output that is to be predicted; outputs are used from lag 1, {lag.channel}[k-1]."
+            )
+    return tuple(sorted(set(lags), key=lambda lag: (place[lag.channel], lag.lag)))
+
+
+def largest_lag(layout: Layout) -> int:
+    """The first row of an experiment at which every lag of the layout exists."""
+    return max((lag.lag for lag in layout), default=0)
+
+
+def lag_matrix(experiment: Experiment, layout: Layout, record: Record, start: int) -> Matrix:
+    """Rows `start … N-1` of the regressor, (N - start, len(layout)); never reaches before the experiment."""
+    column = {channel.name: experiment.outputs[:, i] for i, channel in enumerate(record.outputs)}
+    column |= {channel.name: experiment.inputs[:, i] for i, channel in enumerate(record.inputs)}
+    matrix = np.empty((max(len(experiment) - start, 0), len(layout)))
+    for j, lag in enumerate(layout):
+        matrix[:, j] = column[lag.channel][start - lag.lag : start - lag.lag + len(matrix)]
+    return matrix
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """The usable rows of a record, stacked over experiments: regressors `x` (N, nx), outputs `y` (N, ny)."""
+
+    x: Matrix
+    y: Matrix
+    layout: Layout
+    start: int
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+
+def stack_rows(record: Record, layout: Layout) -> Rows:
+    """All rows from the largest lag on, experiment after experiment.
+
+    Raises:
+        InputError: an experiment with too few rows for a single prediction.
+    """
+    start = largest_lag(layout)
+    for i, experiment in enumerate(record.experiments):
+        if len(experiment) <= start:
+            name = experiment.source or f"experiment {i}"
+            raise InputError(
+                f"{name} has {len(experiment)} rows, too few: the largest lag is {start}, "
+                f"so at least {start + 1} are needed."
+            )
+    x = [lag_matrix(experiment, layout, record, start) for experiment in record.experiments]
+    y = [experiment.outputs[start:] for experiment in record.experiments]
+    return Rows(np.concatenate(x), np.concatenate(y), layout, start)
+
+
+@dataclass(frozen=True)
+class Features:
+    """What the learner sees of the regressor: expressions, most often single raw lags."""
+
+    entries: tuple[Expression, ...]
+
+    @classmethod
+    def of(cls, layout: Layout) -> Features:
+        """All raw lags of a layout."""
+        return cls(tuple(Expression(str(lag)) for lag in layout))
+
+    @property
+    def lags(self) -> tuple[Lag, ...]:
+        """The raw lags that the features read."""
+        return tuple(dict.fromkeys(lag for entry in self.entries for lag in entry.lags))
+
+    def evaluate(self, x: Any, layout: Layout, xp: Any) -> Any:
+        """Features (…, nz) of regressors (…, nx), by `xp` (numpy or jax.numpy)."""
+        if not self.entries:
+            return xp.zeros((*x.shape[:-1], 0))
+        columns = {lag: x[..., j] for j, lag in enumerate(layout)}
+        values = [xp.asarray(entry.evaluate(columns, xp), dtype=float) for entry in self.entries]
+        return xp.stack([xp.broadcast_to(v, x.shape[:-1]) for v in values], axis=-1)

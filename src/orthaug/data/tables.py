@@ -1,0 +1,233 @@
+"""Files to named columns of floats, by the file's ending; what is no number is kept to be named later."""
+
+from __future__ import annotations
+
+import csv
+import re
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import Vector, nearest
+from orthaug._base.errors import InputError, MissingColumnError
+from orthaug.data.variables import ENDINGS, read_variables
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Columns of a file as floats; NaN where the cell is empty or no number, `where` and `cell` to say so.
+
+    `filled` counts the rows of each column up to its last cell that holds anything; `first_line` is the
+    file's line of row 0, for text files.
+    """
+
+    path: Path
+    columns: Mapping[str, Vector]
+    filled: Mapping[str, int]
+    first_line: int | None = None
+    cell: Callable[[str, int], str] = lambda column, row: "nan"
+
+    def where(self, row: int) -> str:
+        """`line 17 (row 15)` in a text file, `row 15` otherwise."""
+        return f"row {row}" if self.first_line is None else f"line {self.first_line + row} (row {row})"
+
+
+def read_table(path: Path, columns: Sequence[str]) -> Table:
+    """The named columns of a file.
+
+    Raises:
+        InputError: no such file, an unknown ending, content that does not fit it, or missing columns.
+    """
+    check_readable(path)
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise InputError(f"{path}: unknown file type '{path.suffix}'; known are {', '.join(_READERS)}.")
+    return reader(path, columns)
+
+
+def has_column(path: Path, name: str) -> bool:
+    """Whether the file has a column (or variable) of that name.
+
+    Raises:
+        InputError: a file that cannot be read, or holds the column twice.
+    """
+    try:
+        read_table(path, (name,))
+    except MissingColumnError:
+        return False
+    return True
+
+
+def check_readable(path: Path) -> None:
+    """Raise InputError unless `path` is a file with something in it."""
+    try:
+        if not path.exists():
+            raise InputError(f"{path}: no such file.")
+        if not path.is_file():
+            raise InputError(f"{path}: not a file.")
+        with path.open("rb") as file:
+            empty = not file.read(1)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+    if empty:
+        raise InputError(f"{path}: the file is empty (0 bytes).")
+
+
+def _read_text(path: Path, columns: Sequence[str]) -> Table:
+    """CSV and TSV as they are found: byte-order mark, trailing separators, units in headers, decimal commas."""
+    import pandas as pd
+
+    try:
+        header, header_line, separator = _header(path)
+    except (UnicodeDecodeError, csv.Error):
+        raise InputError(f"{path}: not a text table; expected UTF-8 text with a header row.") from None
+    _check_present(path, columns, header)
+    place = {name: str(header.index(name)) for name in columns}
+    beyond = str(len(header))  # a column that must stay empty: cells behind the last header
+    decimal = "," if separator == ";" else "."
+
+    def read(**options: Any) -> pd.DataFrame:
+        return pd.read_csv(
+            path,
+            sep=separator,
+            header=None,
+            names=[str(i) for i in range(len(header) + 1)],
+            index_col=False,
+            skiprows=header_line,
+            skip_blank_lines=False,
+            keep_default_na=False,
+            encoding="utf-8-sig",
+            low_memory=False,
+            **options,
+        )[[*place.values(), beyond]]
+
+    try:
+        frame = read(dtype=dict.fromkeys((*place.values(), beyond), np.float64), na_values=[""], decimal=decimal)
+        texts, held = None, frame.notna()
+    except ValueError:  # something is no number: read again as text, to be able to name it
+        try:
+            texts = read(dtype=str).fillna("").apply(lambda column: column.str.strip())
+        except ValueError as error:
+            if "found 0" in str(error) or isinstance(error, pd.errors.EmptyDataError):
+                raise InputError(f"{path}: there are no data rows below the header.") from None
+            raise InputError(f"{path}: not a readable table ({_short(error)}).") from None
+        frame = texts.apply(lambda column: pd.to_numeric(column.str.replace(decimal, "."), errors="coerce"))
+        held = texts != ""
+
+    extra = np.flatnonzero(np.asarray(held[beyond]))
+    if extra.size:
+        raise InputError(
+            f"{path}: line {header_line + 1 + extra[0]} has {len(header) + 1} cells under {len(header)} headers; "
+            "is a separator or a decimal comma wrong?"
+        )
+    values = {name: np.asarray(frame[place[name]], dtype=float) for name in columns}
+
+    def cell(column: str, row: int) -> str:
+        if texts is not None:
+            return " ".join(str(texts.loc[row, place[column]]).split())
+        value = values[column][row]
+        return "" if np.isnan(value) else str(value)
+
+    filled = {name: _up_to_last(np.asarray(held[place[name]])) for name in columns}
+    return Table(path, values, filled, header_line + 1, cell)
+
+
+def _header(path: Path) -> tuple[list[str], int, str]:
+    """Column names, the number of lines up to and with the header, and the separator."""
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        line, number = "", 0
+        while not line.strip():
+            line, number = file.readline(), number + 1
+            if not line:
+                raise InputError(f"{path}: the file holds only blank lines.")
+    if "\0" in line:
+        raise csv.Error("NUL byte")
+    tab = path.suffix.lower() == ".tsv"
+    bare = re.sub(r'"[^"]*"', "", line)  # separators inside quotes do not count
+    separator = "\t" if tab else ";" if ";" in bare and "," not in bare else ","
+    return [name.strip() for name in next(csv.reader([line], delimiter=separator))], number, separator
+
+
+def _up_to_last(held: np.ndarray) -> int:
+    return int(np.flatnonzero(held)[-1]) + 1 if held.any() else 0
+
+
+def _read_parquet(path: Path, columns: Sequence[str]) -> Table:
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    except ImportError:
+        raise InputError(f"{path}: reading Parquet needs pyarrow; install orthaug[parquet].") from None
+    try:
+        names = pq.read_schema(path).names
+        _check_present(path, columns, names)
+        frame = pq.read_table(path, columns=list(columns)).to_pandas()
+    except (pa.ArrowInvalid, OSError) as error:
+        raise InputError(f"{path}: not a readable Parquet file ({_short(error)}).") from None
+    return _full(path, {name: _as_floats(frame[name].to_numpy(), name, path) for name in columns})
+
+
+def _read_excel(path: Path, columns: Sequence[str]) -> Table:
+    """The first sheet; the first row that holds anything is the header."""
+    import pandas as pd
+
+    try:
+        sheet = pd.read_excel(path, header=None, dtype=object)
+    except ImportError:
+        raise InputError(f"{path}: reading Excel needs openpyxl; install orthaug[excel].") from None
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: not a readable Excel file ({_short(error)}).") from None
+    rows = sheet.notna().any(axis=1).to_numpy()
+    if not rows.any():
+        raise InputError(f"{path}: the first sheet is empty.")
+    top = int(np.argmax(rows))
+    header = ["" if pd.isna(name) else str(name).strip() for name in sheet.iloc[top]]
+    _check_present(path, columns, header)
+    cells = {name: sheet.iloc[top + 1 :, header.index(name)].reset_index(drop=True) for name in columns}
+    values = {name: np.asarray(pd.to_numeric(column, errors="coerce"), dtype=float) for name, column in cells.items()}
+    filled = {name: _up_to_last(column.notna().to_numpy()) for name, column in cells.items()}
+    return Table(path, values, filled, top + 2, lambda column, row: str(cells[column].fillna("").iloc[row]))
+
+
+def _read_variables(path: Path, columns: Sequence[str]) -> Table:
+    return _full(path, read_variables(path, columns))
+
+
+def _full(path: Path, columns: Mapping[str, Vector]) -> Table:
+    """A table of a file type that has no empty cells."""
+    return Table(path, columns, {name: len(values) for name, values in columns.items()})
+
+
+def _as_floats(array: np.ndarray, name: str, path: Path) -> Vector:
+    try:
+        if array.dtype.kind not in "fiub":
+            raise TypeError
+        return np.asarray(array, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"{path}: column '{name}' holds {array.dtype} values; expected numbers.") from None
+
+
+_READERS: dict[str, Callable[[Path, Sequence[str]], Table]] = {
+    ".csv": _read_text,
+    ".tsv": _read_text,
+    ".parquet": _read_parquet,
+    ".xlsx": _read_excel,
+    **dict.fromkeys(ENDINGS, _read_variables),
+}
+
+
+def _check_present(path: Path, columns: Sequence[str], header: Sequence[str]) -> None:
+    for name in columns:
+        if name not in header:
+            known = ", ".join(f"'{h}'" for h in header if h) or "no column names"
+            raise MissingColumnError(f"{path}: no column '{name}'{nearest(name, header)}; the file has {known}.")
+        if list(header).count(name) > 1:
+            raise InputError(f"{path}: the column '{name}' stands {list(header).count(name)} times; names must differ.")
+
+
+def _short(error: Exception) -> str:
+    return " ".join(str(error).split())[:120]

@@ -1,0 +1,12 @@
+from .criteria import Prediction as Prediction
+from .criteria import Simulation as Simulation
+from .estimates import Estimate as Estimate
+from .estimation import estimate as estimate
+from .estimation import orthogonalize as orthogonalize
+from .solvers import AdamLBFGS as AdamLBFGS
+from .solvers import LevenbergMarquardt as LevenbergMarquardt
+from .status import Status as Status
+from .structures import Additive as Additive
+from .structures import BaselinePenalty as BaselinePenalty
+from .structures import Orthogonal as Orthogonal
+from .structures import OrthogonalPenalty as OrthogonalPenalty

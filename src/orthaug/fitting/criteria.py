@@ -1,0 +1,66 @@
+"""Criteria: what is minimised, as declarations. One step ahead, several, or over a free run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from orthaug._base.checks import check_count
+from orthaug._base.errors import InputError
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Declaration: the error of the prediction `horizon` steps ahead; 1 is the paper's criterion (eq:cost_fun)."""
+
+    horizon: int = 1
+
+    def __post_init__(self) -> None:
+        check_count(self.horizon, "horizon")
+
+    @property
+    def flown(self) -> Simulation | None:
+        """The free run that gives it: segments of `horizon` steps whose last one is scored; None for one step."""
+        return Simulation(self.horizon, self.horizon - 1, exact_start=True) if self.horizon > 1 else None
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """Declaration: the error of a free run over segments that start from measured lags.
+
+    With a washout, or over whole experiments, the outputs before a segment are taken for as noisy as all others: they
+    are unknowns too (`Pasts`). Segments without a washout start exactly from what was measured.
+
+    Args:
+        segment: steps of a segment; 0 for whole experiments.
+        washout: leading steps of a segment that are not scored, until its start is forgotten.
+        start_iterations: one-step iterations that training starts from.
+        exact_start: whether a segment starts exactly from what was measured; None for the rule above.
+    """
+
+    segment: int = 512
+    washout: int = 40
+    start_iterations: int = 20
+    exact_start: bool | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("segment", "washout", "start_iterations"):
+            check_count(getattr(self, name), name, least=0)
+        if self.segment and self.washout >= self.segment:
+            raise InputError(
+                f"`washout` must be shorter than `segment`; got {self.washout} and {self.segment}: nothing is scored."
+            )
+
+    @property
+    def flown(self) -> Simulation:
+        """Itself: the free run that training makes."""
+        return self
+
+    @property
+    def estimates_pasts(self) -> bool:
+        """Whether the outputs before a segment are unknowns."""
+        if self.exact_start is not None:
+            return not self.exact_start
+        return self.washout > 0 or self.segment == 0
+
+
+Criterion = Prediction | Simulation

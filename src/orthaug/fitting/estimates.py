@@ -1,0 +1,233 @@
+"""The result of an estimation: parameters with intervals, status with cause and remedy, the model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from orthaug._base.checks import Matrix, Vector, check_type
+from orthaug._base.errors import InputError
+from orthaug.fitting.criteria import Criterion, Prediction
+from orthaug.fitting.status import Status
+from orthaug.inference.covariance import interval
+from orthaug.inference.intervals import joint_covariance, robust_covariance
+from orthaug.inference.measures import Measure, Support, Training
+from orthaug.inference.physical import PhysicalEstimate, profile, solve
+from orthaug.inference.splitting import MeasureSplit, split_under
+from orthaug.models.model import Model
+from orthaug.physics.excitation import Excitation
+from orthaug.physics.parameters import PhysicsMap
+from orthaug.physics.problem import Problem
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class Restart:
+    """One run from its own initial weights."""
+
+    seed: int
+    loss: float | None
+    iterations: int
+    code: str
+    chosen: bool
+    regularization: str | float = "none"
+    validation: float | None = None
+    """Mean squared one-step error on the validation record, where there is one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What `estimate` returns. Print `fit.summary()`; use `fit.model`; read `fit.parameters`."""
+
+    model: Model
+    status: Status
+    restarts: tuple[Restart, ...]
+    excitation: Excitation
+    covariance: Matrix | None
+    """Cov θ̂ (nθ, nθ); None where θ has no standard error."""
+    freedom: float
+    """Degrees of freedom of the residual, rows less parameters less effective weights."""
+    effective_weights: float
+    defect: float | None
+    """‖QᵀF̃‖ / ‖F‖ over the training rows: how much of the learner the physics could express; None without one."""
+    problem: Problem = field(repr=False)
+    criterion: Criterion = Prediction()  # noqa: RUF009  (frozen)
+    measure: MeasureSplit | None = None
+    """What θ was split under, if not the training measure."""
+    at_bound: Mapping[str, float] = field(default_factory=dict)
+    """Parameters that stand at a bound, with its value."""
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def theta(self) -> Vector:
+        """θ̂ (nθ,)."""
+        return self.model.theta
+
+    @property
+    def one_step_theta(self) -> Vector | None:
+        """Φ⁺Y (nθ,), what one-step least squares gives, where θ was trained on something else; None otherwise."""
+        if self.criterion.flown is None:
+            return None
+        return self.problem.projection.solve(self.problem.whitened_target)
+
+    @property
+    def std(self) -> Vector | None:
+        """Standard errors of θ̂ (nθ,)."""
+        return None if self.covariance is None else np.sqrt(np.diag(self.covariance))
+
+    @property
+    def interval(self) -> Matrix | None:
+        """95 % intervals of θ̂ (nθ, 2)."""
+        std = self.std
+        return None if std is None else interval(self.theta, std, self.freedom)
+
+    @cached_property
+    def parameters(self) -> pd.DataFrame:
+        """Table with a row per parameter: unit, initial, value, std, and the 95 % interval."""
+        import pandas as pd
+
+        baseline = self.problem.baseline
+        nothing = np.full(len(baseline.names), np.nan)
+        ci = self.interval if self.interval is not None else np.stack([nothing, nothing], axis=-1)
+        return pd.DataFrame(
+            {
+                "unit": [p.unit for p in baseline.parameters],
+                "initial": baseline.initial,
+                "value": self.theta,
+                "std": self.std if self.std is not None else nothing,
+                "ci95_low": ci[:, 0],
+                "ci95_high": ci[:, 1],
+            },
+            index=pd.Index(baseline.names, name="parameter"),
+        )
+
+    def split(self, measure: Measure) -> Estimate:
+        """The same fitted function with θ, θ_aux, components and intervals under a measure, without training (F2).
+
+        Raises:
+            InputError: a measure that does not fit the model, or a θ at a bound.
+        """
+        check_type(measure, Measure, "measure", "a measure such as Uniform()")
+        if self.at_bound:
+            raise InputError(
+                f"{', '.join(self.at_bound)} stand at a bound, which a split under the {measure.name} measure would "
+                "leave; drop the bounds, or keep the training measure."
+            )
+        support = Support(self.problem.record, self.problem.layout, self.model.form.used)
+        found, joint = split_under(measure, self.model, support, self.model.joint), self.model.joint
+        if found.covariance is not None:
+            training = self.covariance if self.measure is None else None
+            training = split_under(Training(), self.model, support, joint).covariance if training is None else training
+            with np.errstate(all="ignore"):
+                price = np.sqrt(np.diag(found.covariance) / np.diag(np.asarray(training)))
+            found = replace(found, price=price)
+        ensemble = found.covariance is None and self.model.numbers.tilt is not None
+        unknown = ("no standard errors after a split: an ensemble has no gradient in its weights.",) if ensemble else ()
+        numbers = self.model.numbers._replace(theta=found.theta, theta_aux=found.theta_aux)
+        return replace(
+            self,
+            model=replace(self.model, numbers=numbers, structure="orthogonal", measure=measure.name),
+            covariance=found.covariance,
+            defect=found.defect,
+            measure=found,
+            warnings=(*(w for w in self.warnings if "not unique" not in w), *found.warnings, *unknown),
+        )
+
+    def joint_covariance(self, convention: str = "calibrated") -> Matrix:
+        """Cov of θ̂ and the weights from the raw `[Φ P⊥J]`, (nθ + nw)²; convention "paper" for eq:cov_approx / N."""
+        if self.criterion.flown is not None or (self.model.gram is None and self.model.numbers.tilt is None):
+            raise InputError("the joint covariance is that of a one-step fit with statistics of its own.")
+        return joint_covariance(self.problem, self.model, convention)
+
+    def robust(self, lags: int | None = None) -> Estimate:
+        """The same with standard errors of θ that hold for coloured and uneven noise (Newey-West).
+
+        Raises:
+            InputError: θ that is not `Φ⁺Y`: of another structure or measure, at a bound, or trained on the free run.
+        """
+        plain = self.covariance is not None and self.measure is None and isinstance(self.criterion, Prediction)
+        if not plain or self.at_bound:
+            raise InputError(
+                "robust standard errors are those of θ = Φ⁺Y: an orthogonal structure under the training measure, "
+                "one step ahead, with no parameter at a bound."
+            )
+        trajectories = self.model.predict(self.problem.record).trajectories
+        residual = np.concatenate([(t.measured - t.model)[t.start :] for t in trajectories])  # type: ignore[operator]
+        return replace(self, covariance=robust_covariance(self.problem, residual, self.effective_weights, lags))
+
+    def physical(self, physics: PhysicsMap) -> PhysicalEstimate:
+        """The physical parameters that θ̂ is made of, with intervals by the delta method."""
+        order, covariance = self._in_order_of(physics)
+        return solve(physics, self.theta[order], covariance, freedom=max(self.freedom, 1.0))
+
+    def physical_profile(self, physics: PhysicsMap, name: str) -> tuple[float, float]:
+        """95 % profile-likelihood interval of one physical parameter; a side without limit is infinite."""
+        order, covariance = self._in_order_of(physics)
+        if covariance is None:
+            raise InputError("θ has no standard errors, so physical parameters have no profile.")
+        return profile(physics, self.theta[order], covariance, name, freedom=max(self.freedom, 1.0))
+
+    def _in_order_of(self, physics: PhysicsMap) -> tuple[list[int], Matrix | None]:
+        names = self.problem.baseline.names
+        missing = [name for name in physics.theta_names if name not in names]
+        if missing:
+            raise InputError(f"the physics gives {', '.join(missing)}, which the baseline does not have.")
+        order = [names.index(name) for name in physics.theta_names]
+        return order, None if self.covariance is None else self.covariance[np.ix_(order, order)]
+
+    def __repr__(self) -> str:
+        values = ", ".join(f"{n} = {v:.6g}" for n, v in zip(self.problem.baseline.names, self.theta, strict=True))
+        return f"Estimate({self.model.structure}, {self.status.code}, loss {self.status.loss:.3g}, {values})"
+
+    def summary(self) -> str:
+        """A page of text: status, parameters, excitation, warnings."""
+        return "\n".join(summary_lines(self))
+
+
+def summary_lines(fit: Estimate) -> Sequence[str]:
+    """The lines of `Estimate.summary`."""
+    status, baseline = fit.status, fit.problem.baseline
+    bound = fit.model.form.bound
+    learner = (
+        "none" if bound is None else f"{bound.learner}, {bound.size} weights, {fit.effective_weights:.1f} effective"
+    )
+    lines = [
+        f"structure   {fit.model.structure}",
+        f"learner     {learner}",
+        f"data        {fit.problem.record!r}, {len(fit.problem.rows)} usable rows",
+        f"status      {status.code}, {status.iterations} iterations, {status.seconds:.2f} s, loss {status.loss:.6g}",
+    ]
+    if status.message:
+        lines.append(f"            {status.message}")
+    if fit.defect is not None:
+        lines.append(f"orthogonal  ‖QᵀF̃‖/‖F‖ = {fit.defect:.1e}")
+    condition = fit.excitation.condition
+    lines.append(
+        f"excitation  rank {fit.excitation.rank} of {fit.excitation.columns}"
+        + (f", condition {condition:.3g}" if condition else "")
+    )
+    if fit.measure is not None:
+        lines.append(f"measure     {fit.measure}")
+    one_step = fit.one_step_theta
+    if one_step is not None:
+        moved = ", ".join(f"{name} {value:.6g}" for name, value in zip(baseline.names, one_step, strict=True))
+        lines.append(f"one step    Φ⁺Y would give {moved}")
+    width = max([9, *(len(name) for name in baseline.names)])
+    lines += ["", f"{'parameter':<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  {'initial':>11}  unit"]
+    std, ci = fit.std, fit.interval
+    for i, parameter in enumerate(baseline.parameters):
+        spread = f"{std[i]:11.4g}" if std is not None else f"{'–':>11}"
+        reach = f"[{ci[i, 0]:13.7g}, {ci[i, 1]:13.7g}]" if ci is not None else f"{'–':^29}"
+        lines.append(
+            f"{parameter.name:<{width}}  {fit.theta[i]:14.8g}  {spread}  {reach}  "
+            f"{parameter.initial:11.5g}  {parameter.unit}".rstrip()
+        )
+    if fit.warnings:
+        lines += ["", *(f"warning: {text}" for text in fit.warnings)]
+    return lines

@@ -1,0 +1,152 @@
+"""Covariances beyond θ: of θ and weights together, of predictions, and robust to coloured or uneven noise.
+
+`Cov p̂ = M⁻¹ (ΣψᵀΣ_eψ) M⁻¹`, `M = Σψᵀψ` (Ljung 1999, ch. 9). The paper's eq:cov_approx has a factor 2 in the middle; for
+plain least squares it gives twice `σ²(ΦᵀΦ)⁻¹`. Learner weights are over-parametrised: their block is singular, and only
+functions of the model have intervals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from orthaug._base.checks import Matrix, check_choice, check_count
+from orthaug._base.errors import InputError
+from orthaug._base.jax import jax, jnp
+from orthaug.data.record import Record
+from orthaug.data.regressors import lag_matrix
+from orthaug.inference.covariance import mixing
+from orthaug.models.model import Model
+from orthaug.models.predictor import Form, Numbers
+from orthaug.models.rows import Chunks, chunk_shape, from_chunks, in_chunks, learner_chunks, projected_gram
+from orthaug.models.statistics import half_inverse
+from orthaug.physics.problem import Problem
+
+CONVENTIONS = ("calibrated", "paper")
+
+
+def joint_covariance(problem: Problem, model: Model, convention: str = "calibrated") -> Matrix:
+    """Cov of θ̂ and the learner's weights in the orthogonal structure, from the raw `[Φ J̃]`, J̃ = P⊥J; (nθ + nw)².
+
+    Under the training measure its blocks between θ and weights are zero (`thm:zero_cov`) where the noise is the same in
+    all outputs, or the outputs share no θ. One pass over the rows.
+
+    Args:
+        convention: "paper" for eq:cov_approx divided by N, factor 2 and `Σ̂ = (1/N) Σ e eᵀ` included.
+
+    Raises:
+        InputError: an unknown convention, or a model without a learner's gradient.
+    """
+    check_choice(convention, CONVENTIONS, "`convention`")
+    if model.numbers.tilt is not None:
+        raise InputError("an ensemble has no gradient in its weights; use a single learner.")
+    residual = np.concatenate([(t.measured - t.model)[t.start :] for t in model.predict(problem.record).trajectories])
+    noise = residual.T @ residual / len(residual) if convention == "paper" else model.noise
+    if noise is None:
+        raise InputError("the fit has no noise covariance: there are no degrees of freedom left.")
+    projection, nt, ny = problem.projection, len(problem.baseline.names), len(problem.outputs)
+    chunks = learner_chunks(model.form, model.numbers, problem.rows.x, problem.projection.q, problem.weight)
+    whitened = noise * np.outer(problem.weight, problem.weight)
+    outer, middle = (_raw(model, chunks, mix) for mix in (np.eye(ny), mixing(whitened)))
+    change = np.eye(len(outer))
+    change[:nt, :nt] = projection.r / projection.scale
+    outer, middle = (change.T @ found @ change for found in (outer, middle))
+    half = half_inverse(outer, nt)
+    return (2.0 if convention == "paper" else 1.0) * half @ (half.T @ middle @ half) @ half.T
+
+
+def _raw(model: Model, chunks: Chunks, mix: Matrix) -> Matrix:
+    """Gram matrix of `[Q J̃]` with outputs multiplied by `mix`."""
+    bound = model.form.bound
+    if bound is None:
+        mixed = np.einsum("oi,kitm->kotm", mix, np.asarray(chunks.q))
+        q = np.moveaxis(mixed, 2, 0).reshape(mixed.shape[2], -1)
+        return q @ q.T
+    return np.asarray(projected_gram(bound, jnp.asarray(model.numbers.weights), chunks, jnp.asarray(mix)))
+
+
+def prediction_std(model: Model, record: Record) -> list[Matrix]:
+    """Standard error of the one-step prediction on every row of every experiment, (N, ny); NaN on the first lags.
+
+    It is that of the fitted function, `√(ψ Cov(c, w) ψᵀ)`; a new measurement adds the noise, `model.noise`.
+
+    Raises:
+        InputError: a model without statistics, other channels.
+    """
+    joint = model.joint
+    if joint is None or model.numbers.tilt is not None:
+        raise InputError(
+            "the model has no statistics to take standard errors from (an ensemble, or trained elsewhere)."
+        )
+    root = jnp.asarray(joint.root())
+    record = model.fitting(record, need_outputs=True)
+    found = []
+    for experiment in record.experiments:
+        x = lag_matrix(experiment, model.form.layout, record, model.form.start)
+        shape = chunk_shape(len(x))
+        chunks = jnp.asarray(in_chunks(x, shape, repeat=True))
+        variance = np.asarray(_variances(model.form, model.numbers, chunks, root))
+        values = np.full((len(experiment), len(model.outputs)), np.nan)
+        values[model.form.start :] = np.sqrt(np.maximum(from_chunks(variance, len(x)), 0.0))
+        found.append(values)
+    return found
+
+
+@partial(jax.jit, static_argnames="form")
+def _variances(
+    form: Form, numbers: Numbers, x: Float[Array, "k nx m"], root: Float[Array, "n r"]
+) -> Float[Array, "k ny m"]:
+    def one_chunk(rows: Any) -> Any:
+        phi = jax.vmap(lambda row: form.baseline.phi(row, form.layout, form.outputs, jnp), -1, -1)(rows)
+        columns = jnp.moveaxis(phi, 1, 0)  # (nt, ny, m)
+        if form.bound is not None:
+            z = form.features.evaluate(rows.T, form.layout, jnp)
+            z = ((z - numbers.centre) / numbers.halfwidth).T
+            gain = jnp.broadcast_to(numbers.gain[:, None], (len(form.outputs), rows.shape[-1]))
+            columns = jnp.concatenate([columns, form.bound.jacobian(numbers.weights, z, gain)[1]])
+        return jnp.sum(jnp.einsum("nom,nr->rom", columns, root) ** 2, axis=0)
+
+    return jax.lax.map(one_chunk, x)
+
+
+def newey_west(scores: Sequence[Float[np.ndarray, "N nt"]], lags: int | None = None) -> Matrix:
+    """Σ_k Σ_j w_{|k−j|} s_k s_jᵀ with Bartlett weights (Newey and West 1987), lags never across experiments.
+
+    Args:
+        scores: of every experiment, (N_i, nt).
+        lags: how many; default `⌊4 (N/100)^(2/9)⌋`.
+    """
+    if lags is not None:
+        check_count(lags, "lags", least=0)
+    total = sum(len(s) for s in scores)
+    reach = int(4 * (total / 100) ** (2 / 9)) if lags is None else lags
+    found = sum(s.T @ s for s in scores)
+    for lag in range(1, reach + 1):
+        share = sum(s[lag:].T @ s[:-lag] for s in scores if len(s) > lag)
+        found = found + (1 - lag / (reach + 1)) * (share + np.transpose(share))
+    return np.asarray(found)
+
+
+def robust_covariance(problem: Problem, residual: Matrix, used: float, lags: int | None = None) -> Matrix:
+    """Cov θ̂ (nθ, nθ) of `θ̂ = Φ⁺Y` where the noise may be coloured or uneven (Newey-West).
+
+    Args:
+        residual: (N, ny) in the outputs' units, rows as in the problem.
+        used: effective weights of the learner, by which the residual is too small.
+    """
+    projection = problem.projection
+    whitened = residual * problem.weight
+    scores = np.einsum("kit,ki->kt", projection.q, whitened)
+    pieces, begin = [], 0
+    for experiment in problem.record.experiments:
+        end = begin + len(experiment) - problem.rows.start
+        pieces.append(scores[begin:end])
+        begin = end
+    rows, nt = len(whitened) * whitened.shape[1], len(projection.scale)
+    correction = rows / max(rows - nt - used, 1.0)
+    factor = projection.covariance_factor()
+    return correction * factor @ newey_west(pieces, lags) @ factor.T

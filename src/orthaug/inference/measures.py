@@ -1,0 +1,258 @@
+"""Measures: the points, with weights, on which physics and learner are made orthogonal (F3).
+
+θ under a measure is `Φ_μ⁺ G_μ`, the least-squares share of the fitted function g in the physics over those points. The
+paper takes the training set; what is orthogonal to the physics under one measure need not be so under another.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+
+from orthaug._base.checks import Matrix, Vector, nearest
+from orthaug._base.errors import InputError
+from orthaug.data.expressions import Lag
+from orthaug.data.record import Record
+from orthaug.data.regressors import Layout, lag_matrix, largest_lag, stack_rows
+
+_NODES = (1 << 20, 512, 64)  # of the rule for one, two and three coordinates, in each of them
+_PANEL = 8  # Gauss-Legendre nodes of a panel
+_QUASI_RANDOM = 1 << 17  # points for more coordinates, doubled by their mirror images
+_NEIGHBOURS = 20_000  # points at most, of the data and of the measure, by which the reach of the data is judged
+
+
+class Points(NamedTuple):
+    """Regressors (M, nx) and their weights (M,), which add up to 1."""
+
+    x: Matrix
+    weight: Vector
+
+
+@dataclass(frozen=True, eq=False)
+class Support:
+    """What a measure may draw on: the training record, its regressor, and the lags that the model reads."""
+
+    record: Record
+    layout: Layout
+    used: tuple[Lag, ...]
+
+    @property
+    def x(self) -> Matrix:
+        """The training regressors (N, nx)."""
+        return stack_rows(self.record, self.layout).x
+
+    def share(self, points: Points) -> float:
+        """The measure's weight within reach of the training data.
+
+        A point is within reach if a training point lies no farther from it than twice the distance that 99 % of the
+        training points keep from their nearest neighbour; each used lag is divided by the range of its data.
+        """
+        columns = [j for j, lag in enumerate(self.layout) if lag in self.used]
+        x = self.x[:, columns]
+        if not columns:
+            return 1.0
+        unit = np.where(np.ptp(x, axis=0) > 0, np.ptp(x, axis=0), 1.0)
+        known = np.unique(x[:: -(-len(x) // _NEIGHBOURS)] / unit, axis=0)
+        if len(known) < 2:
+            return float(np.sum(points.weight[(points.x[:, columns] / unit == known).all(axis=1)]))
+        from scipy.spatial import KDTree  # slow to import, and few runs need it
+
+        tree = KDTree(known)
+        reach = 2 * np.quantile(tree.query(known, k=2)[0][:, 1], 0.99)
+        some = slice(None, None, -(-len(points.x) // _NEIGHBOURS))
+        weight = points.weight[some] / points.weight[some].sum()
+        return float(np.sum(weight[tree.query(points.x[some][:, columns] / unit)[0] <= reach]))
+
+
+@runtime_checkable
+class Measure(Protocol):
+    """What `Orthogonal(measure=…)` and `fit.split(…)` take."""
+
+    @property
+    def name(self) -> str: ...
+
+    def points(self, support: Support) -> Points:
+        """The points over which physics and learner are made orthogonal."""
+        ...
+
+
+def _even(x: Matrix) -> Points:
+    return Points(x, np.full(len(x), 1 / len(x)))
+
+
+@dataclass(frozen=True)
+class Training:
+    """The training rows, each with the same weight: the paper's measure. `rows` (start, stop) takes a part of each."""
+
+    rows: tuple[int, int] | None = None
+    name: str = "training"
+
+    def points(self, support: Support) -> Points:
+        if self.rows is None:
+            return _even(support.x)
+        start, stop = self.rows
+        first = largest_lag(support.layout)
+        kept = []
+        for experiment in support.record.experiments:
+            rows = lag_matrix(experiment, support.layout, support.record, first)
+            kept.append(rows[max(start - first, 0) : max(stop - first, 0)])
+        x = np.concatenate(kept)
+        if not len(x):
+            raise InputError(f"rows {start}:{stop} hold no usable row; the first is at row {first}.")
+        return _even(x)
+
+
+@dataclass(frozen=True)
+class Symmetrized:
+    """The training rows and their mirror images −x: the paper's sign trick, done to the measure, not the experiment."""
+
+    name: str = "symmetrized"
+
+    def points(self, support: Support) -> Points:
+        x = support.x
+        return _even(np.concatenate([x, -x]))
+
+
+@dataclass(frozen=True, eq=False)
+class Weighted:
+    """The training rows with weights of one's own, (N,), in the order of the usable rows."""
+
+    weights: Any
+    name: str = "weighted"
+
+    def points(self, support: Support) -> Points:
+        x = support.x
+        return Points(x, _normalised(self.weights, len(x), "usable rows"))
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Points of one's own: a column per raw lag that the model reads, named as in expressions.
+
+    Args:
+        columns: values (M,) of each lag, `{"force[k-1]": …}`.
+        weights: (M,), none negative; None for equal ones.
+    """
+
+    columns: Mapping[str, Any]
+    weights: Any = None
+    name: str = "samples"
+
+    def points(self, support: Support) -> Points:
+        values: dict[Lag, Vector] = {}
+        for text, column in self.columns.items():
+            lag = _lag_of(text, support)
+            if lag in values:
+                raise InputError(f"the samples give {lag} twice; one column for each lag.")
+            try:
+                values[lag] = np.asarray(column, dtype=float)
+            except (TypeError, ValueError):
+                raise InputError(f"the samples' column {lag} must be numbers.") from None
+        missing = [str(lag) for lag in support.used if lag not in values]
+        if missing:
+            raise InputError(f"the samples lack {', '.join(missing)}; give a column for every raw lag that is used.")
+        lengths = {str(lag): v.shape for lag, v in values.items()}
+        if len(set(lengths.values())) > 1 or any(len(shape) != 1 for shape in lengths.values()):
+            raise InputError(f"the samples' columns differ in shape: {lengths}; give one vector of a length for each.")
+        count = next(iter(values.values())).shape[0]
+        if not count:
+            raise InputError("the samples have no rows; give at least as many as there are parameters.")
+        bad = [str(lag) for lag, v in values.items() if not np.isfinite(v).all()]
+        if bad:
+            raise InputError(f"the samples' column {bad[0]} holds a value that is not finite.")
+        x = np.zeros((count, len(support.layout)))
+        for j, lag in enumerate(support.layout):
+            x[:, j] = values.get(lag, 0.0)
+        weight = np.ones(count) if self.weights is None else self.weights
+        return Points(x, _normalised(weight, count, "samples"))
+
+
+@dataclass(frozen=True, eq=False)
+class Uniform:
+    """Uniform over a box of raw lags, integrated by a deterministic rule that is symmetric about the box's centre.
+
+    Composite Gauss-Legendre in up to three coordinates, Sobol points with their mirror images in more.
+
+    Args:
+        box: limits of raw lags, `{"force[k-1]": (-200, 200)}`; lags that are not named take the data's own range.
+    """
+
+    box: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    name: str = "uniform"
+
+    def points(self, support: Support) -> Points:
+        low, high = self.limits(support)
+        columns = [j for j, lag in enumerate(support.layout) if lag in support.used]
+        unit = _rule(len(columns))
+        x = np.zeros((len(unit.x), len(support.layout)))
+        centre, half = (low + high) / 2, (high - low) / 2
+        x[:, columns] = centre[columns] + half[columns] * unit.x
+        return Points(x, unit.weight)
+
+    def limits(self, support: Support) -> tuple[Vector, Vector]:
+        """Lower and upper limits of every entry of the regressor, each (nx,).
+
+        Raises:
+            InputError: an unknown lag, limits that are empty or reversed.
+        """
+        x = support.x
+        low, high = x.min(axis=0), x.max(axis=0)
+        for text, limits in self.box.items():
+            lag = _lag_of(text, support)
+            try:
+                start, stop = (float(limit) for limit in limits)
+            except (TypeError, ValueError):
+                raise InputError(f"the box of {text} must be two numbers, lower and upper; got {limits!r}.") from None
+            if not (math.isfinite(start) and math.isfinite(stop) and start < stop):
+                raise InputError(f"the box of {text} is empty or reversed: {start:g} to {stop:g}.")
+            j = support.layout.index(lag)
+            low[j], high[j] = start, stop
+        return low, high
+
+
+def _normalised(weights: Any, count: int, what: str) -> Vector:
+    try:
+        values = np.asarray(weights, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError("the weights must be numbers.") from None
+    if values.shape != (count,):
+        raise InputError(f"there are {values.shape} weights for {count} {what}; give one for each.")
+    if not np.isfinite(values).all() or np.any(values < 0) or values.sum() <= 0:
+        raise InputError("the weights must be finite, none negative, and not all zero.")
+    return values / values.sum()
+
+
+def _lag_of(text: str, support: Support) -> Lag:
+    """The used lag that a text such as `force[k-1]` names."""
+    known = {str(lag): lag for lag in support.used}
+    plain = "".join(text.split())
+    if plain.endswith("[k-0]"):
+        plain = plain[:-3] + "]"
+    if plain not in known:
+        raise InputError(
+            f"'{text}' is no raw lag that this model reads{nearest(plain, known) or '.'} It reads {', '.join(known)}."
+        )
+    return known[plain]
+
+
+def _rule(coordinates: int) -> Points:
+    """Nodes on [−1, 1]ᵈ with weights that add up to 1, symmetric about 0."""
+    if coordinates == 0:
+        return _even(np.zeros((1, 0)))
+    if coordinates <= len(_NODES):
+        panels = _NODES[coordinates - 1] // _PANEL
+        node, weight = np.polynomial.legendre.leggauss(_PANEL)
+        edges = np.linspace(-1, 1, panels + 1)
+        line = ((edges[:-1] + edges[1:])[:, None] / 2 + node / panels).ravel()
+        share = np.tile(weight / (2 * panels), panels)
+        grid = np.meshgrid(*[line] * coordinates, indexing="ij")
+        shares = np.meshgrid(*[share] * coordinates, indexing="ij")
+        return Points(np.stack([g.ravel() for g in grid], axis=-1), np.prod([s.ravel() for s in shares], axis=0))
+    import scipy.stats.qmc  # slow to import, and few boxes have so many coordinates
+
+    quasi = 2 * scipy.stats.qmc.Sobol(coordinates, scramble=True, rng=0).random(_QUASI_RANDOM) - 1
+    return _even(np.concatenate([quasi, -quasi]))

@@ -1,0 +1,341 @@
+"""Physical parameters p̂ from θ̂, with their statistics: the inverse of θ = h(p).
+
+p̂ minimises ‖θ̂ − h(p)‖² under W = Cov(θ̂)⁻¹; with as many θ as p that solves θ̂ = h(p), with more θ the leftover
+tests the physics. Cov p̂ = (HᵀWH)⁻¹, H = dh/dp (delta method).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.optimize
+import scipy.special
+from jaxtyping import Bool
+
+from orthaug._base.checks import Matrix, Vector, nearest
+from orthaug._base.errors import InputError
+from orthaug.inference.covariance import interval
+from orthaug.physics.excitation import excitation
+from orthaug.physics.parameters import PhysicsMap, magnitude, tied
+
+CONTRADICTION = 0.05  # p-value below which θ̂ contradicts the physics, to match the 95 % intervals
+ITERATIONS = 200  # Levenberg-Marquardt steps from one start
+_ROUNDING = 1e-14  # smallest eigenvalue of a correlation matrix that is not rounding
+_SOLVED = {True: 1e-6, False: 1e-18}  # ‖residual‖² that counts as none: in variances of θ̂; without them relative to θ̂²
+
+
+class Consistency(NamedTuple):
+    """Whether θ̂ obeys what the physics fixes among θ: χ² = rᵀCov⁻¹r, its degrees of freedom, p-value, a sentence."""
+
+    chi2: float
+    df: int
+    p: float
+    text: str
+
+
+@dataclass(frozen=True, eq=False)
+class PhysicalEstimate:
+    """p̂ and its statistics, in the order and units of the physical parameters."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    initial: Vector
+    value: Vector
+    std: tuple[float | None, ...]
+    ci95: tuple[tuple[float, float] | None, ...]
+    covariance: Matrix | None
+    """Cov p̂ (np, np), NaN at parameters that stand at a bound; None where there are no standard errors."""
+    consistency: Consistency | None
+    """None where θ̂ has no covariance or nothing is left over to test."""
+    sensitivities: Matrix | None
+    """∂ln p̂ / ∂ln θ̂ (np, nθ): 10 says that 1 % in θ moves p by 10 %. NaN for p̂ = 0, 0 for one at a bound."""
+    warnings: tuple[str, ...] = ()
+
+    def as_rows(self) -> list[dict[str, Any]]:
+        """A row for each parameter, as `result.json` has them; None for what does not exist."""
+        columns = (self.names, self.units, self.initial.tolist(), self.value.tolist(), self.std, self.ci95)
+        keys = ("name", "unit", "initial", "value", "std", "ci95")
+        rows = [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]
+        return [row | {"ci95": list(row["ci95"]) if row["ci95"] else None} for row in rows]
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """min ‖K(h(p) − θ̂)‖² within the bounds, KᵀK = Cov⁻¹, over the entries `free` of p."""
+
+    physics: PhysicsMap
+    target: Vector
+    whiten: Matrix
+    known: bool
+    """Whether K comes from a covariance; otherwise from |θ̂|."""
+    free: tuple[int, ...]
+
+    @classmethod
+    def of(cls, physics: PhysicsMap, theta_hat: Vector, covariance: Matrix | None) -> _Fit:
+        target, names = np.asarray(theta_hat, dtype=float), physics.theta_names
+        if target.shape != (len(names),):
+            raise InputError(
+                f"`theta_hat` has shape {target.shape}; expected one number for each of {', '.join(names)}."
+            )
+        for name, value in zip(names, target, strict=True):
+            if not np.isfinite(value):
+                raise InputError(f"`theta_hat` is {value} for {name}; expected a finite estimate.")
+        whiten = None if covariance is None else _whitener(target, np.asarray(covariance, dtype=float))
+        default = np.diag(1 / magnitude(target))
+        free = tuple(range(len(physics.parameters)))
+        return cls(physics, target, default if whiten is None else whiten, whiten is not None, free)
+
+    def at(self, p: Vector) -> tuple[Vector, Matrix]:
+        """Whitened residual (nθ,) and its derivative (nθ, np)."""
+        theta, jacobian = self.physics.linearised(p)
+        with np.errstate(all="ignore"):
+            return self.whiten @ (theta - self.target), self.whiten @ jacobian
+
+    def descend(self, p: Vector) -> tuple[float, Vector]:
+        """Cost and p of the minimum that Levenberg-Marquardt finds from p; cost inf where θ has no value at p.
+
+        Every step solves its linear problem within the bounds exactly, so that p ends on a bound or off it, not near.
+        """
+        free = list(self.free)
+        low, high = (bound[free] for bound in self.physics.bounds)
+        residual, jacobian = self.at(p)
+        cost, damping = _cost(residual, jacobian), 0.0
+        for _ in range(ITERATIONS if free and np.isfinite(cost) else 0):
+            scale = self.physics.size[free]
+            columns = jacobian[:, free] * scale
+            rows = np.vstack([columns, np.diag(np.sqrt(damping) * np.linalg.norm(columns, axis=0))])
+            right = np.concatenate([-residual, np.zeros(len(free))])
+            limits = ((low - p[free]) / scale, (high - p[free]) / scale)
+            step = scipy.optimize.lsq_linear(rows, right, limits, method="bvls")
+            new = p.copy()
+            moved = np.clip(p[free] + scale * step.x, low, high)
+            new[free] = np.where(step.active_mask < 0, low, np.where(step.active_mask > 0, high, moved))
+            small = np.max(np.abs(new - p) / np.maximum(np.abs(p), 1e-3 * self.physics.size)) < 1e-11
+            at_new = self.at(new)
+            lower = _cost(*at_new)
+            if lower <= cost * (1 + 1e-9 * small):
+                p, cost, (residual, jacobian) = new, lower, at_new
+                damping = damping / 10 if damping > 1e-6 else 0.0
+            elif not small:
+                damping = max(10 * damping, 1e-3)
+            if small or damping > 1e12:
+                break
+        return cost, p
+
+    def solutions(self, starts: int) -> list[Vector]:
+        """The best p, first, and others that explain θ̂ as well, from p⁰ and `starts` points about it."""
+        points = (self.physics.initial, *self.physics.around(starts, 4.0))
+        found = [self.descend(p) for p in points]
+        least = min(cost for cost, _ in found)
+        distinct: list[Vector] = []
+        for cost, p in found:
+            near = [np.all(np.abs(p - q) <= 1e-3 * np.maximum(np.abs(q), 1e-3 * self.physics.size)) for q in distinct]
+            if cost <= least * (1 + 1e-9) + _SOLVED[self.known] and not any(near):
+                distinct.append(p)
+        return distinct
+
+
+def _cost(residual: Vector, jacobian: Matrix) -> float:
+    """‖residual‖², infinite where it or the derivative is not finite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        cost = float(residual @ residual)
+    return cost if np.isfinite(cost) and np.isfinite(jacobian).all() else math.inf
+
+
+def _whitener(target: Vector, covariance: Matrix) -> Matrix | None:
+    """K (nθ, nθ) with KᵀK = Cov⁻¹; None where an entry of θ has no variance, as at a bound."""
+    nt = len(target)
+    if covariance.shape != (nt, nt):
+        raise InputError(f"`covariance` has shape {covariance.shape}; expected ({nt}, {nt}), a row for each theta.")
+    if not np.isfinite(covariance).all():
+        return None
+    # θ̂ is rounded itself: a variance of zero becomes that of its last digit
+    rounded = (np.finfo(float).eps * magnitude(target)) ** 2 + np.finfo(float).tiny
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0) + rounded)
+    correlation = (covariance + np.diag(rounded)) / np.outer(std, std)
+    eigenvalues, vectors = np.linalg.eigh(correlation)
+    if not np.allclose(correlation, correlation.T, rtol=0, atol=1e-8) or eigenvalues[0] < -1e-8:
+        raise InputError("`covariance` must be symmetric with no negative eigenvalue; expected that of theta_hat.")
+    # a combination of θ without variance is known as well as double precision can tell, not unknown
+    return (vectors / np.sqrt(np.maximum(eigenvalues, _ROUNDING))).T / std
+
+
+def solve(
+    physics: PhysicsMap, theta_hat: Vector, covariance: Matrix | None, *, freedom: float, starts: int = 4
+) -> PhysicalEstimate:
+    """p̂ = argmin (θ̂ − h(p))ᵀ Cov⁻¹ (θ̂ − h(p)) within the bounds of p, with its statistics.
+
+    Args:
+        physics: h.
+        theta_hat: θ̂ (nθ,) in the order of `physics.theta_names`.
+        covariance: Cov θ̂ (nθ, nθ); None, or one that is not finite, gives relative weights and no statistics.
+        freedom: degrees of freedom of the noise variance within it; inf where that is known.
+        starts: points about p⁰ from which the solution is sought besides p⁰ itself.
+
+    Raises:
+        InputError: arguments of another shape, or that are no estimate, covariance or degrees of freedom.
+    """
+    _check_freedom(freedom)
+    fit = _Fit.of(physics, theta_hat, covariance)
+    value, *others = fit.solutions(starts)
+    residual, jacobian = fit.at(value)
+    held = _held(physics, value, jacobian.T @ residual)
+    chi2, df = float(residual @ residual), len(residual) - int(np.sum(~held))
+    outside = df == 0 and chi2 > _SOLVED[fit.known]
+    found = excitation(
+        jacobian[:, ~held], [name for name, at_bound in zip(physics.names, held, strict=True) if not at_bound]
+    )
+    spread, sensitivities = _linear(fit, value, jacobian, held) if found.full_rank and not outside else (None, None)
+    consistency = _consistency(chi2, df, freedom, bool(held.any())) if fit.known and df > 0 else None
+    warnings = [*_at_bounds(physics, value, held), *_elsewhere(physics, others)]
+    if outside:
+        warnings.append(_outside(fit, value))
+    elif not found.full_rank:
+        warnings.append(f"At the solution {tied(found)}; the physical parameters have no standard errors.")
+    if not fit.known:
+        warnings.append("theta has no finite covariance, so the physical parameters have no standard errors.")
+    if consistency is not None and consistency.p < CONTRADICTION:
+        warnings.append(consistency.text)
+    std = np.full(len(value), np.nan) if spread is None else np.sqrt(np.diag(spread))
+    return PhysicalEstimate(
+        names=physics.names,
+        units=tuple(p.unit for p in physics.parameters),
+        initial=physics.initial,
+        value=value,
+        std=tuple(float(s) if np.isfinite(s) else None for s in std),
+        ci95=tuple((float(a), float(b)) if np.isfinite(b - a) else None for a, b in interval(value, std, freedom)),
+        covariance=spread,
+        consistency=consistency,
+        sensitivities=sensitivities,
+        warnings=tuple(warnings),
+    )
+
+
+def _held(physics: PhysicsMap, value: Vector, gradient: Vector) -> Bool[np.ndarray, "n"]:
+    """Which parameters the data press against a bound, (np,)."""
+    low, high = physics.bounds
+    return ((value <= low) & (gradient > 0)) | ((value >= high) & (gradient < 0))
+
+
+def _linear(fit: _Fit, value: Vector, jacobian: Matrix, held: Bool[np.ndarray, "n"]) -> tuple[Matrix | None, Matrix]:
+    """Cov p̂ = (HᵀWH)⁻¹, None without Cov θ̂, and ∂ln p̂ / ∂ln θ̂ from dp̂/dθ̂ = (HᵀWH)⁻¹HᵀW, by SVD of KH."""
+    norms = np.linalg.norm(jacobian[:, ~held], axis=0)
+    u, sigma, vt = np.linalg.svd(jacobian[:, ~held] / norms, full_matrices=False)
+    root = vt.T / sigma / norms[:, None]
+    inverse = np.zeros((len(value), len(fit.target)))
+    inverse[~held] = root @ u.T @ fit.whiten
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sensitivities = np.where(value[:, None] != 0, inverse * fit.target / value[:, None], np.nan)
+    if not fit.known:
+        return None, sensitivities
+    spread = np.full((len(value), len(value)), np.nan)
+    spread[np.ix_(~held, ~held)] = root @ root.T
+    return spread, sensitivities
+
+
+def _check_freedom(freedom: float) -> None:
+    if isinstance(freedom, bool) or not isinstance(freedom, int | float | np.number) or not freedom > 0:
+        raise InputError(f"`freedom` must be a positive number, the residual's degrees of freedom; got {freedom!r}.")
+
+
+def _consistency(chi2: float, df: int, freedom: float, held: bool) -> Consistency:
+    """The noise variance is estimated itself, so χ²/df is compared with F(df, freedom), for inf with χ²."""
+    p = scipy.special.chdtrc(df, chi2) if math.isinf(freedom) else scipy.special.fdtrc(df, freedom, chi2 / df)
+    verb = "contradict" if p < CONTRADICTION else "agree with"
+    what = ("constraint" if df == 1 else f"{df} constraints") + (", bounds included" if held else "")
+    return Consistency(chi2, df, float(p), f"The data {verb} the physics' own {what} (chi2 = {chi2:.3g}, p = {p:.2g}).")
+
+
+def _at_bounds(physics: PhysicsMap, value: Vector, held: Bool[np.ndarray, "n"]) -> list[str]:
+    return [
+        f"{name} stands at its bound {v:g} and has no standard error; those of the others hold with it there."
+        for name, v, at_bound in zip(physics.names, value, held, strict=True)
+        if at_bound
+    ]
+
+
+def _elsewhere(physics: PhysicsMap, others: Sequence[Vector]) -> list[str]:
+    return [
+        "theta is explained as well by "
+        + ", ".join(f"{name} = {v:.6g}" for name, v in zip(physics.names, p, strict=True))
+        + "; bounds or better initial values choose between the solutions."
+        for p in others[:1]
+    ]
+
+
+def _outside(fit: _Fit, value: Vector) -> str:
+    nearby = fit.physics.theta(value)
+    worst = int(np.argmax(np.abs(nearby - fit.target) / magnitude(fit.target)))
+    return (
+        f"No physical parameters give the estimated theta: nearest is {fit.physics.theta_names[worst]} = "
+        f"{nearby[worst]:.6g} instead of {fit.target[worst]:.6g}. They have no standard errors; check the expressions "
+        "of theta, and whether theta is biased."
+    )
+
+
+def profile(
+    physics: PhysicsMap,
+    theta_hat: Vector,
+    covariance: Matrix,
+    name: str,
+    *,
+    freedom: float,
+    level: float = 0.95,
+    starts: int = 4,
+) -> tuple[float, float]:
+    """Profile-likelihood interval of one physical parameter: {pᵢ : min over the others χ² ≤ least χ² + F(1, freedom)}.
+
+    Unlike p̂ ± reach·std it is asymmetric where h bends, and ends at the parameter's bounds; a side on which the
+    data set no limit is ±inf.
+
+    Raises:
+        InputError: as for `solve`, an unknown name, a level outside (0, 1), or no covariance.
+    """
+    _check_freedom(freedom)
+    if name not in physics.names:
+        hint = nearest(name, physics.names) or f"; known are {', '.join(physics.names)}"
+        raise InputError(f"'{name}' is no physical parameter{hint}.")
+    if not 0 < level < 1:
+        raise InputError(f"`level` must be between 0 and 1, such as 0.95; got {level!r}.")
+    fit = _Fit.of(physics, theta_hat, covariance)
+    if not fit.known:
+        raise InputError("theta has no finite covariance, so there is no interval; expected that of theta_hat.")
+    best, i = fit.solutions(starts)[0], physics.names.index(name)
+    residual, jacobian = fit.at(best)
+    others = replace(fit, free=tuple(j for j in fit.free if j != i))
+    least, limit = float(residual @ residual), scipy.special.stdtrit(freedom, 0.5 + level / 2) ** 2
+    path = [best]  # the others' last minimum is the next start
+
+    @cache  # a bracket's end keeps its sign whatever the path has found since
+    def excess(value: float) -> float:
+        p = path[-1].copy()
+        p[i] = value
+        cost, p = others.descend(p)
+        if np.isfinite(cost):
+            path.append(p)
+        return float(np.clip(cost - least - limit, -limit, 1e6 * limit))
+
+    slope = np.linalg.norm(jacobian[:, i])
+    step = float(1 / slope) if slope > 0 else 1e-3 * physics.size[i]  # at most one standard deviation
+    bounds = (physics.parameters[i].min, physics.parameters[i].max)
+    low, high = (_crossing(excess, best[i], sign * step, bound) for sign, bound in zip((-1, 1), bounds, strict=True))
+    return low, high
+
+
+def _crossing(excess: Callable[[float], float], start: float, step: float, bound: float) -> float:
+    """Where `excess`, negative at `start`, changes its sign on the way to `bound`; `bound` where it does not."""
+    inner = start
+    for doubling in range(60):  # 10¹⁸ standard deviations
+        outer = start + step * 2.0**doubling
+        outer = min(outer, bound) if step > 0 else max(outer, bound)
+        if excess(outer) > 0:
+            return scipy.optimize.brentq(excess, inner, outer, xtol=1e-10 * abs(step))  # pyright: ignore[reportReturnType]
+        if outer == bound:
+            return float(bound)
+        inner = outer
+    return math.copysign(math.inf, step)

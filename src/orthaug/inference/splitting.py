@@ -1,0 +1,108 @@
+"""θ of a fitted function under any measure, with its uncertainty: `θ_μ = c + Φ_μ⁺F_μ`, without training again (F2).
+
+With `Cov(c, w)` from training, `Cov θ_μ = K Cov(c, w) Kᵀ`, `K = [I, Φ_μ⁺J_μ]`: under another measure θ depends on the
+learner, and shares its variance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.errors import InputError
+from orthaug._base.jax import jnp
+from orthaug.inference.measures import Measure, Points, Support
+from orthaug.models.model import Model
+from orthaug.models.rows import learner_chunks, share_of
+from orthaug.models.statistics import Joint
+from orthaug.physics.excitation import excitation, require_rank
+from orthaug.physics.projection import Projection
+
+SUPPORTED = 0.9  # share of a measure within reach of the data, below which it is warned of
+
+
+@dataclass(frozen=True, eq=False)
+class MeasureSplit:
+    """θ and θ_aux under a measure, Cov θ (None without statistics), and how far the data support the measure."""
+
+    name: str
+    theta: Vector
+    theta_aux: Vector
+    covariance: Matrix | None
+    defect: float | None
+    support: float
+    points: int
+    condition: float | None
+    warnings: tuple[str, ...]
+    price: Vector | None = None
+    """Standard error of each θ over that under the training measure (nθ,)."""
+
+    def __str__(self) -> str:
+        told = f"{self.name}, {self.points} points, {100 * self.support:.0f} % of it within reach of the data"
+        if self.price is None or not np.isfinite(self.price).all():
+            return told
+        return f"{told}; standard errors {', '.join(f'{r:.3g}' for r in self.price)} times the training measure's"
+
+    def as_dict(self) -> dict[str, Any]:
+        """What result.json tells of the measure."""
+        price = None if self.price is None else [float(ratio) for ratio in self.price]
+        found = {"kind": self.name, "points": self.points, "support": self.support, "condition": self.condition}
+        return {**found, "std_over_training": price}
+
+
+def split_under(measure: Measure, model: Model, support: Support, joint: Joint | None) -> MeasureSplit:
+    """Split a model under a measure.
+
+    Args:
+        model: any, however it was trained: with c = θ − θ_aux its prediction stays what it is.
+        support: the training data.
+        joint: Cov(c, w) from training; None for no intervals.
+
+    Raises:
+        InputError: a measure that does not fit the model, or under which the physics is rank-deficient.
+    """
+    points = measure.points(support)
+    form, numbers = model.form, model.numbers
+    with np.errstate(all="ignore"):
+        phi = np.asarray(form.baseline.phi(points.x, form.layout, form.outputs, np))
+    if not np.isfinite(phi).all():
+        raise InputError(f"the physics is not finite on all points of the {measure.name} measure; narrow it.")
+    unit = np.sqrt(points.weight)[:, None] * model.weight
+    projection = Projection.factor(phi * unit[:, :, None])
+    found = excitation(projection.r, form.baseline.names)
+    try:
+        require_rank(found, phi.shape[0] * phi.shape[1])
+    except InputError as error:
+        raise type(error)(f"under the {measure.name} measure {error}") from None
+    raw = model.learner_at(points.x)
+    if not np.isfinite(raw).all():
+        raise InputError(f"the learner is not finite on all points of the {measure.name} measure; narrow it.")
+    values = raw * unit
+    aux = projection.solve(values)
+    theta = model.theta - model.theta_aux + aux
+    covariance = None
+    if joint is not None and numbers.tilt is None:
+        slope = learner_slope(model, points, projection, unit)
+        covariance = joint.of(np.column_stack([np.eye(len(theta)), slope]))
+    size = np.linalg.norm(values)
+    rest = values - projection.phi @ aux
+    defect = float(np.linalg.norm(projection.coordinates(rest)) / size) if 0 < size < np.inf else None
+    share = support.share(points)
+    reach = f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the training data"
+    learns = form.bound is not None
+    warnings = (f"{reach}: elsewhere θ rests on how the learner extrapolates.",) if share < SUPPORTED and learns else ()
+    return MeasureSplit(measure.name, theta, aux, covariance, defect, share, len(points.x), found.condition, warnings)
+
+
+def learner_slope(model: Model, points: Points, projection: Projection, unit: Matrix) -> Matrix:
+    """Φ_μ⁺J_μ (nθ, nw), in one pass over the points."""
+    bound, numbers = model.form.bound, model.numbers
+    nt = len(model.theta)
+    if bound is None or not bound.size:
+        return np.zeros((nt, 0))
+    chunks = learner_chunks(model.form, numbers, points.x, projection.q, unit)
+    overlap = share_of(bound, jnp.asarray(numbers.weights), chunks)
+    return projection.from_coordinates(np.asarray(overlap.jacobian))

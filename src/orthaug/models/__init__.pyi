@@ -1,0 +1,10 @@
+from .learners import MLP as MLP
+from .learners import EquinoxModule as EquinoxModule
+from .learners import External as External
+from .learners import Function as Function
+from .model import Model as Model
+from .response import Response as Response
+from .response import Trajectory as Trajectory
+from .response import scores as scores
+from .storage import load as load
+from .storage import save as save

@@ -1,0 +1,284 @@
+"""Learners: the trainable correction f(z; w) of scaled features z (nz,), giving (ny,) values.
+
+A learner is a frozen declaration with `init` and `apply` on a pytree of weights. `Bound` fixes the
+numbers of features and outputs; from there on the weights are one flat vector w, and its methods are
+the only place that knows the tree.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from orthaug._base.checks import Matrix, check_choice
+from orthaug._base.errors import InputError
+from orthaug._base.jax import jax, jnp
+
+Tree = Any  # a pytree of weight arrays
+
+ACTIVATIONS: dict[str, Callable[[Any], Any]] = {
+    "tanh": jnp.tanh,
+    "relu": jax.nn.relu,
+    "gelu": jax.nn.gelu,
+    "sigmoid": jax.nn.sigmoid,
+    "silu": jax.nn.silu,
+    "elu": jax.nn.elu,
+    "softplus": jax.nn.softplus,
+    "identity": lambda a: a,
+}
+_GAIN = {"tanh": 5 / 3, "relu": math.sqrt(2.0)}  # Xavier gains; 1 for the others
+
+
+@runtime_checkable
+class Learner(Protocol):
+    """What `estimate(learner=…)` takes: hashable, with `inputs` and these two methods.
+
+    `inputs` are the expressions or raw lags it sees ("v[k-1]", "sin(y[k-1])"); None for all lags.
+    """
+
+    @property
+    def inputs(self) -> tuple[str, ...] | None: ...
+
+    def init(self, key: Array, nz: int, ny: int) -> Tree:
+        """Initial weights, any pytree of float arrays, for `nz` features and `ny` outputs."""
+        ...
+
+    def apply(self, tree: Tree, z: Float[Array, "nz"]) -> Float[Array, "ny"]:
+        """f(z; w) for one row."""
+        ...
+
+
+@dataclass(frozen=True)
+class MLP:
+    """Fully connected feedforward network with a linear output layer.
+
+    Initialised with the Xavier method as in the paper's Sect. 5.1: weights uniform on (-a, a) with
+    `a = gain √(6 / (fan_in + fan_out))`, biases zero.
+
+    Args:
+        hidden: neurons of each hidden layer; () is a linear learner.
+        activation: one of tanh, relu, gelu, sigmoid, silu, elu, softplus, identity.
+        inputs: what it sees, as expressions or raw lags; None for all lags.
+    """
+
+    hidden: tuple[int, ...] = (16,)
+    activation: str = "tanh"
+    inputs: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.hidden, tuple | list):
+            raise InputError(f"`hidden` must be a tuple of neurons per layer, such as (16,); got {self.hidden!r}.")
+        if isinstance(self.inputs, str):
+            raise InputError(f"`inputs` must be a tuple of expressions, such as ('{self.inputs}',); got one text.")
+        object.__setattr__(self, "hidden", tuple(self.hidden))
+        if self.inputs is not None:
+            object.__setattr__(self, "inputs", tuple(self.inputs))
+        if any(isinstance(n, bool) or not isinstance(n, int) or n < 1 for n in self.hidden):
+            raise InputError(f"`hidden` must be whole numbers of neurons, 1 or more; got {self.hidden}.")
+        check_choice(self.activation, ACTIVATIONS, "`activation`")
+
+    def init(self, key: Array, nz: int, ny: int) -> Tree:
+        sizes = (nz, *self.hidden, ny)
+        keys = jax.random.split(key, len(sizes) - 1)
+        layers = []
+        for i, (fan_in, fan_out) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+            gain = _GAIN.get(self.activation, 1.0) if i < len(self.hidden) else 1.0
+            a = gain * math.sqrt(6.0 / (fan_in + fan_out))
+            weight = jax.random.uniform(keys[i], (fan_out, fan_in), minval=-a, maxval=a, dtype=float)
+            layers.append((weight, jnp.zeros(fan_out)))
+        return layers
+
+    def apply(self, tree: Tree, z: Float[Array, "nz"]) -> Float[Array, "ny"]:
+        activation = ACTIVATIONS[self.activation]
+        for weight, bias in tree[:-1]:
+            z = activation(weight @ z + bias)
+        weight, bias = tree[-1]
+        return weight @ z + bias
+
+
+@dataclass(frozen=True)
+class Function:
+    """Any JAX function `f(weights, z) -> (ny,)` with `initial(key) -> weights`, a pytree of float arrays.
+
+    Examples:
+        >>> quadratic = Function(lambda w, z: w * z[:1] ** 2, initial=lambda key: jnp.zeros(1))
+        >>> Bound(quadratic, nz=1, ny=1).values(jnp.array([3.0]), jnp.array([2.0]))
+        Array([12.], dtype=float64)
+    """
+
+    function: Callable[[Tree, Any], Any]
+    initial: Callable[[Any], Tree]
+    inputs: tuple[str, ...] | None = None
+
+    def init(self, key: Array, nz: int, ny: int) -> Tree:
+        return self.initial(key)
+
+    def apply(self, tree: Tree, z: Float[Array, "nz"]) -> Float[Array, "ny"]:
+        return self.function(tree, z)
+
+
+@dataclass(frozen=True)
+class EquinoxModule:
+    """An Equinox module; `build(key)` makes it, and calling it with z (nz,) gives (ny,)."""
+
+    build: Callable[[Any], Any]
+    inputs: tuple[str, ...] | None = None
+
+    @cached_property
+    def _static(self) -> Any:
+        import equinox as eqx
+
+        with jax.ensure_compile_time_eval():  # asked for while tracing, kept for later traces
+            return eqx.partition(self.build(jax.random.key(0)), eqx.is_inexact_array)[1]
+
+    def init(self, key: Array, nz: int, ny: int) -> Tree:
+        import equinox as eqx
+
+        arrays = eqx.filter(self.build(key), eqx.is_inexact_array)
+        return jax.tree.map(lambda a: jnp.asarray(a, dtype=float), arrays)
+
+    def apply(self, tree: Tree, z: Float[Array, "nz"]) -> Float[Array, "ny"]:
+        import equinox as eqx
+
+        return eqx.combine(tree, self._static)(z)
+
+
+@dataclass(frozen=True)
+class External:
+    """A model trained elsewhere: `function(x)` on NumPy rows (N, nx) → (N, ny), with nothing left to train.
+
+    It is called back from compiled code, so it may come from any toolbox; it has no weights.
+    """
+
+    function: Callable[[np.ndarray], np.ndarray]
+    inputs: tuple[str, ...] | None = None
+    ny: int = 1
+
+    def init(self, key: Array, nz: int, ny: int) -> Tree:
+        return ()
+
+    def apply(self, tree: Tree, z: Float[Array, "nz"]) -> Float[Array, "ny"]:
+        shape = jax.ShapeDtypeStruct((self.ny,), float)
+        return jax.pure_callback(self.values, shape, z, vmap_method="expand_dims")
+
+    def values(self, z: Any) -> np.ndarray:
+        """The function's values (…, ny) of features (…, nz).
+
+        Raises:
+            InputError: the function returns another shape.
+        """
+        z = np.asarray(z)
+        every = z.reshape(-1, z.shape[-1])
+        finite = np.isfinite(every).all(axis=1)  # a run that diverged ends as NaN, not in the toolbox's own error
+        result = np.full((len(every), self.ny), np.nan)
+        if finite.any():
+            result[finite] = self._evaluate(every[finite])
+        return result.reshape(*z.shape[:-1], self.ny)
+
+    def _evaluate(self, rows: np.ndarray) -> np.ndarray:
+        values = np.asarray(self.function(rows), dtype=float)
+        if values.shape != (len(rows), self.ny) and (values.shape, self.ny) != ((len(rows),), 1):
+            raise InputError(f"the external model returned shape {values.shape}; expected ({len(rows)}, {self.ny}).")
+        return values.reshape(len(rows), self.ny)
+
+
+@dataclass(frozen=True, eq=False)
+class Scaling:
+    """Affine map of each feature onto [-1, 1] over the training data: `(z - centre) / halfwidth`."""
+
+    centre: Float[np.ndarray, "nz"]
+    halfwidth: Float[np.ndarray, "nz"]
+
+    @classmethod
+    def fit(cls, features: Matrix) -> Scaling:
+        """From training rows (N, nz); a feature that never moves keeps its unit."""
+        low, high = features.min(axis=0), features.max(axis=0)
+        halfwidth = (high - low) / 2
+        return cls((low + high) / 2, np.where(halfwidth > 0, halfwidth, 1.0))
+
+    def __call__(self, features: Any) -> Any:
+        return (features - self.centre) / self.halfwidth
+
+
+@dataclass(frozen=True)
+class Bound:
+    """A learner with its numbers of features and outputs; hashable, so compiled programs are reused."""
+
+    learner: Learner
+    nz: int
+    ny: int
+    _shape: tuple[Any, ...] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        tree = jax.eval_shape(lambda key: self.learner.init(key, self.nz, self.ny), jax.random.key(0))
+        leaves, treedef = jax.tree.flatten(tree)
+        if any(not jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves):
+            raise InputError(
+                "the learner's weights must be float arrays; found "
+                + ", ".join(str(leaf.dtype) for leaf in leaves)
+                + "."
+            )
+        object.__setattr__(self, "_shape", (treedef, tuple(leaf.shape for leaf in leaves)))
+        out = jax.eval_shape(self.learner.apply, tree, jax.ShapeDtypeStruct((self.nz,), float))
+        if getattr(out, "shape", None) != (self.ny,):
+            raise InputError(
+                f"the learner returned shape {getattr(out, 'shape', type(out).__name__)} for one row; "
+                f"expected (ny,) = ({self.ny},)."
+            )
+
+    @property
+    def size(self) -> int:
+        """Number of weights."""
+        return sum(math.prod(shape) for shape in self._shape[1])
+
+    def init(self, key: Array) -> Float[Array, "nw"]:
+        """Initial weights as one vector."""
+        return self.ravel(jax.tree.leaves(self.learner.init(key, self.nz, self.ny)))
+
+    @staticmethod
+    def ravel(leaves: list[Any]) -> Float[Array, "nw"]:
+        flat = [jnp.ravel(jnp.asarray(leaf, dtype=float)) for leaf in leaves]
+        return jnp.concatenate(flat) if flat else jnp.zeros(0)
+
+    def leaves(self, w: Float[Array | np.ndarray, "nw"]) -> list[Float[Array, "..."]]:
+        """The weight arrays that the vector holds, in the tree's order."""
+        pieces, offset = [], 0
+        for shape in self._shape[1]:
+            size = math.prod(shape)
+            pieces.append(jnp.reshape(w[offset : offset + size], shape))
+            offset += size
+        return pieces
+
+    def values(self, w: Float[Array | np.ndarray, "nw"] | list[Any], z: Float[Array, "nz"]) -> Float[Array, "ny"]:
+        """f(z; w) for one row, of the weights as one vector or as leaves."""
+        return self.from_leaves(w if isinstance(w, list) else self.leaves(w), z)
+
+    def from_leaves(self, leaves: list[Any], z: Float[Array, "nz"]) -> Float[Array, "ny"]:
+        """f(z; w) for one row, of the weight arrays."""
+        return self.learner.apply(jax.tree.unflatten(self._shape[0], leaves), z)
+
+    def jacobian(
+        self, w: Float[Array, "nw"], z: Float[Array, "nz m"], gain: Float[Array, "ny m"]
+    ) -> tuple[Float[Array, "ny m"], Float[Array, "nw ny m"]]:
+        """`gain·f` and `gain·∂f/∂w` for a batch of rows.
+
+        Reverse mode per row, one pass per output, with the batch as the *last* axis: every entry of the
+        Jacobian is then a contiguous run over rows, which is 2.5 times faster here than rows first.
+        """
+
+        def one_row(leaves: list[Any], z_row: Any, gain_row: Any) -> tuple[Any, list[Any]]:
+            value, pullback = jax.vjp(lambda tree: self.from_leaves(tree, z_row), leaves)
+            gradients = [pullback(seed)[0] for seed in jnp.diag(gain_row)]
+            return gain_row * value, gradients
+
+        values, per_output = jax.vmap(one_row, in_axes=(None, -1, -1), out_axes=-1)(self.leaves(w), z, gain)
+        batch = z.shape[-1]
+        none = jnp.zeros((0, batch))  # a learner may have no weights
+        columns = [jnp.concatenate([none, *(g.reshape(-1, batch) for g in grads)]) for grads in per_output]
+        return values, jnp.stack(columns, axis=1) if len(columns) > 1 else columns[0][:, None, :]

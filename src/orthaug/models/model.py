@@ -1,0 +1,283 @@
+"""The fitted model ŷ_k = φ(x_k)θ + (f(x_k) − φ(x_k)θ_aux): prediction, free run and its two parts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from orthaug._base.checks import Matrix, Vector, as_signal
+from orthaug._base.errors import InputError
+from orthaug._base.jax import jax, jnp
+from orthaug.data.record import Channel, Experiment, Record, same_step
+from orthaug.data.regressors import lag_matrix
+from orthaug.models.predictor import Form, Numbers, Parts, parts, push, regressor
+from orthaug.models.response import Response, Trajectory
+from orthaug.models.statistics import Joint
+
+if TYPE_CHECKING:
+    pass
+
+_BATCH = 4096  # rows per compiled call; records of any length share the program
+_WINDOW_CELLS = 8_000_000  # input cells of a batch of multi-step predictions
+_RUNAWAY = 1e6  # times the largest training output: a free run beyond this has diverged
+
+
+@partial(jax.jit, static_argnames="form")
+def _predict_rows(form: Form, numbers: Numbers, x: Float[Array, "m nx"]) -> Parts:
+    return jax.vmap(lambda row: parts(form, numbers, row))(x)
+
+
+@partial(jax.jit, static_argnames="form")
+def _free_run(form: Form, numbers: Numbers, past: Float[Array, "na ny"], inputs: Float[Array, "T nu"]) -> Parts:
+    """One scan over the rows; `past` holds the outputs before the first one, newest first."""
+
+    def step(past: Any, row: Any) -> tuple[Any, Parts]:
+        found = parts(form, numbers, regressor(form, past, row))
+        return push(past, found.baseline + found.learner), found
+
+    return jax.lax.scan(step, past, inputs)[1]
+
+
+@partial(jax.jit, static_argnames="form")
+def _ahead(
+    form: Form, numbers: Numbers, past: Float[Array, "m na ny"], inputs: Float[Array, "m T nu"], horizon: Any
+) -> Parts:
+    """The last of `horizon` free-run steps from each of m starts."""
+    one = jax.vmap(lambda p, row: parts(form, numbers, regressor(form, p, row)))
+
+    def step(i: Any, carry: tuple[Any, Parts]) -> tuple[Any, Parts]:
+        found = one(carry[0], inputs[:, i])
+        return jax.vmap(push)(carry[0], found.baseline + found.learner), found
+
+    nothing = jnp.zeros((past.shape[0], len(form.outputs)))
+    return jax.lax.fori_loop(0, horizon, step, (past, Parts(nothing, nothing, nothing)))[1]
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A fitted model; `estimate` makes it, `orthaug.save` and `orthaug.load` keep it.
+
+    `weight` (ny,) is one over each output's deviation; outputs times it are whitened. With the following every function
+    of the model has an interval (`Joint`): `gram` (nθ + nw)², the Gram matrix of ∂ŷ/∂(c, w) over the training rows in
+    whitened outputs, `[Φ J]` one step ahead; `ridge`, the weights' prior precision beside it; `middle` = ΣψᵀΣ_eψ;
+    `noise` (ny, ny), the noise covariance; `freedom`, its degrees of freedom.
+    """
+
+    form: Form
+    numbers: Numbers
+    outputs: tuple[Channel, ...]
+    inputs: tuple[Channel, ...]
+    sampling_time: float
+    structure: str
+    measure: str = field(default="training", kw_only=True)
+    largest_output: Vector
+    weight: Vector
+    time_column: str | None = None
+    gram: Matrix | None = None
+    noise: Matrix | None = None
+    ridge: float = 0.0
+    middle: Matrix | None = None
+    freedom: float = np.inf
+
+    def __repr__(self) -> str:
+        learner = self.form.bound.learner if self.form.bound else "none"
+        return f"Model({self.structure}, θ: {', '.join(self.form.baseline.names) or 'none'}, learner: {learner})"
+
+    @property
+    def theta(self) -> Vector:
+        """θ̂ (nθ,)."""
+        return np.asarray(self.numbers.theta)
+
+    @property
+    def joint(self) -> Joint | None:
+        """Cov(c, w); None where training left no statistics."""
+        if self.gram is None or self.middle is None:
+            return None
+        return Joint(self.gram, self.ridge, self.middle, len(self.theta))
+
+    def learner_at(self, x: Float[np.ndarray, "M nx"]) -> Float[np.ndarray, "M ny"]:
+        """f, before any split, at regressors of the form's layout; in the outputs' units."""
+        return _in_batches(lambda rows: _predict_rows(self.form, self.numbers, rows), (x,)).raw
+
+    @property
+    def theta_aux(self) -> Vector:
+        """θ_aux (nθ,), fixed after training."""
+        return np.asarray(self.numbers.theta_aux)
+
+    def components(self, record: Record) -> Response:
+        """One-step prediction of every row in its parts, before and after projection."""
+        return self.predict(record, horizon=1)
+
+    def predict(self, record: Record, horizon: int = 1) -> Response:
+        """Predict each row from outputs measured up to `horizon` samples before it.
+
+        Raises:
+            InputError: a record without outputs, other channels, a horizon below 1, too few rows.
+        """
+        if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1:
+            raise InputError(f"`horizon` must be a whole number of steps, 1 or more; got {horizon}.")
+        record = self.fitting(record, need_outputs=True)
+        trajectories = []
+        for experiment in record.experiments:
+            first = self.form.start + horizon - 1
+            self._check_rows(experiment, first)
+            if horizon == 1 or not self.form.memory:
+                x = lag_matrix(experiment, self.form.layout, record, first)
+                found = _in_batches(lambda rows: _predict_rows(self.form, self.numbers, rows), (x,))
+            else:
+                found = self._predict_ahead(experiment, record, int(horizon))
+            trajectories.append(_trajectory(found, experiment, experiment.outputs, first))
+        return Response(tuple(trajectories), int(horizon), self.outputs, record.sampling_time)
+
+    def simulate(self, record: Record, initial: str | Any = "measured") -> Response:
+        """Free run: the outputs' past is the model's own, from the first usable row on.
+
+        Args:
+            record: inputs, and outputs where they are measured.
+            initial: the outputs on the rows before the first usable one: "measured" (from the record),
+                "zero", or an array (rows, ny) that holds them.
+
+        Raises:
+            InputError: other channels, too few rows, or initial values that are not there.
+        """
+        record = self.fitting(record, need_outputs=False)
+        trajectories = []
+        for experiment in record.experiments:
+            self._check_rows(experiment, self.form.start)
+            measured = experiment.outputs if record.outputs else None
+            past = self._initial(initial, measured)
+            found = self._run(past, experiment, record)
+            trajectories.append(self._bounded(found, experiment, measured))
+        return Response(tuple(trajectories), None, self.outputs, record.sampling_time)
+
+    def check_initial(self, initial: Any) -> Matrix:
+        """Outputs before the first usable row, (rows, ny).
+
+        Raises:
+            InputError: too few rows, or not one column per output.
+        """
+        if isinstance(initial, str):
+            raise InputError(f"`initial` must be 'measured', 'zero' or an array; got '{initial}'.")
+        rows, ny = as_signal(initial, "initial"), len(self.outputs)
+        if rows.shape[1] != ny:
+            raise InputError(f"`initial` has {rows.shape[1]} columns; expected one per output, {ny}.")
+        if len(rows) < self.form.memory:
+            raise InputError(
+                f"`initial` has {len(rows)} rows; expected the first {self.form.start} outputs of the record."
+            )
+        return rows
+
+    def _run(self, past: Matrix, experiment: Experiment, record: Record) -> Parts:
+        inputs = lag_matrix(experiment, self.form.input_layout, record, self.form.start)
+        if not self.form.memory:
+            x = lag_matrix(experiment, self.form.layout, record, self.form.start)
+            return _in_batches(lambda rows: _predict_rows(self.form, self.numbers, rows), (x,))
+        steps = len(inputs)
+        padded = np.zeros((_bucket(steps), inputs.shape[1]))
+        padded[:steps] = inputs
+        found = _free_run(self.form, self.numbers, jnp.asarray(past), jnp.asarray(padded))
+        return Parts(*(np.asarray(part)[:steps] for part in found))
+
+    def _predict_ahead(self, experiment: Experiment, record: Record, horizon: int) -> Parts:
+        start = self.form.start
+        inputs = lag_matrix(experiment, self.form.input_layout, record, start)
+        windows = np.lib.stride_tricks.sliding_window_view(inputs, horizon, axis=0).swapaxes(1, 2)
+        outputs = experiment.outputs[: len(experiment) - horizon]
+        past = np.stack([outputs[start - i - 1 : len(outputs) - i] for i in range(self.form.memory)], axis=1)
+        largest = max(1, _WINDOW_CELLS // max(1, windows[0].size))  # windows overlap: they are copied batch by batch
+        rows = (past[: len(windows)], windows)
+        return _in_batches(lambda p, u: _ahead(self.form, self.numbers, p, u, horizon), rows, largest)
+
+    def _initial(self, initial: Any, measured: Matrix | None) -> Matrix:
+        """The last `_memory` outputs before the first usable row, newest first."""
+        start, memory, ny = self.form.start, self.form.memory, len(self.outputs)
+        if isinstance(initial, str) and initial == "zero":
+            return np.zeros((memory, ny))
+        if isinstance(initial, str) and initial == "measured":
+            if measured is None:
+                raise InputError(
+                    "the record has no measured outputs to start from; use initial='zero' or give the values."
+                )
+            rows = measured[:start]
+        else:
+            rows = self.check_initial(initial)[:start]
+        return rows[len(rows) - memory :][::-1].copy()
+
+    def _bounded(self, found: Parts, experiment: Experiment, measured: Matrix | None) -> Trajectory:
+        """A free run cut where it left all bounds."""
+        trajectory = _trajectory(found, experiment, measured, self.form.start)
+        with np.errstate(all="ignore"):
+            wild = ~(np.abs(trajectory.model[self.form.start :]) <= _RUNAWAY * self.largest_output)
+        if not wild.any():
+            return trajectory
+        step = int(np.argmax(wild.any(axis=1)))
+        output = self.outputs[int(np.argmax(wild[step]))].name
+        cut = Parts(*(np.where(np.arange(len(part))[:, None] < step, part, np.nan) for part in found))
+        bounded = _trajectory(cut, experiment, measured, self.form.start)
+        return replace(bounded, diverged=(step + self.form.start, output))
+
+    def _check_rows(self, experiment: Experiment, first: int) -> None:
+        if len(experiment) <= first:
+            name = experiment.source or "the record"
+            raise InputError(f"{name} has {len(experiment)} rows, too few: the first value is at row {first}.")
+
+    def fitting(self, record: Record, *, need_outputs: bool) -> Record:
+        """The record's channels in the model's order, by name.
+
+        Raises:
+            InputError: a channel is missing, or the sampling time differs by more than 0.1 %.
+        """
+        if not same_step(record.sampling_time, self.sampling_time):
+            raise InputError(
+                f"the record is sampled every {record.sampling_time:g} s, the model every {self.sampling_time:g} s; "
+                "resample the record."
+            )
+        with_outputs = need_outputs or bool(record.outputs)
+        names = {kind: [c.name for c in getattr(record, kind)] for kind in ("inputs", "outputs")}
+        wanted = {"inputs": self.inputs, "outputs": self.outputs if with_outputs else ()}
+        for kind, channels in wanted.items():
+            missing = [c.name for c in channels if c.name not in names[kind]]
+            if missing:
+                found = ", ".join(names[kind]) or "none"
+                raise InputError(f"the record lacks the {kind[:-1]} {', '.join(missing)} of the model; it has {found}.")
+        order = {kind: [names[kind].index(c.name) for c in channels] for kind, channels in wanted.items()}
+        experiments = tuple(
+            replace(e, inputs=e.inputs[:, order["inputs"]], outputs=e.outputs[:, order["outputs"]])
+            for e in record.experiments
+        )
+        return Record(self.inputs, wanted["outputs"], record.sampling_time, experiments)
+
+
+def _bucket(steps: int) -> int:
+    """Lengths grow by powers of two, so that few programs are compiled."""
+    return max(256, 1 << (steps - 1).bit_length())
+
+
+def _in_batches(function: Callable[..., Parts], rows: tuple[np.ndarray, ...], largest: int = _BATCH) -> Parts:
+    """`function` over batches of rows, padded to one shape, its results concatenated."""
+    count = len(rows[0])
+    size = min(_BATCH, largest, _bucket(count))
+    pieces = []
+    for begin in range(0, count, size):
+        batch = [array[begin : begin + size] for array in rows]
+        padding = size - len(batch[0])
+        padded = [np.concatenate([b, np.repeat(b[-1:], padding, axis=0)]) if padding else b for b in batch]
+        found = function(*(jnp.asarray(b) for b in padded))
+        pieces.append([np.asarray(part)[: size - padding] for part in found])
+    return Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True)))
+
+
+def _trajectory(found: Parts, experiment: Experiment, measured: Matrix | None, first: int) -> Trajectory:
+    def whole(values: Any) -> Matrix:
+        padded = np.full((len(experiment), values.shape[1]), np.nan)
+        padded[first:] = values
+        return padded
+
+    return Trajectory(
+        whole(found.baseline), whole(found.learner), whole(found.raw), measured, first, experiment.start_time
+    )

@@ -1,0 +1,132 @@
+"""What a model answers along a record, and how well that follows the measured outputs.
+
+The horizon always stands beside the number.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.errors import InputError
+from orthaug.data.record import Channel
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Per output: `rmse` in the output's unit, `nrmse` = RMSE / std(y), `fit` = 100 (1 − NRMSE) in %, not clipped.
+
+    Entries are NaN where a score does not exist (a run that diverged, an output that does not move);
+    `as_dict` turns them into None.
+    """
+
+    rmse: Vector
+    nrmse: Vector
+    fit: Vector
+    samples: int
+
+    def as_dict(self) -> dict[str, list[float | None] | None]:
+        """Plain lists for JSON; None instead of a list where no output has a score."""
+        entries = {"rmse": self.rmse, "nrmse": self.nrmse, "fit": self.fit}
+        return {
+            key: None if np.isnan(values).all() else [None if np.isnan(v) else float(v) for v in values]
+            for key, values in entries.items()
+        }
+
+
+def scores(measured: Matrix, model: Matrix) -> Scores:
+    """RMSE, NRMSE (population standard deviation of the scored samples) and FIT of each column, (N, ny)."""
+    with np.errstate(all="ignore"):
+        rmse = np.sqrt(np.mean((measured - model) ** 2, axis=0))
+        deviation = measured.std(axis=0)
+    rmse = np.where(np.isfinite(rmse), rmse, np.nan)
+    moves = (deviation > 0) & np.isfinite(deviation)
+    nrmse = np.where(moves, rmse / np.where(moves, deviation, 1.0), np.nan)
+    return Scores(rmse, nrmse, 100 * (1 - nrmse), len(measured))
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A model along one experiment; arrays (N, ny) are NaN on rows without a value (the first lags).
+
+    `baseline + learner` is the model's output; `learner_before` is f, before θ_aux moved its share of
+    the physics to θ. `diverged` is the row and output at which a free run left all bounds, if it did.
+    """
+
+    baseline: Matrix
+    learner: Matrix
+    learner_before: Matrix
+    measured: Matrix | None
+    start: int
+    start_time: float = 0.0
+    diverged: tuple[int, str] | None = None
+
+    @property
+    def model(self) -> Matrix:
+        return self.baseline + self.learner
+
+    @property
+    def baseline_before(self) -> Matrix:
+        """φ(θ − θ_aux): what goes with `learner_before`."""
+        return self.model - self.learner_before
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """Trajectories of every experiment of a record; `horizon` in steps, None for a free run (simulation)."""
+
+    trajectories: tuple[Trajectory, ...]
+    horizon: int | None
+    outputs: tuple[Channel, ...]
+    sampling_time: float
+
+    @property
+    def model(self) -> Matrix:
+        """The model's output (N, ny), experiments one after another."""
+        return np.concatenate([t.model for t in self.trajectories])
+
+    def __repr__(self) -> str:
+        kind = "simulation" if self.horizon is None else f"{self.horizon}-step prediction"
+        return f"Response({kind}, {len(self.trajectories)} experiment(s), {len(self.model)} samples)"
+
+    def scores(self, skip: int | tuple[int, ...] = 0) -> Scores:
+        """Scores over all experiments; the first `skip` samples of each (or of each its own) are not counted.
+
+        Raises:
+            InputError: no measured outputs, or no sample left to score.
+        """
+        skips = (skip,) * len(self.trajectories) if isinstance(skip, int | np.integer) else tuple(skip)
+        if len(skips) != len(self.trajectories):
+            raise InputError(f"`skip` has {len(skips)} numbers for {len(self.trajectories)} experiments.")
+        measured, model = [], []
+        for trajectory, first in zip(self.trajectories, skips, strict=True):
+            if trajectory.measured is None:
+                raise InputError("the record has no measured outputs to compare with.")
+            rows = slice(max(trajectory.start, first), None)
+            measured.append(trajectory.measured[rows])
+            model.append(trajectory.model[rows])
+        if not sum(len(m) for m in measured):
+            raise InputError(f"no samples are left to score after the first {max(skips)}.")
+        return scores(np.concatenate(measured), np.concatenate(model))
+
+    def to_frame(self, experiment: int = 0) -> pd.DataFrame:
+        """A table with `time` and, per output, measured, model, baseline and learner."""
+        import pandas as pd
+
+        trajectory = self.trajectories[experiment]
+        columns: dict[str, Any] = {
+            "time": trajectory.start_time + np.arange(len(trajectory.model)) * self.sampling_time
+        }
+        for i, channel in enumerate(self.outputs):
+            if trajectory.measured is not None:
+                columns[channel.name] = trajectory.measured[:, i]
+            columns[f"{channel.name}_model"] = trajectory.model[:, i]
+            columns[f"{channel.name}_baseline"] = trajectory.baseline[:, i]
+            columns[f"{channel.name}_learner"] = trajectory.learner[:, i]
+        return pd.DataFrame(columns)

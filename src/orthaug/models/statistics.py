@@ -1,0 +1,62 @@
+"""What training leaves for later intervals: the Gram matrix of the model's derivatives, and Cov(c, w) from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._base.checks import Matrix, Vector
+
+_ROUNDING = 1e-13  # of the largest eigenvalue of a Gram matrix with unit columns: what is below is rounding
+
+
+def column_units(gram: Matrix, nt: int) -> Vector:
+    """One over the norm of each column, θ first; learner columns that are rounding beside the largest stay small."""
+    size = np.sqrt(np.maximum(np.diag(gram), 0.0))
+    size[nt:] = np.maximum(size[nt:], np.sqrt(np.finfo(float).eps) * size[nt:].max(initial=0.0))
+    return 1 / np.where(size > 1e-150, size, 1.0)
+
+
+def half_inverse(gram: Matrix, nt: int) -> Float[np.ndarray, "n r"]:
+    """H with `H Hᵀ` the inverse of the Gram matrix of `[S_c S_w]` on the directions that the data see.
+
+    Products with the inverse are formed from H on both sides: the inverse itself has entries up to 1e13.
+    """
+    unit = column_units(gram, nt)
+    values, vectors = np.linalg.eigh(gram * np.outer(unit, unit))
+    kept = values > _ROUNDING * values.max(initial=0.0)
+    return unit[:, None] * vectors[:, kept] / np.sqrt(values[kept])
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """Cov of all that training estimated, p = (c, w): `σ² M⁻¹` with `M = G + ridge` on the weights.
+
+    G is the Gram matrix of ∂ŷ/∂p in whitened outputs. Only functions of the fitted model have a variance: directions of
+    p that change no prediction on the training rows count as absent.
+    """
+
+    gram: Matrix
+    ridge: float
+    middle: Matrix
+    """ΣψᵀΣ_eψ in whitened outputs, `σ² G` for one output."""
+    nt: int
+
+    def root(self) -> Float[np.ndarray, "n r"]:
+        """S with `Cov p = S Sᵀ = M⁻¹ (ΣψᵀΣ_eψ + σ² ridge) M⁻¹`, the ridge counted as the prior that it is.
+
+        Variances are then sums of squares, which no rounding makes negative.
+        """
+        nw = len(self.gram) - self.nt
+        prior = self.ridge * np.concatenate([np.zeros(self.nt), np.ones(nw)])
+        half = half_inverse(self.gram + np.diag(prior), self.nt)
+        variance = float(np.trace(self.middle) / max(np.trace(self.gram), 1e-300))
+        values, vectors = np.linalg.eigh(half.T @ (self.middle + variance * np.diag(prior)) @ half)
+        return half @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+
+    def of(self, k: Float[np.ndarray, "m n"]) -> Matrix:
+        """Cov of `K p`, (m, m)."""
+        reach = k @ self.root()
+        return reach @ reach.T

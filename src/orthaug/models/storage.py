@@ -1,0 +1,198 @@
+"""Models on disk: `model.json` for what a model is, `arrays.safetensors` for its numbers; nothing executable.
+
+The JSON carries a checksum of itself and of the arrays, so that a file that was cut or altered is refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load as load_arrays
+from safetensors.numpy import save as save_arrays
+
+from orthaug import __version__
+from orthaug._base.errors import InputError
+from orthaug._base.folders import whole_folder
+from orthaug.data.expressions import Expression, Lag
+from orthaug.data.record import Channel
+from orthaug.data.regressors import Features
+from orthaug.models.learners import MLP, Bound, Learner
+from orthaug.models.model import Model
+from orthaug.models.predictor import Form, Numbers
+from orthaug.physics.baseline import Baseline, Parameter, Term
+
+FORMAT = 1
+_DECLARATION, _ARRAYS = "model.json", "arrays.safetensors"
+
+
+def is_model(folder: Path) -> bool:
+    """Whether a folder holds a saved model and nothing else."""
+    return {p.name for p in folder.iterdir()} <= {_DECLARATION, _ARRAYS}
+
+
+def save(model: Model, folder: str | Path) -> None:
+    """Write a model to a folder of its own, whole or not at all.
+
+    A baseline or learner that is a Python callable cannot be written; its numbers are, and `load` asks for it again.
+
+    Raises:
+        InputError: the folder cannot be written, or holds something else.
+    """
+    with whole_folder(Path(folder), is_model) as partial:
+        write(model, partial)
+
+
+def write(model: Model, folder: Path) -> None:
+    """Write the two files into an existing folder."""
+    numbers = {name: value for name, value in model.numbers._asdict().items() if value is not None}
+    arrays = {f"numbers.{name}": np.asarray(value) for name, value in numbers.items()}
+    arrays |= {
+        "largest_output": model.largest_output,
+        "weight": model.weight,
+        "scalars": np.array([model.ridge, model.freedom]),
+    }
+    arrays |= {
+        name: value
+        for name, value in (("gram", model.gram), ("noise", model.noise), ("middle", model.middle))
+        if value is not None
+    }
+    packed = save_arrays({name: np.ascontiguousarray(value, dtype=np.float64) for name, value in arrays.items()})
+    declaration = _declare(model) | {"arrays_sha256": hashlib.sha256(packed).hexdigest()}
+    declaration["checksum"] = _checksum(declaration)
+    (folder / _ARRAYS).write_bytes(packed)
+    (folder / _DECLARATION).write_text(json.dumps(declaration, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def load(folder: str | Path, *, baseline: Baseline | None = None, learner: Learner | None = None) -> Model:
+    """Read a model that `save` or `orthaug fit` wrote.
+
+    Args:
+        folder: the model's folder, or the result folder that holds it as `model/`.
+        baseline, learner: the Python callables again, where the saved model had such.
+
+    Raises:
+        InputError: no model there; a file that is cut, altered, or from a newer version.
+    """
+    folder = Path(folder)
+    try:
+        if not (folder / _DECLARATION).exists() and (folder / "model" / _DECLARATION).exists():
+            folder = folder / "model"
+        there = (folder / _DECLARATION).is_file() and (folder / _ARRAYS).is_file()
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read ({error.strerror}).") from None
+    if not there:
+        raise InputError(f"{folder}: no saved model there; expected {_DECLARATION} and {_ARRAYS}.")
+    path = folder / _DECLARATION
+    try:
+        declared = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError):
+        raise InputError(f"{path}: the file is cut or altered (no JSON); fit again, or copy it again.") from None
+    if not isinstance(declared, dict) or type(declared.get("format")) is not int or declared["format"] < 1:
+        raise InputError(f"{path}: not a model of orthaug.")
+    if declared["format"] > FORMAT:
+        raise InputError(
+            f"{path}: written by orthaug {declared.get('orthaug')} in format {declared['format']}; this version "
+            f"({__version__}) reads up to {FORMAT}. Update orthaug."
+        )
+    if declared.pop("checksum", None) != _checksum(declared):
+        raise InputError(f"{path}: the file was altered (its checksum differs); fit again, or copy it again.")
+    packed = (folder / _ARRAYS).read_bytes()
+    if hashlib.sha256(packed).hexdigest() != declared["arrays_sha256"]:
+        raise InputError(f"{folder / _ARRAYS}: the file is cut or altered (its checksum differs); copy it again.")
+    try:
+        arrays = load_arrays(packed)
+    except SafetensorError as error:
+        raise InputError(f"{folder / _ARRAYS}: cannot be read ({error}).") from None
+    try:
+        return _rebuild(declared, arrays, baseline, learner, path)
+    except (KeyError, TypeError, AttributeError, IndexError) as error:
+        raise InputError(f"{path}: not a model of this version (missing or misplaced: {error}).") from None
+
+
+def _declare(model: Model) -> dict[str, Any]:
+    form = model.form
+    learner: dict[str, Any] | None = None
+    if form.bound is not None:
+        declared = form.bound.learner
+        learner = {"kind": "mlp", **asdict(declared)} if isinstance(declared, MLP) else {"kind": "callable"}
+        learner |= {"nz": form.bound.nz, "ny": form.bound.ny}
+    baseline = form.baseline
+    return {
+        "format": FORMAT,
+        "orthaug": __version__,
+        "structure": model.structure,
+        "measure": model.measure,
+        "sampling_time": model.sampling_time,
+        "time_column": model.time_column,
+        "outputs": [asdict(channel) for channel in model.outputs],
+        "inputs": [asdict(channel) for channel in model.inputs],
+        "layout": [list(lag) for lag in form.layout],
+        "features": [{"text": e.text, "constants": dict(e.constants)} for e in form.features.entries],
+        "baseline": {
+            "kind": "terms" if baseline.function is None else "callable",
+            "parameters": [asdict(parameter) for parameter in baseline.parameters],
+            "terms": [asdict(term) for term in baseline.terms],
+            "constants": dict(baseline.constants),
+        },
+        "learner": learner,
+    }
+
+
+def _rebuild(
+    declared: dict[str, Any],
+    arrays: dict[str, np.ndarray],
+    baseline: Baseline | None,
+    learner: Learner | None,
+    path: Path,
+) -> Model:
+    physics = declared["baseline"]
+    if physics["kind"] == "terms":
+        baseline = Baseline.from_terms([Term(**term) for term in physics["terms"]], physics["constants"])
+    elif baseline is None:
+        raise InputError(f"{path}: the baseline was a Python function; give it again, load(…, baseline=…).")
+    else:
+        baseline = replace(baseline, parameters=tuple(Parameter(**p) for p in physics["parameters"]))
+    bound, kept = None, declared["learner"]
+    if kept is not None:
+        if kept["kind"] == "mlp":
+            inputs = None if kept["inputs"] is None else tuple(kept["inputs"])
+            learner = MLP(tuple(kept["hidden"]), kept["activation"], inputs)
+        elif learner is None:
+            raise InputError(f"{path}: the learner was a Python callable; give it again, load(…, learner=…).")
+        bound = Bound(learner, kept["nz"], kept["ny"])  # type: ignore[arg-type]
+        found = arrays["numbers.weights"].shape[-1]
+        if bound.size != found:
+            raise InputError(f"{path}: the learner has {bound.size} weights, the saved one {found}; give the same one.")
+    features = Features(tuple(Expression(e["text"], tuple(e["constants"].items())) for e in declared["features"]))
+    outputs, inputs_ = (tuple(Channel(**c) for c in declared[kind]) for kind in ("outputs", "inputs"))
+    form = Form(
+        baseline, features, tuple(Lag(*lag) for lag in declared["layout"]), tuple(c.name for c in outputs), bound
+    )
+    return Model(
+        form=form,
+        numbers=Numbers(**{name: arrays.get(f"numbers.{name}") for name in Numbers._fields}),  # type: ignore[arg-type]
+        outputs=outputs,
+        inputs=inputs_,
+        sampling_time=float(declared["sampling_time"]),
+        time_column=declared["time_column"],
+        structure=declared["structure"],
+        measure=declared["measure"],
+        largest_output=arrays["largest_output"],
+        weight=arrays["weight"],
+        ridge=float(arrays["scalars"][0]),
+        freedom=float(arrays["scalars"][1]),
+        gram=arrays.get("gram"),
+        middle=arrays.get("middle"),
+        noise=arrays.get("noise"),
+    )
+
+
+def _checksum(declaration: dict[str, Any]) -> str:
+    canonical = json.dumps(declaration, sort_keys=True, ensure_ascii=False, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()

@@ -1,0 +1,224 @@
+"""The baseline: physics that is linear in its parameters, ŷ_k = φ(x_k) θ (eq:fp_model)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import check_unique
+from orthaug._base.errors import InputError
+from orthaug.data.expressions import RESERVED, Expression, Lag, is_name, parse
+from orthaug.data.regressors import Layout, in_order
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One entry of θ: name, initial value θ⁰, unit and bounds."""
+
+    name: str
+    initial: float = 0.0
+    unit: str = ""
+    min: float = -math.inf
+    max: float = math.inf
+
+
+@dataclass(frozen=True)
+class Term:
+    """`parameter * regressor`, a summand of one output; the same parameter in several terms shares θ.
+
+    `initial`, `unit` and the bounds `min` and `max` on the parameter may be left out where another of its
+    terms gives them, or none does (0, no unit, no bounds). `fixed` keeps `initial` as a known coefficient:
+    the term is subtracted from the output first and the learner is not made orthogonal to it. `output` may
+    be left out where there is only one.
+    """
+
+    parameter: str
+    regressor: str
+    initial: float | None = None
+    unit: str | None = None
+    output: str | None = None
+    fixed: bool = False
+    min: float | None = None
+    max: float | None = None
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """φ and the parameters it multiplies; make one with `from_terms` or `from_function`.
+
+    Examples:
+        >>> spring = Baseline.from_terms([Term("a", "y[k-1]", initial=0.9), Term("b", "u[k-1]")])
+        >>> spring.names
+        ('a', 'b')
+    """
+
+    parameters: tuple[Parameter, ...]
+    terms: tuple[Term, ...] = ()
+    constants: tuple[tuple[str, float], ...] = ()
+    function: Callable[[Any], Any] | None = field(default=None, repr=False)
+
+    @classmethod
+    def from_terms(cls, terms: Sequence[Term], constants: Mapping[str, float] | None = None) -> Baseline:
+        """One term per summand; expressions may use the names in `constants`.
+
+        Raises:
+            InputError: an expression that is not arithmetic on lagged channels, or terms of one parameter
+                that disagree on its initial value, unit or being fixed.
+        """
+        if not terms:
+            raise InputError("the baseline has no terms; give at least one, such as y[k-1].")
+        constants = dict(constants or {})
+        for name, value in constants.items():
+            if not is_name(name):
+                raise InputError(
+                    f"'{name}' cannot name a constant; use letters, digits and underscores, not starting with a digit, "
+                    f"and no keyword; {', '.join(sorted(RESERVED))} are taken."
+                )
+            if not _is_number(value):
+                raise InputError(f"the constant '{name}' must be a finite number; got {value!r}.")
+        terms = _agreed(terms)
+        parameters = {t.parameter: _parameter(t) for t in terms if not t.fixed}
+        baseline = cls(tuple(parameters.values()), tuple(terms), tuple(sorted(constants.items())))
+        _ = baseline.expressions  # report what does not parse here, not at first use
+        return baseline
+
+    @classmethod
+    def from_function(cls, function: Callable[[Any], Any], parameters: Sequence[str | Parameter]) -> Baseline:
+        """From a JAX function φ(x) of the regressor x (nx,) in `Lags` order, returning (ny, nθ)."""
+        entries = tuple(p if isinstance(p, Parameter) else Parameter(p) for p in parameters)
+        check_unique((p.name for p in entries), "parameter")
+        return cls(entries, function=function)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameter names in order of first appearance."""
+        return tuple(p.name for p in self.parameters)
+
+    @property
+    def initial(self) -> np.ndarray:
+        """θ⁰, (nθ,)."""
+        return np.array([p.initial for p in self.parameters], dtype=float)
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper bounds of θ, each (nθ,); infinite where there are none."""
+        return np.array([p.min for p in self.parameters]), np.array([p.max for p in self.parameters])
+
+    @cached_property
+    def expressions(self) -> tuple[Expression, ...]:
+        """The parsed regressor of each term."""
+        parsed = []
+        for term in self.terms:
+            try:
+                parsed.append(parse(term.regressor, dict(self.constants)))
+            except InputError as error:
+                raise InputError(f"baseline term '{term.parameter}': {error}") from None
+        return tuple(parsed)
+
+    @property
+    def lags(self) -> tuple[Lag, ...]:
+        """The raw lags that the expressions read (none known for a function)."""
+        return tuple(dict.fromkeys(lag for expression in self.expressions for lag in expression.lags))
+
+    def check_channels(self, outputs: Sequence[str], inputs: Sequence[str]) -> None:
+        """Raise InputError for a term that uses an unknown channel, an output at lag 0 or an unknown output."""
+        for name, _ in self.constants:
+            if name in (*outputs, *inputs):
+                raise InputError(f"'{name}' is a constant and a channel; give one of them another name.")
+        for term, expression in zip(self.terms, self.expressions, strict=True):
+            try:
+                in_order(expression.lags, outputs, inputs)
+            except InputError as error:
+                raise InputError(f"baseline term '{term.parameter}' = {term.regressor}: {error}") from None
+            if term.output is None and len(outputs) != 1:
+                raise InputError(
+                    f"baseline term '{term.parameter}' = {term.regressor}: `output` is missing; "
+                    f"one of {', '.join(outputs)}."
+                )
+            if term.output is not None and term.output not in outputs:
+                raise InputError(
+                    f"baseline term '{term.parameter}' = {term.regressor}: unknown output '{term.output}'; "
+                    f"known are {', '.join(outputs)}."
+                )
+
+    def phi(self, x: Any, layout: Layout, outputs: Sequence[str], xp: Any) -> Any:
+        """φ(x), (…, ny, nθ), of regressors x (…, nx); several terms of a parameter and output add up."""
+        if self.function is not None:
+            return self._call(x, len(outputs), xp)
+        return self._matrix([p.name for p in self.parameters], x, layout, outputs, xp)
+
+    def known(self, x: Any, layout: Layout, outputs: Sequence[str], xp: Any) -> Any:
+        """The sum of the fixed terms, (…, ny)."""
+        fixed = {term.parameter: term.initial or 0.0 for term in self.terms if term.fixed}
+        if not fixed:
+            return xp.zeros((*x.shape[:-1], len(outputs)))
+        return self._matrix(list(fixed), x, layout, outputs, xp) @ xp.asarray(list(fixed.values()))
+
+    def _matrix(self, names: list[str], x: Any, layout: Layout, outputs: Sequence[str], xp: Any) -> Any:
+        columns = {lag: x[..., j] for j, lag in enumerate(layout)}
+        entries = [[xp.zeros(x.shape[:-1]) for _ in names] for _ in outputs]
+        for term, expression in zip(self.terms, self.expressions, strict=True):
+            if term.parameter in names:
+                row = outputs.index(term.output) if term.output is not None else 0
+                column = names.index(term.parameter)
+                entries[row][column] = entries[row][column] + expression.evaluate(columns, xp)
+        if not names:
+            return xp.zeros((*x.shape[:-1], len(outputs), 0))
+        return xp.stack([xp.stack(row, axis=-1) for row in entries], axis=-2)
+
+    def _call(self, x: Any, ny: int, xp: Any) -> Any:
+        assert self.function is not None
+        if x.ndim == 1:
+            phi = self.function(x)
+        else:
+            from orthaug._base.jax import jax
+
+            phi = jax.vmap(self.function)(x)
+        wanted = (*x.shape[:-1], ny, len(self.parameters))
+        if np.shape(phi) != wanted:
+            raise InputError(
+                f"the baseline function returned shape {np.shape(phi)[x.ndim - 1 :]} for one row; "
+                f"expected (ny, nθ) = {wanted[x.ndim - 1 :]}."
+            )
+        return xp.asarray(phi)
+
+
+_SHARED = ("initial", "unit", "fixed", "min", "max")  # what the terms of one parameter share
+
+
+def _agreed(terms: Sequence[Term]) -> list[Term]:
+    """The terms with what one of them says about a parameter said by all of them."""
+    said: dict[tuple[str, str], Any] = {}
+    for term in terms:
+        if not term.parameter.strip() or not term.parameter.isprintable():
+            raise InputError(f"{term.parameter!r} cannot name a parameter; use visible characters on one line.")
+        for what, value in (("initial value", term.initial), ("lower bound", term.min), ("upper bound", term.max)):
+            if value is not None and not _is_number(value):
+                raise InputError(f"the {what} of '{term.parameter}' must be a finite number; got {value!r}.")
+        for attribute in _SHARED:
+            value = getattr(term, attribute)
+            if value is not None and said.setdefault((term.parameter, attribute), value) != value:
+                first = said[term.parameter, attribute]
+                raise InputError(f"the terms of '{term.parameter}' disagree on `{attribute}`: {first!r} and {value!r}.")
+    for term in terms:
+        if term.fixed and (term.parameter, "initial") not in said:
+            raise InputError(f"the term of '{term.parameter}' is fixed but gives no `initial`: its known coefficient.")
+    return [replace(term, **{a: said.get((term.parameter, a), getattr(term, a)) for a in _SHARED}) for term in terms]
+
+
+def _parameter(term: Term) -> Parameter:
+    """The parameter of a term that says all that any of its terms says."""
+    low = -math.inf if term.min is None else float(term.min)
+    high = math.inf if term.max is None else float(term.max)
+    if not low < high:
+        raise InputError(f"the bounds of '{term.parameter}' are empty or reversed: min = {low:g}, max = {high:g}.")
+    return Parameter(term.parameter, float(term.initial or 0.0), term.unit or "", low, high)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float | np.number) and math.isfinite(value)

@@ -1,0 +1,108 @@
+"""Excitation and identifiability: do the data, and could any data, determine θ?
+
+Identifiability is the rank of φ at random regressor points, a property of the physics alone; excitation
+is the rank of φ on the measured rows (assumption `assum:phi_full_rank`). The first can hold without the second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthaug._base.checks import Matrix
+from orthaug._base.errors import RankError
+from orthaug.data.regressors import Layout
+from orthaug.physics.baseline import Baseline
+from orthaug.physics.projection import Projection
+
+RANK_TOLERANCE = 1e-13  # σmin/σmax of the unit-norm columns below which Φ counts as rank-deficient
+ILL_CONDITIONED = 1e8  # condition number above which half of the digits of θ are lost: a warning
+
+
+@dataclass(frozen=True, eq=False)
+class Excitation:
+    """How well rows of φ determine θ: rank, condition number and which columns depend on each other."""
+
+    rank: int
+    columns: int
+    condition: float | None
+    collinear: tuple[tuple[str, ...], ...]
+
+    @property
+    def full_rank(self) -> bool:
+        return self.rank == self.columns
+
+
+def excitation(r: Matrix, names: Sequence[str]) -> Excitation:
+    """Rank and condition of a matrix from its R factor (or itself), columns scaled to unit norm.
+
+    The condition number is σmax/σmin of the scaled columns, None where it is infinite. Columns that a
+    null direction involves are grouped: nothing in the data can tell their parameters apart.
+    """
+    columns = len(names)
+    if columns == 0:
+        return Excitation(0, 0, None, ())
+    norms = np.linalg.norm(r, axis=0)
+    scaled = r / np.where(norms > 0, norms, 1.0)
+    _, sigma, vt = np.linalg.svd(scaled, full_matrices=True)
+    sigma = np.concatenate([sigma, np.zeros(columns - len(sigma))])
+    rank = int(np.sum(sigma > RANK_TOLERANCE * sigma[0])) if sigma[0] > 0 else 0
+    condition = float(sigma[0] / sigma[-1]) if rank == columns else None
+    return Excitation(rank, columns, condition, _groups(vt[rank:], names))
+
+
+def _groups(null_space: Matrix, names: Sequence[str]) -> tuple[tuple[str, ...], ...]:
+    """Sets of columns tied by null directions: connected components of the null-space projector."""
+    tied = np.abs(null_space.T @ null_space) > 1e-6
+    groups, seen = [], set()
+    for start in range(len(names)):
+        if start in seen or not tied[start, start]:
+            continue
+        group, frontier = {start}, [start]
+        while frontier:
+            new = {int(i) for i in np.flatnonzero(tied[frontier.pop()])} - group
+            group |= new
+            frontier.extend(new)
+        seen |= group
+        groups.append(tuple(names[i] for i in sorted(group)))
+    return tuple(groups)
+
+
+def require_rank(found: Excitation, rows: int) -> None:
+    """Raise RankError where θ is not determined, naming the parameters that cannot be told apart."""
+    if rows < found.columns:
+        raise RankError(f"{rows} usable rows for {found.columns} parameters; give at least as many rows as parameters.")
+    if found.full_rank:
+        return
+    groups = "; ".join(
+        f"the column of {group[0]} is zero"
+        if len(group) == 1
+        else f"the columns of {', '.join(group)} are linearly dependent"
+        for group in found.collinear
+    )
+    raise RankError(
+        f"the physics is rank-deficient on the data (rank {found.rank} of {found.columns}): {groups}. "
+        "Remove or fix one of them, or use data that excite them separately."
+    )
+
+
+def identifiability(baseline: Baseline, layout: Layout, outputs: Sequence[str], x: Matrix) -> Excitation:
+    """Rank of φ at random points of a box twice as wide as the data's (width 1 where the data do not move).
+
+    Args:
+        x: regressors (N, nx), only for their ranges. The points are the same on every call.
+    """
+    nt = len(baseline.names)
+    if not nt:
+        return excitation(np.zeros((0, 0)), ())
+    low, high = x.min(axis=0), x.max(axis=0)
+    halfwidth = np.where(high > low, high - low, 1.0)
+    points = (low + high) / 2 + halfwidth * np.random.default_rng(0).uniform(-1, 1, (50 * nt + 200, len(layout)))
+    with np.errstate(all="ignore"):
+        phi = np.asarray(baseline.phi(points, layout, outputs, np))
+    finite = np.isfinite(phi).all(axis=(1, 2))  # a logarithm or a root has no value at some of them
+    if finite.sum() < nt:
+        return excitation(np.zeros((1, nt)), baseline.names)
+    return excitation(Projection.factor(phi[finite]).r, baseline.names)

@@ -1,0 +1,295 @@
+"""Physical parameters p (m, ks, cd …) and the baseline's θ: θ = h(p), given as expressions, and dh/dp."""
+
+from __future__ import annotations
+
+import keyword
+import math
+import re
+import unicodedata
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import Matrix, Vector, check_unique, nearest
+from orthaug._base.errors import InputError
+from orthaug.data.expressions import FUNCTIONS, RESERVED, Expression, is_name, parse
+from orthaug.physics.baseline import Baseline
+from orthaug.physics.excitation import Excitation, excitation
+
+AGREEMENT = 1e-6  # relative difference up to which a term's `initial` is what the physics gives
+
+
+# What `Expression.evaluate` asks of numpy, on p + ih: Im θ / h is dθ/dp by the complex step (Squire & Trapp 1998),
+# exact up to rounding whatever the scales of p are. numpy's own functions are analytic; these five are not and take
+# the branch of the real part, which gives the slope of one side at a kink.
+_COMPLEX = SimpleNamespace(
+    asarray=lambda x, dtype=None: np.asarray(x, dtype=complex),
+    abs=lambda x: np.where(np.real(x) < 0, -1.0, 1.0) * x,
+    sign=lambda x: np.sign(np.real(x)),
+    minimum=lambda a, b: np.where(np.real(a) <= np.real(b), a, b),
+    maximum=lambda a, b: np.where(np.real(a) >= np.real(b), a, b),
+    **{name: getattr(np, name) for name in FUNCTIONS if name not in ("abs", "sign", "min", "max")},
+)
+_STEP = 1e-100  # h relative to p: h² vanishes beside 1, and products with h are far from underflow
+
+
+@dataclass(frozen=True)
+class PhysicalParameter:
+    """One entry of p: name, initial value, unit and bounds."""
+
+    name: str
+    initial: float
+    unit: str = ""
+    min: float = -math.inf
+    max: float = math.inf
+
+
+@dataclass(frozen=True)
+class PhysicsMap:
+    """θ = h(p); make one with `of`.
+
+    Examples:
+        >>> physics = PhysicsMap.of([PhysicalParameter("m", 2.0, "kg")], {"theta1": "Ts / m"}, {"Ts": 0.1})
+        >>> physics.initial_theta(), physics.jacobian(np.array([2.0]))
+        (array([0.05]), array([[-0.025]]))
+    """
+
+    parameters: tuple[PhysicalParameter, ...]
+    theta_names: tuple[str, ...]
+    expressions: tuple[Expression, ...]
+    constants: tuple[tuple[str, float], ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        parameters: Sequence[PhysicalParameter],
+        theta: Mapping[str, str],
+        constants: Mapping[str, float] | None = None,
+    ) -> PhysicsMap:
+        """`theta[name]` is an expression of the parameters' names and the `constants`.
+
+        Raises:
+            InputError: a name, value or bound that cannot be; an expression that is not arithmetic on
+                parameters and constants, uses no parameter, or is not finite at the initial values;
+                parameters that θ does not determine, at any point near the initial values.
+        """
+        constants = dict(constants or {})
+        _check_parameters(parameters, constants)
+        if not theta:
+            raise InputError("the physics gives no theta; give one expression for each parameter of the baseline.")
+        names = [p.name for p in parameters]
+        known = constants | {p.name: float(p.initial) for p in parameters}
+        expressions = tuple(_parsed(name, text, known, names) for name, text in theta.items())
+        used = {name for expression in expressions for name, _ in expression.constants}
+        for name in names:
+            if name not in used:
+                raise InputError(f"the physical parameter '{name}' is in no expression of theta; use or remove it.")
+        physics = cls(tuple(parameters), tuple(theta), expressions, tuple(sorted(constants.items())))
+        physics._check_start()
+        _check_identifiable(physics)
+        return physics
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of p in order."""
+        return tuple(p.name for p in self.parameters)
+
+    @property
+    def initial(self) -> Vector:
+        """p⁰, (np,)."""
+        return np.array([p.initial for p in self.parameters], dtype=float)
+
+    @property
+    def bounds(self) -> tuple[Vector, Vector]:
+        """Lower and upper bounds of p, each (np,); infinite where there are none."""
+        return np.array([p.min for p in self.parameters], float), np.array([p.max for p in self.parameters], float)
+
+    def theta(self, p: Vector) -> Vector:
+        """h(p), (nθ,) in the order of `theta_names`; not finite where an expression has no value."""
+        return self.linearised(p)[0]
+
+    def jacobian(self, p: Vector) -> Matrix:
+        """dh/dp, (nθ, np)."""
+        return self.linearised(p)[1]
+
+    def initial_theta(self) -> Vector:
+        """θ⁰ = h(p⁰), (nθ,)."""
+        return self.theta(self.initial)
+
+    def linearised(self, p: Vector) -> tuple[Vector, Matrix]:
+        """h(p) (nθ,) and dh/dp (nθ, np) in one pass.
+
+        Raises:
+            InputError: p has not one entry for each parameter.
+        """
+        p = np.asarray(p, dtype=float)
+        if p.shape != (len(self.parameters),):
+            raise InputError(f"`p` has shape {p.shape}; expected one value for each of {', '.join(self.names)}.")
+        step = _STEP * np.where(p != 0, np.abs(p), 1.0)
+        reals = {**dict(self.constants), **dict(zip(self.names, p, strict=True))}
+        lifted: dict[str, Any] = reals | dict(zip(self.names, p[:, None] + 1j * np.diag(step), strict=True))
+        theta, jacobian = np.empty(len(self.expressions)), np.empty((len(self.expressions), len(p)))
+        with np.errstate(all="ignore"):  # what has no value is told by the caller
+            for i, expression in enumerate(self.expressions):
+                theta[i] = _at(expression, reals).evaluate({}, np)
+                jacobian[i] = np.imag(_at(expression, lifted).evaluate({}, _COMPLEX))
+            # a root at 0 gives h^½, not h, and has no slope; nor has what has no value
+            none = (np.abs(jacobian) > 1e-60 * np.maximum(np.abs(theta), 1.0)[:, None]) | ~np.isfinite(theta)[:, None]
+            return theta, np.where(none, np.inf, jacobian / step)
+
+    @cached_property
+    def size(self) -> Vector:
+        """The magnitude of each p, (np,), for scaling: |p⁰|, and where p⁰ = 0 its bounds' or what changes θ."""
+        theta, jacobian = self.linearised(self.initial)
+        change = np.max(np.abs(jacobian) / magnitude(theta)[:, None], axis=0)
+        reach = np.max(np.abs(self.bounds), axis=0)
+        moving = 1 / np.where((change > 0) & np.isfinite(change), change, 1.0)
+        return np.where(self.initial != 0, np.abs(self.initial), np.where(np.isfinite(reach), reach, moving))
+
+    def around(self, count: int, factor: float) -> Matrix:
+        """`count` points within the bounds, (count, np), p⁰ times 1/`factor` to `factor`; always the same."""
+        exponent = np.random.default_rng(0).uniform(-1, 1, (count, len(self.parameters)))
+        points = np.where(self.initial != 0, self.initial * factor**exponent, self.size * exponent)
+        return np.clip(points, *self.bounds)
+
+    def _check_start(self) -> None:
+        for name, expression, value, slope in zip(
+            self.theta_names, self.expressions, *self.linearised(self.initial), strict=True
+        ):
+            if not (np.isfinite(value) and np.isfinite(slope).all()):
+                what = f"is {value}" if not np.isfinite(value) else "has no finite derivative"
+                raise InputError(
+                    f"physics.theta '{name}' = {expression} {what} at the initial values of "
+                    f"{', '.join(self.names)}; expected a finite one: start elsewhere."
+                )
+
+
+def magnitude(values: Vector) -> Vector:
+    """|values|, where zero the largest of them, where all are zero 1."""
+    size = np.abs(values)
+    return np.where(size > 0, size, size.max(initial=0.0) or 1.0)
+
+
+def _at(expression: Expression, values: Mapping[str, Any]) -> Expression:
+    """The expression with other values of the names that it uses."""
+    return Expression(expression.text, tuple((name, values[name]) for name, _ in expression.constants))
+
+
+def _is_finite(value: Any) -> bool:
+    return not isinstance(value, bool) and isinstance(value, int | float | np.number) and math.isfinite(value)
+
+
+def _check_parameters(parameters: Sequence[PhysicalParameter], constants: Mapping[str, float]) -> None:
+    if not parameters:
+        raise InputError("the physics has no parameters; give at least one, such as m.")
+    check_unique((p.name for p in parameters), "physical parameter")
+    for name in (*constants, *(p.name for p in parameters)):
+        if not is_name(name):
+            raise InputError(
+                f"'{name}' cannot name a physical parameter or constant; use letters, digits and underscores, not "
+                f"starting with a digit, and no keyword; {', '.join(sorted(RESERVED))} are taken (k is the time index)."
+            )
+    for name, value in constants.items():
+        if not _is_finite(value):
+            raise InputError(f"the constant '{name}' must be a finite number; got {value!r}.")
+    for p in parameters:
+        if p.name in constants:
+            raise InputError(f"'{p.name}' is a physical parameter and a constant; give one of them another name.")
+        if not _is_finite(p.initial):
+            raise InputError(f"the initial value of '{p.name}' must be a finite number; got {p.initial!r}.")
+        if any(isinstance(b, bool) or not isinstance(b, int | float | np.number) for b in (p.min, p.max)):
+            raise InputError(f"the bounds of '{p.name}' must be numbers; got min = {p.min!r}, max = {p.max!r}.")
+        if not p.min < p.max:
+            raise InputError(f"the bounds of '{p.name}' are empty or reversed: min = {p.min:g}, max = {p.max:g}.")
+        if not p.min <= p.initial <= p.max:
+            raise InputError(
+                f"the initial value of '{p.name}' is {p.initial:g}; its bounds are {p.min:g} and {p.max:g}."
+            )
+
+
+def _parsed(name: str, text: str, known: Mapping[str, float], parameters: Sequence[str]) -> Expression:
+    """The expression of one θ, its names checked before `parse` takes an unknown one for a channel."""
+    where = f"physics.theta '{name}'"
+    if not isinstance(text, str):
+        raise InputError(f"{where} must be an expression in text such as 'Ts**2 / m'; got {text!r}.")
+    if "[" in text:
+        raise InputError(f"{where} = {text}: a signal such as y[k-1] is no part of it; use parameters and constants.")
+    for word in re.findall(r"\b[^\W\d]\w*", unicodedata.normalize("NFKC", text)):
+        if word not in known and word not in FUNCTIONS and not keyword.iskeyword(word):
+            hint = nearest(word, known) or f"; known are {', '.join(known)}"
+            raise InputError(f"{where} = {text}: unknown name '{word}'{hint}.")
+    try:
+        expression = parse(text, known)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+    if not any(used in parameters for used, _ in expression.constants):
+        raise InputError(
+            f"{where} = {text} depends on no physical parameter; use one of {', '.join(parameters)}, "
+            "or make it a fixed term of the baseline."
+        )
+    return expression
+
+
+def _check_identifiable(physics: PhysicsMap) -> None:
+    """Raise InputError where θ does not determine p at p⁰ nor at any of twenty points within a factor 2 of it."""
+    best: Excitation | None = None
+    for p in (physics.initial, *physics.around(20, 2.0)):
+        jacobian = physics.jacobian(p) * physics.size
+        if not np.isfinite(jacobian).all():
+            continue
+        row = np.abs(jacobian).max(axis=1, keepdims=True)
+        found = excitation(jacobian / np.where(row > 0, row, 1.0), physics.names)
+        if best is None or found.rank > best.rank:
+            best = found
+    if best is not None and not best.full_rank:
+        raise InputError(
+            f"theta does not determine the physical parameters: {tied(best)} ({len(physics.theta_names)} theta, "
+            f"rank {best.rank} of {best.columns}). Make one of them a constant, or add a term that tells them apart."
+        )
+
+
+def tied(found: Excitation) -> str:
+    """Which parameters θ does not tell apart, in words."""
+    return "; ".join(
+        f"{group[0]} has no effect" if len(group) == 1 else f"{', '.join(group)} cannot be told apart"
+        for group in found.collinear
+    )
+
+
+def check_baseline(physics: PhysicsMap, baseline: Baseline) -> None:
+    """Raise InputError unless the map gives exactly the baseline's θ, and no term's `initial` differs from it."""
+    fixed = {term.parameter for term in baseline.terms if term.fixed}
+    for name in physics.theta_names:
+        if name in fixed:
+            raise InputError(
+                f"physics.theta '{name}' is a fixed term of the baseline; leave out the expression, or `fixed`."
+            )
+        if name not in baseline.names:
+            hint = nearest(name, baseline.names) or f"; its parameters are {', '.join(baseline.names)}"
+            raise InputError(f"physics.theta '{name}' is no parameter of the baseline{hint}.")
+    given = dict(zip(physics.theta_names, physics.initial_theta(), strict=True))
+    for name in baseline.names:
+        if name not in given:
+            raise InputError(f"the physics gives no '{name}'; expected an expression for every theta of the baseline.")
+    for term in baseline.terms:
+        if not term.fixed and term.initial is not None:
+            value = given[term.parameter]
+            if not math.isclose(term.initial, value, rel_tol=AGREEMENT):
+                raise InputError(
+                    f"{term.parameter}: initial {term.initial:.7g} but the physics gives {value:.7g}; leave one out."
+                )
+
+
+def with_initial(physics: PhysicsMap, baseline: Baseline) -> Baseline:
+    """The baseline with θ⁰ = h(p⁰), after `check_baseline`."""
+    check_baseline(physics, baseline)
+    given = {name: float(v) for name, v in zip(physics.theta_names, physics.initial_theta(), strict=True)}
+    return replace(
+        baseline,
+        parameters=tuple(replace(p, initial=given[p.name]) for p in baseline.parameters),
+        terms=tuple(t if t.fixed else replace(t, initial=given[t.parameter]) for t in baseline.terms),
+    )

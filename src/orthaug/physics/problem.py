@@ -1,0 +1,198 @@
+"""The estimation problem: rows, physics matrix and projection of a record, checked before any training.
+
+Everything that can be wrong with data and physics together is found here, without JAX.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.errors import InputError
+from orthaug.data.expressions import Lag, parse
+from orthaug.data.record import Record
+from orthaug.data.regressors import Features, Lags, Layout, Rows, in_order, stack_rows
+from orthaug.physics.baseline import Baseline
+from orthaug.physics.excitation import Excitation, excitation, require_rank
+from orthaug.physics.projection import Projection
+
+_LARGEST = 1e120  # size of outputs and regressors whose squares still add up; 1 / _LARGEST is the smallest
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Usable rows of a record with everything that does not depend on the learner's weights.
+
+    Outputs are whitened by `weight` = 1 / standard deviation, for criterion and measure alike, so that
+    fact F1 holds for several outputs too. `target` has the fixed terms subtracted.
+    """
+
+    record: Record
+    baseline: Baseline
+    features: Features
+    layout: Layout
+    rows: Rows
+    target: Float[np.ndarray, "N ny"]
+    weight: Vector
+    projection: Projection
+    excitation: Excitation
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return tuple(channel.name for channel in self.record.outputs)
+
+    @property
+    def whitened_target(self) -> Float[np.ndarray, "N ny"]:
+        return self.target * self.weight
+
+    def feature_rows(self) -> Matrix:
+        """The learner's features (N, nz).
+
+        Raises:
+            InputError: a feature that is not finite on some row.
+        """
+        return _feature_rows(self.features, self.rows, self.layout, self.record)
+
+
+def pose(
+    record: Record,
+    baseline: Baseline,
+    lags: Lags | None = None,
+    learner_inputs: tuple[str, ...] | None = None,
+    *,
+    require_full_rank: bool = True,
+) -> Problem:
+    """Check record and physics against each other and factorise.
+
+    Args:
+        lags: the learner's regressor; None for what the baseline's expressions use.
+        learner_inputs: expressions or raw lags that the learner sees instead of all lags.
+        require_full_rank: raise where the data do not determine θ; `check` reports it instead.
+
+    Raises:
+        InputError: unknown channels, outputs at lag 0, constant channels, values that are not finite,
+            too few rows; RankError for linearly dependent physics.
+    """
+    outputs, inputs = (tuple(c.name for c in group) for group in (record.outputs, record.inputs))
+    if not outputs:
+        raise InputError("the record has no outputs; there is nothing to fit.")
+    baseline.check_channels(outputs, inputs)
+    layout, features = regressor_of(baseline, lags, learner_inputs, outputs, inputs)
+    rows = stack_rows(record, layout)
+    _check_moving(record, layout)
+    with np.errstate(all="ignore"):
+        phi = np.asarray(baseline.phi(rows.x, layout, outputs, np))
+        known = np.asarray(baseline.known(rows.x, layout, outputs, np))
+        target = rows.y - known
+        deviation = target.std(axis=0)
+    _check_physics(phi, known, baseline, rows, record)
+    moves = np.ptp(target, axis=0) > 0
+    if not np.all(np.isfinite(deviation)) or np.any(moves & ((deviation > _LARGEST) | (deviation < 1 / _LARGEST))):
+        raise InputError(
+            f"the outputs move by {np.max(np.ptp(target, axis=0)):.3g}, too large or too small for double precision "
+            "arithmetic; scale them (`scale` of the channel)."
+        )
+    weight = 1.0 / np.where(deviation > 0, deviation, 1.0)
+    projection = Projection.factor(phi * weight[:, None])
+    found = excitation(projection.r, baseline.names)
+    if require_full_rank:
+        require_rank(found, rows.y.size)
+    return Problem(record, baseline, features, layout, rows, target, weight, projection, found)
+
+
+def check_defined(problem: Problem, record: Record) -> None:
+    """Raise InputError where physics or learner inputs are not finite on another record's measured rows."""
+    rows = stack_rows(record, problem.layout)
+    with np.errstate(all="ignore"):
+        phi = np.asarray(problem.baseline.phi(rows.x, problem.layout, problem.outputs, np))
+        known = np.asarray(problem.baseline.known(rows.x, problem.layout, problem.outputs, np))
+    _check_physics(phi, known, problem.baseline, rows, record)
+    _feature_rows(problem.features, rows, problem.layout, record)
+
+
+def _feature_rows(features: Features, rows: Rows, layout: Layout, record: Record) -> Matrix:
+    with np.errstate(all="ignore"):
+        z = np.asarray(features.evaluate(rows.x, layout, np))
+    for j, entry in enumerate(features.entries):
+        _check_finite(z[:, j], f"the learner input {entry}", rows, record)
+    return z
+
+
+def regressor_of(
+    baseline: Baseline,
+    lags: Lags | None,
+    learner_inputs: tuple[str, ...] | None,
+    outputs: tuple[str, ...],
+    inputs: tuple[str, ...],
+) -> tuple[Layout, Features]:
+    """The regressor of the whole model, and what the learner sees of it.
+
+    Raises:
+        InputError: unknown channels, outputs at lag 0, learner inputs that cannot be read.
+    """
+    chosen = in_order(baseline.lags, outputs, inputs) if lags is None else lags.layout(outputs, inputs)
+    features = Features.of(chosen)
+    if learner_inputs is not None:
+        constants = dict(baseline.constants)
+        try:
+            expressions = [parse(text, constants) for text in learner_inputs]
+            for expression in expressions:
+                in_order(expression.lags, outputs, inputs)
+        except InputError as error:
+            raise InputError(f"learner input: {error}") from None
+        features = Features(tuple(expressions))
+    if baseline.function is not None:  # it takes the regressor exactly as `lags` lays it out
+        if lags is None:
+            raise InputError("a baseline function needs `lags`: they define the regressor x that it is called with.")
+        missing = set(features.lags) - set(chosen)
+        if missing:
+            raise InputError(f"the learner inputs use {', '.join(map(str, missing))}, which `lags` does not contain.")
+        return chosen, features
+    return in_order((*chosen, *features.lags, *baseline.lags), outputs, inputs), features
+
+
+def _check_moving(record: Record, layout: Layout) -> None:
+    used = {lag.channel for lag in layout} | {channel.name for channel in record.outputs}
+    for kind, channels in (("outputs", record.outputs), ("inputs", record.inputs)):
+        for i, channel in enumerate(channels):
+            values = [getattr(experiment, kind)[:, i] for experiment in record.experiments]
+            low, high = min(v.min() for v in values), max(v.max() for v in values)
+            if channel.name in used and low == high:
+                raise InputError(
+                    f"channel '{channel.name}' is constant ({low:g}) over all training data; "
+                    "nothing can be learned from it. Remove it, or use data in which it moves."
+                )
+
+
+def _check_physics(phi: np.ndarray, known: np.ndarray, baseline: Baseline, rows: Rows, record: Record) -> None:
+    for j, name in enumerate(baseline.names):
+        texts = ", ".join(t.regressor for t in baseline.terms if t.parameter == name) or "the baseline function"
+        _check_finite(phi[:, :, j], f"the regressor of {name} ({texts})", rows, record)
+        size = np.abs(phi[:, :, j]).max()
+        if size > _LARGEST or 0 < size < 1 / _LARGEST:
+            raise InputError(
+                f"the regressor of {name} ({texts}) is of size {size:.3g}, beyond double precision arithmetic; "
+                "scale its channels (`scale`)."
+            )
+    _check_finite(known, "the sum of the fixed terms", rows, record)
+
+
+def _check_finite(values: np.ndarray, what: str, rows: Rows, record: Record) -> None:
+    bad = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
+    if not bad.size:
+        return
+    row = int(bad[0])
+    for experiment in record.experiments:
+        usable = len(experiment) - rows.start
+        if row < usable:
+            raise InputError(f"{experiment.where(row + rows.start)}: {what} is not finite there.")
+        row -= usable
+
+
+def used_lags(problem: Problem) -> tuple[Lag, ...]:
+    """The raw lags that the physics or the learner reads."""
+    read = {*problem.baseline.lags, *problem.features.lags}
+    return tuple(lag for lag in problem.layout if lag in read)

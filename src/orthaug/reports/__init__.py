@@ -1,0 +1,1 @@
+"""Results in words, pictures and on a page; nothing is computed here."""

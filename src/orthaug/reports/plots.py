@@ -1,0 +1,214 @@
+"""Figures of results; results in, figures out, nothing is computed here that a result does not hold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from orthaug.analysis.residuals import ResidualTest
+from orthaug.models.response import Response
+
+# Okabe-Ito: told apart by every reader
+_BLACK, _GREY, _BLUE, _ORANGE, _GREEN = "#000000", "#B8B8B8", "#0072B2", "#E69F00", "#009E73"
+_CYCLE = (_BLUE, _ORANGE, _GREEN, _BLACK)
+_KINDS = ("prediction", "simulation")
+_WINDOW = 250  # samples of a long record that are shown, so that single swings can be seen
+_SIZE = (7.0, 2.4)  # inches per panel
+
+
+def output_figure(response: Response, title: str) -> Figure:
+    """Measured output against the model, and below it their difference, from the first value on."""
+    trajectory = response.trajectories[0]
+    time, rows = _window(response)
+    figure, axes = _panels(response, f"{title}: {_extent(response, rows)}", heights=(2, 1))
+    for i, channel in enumerate(response.outputs):
+        upper, lower = axes[2 * i], axes[2 * i + 1]
+        if trajectory.measured is not None:
+            upper.plot(time, trajectory.measured[rows, i], color=_GREY, linewidth=2.6, label="measured")
+            error = trajectory.measured[rows, i] - trajectory.model[rows, i]
+            lower.plot(time, error, color=_BLUE, linewidth=0.9)
+        upper.plot(time, trajectory.model[rows, i], color=_BLACK, linewidth=0.9, label="model")
+        upper.set_ylabel(channel.label)
+        lower.set_ylabel("difference" + (f" [{channel.unit}]" if channel.unit else ""))
+        _legend(upper)
+    axes[-1].set_xlabel("time [s]")
+    figure.align_ylabels()
+    return figure
+
+
+def residual_figure(response: Response, title: str) -> Figure:
+    """Measured minus model over the whole record, one panel per output."""
+    trajectory = response.trajectories[0]
+    figure, axes = _panels(response, f"{title}: {_extent(response, slice(trajectory.start, len(trajectory.model)))}")
+    assert trajectory.measured is not None
+    time = np.arange(len(trajectory.model)) * response.sampling_time
+    for i, (axis, channel) in enumerate(zip(axes, response.outputs, strict=True)):
+        residual = trajectory.measured[:, i] - trajectory.model[:, i]
+        axis.plot(time, residual, color=_BLUE, linewidth=0.6, rasterized=len(time) > 5000)
+        axis.axhline(0.0, color=_BLACK, linewidth=0.6)
+        axis.set_ylabel(f"residual of {channel.label}")
+    axes[-1].set_xlabel("time [s]")
+    return figure
+
+
+def components_figure(response: Response, title: str) -> Figure:
+    """The baseline's and the learner's part of the model's output, each on its own scale; two panels per output."""
+    time, rows = _window(response)
+    trajectory = response.trajectories[0]
+    figure, axes = _panels(response, f"{title}: {_extent(response, rows)}", heights=(1, 1))
+    for i, channel in enumerate(response.outputs):
+        unit = f" [{channel.unit}]" if channel.unit else ""
+        for axis, values, color, part, formula in (
+            (axes[2 * i], trajectory.baseline, _BLUE, "baseline", r"$\varphi\,\theta$"),
+            (axes[2 * i + 1], trajectory.learner, _GREEN, "learner", r"$f - \varphi\,\theta_{\mathrm{aux}}$"),
+        ):
+            axis.plot(
+                time, values[rows, i], color=color, linewidth=1.1, label=f"{part} part of {channel.name}, {formula}"
+            )
+            axis.set_ylabel(part + unit)
+            _legend(axis)
+    axes[-1].set_xlabel("time [s]")
+    figure.align_ylabels()
+    return figure
+
+
+def residual_analysis_figure(tests: Sequence[ResidualTest], title: str) -> Figure:
+    """Of each residual: autocorrelation, correlation with the inputs, means over its most telling regressor."""
+    figure = Figure(figsize=(_SIZE[0] * 1.3, 0.5 + 2.6 * len(tests)), layout="constrained")
+    axes = figure.subplots(len(tests), 3, squeeze=False)
+    figure.suptitle(f"{title}: 99 % bands", fontsize=10)
+    for row, test in zip(axes, tests, strict=True):
+        if test.acf is not None and test.acf_band is not None:
+            row[0].bar(np.arange(1, len(test.acf)), test.acf[1:], color=_BLUE, width=0.6)
+            row[0].axhspan(-test.acf_band, test.acf_band, color=_GREY, alpha=0.5)
+        row[0].set_ylabel(f"residual of {test.name}")
+        row[0].set_xlabel("lag")
+        row[0].set_title("autocorrelation", fontsize=9)
+        shown = [(name, cross) for name, cross in test.cross.items() if cross is not None]
+        for (name, cross), color in zip(shown, _CYCLE, strict=False):
+            reach = len(cross.values) // 2
+            row[1].plot(np.arange(-reach, reach + 1), cross.values, ".-", color=color, linewidth=0.8, label=name)
+        if shown:
+            band = max(cross.band for _, cross in shown)
+            row[1].axhspan(-band, band, color=_GREY, alpha=0.5)
+            row[1].legend(fontsize=8, frameon=False)
+        row[1].set_xlabel("lag behind the input")
+        row[1].set_title("correlation with the inputs", fontsize=9)
+        curved = {name: found for name, found in test.regressors.items() if found is not None}
+        if curved:
+            name = max(curved, key=lambda key: curved[key].share)
+            found = curved[name]
+            row[2].errorbar(found.centres, found.means, 2.576 * found.errors, fmt="o", color=_GREEN, markersize=3)
+            row[2].axhline(0.0, color=_BLACK, linewidth=0.6)
+            row[2].set_xlabel(name)
+            row[2].set_title(f"mean over {name}, {100 * found.share:.2g} % explained", fontsize=9)
+        for axis in row:
+            axis.grid(alpha=0.25)
+            axis.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def bias_figure(names: Sequence[str], suspects: Sequence[str], shares: np.ndarray, title: str) -> Figure:
+    """Heat map of the bias of each parameter by each suspect, in per cent; `shares` (n suspects, n parameters)."""
+    width, height = 2.6 + 0.8 * len(names) + 0.05 * max(map(len, suspects)), 1.2 + 0.28 * len(suspects)
+    figure = Figure(figsize=(max(width, _SIZE[0]), height), layout="constrained")
+    axis = figure.subplots()
+    signed = np.sign(shares) * np.log10(1 + np.abs(shares))  # biases of 0.1 % and of 100 % both show
+    reach = max(float(np.nanmax(np.abs(signed), initial=0.0)), 1e-12)
+    axis.imshow(signed, cmap="PuOr", vmin=-reach, vmax=reach, aspect="auto")
+    for i, j in np.ndindex(*shares.shape):
+        if np.isfinite(shares[i, j]):
+            dark = abs(signed[i, j]) > 0.6 * reach
+            color = "white" if dark else _BLACK
+            axis.text(j, i, f"{shares[i, j]:+.2g}", ha="center", va="center", fontsize=7, color=color)
+    axis.set_xticks(range(len(names)), names)
+    axis.set_yticks(range(len(suspects)), suspects, fontsize=8)
+    axis.tick_params(length=0)
+    axis.spines[:].set_visible(False)
+    figure.suptitle(title, fontsize=10)
+    return figure
+
+
+def comparison_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Scores and parameters of several ways of modelling, from the rows of a comparison.
+
+    Upper panel: free-run and one-step NRMSE on the last part. Below, a panel per parameter with 95 % intervals.
+    """
+    names = [Path(row["name"]).name for row in rows]
+    parameters = [parameter["name"] for parameter in rows[0]["parameters"]]
+    figure = Figure(figsize=(_SIZE[0], 2.2 + 1.3 * len(parameters)), layout="constrained")
+    axes = figure.subplots(1 + len(parameters), 1, sharex=True, squeeze=False)[:, 0]
+    place = np.arange(len(rows))
+    for kind, marker, color in zip(_KINDS, "os", (_BLUE, _ORANGE), strict=True):
+        label = "one step" if kind == "prediction" else "free run"
+        axes[0].plot(place, [_mean_nrmse(row, kind) for row in rows], marker, color=color, label=label)
+    part = list(rows[0]["scores"])[-1] if rows[0]["scores"] else ""
+    axes[0].set_title(f"NRMSE on {part}, and parameters with their 95 % intervals (hollow: none)", fontsize=10, pad=20)
+    axes[0].set_ylabel("NRMSE")
+    axes[0].set_ylim(0, 1.15 * np.nanmax([0.0, *(_mean_nrmse(row, kind) for row in rows for kind in _KINDS)]) or 1.0)
+    _legend(axes[0])
+    for axis, name in zip(axes[1:], parameters, strict=True):
+        for i, row in enumerate(rows):
+            entry = next((p for p in row["parameters"] if p["name"] == name), None)
+            if entry is None or entry["value"] is None:
+                continue
+            interval = entry["ci95"] if entry["ci95"] and None not in entry["ci95"] else None
+            if interval:
+                axis.plot([i, i], interval, "_-", color=_GREEN, markersize=14)
+            axis.plot([i], [entry["value"]], "o", color=_GREEN, markerfacecolor=_GREEN if interval else "white")
+        unit = rows[0]["parameters"][parameters.index(name)]["unit"]
+        axis.set_ylabel(f"{name} [{unit}]" if unit else name)
+    for axis in axes:
+        axis.margins(y=0.15)
+        axis.grid(alpha=0.25)
+        axis.spines[["top", "right"]].set_visible(False)
+    axes[-1].set_xticks(place, names, rotation=15, ha="right")
+    axes[-1].set_xlim(-0.5, len(rows) - 0.5)
+    figure.align_ylabels()
+    return figure
+
+
+def _mean_nrmse(row: Mapping[str, Any], kind: str) -> float:
+    """RMS over outputs of the last part's NRMSE; NaN where there is none."""
+    if not row["scores"]:
+        return float("nan")
+    found = list(row["scores"].values())[-1][kind]["nrmse"]
+    return float("nan") if found is None or None in found else float(np.sqrt(np.mean(np.square(found))))
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a PNG that is sharp at column width."""
+    figure.savefig(path, dpi=160)
+
+
+def _panels(response: Response, title: str, heights: tuple[int, ...] = (1,)) -> tuple[Figure, list]:
+    """Stacked axes, `len(heights)` per output."""
+    ratios = heights * len(response.outputs)
+    figure = Figure(figsize=(_SIZE[0], 0.5 + _SIZE[1] * sum(ratios) / max(heights)), layout="constrained")
+    axes = list(figure.subplots(len(ratios), 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0])
+    for axis in axes:
+        axis.grid(alpha=0.25)
+        axis.spines[["top", "right"]].set_visible(False)
+    figure.suptitle(title, fontsize=10)
+    return figure, axes
+
+
+def _extent(response: Response, rows: slice) -> str:
+    """What of the record is drawn."""
+    whole = len(response.trajectories[0].model)
+    text = f"samples {rows.start} to {rows.stop - 1} of {whole}"
+    return text + (f", first of {len(response.trajectories)} experiments" if len(response.trajectories) > 1 else "")
+
+
+def _window(response: Response) -> tuple[np.ndarray, slice]:
+    trajectory = response.trajectories[0]
+    rows = slice(trajectory.start, min(trajectory.start + _WINDOW, len(trajectory.model)))
+    return np.arange(rows.start, rows.stop) * response.sampling_time, rows
+
+
+def _legend(axis) -> None:  # noqa: ANN001  (a matplotlib Axes)
+    axis.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, fontsize=8, frameon=False, ncols=2)
