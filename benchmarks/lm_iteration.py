@@ -12,7 +12,7 @@ from orthaug import MLP, Baseline, LevenbergMarquardt, Record, Term
 from orthaug._base.jax import jax
 from orthaug._base.parallel import one_blas_thread
 from orthaug.data.regressors import Lags
-from orthaug.fitting.one_step import Task
+from orthaug.fitting.one_step import OneStepTask
 from orthaug.physics.problem import pose
 
 CASES = (  # rows, lags, neurons, weights, iterations per timing, repeats, allowed ratio
@@ -21,7 +21,7 @@ CASES = (  # rows, lags, neurons, weights, iterations per timing, repeats, allow
 )
 
 
-def task(rows: int, lags: Lags, neurons: int) -> Task:
+def task(rows: int, lags: Lags, neurons: int) -> OneStepTask:
     """A noisy nonlinear record on which training does not end early."""
     rng = np.random.default_rng(0)
     u, y = rng.normal(size=rows + 3), np.zeros(rows + 3)
@@ -29,7 +29,7 @@ def task(rows: int, lags: Lags, neurons: int) -> Task:
         y[k] = 0.5 * y[k - 1] - 0.3 * y[k - 2] + u[k - 1] + 0.3 * np.tanh(2 * u[k - 1] * y[k - 1]) + 0.1 * rng.normal()
     baseline = Baseline.from_terms([Term(n, e) for n, e in (("a1", "y[k-1]"), ("a2", "y[k-2]"), ("b1", "u[k-1]"))])
     record = Record.from_arrays(u, y).rows(0, rows + max(lags.na, lags.nb))  # type: ignore[type-var]
-    return Task.of(pose(record, baseline, lags), MLP((neurons,)))
+    return OneStepTask.of(pose(record, baseline, lags), MLP((neurons,)))
 
 
 def main() -> None:
@@ -41,7 +41,7 @@ def main() -> None:
         start = posed.bound.init(jax.random.key(0))
         jacobian = np.random.default_rng(1).normal(size=(rows, weights))
 
-        def train(n: int, posed: Task = posed, start: object = start) -> None:
+        def train(n: int, posed: OneStepTask = posed, start: object = start) -> None:
             with one_blas_thread():  # as `estimate` trains
                 run = posed.run(LevenbergMarquardt(n, tolerance=0.0), start)
             assert run.iterations == n, "training ended early"

@@ -13,7 +13,7 @@ from machine import describe
 
 import orthaug as oa
 from orthaug._base.jax import jax
-from orthaug.fitting.one_step import OUTPUT_UNIT, Task
+from orthaug.fitting.one_step import OUTPUT_UNIT, OneStepTask
 from orthaug.physics.problem import pose
 from orthaug.studies import synthetic
 
@@ -23,8 +23,8 @@ UNITS = (1, 3, 10, 30, 100)
 def test_rmse(example: synthetic.Example, unit: float, seed: int, regularization: str, iterations: int) -> float:
     """RMSE of the one-step prediction on the test record."""
     problem = pose(example.train, example.baseline)
-    usual = Task.of(problem, oa.MLP())
-    task = Task.of(problem, oa.MLP(), usual.scaling, usual.unit * unit / OUTPUT_UNIT)
+    usual = OneStepTask.of(problem, oa.MLP())
+    task = OneStepTask.of(problem, oa.MLP(), usual.scaling, usual.unit * unit / OUTPUT_UNIT)
     solver = oa.LevenbergMarquardt(iterations)
     run = task.run(solver, task.bound.init(jax.random.key(seed)), regularization=regularization)
     c = problem.projection.solve((problem.target - task.values(run.w)) * problem.weight)

@@ -13,7 +13,7 @@ from machine import alternate, describe
 from orthaug import MLP, LevenbergMarquardt
 from orthaug._base.jax import jax, jnp
 from orthaug.fitting.normal_equations import Hold, OneStep
-from orthaug.fitting.one_step import Task
+from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.solvers.levenberg_marquardt import Options, _advance, _start
 from orthaug.models.rows import Overlap
 from orthaug.physics.problem import pose
@@ -30,10 +30,10 @@ def main() -> None:
         ("static", synthetic.static(1, noise=True)),
         ("mass-spring-damper", synthetic.mass_spring_damper()),
     ):
-        task = Task.of(pose(example.train, example.baseline), MLP())
+        task = OneStepTask.of(pose(example.train, example.baseline), MLP())
         starts = [task.bound.init(jax.random.key(seed)) for seed in SEEDS]
-        nt = task.chunks.q.shape[2]
-        arguments = (task.chunks, Hold(jnp.zeros((nt, nt)), jnp.zeros(nt)))
+        nt = task.rows.q.shape[2]
+        arguments = (task.rows, Hold(jnp.zeros((nt, nt)), jnp.zeros(nt)))
         overlap = Overlap(jnp.zeros((nt, task.bound.size)), jnp.zeros(nt))
         options = Options(jnp.asarray(0.0), jnp.asarray(False), jnp.asarray(1.0))
         criterion = OneStep(task.bound)
@@ -46,11 +46,11 @@ def main() -> None:
 
             return jax.vmap(one)(ws)  # noqa: B023
 
-        def loop(task: Task = task, starts: list = starts) -> None:
+        def loop(task: OneStepTask = task, starts: list = starts) -> None:
             for w in starts:
                 task.run(solver, w)
 
-        def threads(task: Task = task, starts: list = starts) -> None:
+        def threads(task: OneStepTask = task, starts: list = starts) -> None:
             with ThreadPoolExecutor(os.cpu_count()) as pool:
                 list(pool.map(lambda w: task.run(solver, w), starts))
 

@@ -12,7 +12,7 @@ from orthaug import MLP, Baseline, LevenbergMarquardt, Orthogonal, Record, Simul
 from orthaug._base.jax import jax, jnp
 from orthaug._base.parallel import one_blas_thread
 from orthaug.fitting.free_run import FreeRun
-from orthaug.fitting.one_step import Task
+from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.segments import respond
 from orthaug.physics.problem import pose
 
@@ -33,7 +33,7 @@ def record() -> Record:
 def main() -> None:
     baseline = Baseline.from_terms([Term(f"t{i}", text) for i, text in enumerate(TERMS)])
     problem = pose(record(), baseline, None, ("y[k-1]", "y[k-2]"))
-    task = Task.of(problem, MLP((10,)))
+    task = OneStepTask.of(problem, MLP((10,)))
     start = task.bound.init(jax.random.key(0))
     flight = FreeRun.of(problem, task, Simulation(segment=512, washout=40))
     c = problem.projection.solve(problem.whitened_target - task.values(start) * problem.weight)

@@ -11,7 +11,7 @@ from machine import alternate, describe
 from orthaug import MLP, AdamLBFGS, LevenbergMarquardt, Orthogonal
 from orthaug._base.jax import jax
 from orthaug._base.parallel import one_blas_thread
-from orthaug.fitting.one_step import Task
+from orthaug.fitting.one_step import OneStepTask
 from orthaug.physics.problem import pose
 from orthaug.studies import synthetic
 
@@ -23,7 +23,7 @@ CASES = (
 )
 
 
-def iterations_to(task: Task, w: object, loss: float) -> int | None:
+def iterations_to(task: OneStepTask, w: object, loss: float) -> int | None:
     """The fewest Levenberg-Marquardt iterations that end at or below a loss."""
     low, high = 0, 1
     while task.run(LevenbergMarquardt(high, tolerance=0.0), w).normal.loss > loss:
@@ -50,7 +50,7 @@ def table() -> None:
     print("| example | seed | adam-lbfgs | its loss | LM to that loss | iterations | ratio |")
     print("|---|---|---|---|---|---|---|")
     for name, example, pipeline in CASES:
-        task = Task.of(pose(example.train, example.baseline), MLP())
+        task = OneStepTask.of(pose(example.train, example.baseline), MLP())
         ratios = []
         for seed in SEEDS:
             w = task.bound.init(jax.random.key(seed))

@@ -131,7 +131,7 @@ def _accounts(problem: Problem, free_run: Response, skip: int) -> bool:
 def _physics_flown(fit: Estimate) -> list[tuple[Response, int]]:
     """The free run of the physics alone, trained on the free run; with the rows to skip."""
     problem, criterion = fit.problem, Simulation()
-    longest = max(len(e) for e in problem.record.experiments) - fit.model.form.start
+    longest = max(len(e) for e in problem.record.experiments) - fit.model.form.first_row
     if longest <= 2 * criterion.washout:
         criterion = Simulation(segment=0, washout=0)
     found = estimate(problem.record, problem.baseline, lags=_lags_of(fit), learner=None, criterion=criterion)

@@ -24,9 +24,10 @@ from orthaug._base.jax import jax, jnp
 from orthaug._base.parallel import one_blas_thread
 from orthaug.data.record import Record
 from orthaug.data.regressors import lag_matrix
+from orthaug.models.dynamics import Numbers
+from orthaug.models.lagged import Lagged as Form
 from orthaug.models.learners import External
 from orthaug.models.model import Model
-from orthaug.models.predictor import Form, Numbers, parts
 
 _STEPS, _SAMPLES = 20_000, 2000  # most rows that are looked at, spread evenly; most points of the contraction check
 _STEEPEST, _ACTIVE = 50, 64  # points of largest radius always among them; worst points that a round of search adds
@@ -214,7 +215,7 @@ def divergence_scaling(model: Model, record: Record, largest: float = 1024.0) ->
         raise InputError(f"`largest` must be a factor above 1 and at most {_LARGEST_FACTOR:g}; got {largest!r}.")
     if not model.form.memory:
         return None
-    rows = max(_STEPS // len(record.experiments), model.form.start + 1)
+    rows = max(_STEPS // len(record.experiments), model.form.first_row + 1)
     record = replace(record, experiments=tuple(e.rows(None, rows) for e in record.experiments))
     mean = np.concatenate([e.inputs for e in record.experiments]).mean(axis=0)
 
@@ -270,7 +271,7 @@ def _gradient_rows(form: Form, numbers: Numbers, x: Float[Array, "m nx"], step: 
     """∂g/∂x (m, ny, nx), by differences of width `step` (nx,) where a learner has no derivative; or ∂φ/∂x."""
 
     def g(row: Any) -> Any:
-        found = parts(form, numbers, row)
+        found = form.at(numbers, row)
         return found.baseline + found.learner
 
     def differences(row: Any) -> Any:
@@ -314,7 +315,7 @@ def _linearised(model: Model, points: Points) -> tuple[Points, Float[np.ndarray,
 def _visited(model: Model, record: Record, free: bool) -> tuple[Points, Vector, tuple[str, ...]]:
     """Regressors of a free run, up to where it diverged, or measured ones; standard deviations of y; where that was."""
     response = model.simulate(record) if free else model.predict(record)
-    pieces, measured, diverged, start = [], [], [], model.form.start
+    pieces, measured, diverged, start = [], [], [], model.form.first_row
     for i, (e, t) in enumerate(zip(record.experiments, response.trajectories, strict=True)):
         assert t.measured is not None  # a record without outputs was refused
         outputs = np.concatenate([t.measured[:start], (t.model if free else t.measured)[start:]])

@@ -85,7 +85,7 @@ def suspected(job: Job, theta: Vector | None = None, learned: Any = None) -> lis
         deltas = suspect_columns(suspects, points.x, problem.layout, problem.outputs)
     wanted = bool(job.spec.suspects)  # of the usual ones, those that have an effect
     kept = [i for i in range(len(suspects)) if wanted or np.any(deltas[i])]
-    theta = problem.projection.solve(problem.whitened_target) if theta is None else theta
+    theta = problem.least_squares if theta is None else theta
     slopes = _slopes(job.physics, problem, theta)
     table = bias_table(
         Projection.factor(phi * gain[:, :, None]),

@@ -21,7 +21,7 @@ from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, Or
 from orthaug.inference.measures import Measure, Samples, Support, Symmetrized, Training, Uniform
 from orthaug.physics.excitation import excitation
 from orthaug.physics.parameters import PhysicsMap, with_initial
-from orthaug.physics.problem import Problem, check_defined, pose, regressor_of, used_lags
+from orthaug.physics.problem import Problem, check_defined, pose, regressor_of
 from orthaug.physics.projection import Projection
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ class Job:
     @property
     def used(self) -> tuple[Lag, ...]:
         """The raw lags that the model reads."""
-        return used_lags(self.problem)
+        return self.problem.used
 
     @property
     def parts(self) -> tuple[LoadedPart, ...]:
@@ -151,7 +151,7 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
         problem.feature_rows()
         _check_segments(spec, problem)
         section = spec.structure.measure
-        measure = measure_of(section.kind, [str(lag) for lag in used_lags(problem)], section, path.parent)
+        measure = measure_of(section.kind, [str(lag) for lag in problem.used], section, path.parent)
         _check_measure(measure, problem)
         job = Job(path, spec, train, validation, tests, problem, measure, physics, ())
         check_suspects(spec.suspects, problem)
@@ -215,7 +215,7 @@ def measure_of(kind: str, lags: Sequence[str], section: MeasureSection, folder: 
 
 def _check_measure(measure: Measure, problem: Problem) -> None:
     """Raise InputError for a measure that does not fit, or under which the physics is rank-deficient."""
-    points = measure.points(Support(problem.record, problem.layout, used_lags(problem)))
+    points = measure.points(Support(problem.record, problem.layout, problem.used))
     if isinstance(measure, Training) or not problem.excitation.full_rank or not problem.baseline.names:
         return
     with np.errstate(all="ignore"):

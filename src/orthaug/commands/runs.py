@@ -76,7 +76,7 @@ def with_initial(run: Run, initial: str | Any) -> Record:
     """The record with the outputs of its first rows replaced, for predictions that start from others."""
     if isinstance(initial, str) and initial == "measured":
         return run.record
-    start, experiment = run.model.form.start, run.record.experiments[0]
+    start, experiment = run.model.form.first_row, run.record.experiments[0]
     outputs = experiment.outputs.copy()
     rows = np.zeros((start, outputs.shape[1])) if isinstance(initial, str) else initial[:start]
     outputs[start - len(rows) : start] = rows
@@ -152,9 +152,9 @@ def split(run: Run, measure: Measure) -> dict[str, Any]:
     if stands:
         raise InputError(f"{', '.join(stands)} stands at a bound, which a split would leave; fit without the bound.")
     support = Support(run.model.fitting(run.record, need_outputs=True), model.form.layout, model.form.used)
-    found = split_under(measure, model, support, model.joint)
+    found = split_under(measure, model, support, model.statistics.joint(len(model.theta)))
     std = None if found.covariance is None else np.sqrt(np.diag(found.covariance))
-    ci = None if std is None else interval(found.theta, std, model.freedom)
+    ci = None if std is None else interval(found.theta, std, model.statistics.freedom)
     parameters = [
         {
             "name": parameter.name,

@@ -1,96 +1,107 @@
-"""From what training left to an estimate: θ split from the learner, statistics, warnings."""
+"""From what training left to an estimate: θ split from the learner, statistics, warnings.
+
+Everything is a sum over rows that the task's engine makes; no array of N rows is kept.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.fitting.estimates import Estimate
-from orthaug.fitting.learned import FreeStatistics, Learned
-from orthaug.fitting.solvers.levenberg_marquardt import SPANNED
-from orthaug.fitting.status import Status
-from orthaug.fitting.structures import BaselinePenalty, Fixed, Orthogonal, Split, Structure, split
+from orthaug._base.warning import Warning
+from orthaug.fitting.elimination import Fixed, Split, split
+from orthaug.fitting.estimates import NOT_UNIQUE, Estimate
+from orthaug.fitting.learned import ErrorStatistics, Learned
+from orthaug.fitting.one_step import OneStepTask, Share
+from orthaug.fitting.status import Ending, Status
+from orthaug.fitting.structures import Structure
 from orthaug.inference.covariance import degrees_of_freedom, noise_covariance, theta_covariance
-from orthaug.models.learners import Scaling
+from orthaug.models.dynamics import Numbers
+from orthaug.models.lagged import Lagged
 from orthaug.models.model import Model
-from orthaug.models.predictor import Form, Numbers
+from orthaug.models.statistics import Statistics
 from orthaug.physics.excitation import ILL_CONDITIONED
 from orthaug.physics.problem import Problem
 
 
-def nothing_learned(problem: Problem) -> Learned:
-    """Physics alone."""
-    nothing, zeros = np.zeros(0), np.zeros(len(problem.outputs))
-    phi = problem.projection.phi
-    return Learned(
-        bound=None,
-        weights=nothing,
-        scaling=Scaling(nothing, nothing),
-        unit=zeros,
-        values=np.zeros_like(problem.target),
-        gram=np.tensordot(phi, phi, axes=([0, 1], [0, 1])),
-        middle=lambda noise: np.einsum("kit,ij,kjs->ts", phi, noise, phi, optimize=True),
-    )
+def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estimate:
+    """Solve θ, split it from the learner, and attach statistics.
 
-
-def conclude(problem: Problem, structure: Structure, learned: Learned, status: Status) -> Estimate:
-    """Solve θ, split it from the learner, and attach statistics."""
-    projection, weight = problem.projection, problem.weight
-    whitened = learned.values * weight
-    usable = status.code != "non_finite"
+    Args:
+        task: the problem's rows, to sum over.
+        learned: of these rows, or of a free run on the same problem.
+    """
+    problem = task.problem
+    share = task.share(learned)
+    finite = bool(np.isfinite(share.square) and np.isfinite(share.coordinates).all())
+    ending = learned.ending if finite else Ending.NON_FINITE
     if learned.elsewhere:  # c = 0: all of the function is the learner's
-        aux = projection.solve(whitened)
+        aux = problem.projection.from_coordinates(share.coordinates)
         theta, theta_aux, fixed = Split(aux, aux, {})
     else:
-        there = whitened if usable else np.zeros_like(whitened)
-        held = learned.free.fixed if learned.free else None
+        there = share.coordinates if ending.usable else 0.0 * problem.target_coordinates
+        held = learned.errors.fixed if learned.errors else None
         theta, theta_aux, fixed = split(structure, problem, there, learned.coefficients, held)
-    found = learned.free or _one_step_statistics(problem, learned, theta - theta_aux, fixed)
-    noise = found.noise if usable else None
-    known = noise is not None and _unique(structure, learned) and not learned.elsewhere
-    form = Form(problem.baseline, problem.features, problem.layout, problem.outputs, learned.bound)
-    numbers = Numbers(
-        theta, theta_aux, learned.weights, learned.scaling.centre, learned.scaling.halfwidth, learned.unit, learned.tilt
-    )
-    record = problem.record
+    errors = learned.errors or _one_step_errors(task, learned, theta - theta_aux, fixed)
+    noise = errors.noise if ending.usable else None
+    identified = structure.projects or (learned.bound is None and structure.identifies)
+    known = noise is not None and identified and not learned.elsewhere
     return Estimate(
-        model=Model(
-            form=form,
-            numbers=numbers,
-            outputs=record.outputs,
-            inputs=record.inputs,
-            sampling_time=record.sampling_time,
-            time_column=record.time_column,
-            structure=structure.name,
-            largest_output=np.max([np.abs(e.outputs).max(axis=0) for e in record.experiments], axis=0),
-            weight=problem.weight,
-            gram=learned.gram,
-            ridge=learned.ridge,
-            freedom=found.freedom,
-            middle=_middle(learned, noise, weight),
-            noise=noise,
-        ),
-        status=Status(status.code, status.iterations, status.seconds, found.mean_square),
+        model=_model(problem, structure, learned, Split(theta, theta_aux, fixed), errors, noise),
+        status=Status(ending, learned.iterations, learned.seconds, errors.mean_square),
         restarts=(),
         excitation=problem.excitation,
-        covariance=found.covariance if known else None,
-        freedom=found.freedom,
+        covariance=errors.covariance if known else None,
+        freedom=errors.freedom,
         effective_weights=learned.effective,
-        defect=_defect(problem, whitened, theta_aux),
+        defect=_defect(task, learned, share, theta_aux),
         problem=problem,
+        criterion=task.criterion,
         at_bound={problem.baseline.names[i]: value for i, value in fixed.items()},
-        warnings=tuple(_warnings(problem, structure, learned, noise, fixed)),
+        warnings=tuple(_warnings(problem, structure, learned, identified, noise, fixed)),
     )
 
 
-def _one_step_statistics(problem: Problem, learned: Learned, c: Vector, fixed: Fixed) -> FreeStatistics:
-    """The statistics of the one-step residual, in the form of those of a free run."""
-    projection, weight = problem.projection, problem.weight
-    residual = problem.whitened_target - learned.values * weight - projection.phi @ c
-    freedom = degrees_of_freedom(projection, learned.effective) + len(fixed) / len(weight)
-    noise = noise_covariance(residual / weight, freedom) if np.isfinite(residual).all() else None
-    covariance = None if noise is None else theta_covariance(projection, weight, noise, fixed)
-    return FreeStatistics(noise, covariance, float(freedom.min()), float(np.mean(residual**2)), fixed)
+def _model(
+    problem: Problem,
+    structure: Structure,
+    learned: Learned,
+    found: Split,
+    errors: ErrorStatistics,
+    noise: Matrix | None,
+) -> Model:
+    record, scaling = problem.record, learned.scaling
+    numbers = (found.theta, found.theta_aux, learned.weights, scaling.centre, scaling.halfwidth, learned.unit)
+    middle = _middle(learned, noise, problem.weight)
+    return Model(
+        form=Lagged(problem.baseline, problem.features, problem.layout, problem.outputs, learned.bound),
+        numbers=Numbers(*numbers, learned.tilt),
+        outputs=record.outputs,
+        inputs=record.inputs,
+        sampling_time=record.sampling_time,
+        time_column=record.time_column,
+        structure=structure.name,
+        largest_output=np.max([np.abs(e.outputs).max(axis=0) for e in record.experiments], axis=0),
+        weight=problem.weight,
+        statistics=Statistics(learned.gram, middle, noise, learned.ridge, errors.freedom),
+    )
+
+
+def _one_step_errors(task: OneStepTask, learned: Learned, c: Vector, fixed: Fixed) -> ErrorStatistics:
+    """The statistics of the one-step residual."""
+    problem = task.problem
+    rows, weight = len(problem.rows), problem.weight
+    whitened = task.residual_gram(learned, c)
+    freedom = degrees_of_freedom(rows, problem.freedom_used, learned.effective) + len(fixed) / len(weight)
+    finite = bool(np.isfinite(whitened).all())
+    noise = noise_covariance(whitened / np.outer(weight, weight), freedom) if finite else None
+    covariance = None
+    if noise is not None:
+        mixed = noise * np.outer(weight, weight)
+        middle = task.physics_middle(mixed) if len(weight) > 1 else mixed[0, 0] * np.eye(len(c))
+        covariance = theta_covariance(problem.projection, middle, fixed)
+    mean_square = float(np.trace(whitened)) / problem.target.size
+    return ErrorStatistics(noise, covariance, float(freedom.min()), mean_square, fixed)
 
 
 def _middle(learned: Learned, noise: Matrix | None, weight: Vector) -> Matrix | None:
@@ -103,56 +114,57 @@ def _middle(learned: Learned, noise: Matrix | None, weight: Vector) -> Matrix | 
     return None if learned.middle is None else learned.middle(whitened)
 
 
-def _unique(structure: Structure, learned: Learned) -> bool:
-    """Whether the data alone determine θ."""
-    return isinstance(structure, Orthogonal) or (learned.bound is None and not isinstance(structure, BaselinePenalty))
-
-
-def _defect(problem: Problem, whitened: np.ndarray, theta_aux: Vector) -> float | None:
-    """‖QᵀF̃‖ / ‖F‖ with F̃ = F − Φ θ_aux as the model computes it (eq:orth_property); None for F = 0."""
-    size = np.linalg.norm(whitened)
+def _defect(task: OneStepTask, learned: Learned, share: Share, theta_aux: Vector) -> float | None:
+    """‖QᵀF̃‖ / ‖F‖ with F̃ = F − Φ θ_aux (eq:orth_property); None for F = 0."""
+    size = np.sqrt(share.square)
     if not 0 < size < np.inf:
         return None
-    return float(np.linalg.norm(problem.projection.coordinates(whitened - problem.projection.phi @ theta_aux)) / size)
+    return float(np.linalg.norm(task.left_share(learned, theta_aux)) / size)
 
 
 def _warnings(
-    problem: Problem, structure: Structure, learned: Learned, noise: Matrix | None, fixed: Fixed
-) -> list[str]:
-    found = []
+    problem: Problem, structure: Structure, learned: Learned, identified: bool, noise: Matrix | None, fixed: Fixed
+) -> list[Warning]:
+    told = []
     condition = problem.excitation.condition
     if condition is not None and condition > ILL_CONDITIONED:
-        found.append(
+        text = (
             f"the physics is ill-conditioned on the data (condition {condition:.1e} of the scaled columns): "
             "θ is determined, but small changes of the data move it far."
         )
-    if learned.code == SPANNED:
-        found.append(
+        told.append(Warning("ill_conditioned", text))
+    if learned.ending is Ending.SPANNED:
+        text = (
             "the learner lies in the span of the physics (P⊥J = 0): there is nothing for it to learn that the "
             "physics does not express already. Give it another form or other inputs, or leave it out."
         )
-    if learned.free is not None and not np.isfinite(learned.free.mean_square):
-        found.append(
+        told.append(Warning("learner_spanned", text))
+    if learned.errors is not None and not np.isfinite(learned.errors.mean_square):
+        text = (
             "the free run diverges over whole experiments of the training data, so it has no loss; train with longer "
             "segments, or bound what makes it run away."
         )
+        told.append(Warning("free_run_diverges", text))
     if learned.elsewhere:
-        found.append("no standard errors: the function was trained elsewhere.")
-    elif not _unique(structure, learned):
-        found.append(
+        told.append(Warning("no_standard_errors", "no standard errors: the function was trained elsewhere."))
+    elif not identified:
+        text = (
             f"θ of the {structure.name} structure is not unique (it depends on the learner's start or on the "
             "penalty), so it has no standard error; use the orthogonal structure for parameters."
         )
+        told.append(Warning(NOT_UNIQUE, text))
     elif noise is None:
-        found.append(
+        text = (
             f"no standard errors: {len(problem.rows)} rows leave no degrees of freedom for "
             f"{len(problem.baseline.names)} parameters and {learned.effective:.1f} effective weights; "
             "use more data or a smaller learner."
         )
+        told.append(Warning("no_standard_errors", text))
     if fixed:
         names = ", ".join(f"{problem.baseline.names[i]} = {value:g}" for i, value in fixed.items())
-        found.append(
+        text = (
             f"at a bound: {names}. What stands at a bound has no standard error, and those of the others hold "
             "with it fixed there; data that contradict a bound contradict the physics or the bound."
         )
-    return found
+        told.append(Warning("at_a_bound", text))
+    return told

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from orthaug._base.checks import check_count
 from orthaug._base.errors import InputError
@@ -13,9 +14,15 @@ class Prediction:
     """Declaration: the error of the prediction `horizon` steps ahead; 1 is the paper's criterion (eq:cost_fun)."""
 
     horizon: int = 1
+    free_run: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         check_count(self.horizon, "horizon")
+
+    @property
+    def one_step(self) -> bool:
+        """Whether it is the error one step ahead, which is linear in θ."""
+        return self.horizon == 1
 
     @property
     def flown(self) -> Simulation | None:
@@ -41,6 +48,8 @@ class Simulation:
     washout: int = 40
     start_iterations: int = 20
     exact_start: bool | None = None
+    free_run: ClassVar[bool] = True
+    one_step: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         for name in ("segment", "washout", "start_iterations"):

@@ -11,6 +11,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError
+from orthaug._base.warning import Warning
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.status import Status
 from orthaug.inference.covariance import interval
@@ -25,6 +26,10 @@ from orthaug.physics.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+NOT_UNIQUE = "theta_not_unique"
+"""The code of the warning that a split under a measure makes untrue."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +67,7 @@ class Estimate:
     """What θ was split under, if not the training measure."""
     at_bound: Mapping[str, float] = field(default_factory=dict)
     """Parameters that stand at a bound, with its value."""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Warning, ...] = ()
 
     @property
     def theta(self) -> Vector:
@@ -74,7 +79,7 @@ class Estimate:
         """Φ⁺Y (nθ,), what one-step least squares gives, where θ was trained on something else; None otherwise."""
         if self.criterion.flown is None:
             return None
-        return self.problem.projection.solve(self.problem.whitened_target)
+        return self.problem.least_squares
 
     @property
     def std(self) -> Vector | None:
@@ -120,7 +125,8 @@ class Estimate:
                 "leave; drop the bounds, or keep the training measure."
             )
         support = Support(self.problem.record, self.problem.layout, self.model.form.used)
-        found, joint = split_under(measure, self.model, support, self.model.joint), self.model.joint
+        joint = self.model.statistics.joint(len(self.theta))
+        found = split_under(measure, self.model, support, joint)
         if found.covariance is not None:
             training = self.covariance if self.measure is None else None
             training = split_under(Training(), self.model, support, joint).covariance if training is None else training
@@ -128,7 +134,8 @@ class Estimate:
                 price = np.sqrt(np.diag(found.covariance) / np.diag(np.asarray(training)))
             found = replace(found, price=price)
         ensemble = found.covariance is None and self.model.numbers.tilt is not None
-        unknown = ("no standard errors after a split: an ensemble has no gradient in its weights.",) if ensemble else ()
+        text = "no standard errors after a split: an ensemble has no gradient in its weights."
+        unknown = (Warning("no_standard_errors", text),) if ensemble else ()
         numbers = self.model.numbers._replace(theta=found.theta, theta_aux=found.theta_aux)
         return replace(
             self,
@@ -136,12 +143,12 @@ class Estimate:
             covariance=found.covariance,
             defect=found.defect,
             measure=found,
-            warnings=(*(w for w in self.warnings if "not unique" not in w), *found.warnings, *unknown),
+            warnings=(*(w for w in self.warnings if w.code != NOT_UNIQUE), *found.warnings, *unknown),
         )
 
     def joint_covariance(self, convention: str = "calibrated") -> Matrix:
         """Cov of θ̂ and the weights from the raw `[Φ P⊥J]`, (nθ + nw)²; convention "paper" for eq:cov_approx / N."""
-        if self.criterion.flown is not None or (self.model.gram is None and self.model.numbers.tilt is None):
+        if self.criterion.flown is not None or (self.model.statistics.gram is None and self.model.numbers.tilt is None):
             raise InputError("the joint covariance is that of a one-step fit with statistics of its own.")
         return joint_covariance(self.problem, self.model, convention)
 
@@ -151,7 +158,7 @@ class Estimate:
         Raises:
             InputError: θ that is not `Φ⁺Y`: of another structure or measure, at a bound, or trained on the free run.
         """
-        plain = self.covariance is not None and self.measure is None and isinstance(self.criterion, Prediction)
+        plain = self.covariance is not None and self.measure is None and self.criterion.flown is None
         if not plain or self.at_bound:
             raise InputError(
                 "robust standard errors are those of θ = Φ⁺Y: an orthogonal structure under the training measure, "

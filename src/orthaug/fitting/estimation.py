@@ -15,38 +15,23 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import jax, jnp
 from orthaug._base.parallel import spread
 from orthaug.data.record import Record
-from orthaug.data.regressors import Lags
-from orthaug.fitting.conclusion import conclude, nothing_learned
-from orthaug.fitting.criteria import Criterion, Prediction, Simulation
-from orthaug.fitting.ensemble import combine
+from orthaug.data.regressors import Features, Lags
+from orthaug.fitting.conclusion import conclude
+from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.estimates import Estimate, Restart
-from orthaug.fitting.free_run import FreeRun
-from orthaug.fitting.learned import Learned
-from orthaug.fitting.one_step import Solver, Task
-from orthaug.fitting.solvers.levenberg_marquardt import (
-    CONVERGED,
-    NO_DESCENT,
-    NON_FINITE,
-    RUNNING,
-    SPANNED,
-    LevenbergMarquardt,
-)
-from orthaug.fitting.status import Status
+from orthaug.fitting.free_run import FreeRunTask
+from orthaug.fitting.learned import Learned, Task
+from orthaug.fitting.one_step import OneStepTask
+from orthaug.fitting.solvers import AdamLBFGS, LevenbergMarquardt
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.inference.measures import Training
-from orthaug.models.learners import MLP, Bound, External, Learner, Scaling
+from orthaug.models.learners import MLP, External, Learner, Scaling
 from orthaug.models.model import Model
+from orthaug.models.rows import Engine, InMemory
 from orthaug.physics.baseline import Baseline
-from orthaug.physics.problem import pose
+from orthaug.physics.problem import Problem, pose
 
-_CODES = {
-    RUNNING: "iteration_limit",
-    CONVERGED: "converged",
-    SPANNED: "converged",
-    NO_DESCENT: "no_descent",
-    NON_FINITE: "non_finite",
-}
-
+Solver = LevenbergMarquardt | AdamLBFGS
 Regularization = str | float
 Progress = Callable[[int, int, float], None]
 """Called now and then with the number of the restart, the iteration and the loss."""
@@ -106,31 +91,78 @@ def estimate(
         >>> f"{fit.theta[0]:.3f}"
         '2.000'
     """
-    _check_arguments(record, baseline, lags, learner, structure, criterion, solver, initial, validation)
-    _check_splittable(structure, baseline, learner)
-    flown = criterion.flown is not None
+    _check_record(record, baseline, lags, initial)
+    model = initial.model if isinstance(initial, Estimate) else initial
+    inputs = None if learner is None else learner.inputs
+    if model is not None:
+        inputs = tuple(str(entry) for entry in model.form.features.entries)
+    return fit(
+        pose(record, baseline, lags, inputs),
+        learner=learner,
+        structure=structure,
+        criterion=criterion,
+        solver=solver,
+        regularization=regularization,
+        restarts=restarts,
+        seed=seed,
+        ensemble=ensemble,
+        initial=model,
+        validation=validation,
+        progress=progress,
+    )
+
+
+def fit(
+    problem: Problem,
+    *,
+    learner: Learner | None = MLP(),  # noqa: B008  (frozen)
+    structure: Structure = Orthogonal(),  # noqa: B008  (frozen)
+    criterion: Criterion = Prediction(),  # noqa: B008  (frozen)
+    solver: Solver = LevenbergMarquardt(),  # noqa: B008  (frozen)
+    regularization: Regularization | Sequence[Regularization] = "none",
+    restarts: int = 1,
+    seed: int = 0,
+    ensemble: bool = False,
+    initial: Model | None = None,
+    validation: Record | None = None,
+    progress: Progress | None = None,
+    engine: Engine = InMemory(),  # noqa: B008  (frozen)
+) -> Estimate:
+    """`estimate` for a problem that is posed already, for what the learner is to see.
+
+    Args:
+        problem: record and physics; the other arguments as of `estimate`.
+        learner: None for physics alone, on the rows of the problem.
+        engine: where the rows of a one-step criterion are, and who sums over them.
+
+    Raises:
+        InputError: as `estimate`.
+    """
+    _check_choices(learner, structure, criterion, solver, initial, validation)
+    _check_splittable(structure, problem.baseline, learner)
     choices = _regularizations(regularization, validation)
     if ensemble and (restarts < 2 or initial is not None):
         raise InputError("an ensemble needs `restarts` of 2 or more to be the median of.")
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
     if seed + restarts >= 2**63:
         raise InputError(f"`seed` must be below 2**63; got {seed}.")
+    problem = replace(problem, features=Features(())) if learner is None and initial is None else problem
+    warm = None
     if initial is not None:
-        task, w, start = _warm_start(record, baseline, lags, initial)
-        starts = [_Start(0, w, choice) for choice in choices]
-        place = FreeRun.of(task.problem, task, criterion, start) if flown else task
-        return _train(place, starts, structure, solver, validation, progress)
-    problem = pose(record, baseline, lags, None if learner is None else learner.inputs)
-    if learner is None and not flown:
-        return conclude(problem, structure, nothing_learned(problem), Status("exact", 0, 0.0, np.nan))
-    if learner is None:
-        place = FreeRun.of(problem, None, criterion)
-        return _train(place, [_Start(seed, np.zeros(0), "none")], structure, solver, validation, progress)
-    task = Task.of(problem, learner)
-    weights = {s: task.bound.init(jax.random.key(s)) for s in range(seed, seed + restarts)}
-    starts = [_Start(s, w, choice) for choice in choices for s, w in weights.items()]
-    place = FreeRun.of(problem, task, criterion) if flown else task
-    return _train(place, starts, structure, solver, validation, progress, ensemble)
+        task, weights, warm = _warm_start(problem, initial, engine)
+        starts = [_Start(0, weights, choice) for choice in choices]
+    else:
+        task = OneStepTask.of(problem, learner, engine=engine)
+        seeds = range(seed, seed + restarts) if learner is not None else (seed,)
+        keyed = {s: np.zeros(0) if task.bound is None else task.bound.init(jax.random.key(s)) for s in seeds}
+        starts = [_Start(s, w, choice) for choice in choices for s, w in keyed.items()]
+    solved = criterion.one_step and problem.baseline.linear
+    if task.bound is None and solved:
+        return conclude(task, structure, task.physics_learned())
+    if task.bound is None:
+        starts = [_Start(seed, np.zeros(0), "none")]
+    trained = task if solved else FreeRunTask.of(task, criterion, warm)
+    return _train(trained, task, starts, structure, solver, validation, progress, ensemble and task.bound is not None)
 
 
 def _check_splittable(structure: Structure, baseline: Baseline, learner: Learner | None) -> None:
@@ -147,7 +179,7 @@ def _check_splittable(structure: Structure, baseline: Baseline, learner: Learner
 
 def _splits(structure: Structure) -> bool:
     """Whether θ is split off under another measure than that of training."""
-    return isinstance(structure, Orthogonal) and structure.measure != Training()
+    return structure.projects and structure.measure != Training()
 
 
 def orthogonalize(
@@ -168,28 +200,23 @@ def orthogonalize(
     problem = pose(record, baseline, lags)
     ny, nz = len(problem.outputs), len(problem.features.entries)
     external = External(function, ny=ny)
-    bound = Bound(external, nz, ny)
-    values = external.values(problem.feature_rows())
+    external.values(problem.feature_rows()[:1])  # a wrong shape is told here, not from inside of compiled code
     scaling = Scaling(np.zeros(nz), np.ones(nz))
-    learned = Learned(bound, np.zeros(0), scaling, np.ones(ny), values, elsewhere=True)
-    return conclude(problem, Orthogonal(), learned, Status("exact", 0, 0.0, np.nan))
+    task = OneStepTask.of(problem, external, scaling, np.ones(ny))
+    return conclude(task, Orthogonal(), Learned(task.bound, np.zeros(0), scaling, np.ones(ny), elsewhere=True))
 
 
-def _warm_start(
-    record: Record, baseline: Baseline, lags: Lags | None, initial: Estimate | Model
-) -> tuple[Task, Float[Array, "nw"], Vector]:
+def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStepTask, Float[Array, "nw"], Vector]:
     """The task of going on from an earlier model's weights, in its scaling; and the model's c."""
-    model = initial.model if isinstance(initial, Estimate) else initial
     bound, numbers = model.form.bound, model.numbers
     if numbers.tilt is not None:
         raise InputError("`initial` is an ensemble, which has no single weights to start from; fit anew.")
     if bound is None:
         raise InputError("`initial` is physics alone and has nothing to start from; leave it out.")
-    problem = pose(record, baseline, lags, tuple(str(entry) for entry in model.form.features.entries))
     if len(problem.outputs) != bound.ny:
         raise InputError(f"`initial` has {bound.ny} outputs, the record {len(problem.outputs)}; fit anew.")
     scaling = Scaling(np.asarray(numbers.centre), np.asarray(numbers.halfwidth))
-    task = Task.of(problem, bound.learner, scaling, np.asarray(numbers.gain))
+    task = OneStepTask.of(problem, bound.learner, scaling, np.asarray(numbers.gain), engine)
     return task, jnp.asarray(numbers.weights), model.theta - model.theta_aux
 
 
@@ -203,7 +230,8 @@ class _Start:
 
 
 def _train(
-    task: Task | FreeRun,
+    task: Task,
+    rows: OneStepTask,
     starts: Sequence[_Start],
     structure: Structure,
     solver: Solver,
@@ -221,29 +249,31 @@ def _train(
             if progress is not None:
                 progress(i, iteration, loss)
 
-        return task.run(solver, start.weights, structure, start.regularization, tell)  # type: ignore[arg-type]
+        return task.run(solver, start.weights, structure, start.regularization, tell)
 
-    criterion = task.declared if isinstance(task, FreeRun) else Prediction()
+    def concluded(learned: Learned) -> Estimate:
+        return replace(conclude(rows, structure, learned), criterion=task.criterion)
+
     runs = spread(one, list(enumerate(starts)))
-    losses = [task.loss(run) for run in runs]
-    concluded, errors = {}, [math.nan] * len(runs)
+    losses, errors = [task.loss(run) for run in runs], [math.nan] * len(runs)
+    tried: dict[int, Estimate] = {}
     if validation is not None:
-        concluded = {i: _concluded(task, structure, run) for i, run in enumerate(runs)}
-        errors = [_validation_error(fit, validation, criterion) for fit in concluded.values()]
+        tried = {i: concluded(task.learned(run)) for i, run in enumerate(runs)}
+        errors = [_validation_error(one, validation) for one in tried.values()]
     ranking = np.array(losses if validation is None else errors)
     best = int(np.nanargmin(ranking)) if np.isfinite(ranking).any() else 0
+    members = [best]
     if ensemble:
-        members = [i for i, run in enumerate(runs) if starts[i].regularization == starts[best].regularization]
-        fit = _concluded(task, structure, runs[best], [runs[i] for i in members])
+        members = [i for i in range(len(runs)) if starts[i].regularization == starts[best].regularization]
+        estimate = concluded(_median(task, rows, runs, members, best))
     else:
-        members = [best]
-        fit = concluded[best] if validation is not None else _concluded(task, structure, runs[best])
+        estimate = tried[best] if validation is not None else concluded(task.learned(runs[best]))
     restarts = tuple(
         Restart(
             seed=start.seed,
             loss=_finite(losses[i]),
             iterations=run.iterations,
-            code=_CODES[run.code],
+            code=run.ending.code,
             chosen=i in members,
             regularization=start.regularization,
             validation=_finite(errors[i]),
@@ -251,28 +281,24 @@ def _train(
         for i, (start, run) in enumerate(zip(starts, runs, strict=True))
     )
     seconds = sum(run.seconds for run in runs)
-    fit = replace(fit, criterion=criterion, restarts=restarts, status=replace(fit.status, seconds=seconds))
-    split_off = isinstance(structure, Orthogonal) and _splits(structure) and fit.status.ok and task.bound is not None
-    return fit.split(structure.measure) if split_off else fit  # type: ignore[attr-defined]
+    estimate = replace(estimate, restarts=restarts, status=replace(estimate.status, seconds=seconds))
+    split_off = _splits(structure) and estimate.status.ok and task.bound is not None
+    return estimate.split(structure.measure) if split_off else estimate
 
 
-def _concluded(task: Task | FreeRun, structure: Structure, run: Any, members: Sequence[Any] = ()) -> Estimate:
-    """The estimate that a run leads to, or the median of several `members` with it as the best one."""
-    learned = task.learned(run)
-    if members:
-        found = [learned if member is run else task.learned(member) for member in members]
-        found = [one for one in found if np.isfinite(one.values).all()]
-        learned = combine(task, found, found.index(learned)) if learned in found else learned
-    code = _CODES[run.code] if np.isfinite(learned.values).all() else "non_finite"
-    return conclude(task.problem, structure, learned, Status(code, run.iterations, run.seconds, np.nan))
+def _median(task: Task, rows: OneStepTask, runs: Sequence[Any], members: Sequence[int], best: int) -> Learned:
+    """The median of the members that have a value everywhere; the best one alone if it has none."""
+    found = {i: task.learned(runs[i]) for i in members}
+    sound = [i for i, one in found.items() if np.isfinite(rows.share(one).square)]
+    return task.median([found[i] for i in sound], sound.index(best)) if best in sound else found[best]
 
 
-def _validation_error(fit: Estimate, validation: Record, criterion: Criterion) -> float:
+def _validation_error(fit: Estimate, validation: Record) -> float:
     """Mean squared error with each output in its training standard deviation; NaN without a model or a value."""
     if not fit.status.ok:
         return math.nan
-    free_run = isinstance(criterion, Simulation)
-    response = fit.model.simulate(validation) if free_run else fit.model.predict(validation, criterion.horizon)
+    criterion, model = fit.criterion, fit.model
+    response = model.simulate(validation) if criterion.free_run else model.predict(validation, criterion.horizon)
     rmse = response.scores().rmse
     return float(np.mean((rmse * fit.problem.weight) ** 2))
 
@@ -281,29 +307,23 @@ def _finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _check_arguments(
-    record: Any,
-    baseline: Any,
-    lags: Any,
-    learner: Any,
-    structure: Any,
-    criterion: Any,
-    solver: Any,
-    initial: Any,
-    validation: Any,
-) -> None:
+def _check_record(record: Any, baseline: Any, lags: Any, initial: Any) -> None:
     check_type(record, Record, "record", "a Record")
     check_type(baseline, Baseline, "baseline", "a Baseline")
     check_type(lags, Lags | None, "lags", "Lags(…) or None")
+    check_type(initial, Estimate | Model | None, "initial", "an Estimate, a Model or None")
+
+
+def _check_choices(learner: Any, structure: Any, criterion: Any, solver: Any, initial: Any, validation: Any) -> None:
     check_type(learner, Learner | None, "learner", "a learner such as MLP(), or None")
     check_type(structure, Structure, "structure", "a structure such as Orthogonal()")
     check_type(criterion, Criterion, "criterion", "Prediction(…) or Simulation(…)")
-    if criterion.flown is not None and not isinstance(solver, LevenbergMarquardt):
+    if criterion.flown is not None and not solver.gauss_newton:
         raise InputError(
             "only `LevenbergMarquardt` trains on a free run or more than one step ahead; take that solver."
         )
     check_type(solver, Solver, "solver", "a solver such as LevenbergMarquardt()")
-    check_type(initial, Estimate | Model | None, "initial", "an Estimate, a Model or None")
+    check_type(initial, Model | None, "initial", "a Model or None")
     check_type(validation, Record | None, "validation", "a Record or None")
 
 

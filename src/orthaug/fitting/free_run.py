@@ -1,96 +1,107 @@
 """Training on the free run: θ and the weights together, from a one-step solution (the criterion `Simulation`).
 
-Here θ is an unknown beside the weights (F1 does not hold). Without bounds or penalties the unknown is `c = θ − θ_aux`,
-and θ is split off at the end under the measure of the *measured* regressors (F2), which keeps the orthogonal structure
-exact. Where θ has bounds, it is the unknown itself and `c = θ − Φ⁺F(w)` follows, so that the split cannot leave them.
+Here θ is an unknown beside the weights (F1 does not hold); it is split off at the end over the *measured* regressors
+(F2), which keeps the orthogonal structure exact.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
-from orthaug._base.jax import jnp
 from orthaug.fitting.criteria import Criterion, Simulation
-from orthaug.fitting.learned import FreeStatistics, Learned
-from orthaug.fitting.one_step import Task
-from orthaug.fitting.pasts import Pasts
-from orthaug.fitting.segments import Segments, lay_segments, respond, sensitivity
-from orthaug.fitting.solvers.levenberg_marquardt import NON_FINITE, LevenbergMarquardt, Progress
-from orthaug.fitting.solvers.output_error import Outcome, independent_share, minimise
-from orthaug.fitting.structures import Elimination, Orthogonal, Structure, eliminate
+from orthaug.fitting.elimination import eliminate
+from orthaug.fitting.initial_states import InitialStates, Start
+from orthaug.fitting.learned import ErrorStatistics, Learned
+from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, errors_of
+from orthaug.fitting.one_step import OneStepTask
+from orthaug.fitting.segments import Segments, lay_segments
+from orthaug.fitting.solvers.levenberg_marquardt import MARQUARDT, Descent, LevenbergMarquardt, Progress, descend
+from orthaug.fitting.status import Ending
+from orthaug.fitting.structures import Structure
 from orthaug.inference.covariance import noise_covariance, theta_block, whitening
-from orthaug.models.learners import Bound, Scaling
-from orthaug.models.predictor import Form, Numbers
+from orthaug.models.dynamics import Numbers
+from orthaug.models.lagged import Lagged
+from orthaug.models.learners import Bound
 from orthaug.physics.problem import Problem
 
-_RUNAWAY = 1e6  # mean square in deviations of the output: a free run beyond it has diverged
-_LARGEST_ERROR = 1e120
 _COLOURED_STEPS = 256  # shorter segments do not show how long the errors remember
 _COLOUR_ROWS = 4096  # of each experiment, which show it instead
 _SHORTEST = 4  # steps of a segment
 
 
-@dataclass(frozen=True, eq=False)
-class FreeRun:
-    """A problem laid out in segments, with the learner of a one-step task or none."""
+class Flight(NamedTuple):
+    """A finished run on the free-run criterion."""
 
-    problem: Problem
-    task: Task | None
-    form: Form
+    objective: FreeRunObjective
+    end: Descent
+    mean_square: float
+    iterations: int
+    seconds: float
+
+    @property
+    def ending(self) -> Ending:
+        return self.end.ending
+
+
+@dataclass(frozen=True, eq=False)
+class FreeRunTask:
+    """A problem laid out in segments, beside its rows laid out for one step."""
+
+    task: OneStepTask
+    dynamics: Lagged
     segments: Segments
     whole: Segments
     """What runs are compared over: whole experiments; for a prediction h steps ahead its own segments."""
     colour: Segments | None
     """What the colour of the errors is taken from, where segments are too short to show it."""
-    rms: float
-    declared: Criterion
-    criterion: Simulation
+    criterion: Criterion
+    flown: Simulation
     warm: Vector | None = None
     """c of an earlier model, with whose weights training starts."""
 
     @classmethod
-    def of(cls, problem: Problem, task: Task | None, declared: Criterion, warm: Vector | None = None) -> FreeRun:
-        """Lay the problem's record out as a criterion of several steps declares."""
-        criterion = declared.flown
-        assert criterion is not None, "one step ahead is `Task`'s"
+    def of(cls, task: OneStepTask, criterion: Criterion, warm: Vector | None = None) -> FreeRunTask:
+        """Lay the problem's record out as a criterion of several steps declares.
+
+        Raises:
+            InputError: nothing would be scored.
+        """
+        problem, flown = task.problem, criterion.flown
+        assert flown is not None, "one step ahead is `OneStepTask`'s"
         longest = max(len(e) for e in problem.record.experiments) - problem.rows.start
-        if criterion.washout >= longest:
+        if flown.washout >= longest:
             raise InputError(
                 f"nothing is scored: the longest experiment has {longest} usable rows, and the first "
-                f"{criterion.washout} of a segment are washout; shorten it, or the horizon."
+                f"{flown.washout} of a segment are washout; shorten it, or the horizon."
             )
-        bound = None if task is None else task.bound
-        form = Form(problem.baseline, problem.features, problem.layout, problem.outputs, bound)
-        segments = lay_segments(problem.record, form, criterion.segment, criterion.washout)
-        residual = problem.projection.orthogonal_part(problem.whitened_target)
-        rms = task.rms if task is not None else max(float(np.sqrt(np.mean(residual**2))), 1e-10)
+        record = problem.record
+        dynamics = Lagged(problem.baseline, problem.features, problem.layout, problem.outputs, task.bound)
+        segments = lay_segments(record, dynamics, flown.segment, flown.washout)
         whole, colour = segments, None
-        if isinstance(declared, Simulation) and criterion.segment:
-            whole = lay_segments(problem.record, form, 0, criterion.washout)
-            if segments.scored.shape[1] < _COLOURED_STEPS <= longest:
-                first = tuple(e.rows(0, _COLOUR_ROWS) for e in problem.record.experiments)
-                colour = lay_segments(replace(problem.record, experiments=first), form, 0, criterion.washout)
-        return cls(problem, task, form, segments, whole, colour, rms, declared, criterion, warm)
+        if criterion.free_run and flown.segment:
+            whole = lay_segments(record, dynamics, 0, flown.washout)
+            if segments.steps < _COLOURED_STEPS <= longest:
+                first = tuple(e.rows(0, _COLOUR_ROWS) for e in record.experiments)
+                colour = lay_segments(replace(record, experiments=first), dynamics, 0, flown.washout)
+        return cls(task, dynamics, segments, whole, colour, criterion, flown, warm)
+
+    @property
+    def problem(self) -> Problem:
+        return self.task.problem
+
+    @property
+    def bound(self) -> Bound | None:
+        return self.task.bound
 
     def numbers(self, c: Vector, w: Any, tilt: Any = None) -> Numbers:
         """The model's numbers before the split."""
-        return Numbers(c, np.zeros_like(c), np.asarray(w), self.scaling.centre, self.scaling.halfwidth, self.unit, tilt)
-
-    def errors(self, c: Vector, w: Any, past: Any) -> Float[np.ndarray, "k T ny m"]:
-        """Errors of every segment from its past, in the outputs' units; 0 where they are not scored."""
-        return self._errors(self.numbers(c, w), past, self.segments)
-
-    def _errors(self, numbers: Numbers, past: Any, segments: Segments) -> Float[np.ndarray, "k T ny m"]:
-        run = np.asarray(respond(self.form, numbers, segments, jnp.asarray(past)))
-        with np.errstate(all="ignore"):
-            return np.where(np.asarray(segments.scored)[:, :, None], np.asarray(segments.target) - run, 0.0)
+        scaling = self.task.scaling
+        return Numbers(c, np.zeros_like(c), np.asarray(w), scaling.centre, scaling.halfwidth, self.task.unit, tilt)
 
     def run(
         self,
@@ -105,311 +116,163 @@ class FreeRun:
         Training goes on from whichever flies better, the weights after the one-step training or those before it:
         a good one-step predictor may run away.
         """
-        objective = Objective.of(self, structure)
-        places, begun, seconds = [objective.start(np.asarray(w))], 0, 0.0
+        objective = self.objective(structure)
+        nowhere = Start(objective.initial.measured)
+        places, begun, seconds = [objective.begin(np.asarray(w))], 0, 0.0
         evidence = regularization == "evidence"
         ridge = 1.0 if evidence else 0.0 if regularization == "none" else float(regularization)
-        if self.task is not None and self.criterion.start_iterations:
-            short = LevenbergMarquardt(self.criterion.start_iterations, solver.tolerance)
+        if self.bound is not None and self.flown.start_iterations:
+            short = LevenbergMarquardt(self.flown.start_iterations, solver.tolerance)
             first = self.task.run(short, w, structure, regularization, progress)
-            begun, seconds = first.iterations, first.seconds
-            places.append(objective.start(np.asarray(first.w)))
-            ridge = first.ridge
+            begun, seconds, ridge = first.iterations, first.seconds, first.ridge
+            places.append(objective.begin(np.asarray(first.w)))
         if self.warm is not None and not objective.follows:
             places.append(np.concatenate([self.warm, np.asarray(w)]))
-        losses = [objective.loss(p) for p in places]
-        if not np.isfinite(losses).any() and self.segments.scored.shape[1] > _SHORTEST:
+        losses = [objective.fly(p, nowhere).loss for p in places]
+        if not np.isfinite(losses).any() and self.segments.steps > _SHORTEST:
             shorter = self._shorter().run(solver, w, structure, regularization, progress)
-            places, losses = [shorter.found.p], [objective.loss(shorter.found.p)]
+            places, losses = [shorter.end.flown.p], [0.0]
             begun, seconds = begun + shorter.iterations, seconds + shorter.seconds
 
         def tell(iteration: int, loss: float) -> None:
             if progress is not None:
-                progress(begun + iteration, loss * self.rms**2 / (self.segments.count * len(self.form.outputs)))
+                progress(begun + iteration, loss * self.task.rms**2 / self._residuals)
 
-        found = objective.minimise(places[int(np.argmin(losses))], solver, ridge, evidence, tell)
-        _, c, w = objective.end
-        iterations, seconds = begun + found.iterations, seconds + found.seconds
-        return Flight(w, c, objective, found, found.code, self.mean_square(c, w), iterations, seconds)
+        begin = places[int(np.argmin(losses))]
+        objective, end = self._descend(objective, begin, solver, ridge, evidence, tell)
+        flown = end.flown
+        spent = (begun + end.iterations, seconds + end.seconds)
+        return Flight(objective, end, self.mean_square(flown.c, flown.w), *spent)
 
-    def _shorter(self) -> FreeRun:
+    def objective(self, structure: Structure) -> FreeRunObjective:
+        """The criterion as a function of θ and the weights."""
+        start = np.asarray(self.segments.start)
+        return FreeRunObjective(
+            dynamics=self.dynamics,
+            task=self.task,
+            numbers=self.numbers,
+            segments=self.segments,
+            initial=InitialStates(start, start.size > 0 and self.flown.estimates_pasts),
+            elimination=eliminate(structure, self.problem),
+            projects=structure.projects,
+            weight=np.diag(self.problem.weight) / self.task.rms,
+            colour=self.colour,
+        )
+
+    def _descend(
+        self,
+        objective: FreeRunObjective,
+        p: Vector,
+        solver: LevenbergMarquardt,
+        ridge: float,
+        evidence: bool,
+        tell: Progress,
+    ) -> tuple[FreeRunObjective, Descent]:
+        """From p to the end; several outputs are weighted by their errors' covariance in a second leg."""
+        ny = len(self.problem.outputs)
+        options: dict[str, Any] = {"tolerance": solver.tolerance, "evidence": evidence, "bounds": objective.bounds}
+        options |= {"damping": MARQUARDT}
+        first = solver.iterations if ny == 1 else solver.iterations // 2
+        start = Start(objective.initial.measured)
+        end = descend(objective, p, start, iterations=first, ridge=ridge, progress=tell, **options)
+        noise = self._noise(objective, end) if ny > 1 and end.ending.usable else None
+        white = None if noise is None else whitening(noise)
+        if noise is None or white is None:
+            return objective, end
+        size = np.trace(objective.weight @ noise @ objective.weight.T) / ny  # so that the ridge keeps its place
+        objective = replace(objective, weight=np.sqrt(size) * white)
+        done = end.iterations
+        again = descend(
+            objective,
+            end.flown.p,
+            Start(end.flown.states),
+            iterations=solver.iterations - done,
+            ridge=end.ridge,
+            progress=lambda i, loss: tell(done + i, loss),
+            **options,
+        )
+        return objective, again._replace(iterations=done + again.iterations, seconds=end.seconds + again.seconds)
+
+    def _shorter(self) -> FreeRunTask:
         """The same over segments of a quarter of the length, from which training reaches where longer ones run away."""
-        segment = max(_SHORTEST, self.segments.scored.shape[1] // 4)
-        shorter = replace(self.criterion, segment=segment, washout=min(self.criterion.washout, segment // 2))
-        return FreeRun.of(self.problem, self.task, shorter)
+        segment = max(_SHORTEST, self.segments.steps // 4)
+        shorter = replace(self.flown, segment=segment, washout=min(self.flown.washout, segment // 2))
+        return FreeRunTask.of(self.task, shorter)
 
-    def loss(self, flight: Flight) -> float:
+    @property
+    def _residuals(self) -> int:
+        """How many errors are scored."""
+        return self.segments.count * len(self.problem.outputs)
+
+    def loss(self, run: Flight) -> float:
         """The run's `mean_square`."""
-        return flight.mean_square
+        return run.mean_square
 
     def mean_square(self, c: Vector, w: Any, tilt: Any = None) -> float:
         """Mean of squared errors over whole experiments, in deviations of the outputs; NaN where it diverges."""
-        numbers = self.numbers(c, w, tilt)
         with np.errstate(all="ignore"):
-            errors = self._errors(numbers, self.whole.past, self.whole) * self.problem.weight[:, None]
-            found = float(np.sum(errors**2)) / (self.whole.count * len(self.form.outputs))
-        return found if found < _RUNAWAY else np.nan
+            errors = errors_of(self.dynamics, self.numbers(c, w, tilt), self.whole.start, self.whole)
+            scaled = errors * self.problem.weight[:, None]
+            mean = float(np.sum(scaled**2)) / (self.whole.count * len(self.problem.outputs))
+        return mean if mean < RUNAWAY else np.nan
 
-    def learned(self, flight: Flight) -> Learned:
+    def learned(self, run: Flight) -> Learned:
         """What a run left, with the statistics of its errors."""
+        end, objective = run.end, run.objective
+        linear = end.linear
+        gram = None if linear is None else linear.information * self.task.rms**2
+
+        def middle(noise: Matrix) -> Matrix:
+            """ΣψᵀΣ_eψ of the rows of `gram`, which are white where `weight` made them so."""
+            assert gram is not None
+            change = objective.weight / self.problem.weight  # of errors in whitened outputs
+            white = change @ noise @ change.T * self.task.rms**2
+            return gram * float(np.trace(white)) / len(white)
+
         return Learned(
-            bound=self.form.bound,
-            weights=np.asarray(flight.w),
-            scaling=self.scaling,
-            unit=self.unit,
-            values=np.zeros_like(self.problem.target) if self.task is None else self.task.values(flight.w),
-            effective=flight.found.effective,
-            gram=flight.objective.gram,
-            ridge=flight.found.ridge * self.rms**2,
-            middle=flight.objective.middle,
-            code=flight.code,
-            iterations=flight.iterations,
-            seconds=flight.seconds,
-            coefficients=flight.c,
-            free=flight.objective.statistics(flight),
+            bound=self.bound,
+            weights=end.flown.w,
+            scaling=self.task.scaling,
+            unit=self.task.unit,
+            ending=end.ending,
+            iterations=run.iterations,
+            seconds=run.seconds,
+            effective=end.effective,
+            gram=gram,
+            ridge=end.ridge * self.task.rms**2,
+            middle=middle,
+            coefficients=end.flown.c,
+            errors=self._errors(run),
         )
 
-    @property
-    def bound(self) -> Bound | None:
-        return self.form.bound
+    def median(self, members: list[Learned], best: int) -> Learned:
+        """The median of several, with the error of its own free run."""
+        learned = self.task.median(members, best)
+        assert learned.errors is not None and learned.coefficients is not None
+        own = self.mean_square(learned.coefficients, learned.weights, learned.tilt)
+        return replace(learned, errors=learned.errors._replace(mean_square=own))
 
-    @property
-    def scaling(self) -> Scaling:
-        return Scaling(np.zeros(0), np.zeros(0)) if self.task is None else self.task.scaling
-
-    @property
-    def unit(self) -> Vector:
-        return np.zeros(len(self.problem.outputs)) if self.task is None else self.task.unit
-
-
-class Flight(NamedTuple):
-    """A finished run on the free-run criterion."""
-
-    w: Vector
-    c: Vector
-    objective: Objective
-    found: Outcome
-    code: int
-    mean_square: float
-    iterations: int
-    seconds: float
-
-
-@dataclass(eq=False)
-class Objective:
-    """`‖r‖²` of the free run and of the structure's rows, as a function of p = (θ, w).
-
-    `weight` (ny, ny) multiplies the errors of a step; `follows` says that c follows θ, `c = θ − Φ⁺F(w)`.
-    """
-
-    free_run: FreeRun
-    elimination: Elimination
-    orthogonal: bool
-    weight: Matrix
-    pasts: Pasts
-    errors: Any = None
-    """Of the last `loss`, (k, T, ny, m); after `minimise` those of its end."""
-    end: tuple[Vector, Vector, Vector] = (np.zeros(0),) * 3
-    """(unknown θ, c, w) where `minimise` ended."""
-    _flown: tuple[float, Any] = (np.inf, None)
-    """Loss and pasts of the last `loss`."""
-    _anchor: tuple[float, Vector] | None = None
-    """Loss and (c, w) of the last `normal`."""
-
-    @classmethod
-    def of(cls, free_run: FreeRun, structure: Structure) -> Objective:
-        weight = np.diag(free_run.problem.weight) / free_run.rms
-        past = np.asarray(free_run.segments.past)
-        free = past.size > 0 and free_run.criterion.estimates_pasts
-        elimination = eliminate(structure, free_run.problem)
-        return cls(free_run, elimination, isinstance(structure, Orthogonal), weight, Pasts(past, past, free))
-
-    @property
-    def follows(self) -> bool:
-        return self.orthogonal and self.elimination.bounded and self.free_run.task is not None
-
-    def start(self, w: Vector) -> Vector:
-        """p of the one-step θ for the weights w."""
-        problem, task = self.free_run.problem, self.free_run.task
-        values = np.zeros_like(problem.target) if task is None else task.values(w) * problem.weight
-        f = problem.projection.coordinates(values)
-        if self.orthogonal:
-            theta = self.elimination.theta(0 * f, self.elimination.active(0 * f))
-            theta = theta if self.follows else theta - problem.projection.from_coordinates(f)
-        else:
-            theta = self.elimination.theta(f, self.elimination.active(f))
-        return np.concatenate([theta, w])
-
-    def place(self, p: Vector) -> tuple[Vector, Vector, Vector]:
-        """(unknown θ, c, w) of p; without bounds on an orthogonal θ the unknown is c itself."""
-        nt = len(self.free_run.problem.baseline.names)
-        theta, w = p[:nt], p[nt:]
-        c = theta - self.free_run.problem.projection.from_coordinates(self._share(w)) if self.follows else theta
-        return theta, c, w
-
-    def loss(self, p: Vector) -> float:
-        """‖r‖² with the structure's rows; infinite where a free run diverges.
-
-        The pasts follow p to first order; where that does not lower the loss, they stay.
-        """
-        theta, c, w = self.place(p)
-        tried = [self.pasts.values]
-        if self._anchor is not None and self.pasts.free:
-            tried.insert(0, self.pasts.after(np.concatenate([c, w]) - self._anchor[1]))
-        flights = []
-        for past in tried:
-            errors = self.free_run.errors(c, w, past)
-            with np.errstate(all="ignore"):
-                total = float(np.sum(np.einsum("oi,ktim->ktom", self.weight, errors) ** 2))
-                total += self.pasts.loss(past, self.weight)
-            flights.append((total if total < self._largest else np.inf, past, errors))
-            if self._anchor is None or total < self._anchor[0]:
-                break
-        best, past, self.errors = min(flights, key=lambda flight: flight[0])
-        self._flown = best, past
-        rows = self.elimination.rows
-        if len(rows.target):
-            miss = rows.target - rows.theta @ theta - rows.learner @ self._share(w)
-            best += float(miss @ miss) / self.free_run.rms**2
-        return best
-
-    def normal(self, p: Vector) -> tuple[Matrix, Vector]:
-        """JᵀJ and Jᵀr at the p of the last `loss`."""
-        theta, c, w = self.place(p)
-        total, self.pasts.values = self._flown
-        self._anchor = total, np.concatenate([c, w])
-        hessian, gradient = self._linearise(c, w)
-        rows, rms = self.elimination.rows, self.free_run.rms
-        if self.follows:
-            change = self._change(w)
-            hessian, gradient = change.T @ hessian @ change, change.T @ gradient
-        if len(rows.target):
-            slope = np.column_stack([rows.theta, rows.learner @ self._share_slope(w)]) / rms
-            miss = (rows.target - rows.theta @ theta - rows.learner @ self._share(w)) / rms
-            hessian, gradient = hessian + slope.T @ slope, gradient + slope.T @ miss
-        return hessian, gradient
-
-    def samples(self) -> tuple[float, float]:
-        """Number of residuals less the physics' own parameters, and the share of them that is independent."""
-        nt, ny = len(self.free_run.problem.baseline.names), len(self.weight)
-        errors = self.errors if self.free_run.colour is None else self._long_errors()
-        moved = np.moveaxis(errors, 1, -1).swapaxes(1, 2)  # (k, m, ny, T)
-        shares = [independent_share(moved[:, :, i].reshape(-1, moved.shape[-1])) for i in range(ny)]
-        return self.free_run.segments.count * ny - nt, float(np.mean(shares))
-
-    def _long_errors(self) -> Any:
-        """Errors at the last linearisation over stretches that are long enough to show their colour."""
-        run, nt = self.free_run, len(self.free_run.problem.baseline.names)
-        assert self._anchor is not None and run.colour is not None
-        numbers = run.numbers(self._anchor[1][:nt], self._anchor[1][nt:])
-        errors = run._errors(numbers, run.colour.past, run.colour)
-        return errors if np.abs(errors).max() < _LARGEST_ERROR else self.errors
-
-    @property
-    def _largest(self) -> float:
-        """A loss beyond which a free run has diverged."""
-        problem, count = self.free_run.problem, self.free_run.segments.count
-        return _RUNAWAY * count * float(np.sum((self.weight / problem.weight) ** 2))
-
-    def minimise(self, p: Vector, solver: LevenbergMarquardt, ridge: float, evidence: bool, tell: Progress) -> Outcome:
-        """From p to the end; several outputs are weighted by their errors' covariance in a second leg."""
-        nt, ny = len(self.free_run.problem.baseline.names), len(self.free_run.problem.outputs)
-        bounded = not self.orthogonal or self.follows or self.free_run.task is None
-        options: dict[str, Any] = {
-            "physics": nt,
-            "tolerance": solver.tolerance,
-            "evidence": evidence,
-            "bounds": (self.elimination.lower, self.elimination.upper) if bounded else None,
-        }
-        first = solver.iterations if ny == 1 else solver.iterations // 2
-        found = minimise(self, p, iterations=first, ridge=ridge, progress=tell, **options)
-        if ny > 1 and found.code != NON_FINITE:
-            self._settle(found.p)
-            noise = self._noise(found)
-            white = None if noise is None else whitening(noise)
-            if noise is not None and white is not None:
-                size = np.trace(self.weight @ noise @ self.weight.T) / ny  # so that the ridge keeps its place
-                self.weight, self._anchor = np.sqrt(size) * white, None
-                done = found.iterations
-                again = minimise(
-                    self,
-                    found.p,
-                    iterations=solver.iterations - done,
-                    ridge=found.ridge,
-                    progress=lambda i, loss: tell(done + i, loss),
-                    **options,
-                )
-                found = again._replace(iterations=done + again.iterations, seconds=found.seconds + again.seconds)
-        self._settle(found.p)
-        return found
-
-    def _settle(self, p: Vector) -> None:
-        """The errors of p itself, where the last trial was another."""
-        self.end = self.place(p)
-        self.errors = self.free_run.errors(*self.end[1:], self.pasts.values)
-
-    @cached_property
-    def information(self) -> Matrix:
-        """SᵀS of (c, w) where training ended, rows times `weight`, the pasts eliminated (nθ + nw)²."""
-        return self._linearise(*self.end[1:])[0]
-
-    @property
-    def gram(self) -> Matrix:
-        """The same in whitened outputs."""
-        return self.information * self.free_run.rms**2
-
-    def middle(self, noise: Matrix) -> Matrix:
-        """ΣψᵀΣ_eψ of the rows of `gram`, which are white where `weight` made them so."""
-        change = self.weight / self.free_run.problem.weight  # of errors in whitened outputs
-        white = change @ noise @ change.T * self.free_run.rms**2
-        return self.gram * float(np.trace(white)) / len(white)
-
-    def statistics(self, flight: Flight) -> FreeStatistics:
+    def _errors(self, run: Flight) -> ErrorStatistics:
         """Noise covariance of the free run and Cov θ̂ from its sensitivities."""
-        found = flight.found
-        theta, _, w = self.end
-        nt = len(theta)
-        freedom = self.free_run.segments.count - (nt + found.effective) / len(self.weight)
-        noise = self._noise(found)
-        sides = (self.elimination.lower, self.elimination.upper)
+        end, objective = run.end, run.objective
+        theta, nt = end.flown.theta, objective.physics
+        freedom = self.segments.count - (nt + end.effective) / len(objective.weight)
+        noise = self._noise(objective, end)
+        sides = (objective.elimination.lower, objective.elimination.upper)
         at_bound = {i: float(value) for i, value in enumerate(theta) if value in (sides[0][i], sides[1][i])}
         covariance = None
-        if noise is not None:
-            information = self.information
-            if self.orthogonal and self.free_run.task is not None:
-                change = self._change(w)
+        if noise is not None and end.linear is not None:
+            information = end.linear.information
+            if objective.projects and self.bound is not None:
+                change = objective.change(end.flown.w)
                 information = change.T @ information @ change
-            white = self.weight @ noise @ self.weight.T
+            white = objective.weight @ noise @ objective.weight.T
             scale = float(np.trace(white)) / len(white)
-            covariance = theta_block(information, found.ridge, nt, tuple(at_bound)) * scale
-        return FreeStatistics(noise, covariance, freedom, flight.mean_square, at_bound)
+            covariance = theta_block(information, end.ridge, nt, tuple(at_bound)) * scale
+        return ErrorStatistics(noise, covariance, freedom, run.mean_square, at_bound)
 
-    def _noise(self, found: Outcome) -> Matrix | None:
-        ny, count = len(self.weight), self.free_run.segments.count
-        used = (len(self.free_run.problem.baseline.names) + found.effective) / ny
-        errors = np.moveaxis(self.errors, 2, -1).reshape(-1, ny)
-        sane = np.abs(errors).max(initial=0.0) < _LARGEST_ERROR  # whose squares still add up
-        return noise_covariance(errors, np.full(ny, count - used)) if sane else None
-
-    def _linearise(self, c: Vector, w: Vector) -> tuple[Matrix, Vector]:
-        run, past = self.free_run, jnp.asarray(self.pasts.values)
-        found = sensitivity(run.form, run.numbers(c, w), run.segments, past, jnp.asarray(self.weight))
-        return self.pasts.eliminate(found, self.weight)
-
-    def _share(self, w: Vector) -> Vector:
-        """QᵀF (nθ,) at the measured regressors, in whitened outputs."""
-        task, problem = self.free_run.task, self.free_run.problem
-        if task is None:
-            return np.zeros(len(problem.baseline.names))
-        return problem.projection.coordinates(task.values(w) * problem.weight)
-
-    def _share_slope(self, w: Vector) -> Matrix:
-        """QᵀJ (nθ, nw) at the measured regressors, in whitened outputs."""
-        task, nt = self.free_run.task, len(self.free_run.problem.baseline.names)
-        return np.zeros((nt, 0)) if task is None else task.overlap(w)
-
-    def _change(self, w: Vector) -> Matrix:
-        """∂(c, w)/∂(θ, w) for `c = θ − Φ⁺F(w)`."""
-        slope = self.free_run.problem.projection.from_coordinates(self._share_slope(w))
-        nt, nw = slope.shape
-        return np.block([[np.eye(nt), -slope], [np.zeros((nw, nt)), np.eye(nw)]])
+    def _noise(self, objective: FreeRunObjective, end: Descent) -> Matrix | None:
+        """Covariance (ny, ny) of the errors, in the outputs' units."""
+        squares, ny = objective.squares(end.flown), len(objective.weight)
+        used = (objective.physics + end.effective) / ny
+        return None if squares is None else noise_covariance(squares, np.full(ny, self.segments.count - used))

@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 from jaxtyping import Array, Float
 
 from orthaug._base.jax import jax, jnp
+from orthaug.fitting.elimination import Elimination, Fixed
 from orthaug.models.learners import Bound
-from orthaug.models.rows import Chunks, row_sum
+from orthaug.models.rows import Chunk, row_sum
+from orthaug.physics.problem import Problem
 
 
 class Physics(NamedTuple):
@@ -25,9 +28,40 @@ class Physics(NamedTuple):
     samples: Float[Array, ""]
     ridge: Float[Array, ""]
 
+    @classmethod
+    def of(
+        cls, problem: Problem, elimination: Elimination, fixed: Fixed, ridge: float, rms: float, *, solved: bool
+    ) -> Physics:
+        """θ from θ⁰ on: every free column scaled to the size of a row, fixed entries without a column.
+
+        Where θ is `solved` (F1), it stands at its end and has no columns: the learner's path does not depend on it.
+        """
+        to_rows = elimination.to_coordinates / rms
+        initial = np.clip(problem.baseline.initial, elimination.lower, elimination.upper)
+        initial = np.array([fixed.get(i, value) for i, value in enumerate(initial)])
+        free = np.array([float(i not in fixed) for i in range(len(initial))])
+        nt = len(initial)
+        scale = free * np.sqrt(len(problem.rows)) / np.linalg.norm(to_rows, axis=0) if nt else free
+
+        def padded(matrix: np.ndarray) -> np.ndarray:
+            return np.concatenate([matrix, np.zeros((nt - len(matrix), *matrix.shape[1:]))])
+
+        penalty = elimination.rows
+        pieces = (
+            elimination.outputs / rms if solved else to_rows @ initial,
+            to_rows * (0.0 if solved else scale),
+            elimination.outputs / rms,
+            padded(penalty.theta * scale) / rms,
+            padded(penalty.learner),
+            padded(penalty.target - penalty.theta @ initial) / rms,
+            problem.target.size,
+            ridge,
+        )
+        return cls(*(jnp.asarray(piece, dtype=float) for piece in pieces))
+
 
 @dataclass(frozen=True)
-class Joint:
+class JointCriterion:
     """The paper's own problem, for gradient solvers: mean square of `Y − Φθ − F` over θ and w together.
 
     In the orthogonal structure the learner enters as P⊥F, which decouples the two (F1).
@@ -37,7 +71,7 @@ class Joint:
     orthogonal: bool
 
     def __call__(
-        self, unknowns: tuple[Float[Array, "nt"], Float[Array, "nw"]], chunks: Chunks, physics: Physics
+        self, unknowns: tuple[Float[Array, "nt"], Float[Array, "nw"]], chunks: Chunk, physics: Physics
     ) -> Float[Array, ""]:
         v, w = unknowns
         miss = physics.outputs - physics.start - physics.basis @ v  # QᵀY − Rθ
@@ -50,7 +84,7 @@ class Joint:
             total = total + rows @ rows
         return (total + physics.ridge * (w @ w)) / physics.samples
 
-    def _sums(self, w: Float[Array, "nw"], chunk: Chunks) -> tuple[Float[Array, ""], Float[Array, "nt"]]:
+    def _sums(self, w: Float[Array, "nw"], chunk: Chunk) -> tuple[Float[Array, ""], Float[Array, "nt"]]:
         """‖P⊥Y − F‖² and QᵀF of one chunk."""
         one = jax.vmap(self.bound.values, in_axes=(None, -1), out_axes=-1)
         values = chunk.gain * one(w, chunk.z)

@@ -4,50 +4,89 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
-
-import numpy as np
-from jaxtyping import Float
+from typing import Any, NamedTuple, Protocol
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.fitting.structures import Fixed
+from orthaug.fitting.criteria import Criterion
+from orthaug.fitting.elimination import Fixed
+from orthaug.fitting.solvers.levenberg_marquardt import Progress
+from orthaug.fitting.status import Ending
+from orthaug.fitting.structures import Structure
 from orthaug.models.learners import Bound, Scaling
+from orthaug.physics.problem import Problem
 
 
-class FreeStatistics(NamedTuple):
-    """What a training on the free run knows about its own errors."""
+class ErrorStatistics(NamedTuple):
+    """What is known about the errors of a fit, and through them about θ."""
 
     noise: Matrix | None
-    """Covariance (ny, ny) of the errors of the free run, in the outputs' units."""
+    """Covariance (ny, ny) of the errors, in the outputs' units."""
     covariance: Matrix | None
-    """Cov θ̂ (nθ, nθ) from the sensitivities."""
+    """Cov θ̂ (nθ, nθ)."""
     freedom: float
     mean_square: float
+    """Of the errors, each output in its standard deviation."""
     fixed: Fixed
 
 
 @dataclass(frozen=True, eq=False)
 class Learned:
-    """What training left, whatever the criterion: the learner's weights, and its values F (N, ny) at the rows."""
+    """The learner's weights, and what the run that found them knows."""
 
     bound: Bound | None
     weights: Vector
     scaling: Scaling
     unit: Vector
-    values: Float[np.ndarray, "N ny"]
+    ending: Ending = Ending.EXACT
+    iterations: int = 0
+    seconds: float = 0.0
     effective: float = 0.0
     gram: Matrix | None = None
     ridge: float = 0.0
     """Of the weights, in the units of `gram`."""
     middle: Callable[[Matrix], Matrix] | None = None
     """ΣψᵀΣ_eψ in the units of `gram`, for the noise covariance (ny, ny) of whitened outputs."""
-    code: int | None = None
-    iterations: int = 0
-    seconds: float = 0.0
     coefficients: Vector | None = None
     """c = θ − θ_aux (nθ,) where it was an unknown of training; None where θ is solved."""
-    free: FreeStatistics | None = None
+    errors: ErrorStatistics | None = None
+    """Of a free run; None where they are those of the one-step residual."""
     tilt: Matrix | None = None
     """(members, nθ) of an ensemble, whose weights are (members, nw)."""
     elsewhere: bool = False
     """Whether it is a function from another toolbox."""
+
+
+class Task(Protocol):
+    """A problem laid out for training on one criterion; `OneStepTask` and `FreeRunTask`."""
+
+    @property
+    def problem(self) -> Problem: ...
+
+    @property
+    def bound(self) -> Bound | None: ...
+
+    @property
+    def criterion(self) -> Criterion: ...
+
+    def run(
+        self,
+        solver: Any,
+        w: Any,
+        structure: Structure,
+        regularization: str | float = "none",
+        progress: Progress | None = None,
+    ) -> Any:
+        """One run from the weights `w`, with `ending`, `iterations` and `seconds`; arguments as in `estimate`."""
+        ...
+
+    def loss(self, run: Any) -> float:
+        """What runs are compared by: a mean of squared errors, each output in its standard deviation."""
+        ...
+
+    def learned(self, run: Any) -> Learned:
+        """What a run left."""
+        ...
+
+    def median(self, members: list[Learned], best: int) -> Learned:
+        """Several members as one, the median of their predictions (`ensemble`)."""
+        ...

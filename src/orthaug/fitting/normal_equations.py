@@ -11,11 +11,13 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
 from jaxtyping import Array, Float
 
+from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import jax, jnp
 from orthaug.models.learners import Bound
-from orthaug.models.rows import Chunks, Overlap, gram, row_sum
+from orthaug.models.rows import Chunk, Engine, Overlap, gram, row_sum
 
 
 class Hold(NamedTuple):
@@ -35,33 +37,16 @@ class Normal(NamedTuple):
 
 
 @dataclass(frozen=True)
-class OneStep:
-    """One-step prediction error with θ eliminated (F1): `‖P⊥(Y − F)‖²` plus the structure's `Hold`.
+class Blocks:
+    """Gram matrix of the columns `[Q r J]` of one chunk: what one chunk gives to the sum.
 
-    θ minimises the rest exactly for any w, so it is not an unknown here. The Gram matrix of `[Q r J]`
-    gives everything: `JᵀP⊥J = JᵀJ − (QᵀJ)ᵀ(QᵀJ)` (F4). Where J lies almost in the span of Q that
-    difference cancels, so each chunk first subtracts the share that the previous pass found.
+    Where J lies almost in the span of Q, `JᵀJ − (QᵀJ)ᵀ(QᵀJ)` cancels: the share that the previous pass found is
+    subtracted first.
     """
 
     bound: Bound
 
-    def __call__(self, w: Float[Array, "nw"], chunks: Chunks, hold: Hold, before: Overlap) -> Normal:
-        total = row_sum(lambda chunk: self._blocks(w, chunk, before), chunks)
-        nt = before.values.shape[0]
-        g_qr, g_qj = total[:nt, nt], total[:nt, nt + 1 :]
-        g_rr, g_jr, g_jj = total[nt, nt], total[nt + 1 :, nt], total[nt + 1 :, nt + 1 :]
-        overlap = Overlap(before.jacobian + g_qj, before.values - g_qr)
-        held = hold.matrix @ overlap.jacobian
-        miss = hold.target - hold.matrix @ overlap.values
-        return Normal(
-            hessian=g_jj - g_qj.T @ g_qj + held.T @ held,
-            gradient=g_jr - g_qj.T @ g_qr + held.T @ miss,
-            loss=jnp.maximum(g_rr - g_qr @ g_qr, 0.0) + miss @ miss,  # a difference may round below zero
-            overlap=overlap,
-        )
-
-    def _blocks(self, w: Float[Array, "nw"], chunk: Chunks, before: Overlap) -> Float[Array, "n n"]:
-        """Gram matrix of the columns `[Q r J]` of one chunk, each column a row of `columns`."""
+    def __call__(self, chunk: Chunk, w: Float[Array, "nw"], before: Overlap) -> Float[Array, "n n"]:
         values, jacobian = self.bound.jacobian(w, chunk.z, chunk.gain)
         nt, cells = chunk.q.shape[1], chunk.e.size  # outputs and rows as one axis of ny·m cells
         q = jnp.moveaxis(chunk.q, 1, 0).reshape(nt, cells)
@@ -72,6 +57,36 @@ class OneStep:
         return gram(jnp.concatenate([q, residual[None], jacobian]))
 
 
+def collect(total: Float[Array, "n n"], hold: Hold, before: Overlap) -> Normal:
+    """The normal equations from the sum of all `Blocks`: `JᵀP⊥J = JᵀJ − (QᵀJ)ᵀ(QᵀJ)`, plus the structure's `Hold`."""
+    nt = before.values.shape[0]
+    g_qr, g_qj = total[:nt, nt], total[:nt, nt + 1 :]
+    g_rr, g_jr, g_jj = total[nt, nt], total[nt + 1 :, nt], total[nt + 1 :, nt + 1 :]
+    overlap = Overlap(before.jacobian + g_qj, before.values - g_qr)
+    held = hold.matrix @ overlap.jacobian
+    miss = hold.target - hold.matrix @ overlap.values
+    return Normal(
+        hessian=g_jj - g_qj.T @ g_qj + held.T @ held,
+        gradient=g_jr - g_qj.T @ g_qr + held.T @ miss,
+        loss=jnp.maximum(g_rr - g_qr @ g_qr, 0.0) + miss @ miss,  # a difference may round below zero
+        overlap=overlap,
+    )
+
+
+@dataclass(frozen=True)
+class OneStep:
+    """One-step prediction error with θ eliminated (F1): `‖P⊥(Y − F)‖²` plus the structure's `Hold`.
+
+    θ minimises the rest exactly for any w, so it is not an unknown here; rows are in memory.
+    """
+
+    bound: Bound
+
+    def __call__(self, w: Float[Array, "nw"], rows: Chunk, hold: Hold, before: Overlap) -> Normal:
+        blocks = Blocks(self.bound)
+        return collect(row_sum(lambda chunk: blocks(chunk, w, before), rows), hold, before)
+
+
 @partial(jax.jit, static_argnames="criterion")
 def linearise(
     criterion: Callable[..., Normal], w: Float[Array, "nw"], arguments: tuple[Any, ...], overlap: Overlap
@@ -79,3 +94,49 @@ def linearise(
     """The criterion at w, in two passes: the second subtracts the overlap that the first one found."""
     first = criterion(w, *arguments, overlap)
     return criterion(w, *arguments, first.overlap)
+
+
+class Passed(NamedTuple):
+    """One pass over the rows at w."""
+
+    p: Vector
+    loss: float
+    normal: Normal
+
+
+class Linear(NamedTuple):
+    """What a solver's step needs of a pass, and what the next pass subtracts."""
+
+    hessian: Matrix
+    gradient: Vector
+    start: Overlap
+
+
+@dataclass(frozen=True, eq=False)
+class Streamed:
+    """The criterion `OneStep` over rows that an engine sums over, for the solver's loop on the host."""
+
+    engine: Engine
+    bound: Bound
+    rows: Any
+    hold: Hold
+    samples_left: float
+    """Residuals less the physics' own parameters."""
+    physics: int = 0
+
+    def fly(self, p: Vector, start: Overlap) -> Passed:
+        """The normal equations at w = p; `start` is the overlap that the previous pass found."""
+        total = self.engine.sum(Blocks(self.bound), self.rows, jnp.asarray(p), start)
+        normal = _collect(total, self.hold, start)
+        return Passed(np.asarray(p), float(normal.loss), normal)
+
+    def linearise(self, flown: Passed) -> Linear:
+        normal = flown.normal
+        return Linear(np.asarray(normal.hessian), np.asarray(normal.gradient), normal.overlap)
+
+    def samples(self, flown: Passed) -> tuple[float, float]:
+        """Residuals, all of them independent."""
+        return self.samples_left, 1.0
+
+
+_collect = jax.jit(collect)

@@ -1,10 +1,10 @@
-"""Training the learner of a problem: scaling, chunks, and one run of the solver (F5)."""
+"""Training one step ahead: the learner scaled, rows laid out for an engine, one run of a solver (F1, F5)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -12,18 +12,19 @@ from jaxtyping import Array, Float
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jax, jnp
-from orthaug.fitting.joint import Joint, Physics
+from orthaug.fitting.criteria import Criterion, Prediction
+from orthaug.fitting.elimination import Elimination, Fixed, eliminate
+from orthaug.fitting.joint import JointCriterion, Physics
 from orthaug.fitting.learned import Learned
-from orthaug.fitting.normal_equations import Hold, OneStep, linearise
-from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
-from orthaug.fitting.solvers.levenberg_marquardt import NON_FINITE, LevenbergMarquardt, Progress, Run, effective_weights
-from orthaug.fitting.structures import Elimination, Fixed, Orthogonal, Structure, eliminate
+from orthaug.fitting.normal_equations import Blocks, Hold, Normal, OneStep, Streamed, linearise
+from orthaug.fitting.solvers import compiled
+from orthaug.fitting.solvers.levenberg_marquardt import IDENTITY, Progress, descend
+from orthaug.fitting.status import Ending
+from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.inference.covariance import mixing
 from orthaug.models.learners import Bound, Learner, Scaling
-from orthaug.models.rows import Chunks, Overlap, chunk_shape, from_chunks, in_chunks, mixed_gram, share_of
+from orthaug.models.rows import Chunk, Engine, InMemory, MixedGram, Overlap, from_chunks
 from orthaug.physics.problem import Problem
-
-Solver = LevenbergMarquardt | AdamLBFGS
 
 OUTPUT_UNIT = 10.0
 """The learner's output unit in standard deviations of the baseline's residual: the table is in docs/design.md."""
@@ -31,45 +32,60 @@ _ACTIVE_SETS = 10  # tries to find which bounds are active; each changes at leas
 _SMALLEST_RESIDUAL = 1e-10  # of an output's deviation: the physics leaves at least rounding
 
 
-@dataclass(frozen=True, eq=False)
-class Task:
-    """A problem with its learner, scaled for training.
+class Share(NamedTuple):
+    """The learner's values F over the rows, in whitened outputs: QᵀF (nθ,), its part in the physics, and ‖F‖²."""
 
-    `unit` (ny,) is the learner's output unit in the outputs' units; `rms` is the RMS of the baseline's
-    whitened residual, the unit of the criterion's rows.
+    coordinates: Vector
+    square: float
+
+
+@dataclass(frozen=True, eq=False)
+class OneStepTask:
+    """A problem with its learner (None for physics alone), scaled for training.
+
+    `unit` (ny,) is the learner's output unit in the outputs' units; `rms` is the RMS of the baseline's whitened
+    residual, the unit of the criterion's rows, which are the engine's.
     """
 
     problem: Problem
-    bound: Bound
+    bound: Bound | None
     scaling: Scaling
     unit: Vector
     rms: float
-    chunks: Chunks
+    engine: Engine
+    rows: Any
+    criterion: Criterion = Prediction()  # noqa: RUF009  (frozen)
 
     @classmethod
-    def of(cls, problem: Problem, learner: Learner, scaling: Scaling | None = None, unit: Vector | None = None) -> Task:
+    def of(
+        cls,
+        problem: Problem,
+        learner: Learner | None,
+        scaling: Scaling | None = None,
+        unit: Vector | None = None,
+        engine: Engine = InMemory(),  # noqa: B008  (frozen)
+    ) -> OneStepTask:
         """Scale features to [-1, 1] and the learner's output to the baseline's residual, unless both are given."""
-        z = problem.feature_rows()
-        bound = Bound(learner, z.shape[1], len(problem.outputs))
-        e = problem.projection.orthogonal_part(problem.whitened_target)
-        spread = np.maximum(e.std(axis=0), _SMALLEST_RESIDUAL)
+        z = np.zeros((len(problem.rows), 0)) if learner is None else problem.feature_rows()
+        bound = None if learner is None else Bound(learner, z.shape[1], len(problem.outputs))
+        e = problem.unexplained
+        spread = np.maximum(e.std(axis=0) if bound else np.sqrt(np.mean(e**2, axis=0)), _SMALLEST_RESIDUAL)
         rms = float(np.sqrt(np.mean(spread**2)))
         scaling = Scaling.fit(z) if scaling is None else scaling
         unit = np.asarray(OUTPUT_UNIT * spread / problem.weight if unit is None else unit)
-        shape = chunk_shape(len(z))
+        unit = unit if bound is not None else np.zeros_like(unit)
         gain = np.broadcast_to(unit * problem.weight / rms, e.shape)
-        padded = in_chunks(scaling(z), shape, repeat=True)  # zeros may be where the learner has no value
-        pieces = (padded, *(in_chunks(p, shape) for p in (problem.projection.q, e / rms, gain)))
-        return cls(problem, bound, scaling, unit, rms, Chunks(*map(jnp.asarray, pieces)))
+        rows = engine.lay(scaling(z), problem.projection.q, e / rms, gain)
+        return cls(problem, bound, scaling, unit, rms, engine, rows)
 
     def run(
         self,
-        solver: Solver,
+        solver: Any,
         w: Any,
         structure: Structure | None = None,
         regularization: str | float = "none",
         progress: Progress | None = None,
-    ) -> Run:
+    ) -> compiled.Run:
         """One run from the weights `w`; the arguments as in `estimate`, `structure` None for no penalty.
 
         Bounds that reach into training (every structure but the orthogonal, F1) are met by an active set: what
@@ -87,91 +103,75 @@ class Task:
         for _ in range(_ACTIVE_SETS):
             run = self._run_held(solver, w, structure, elimination, fixed, regularization, tell)
             seconds, iterations = seconds + run.seconds, iterations + run.iterations
-            found = {} if isinstance(structure, Orthogonal) else elimination.active(self.coordinates(run))
-            if found == fixed or run.code == NON_FINITE:
+            at_bounds = {} if structure.projects else elimination.active(self.coordinates(run))
+            if at_bounds == fixed or not run.ending.usable:
                 break
-            w, fixed = run.w, found
+            w, fixed = run.w, at_bounds
         held = bool(elimination.hold(fixed)[0].any())
         return run._replace(seconds=seconds, iterations=iterations, held=held)
 
-    def coordinates(self, run: Run) -> Vector:
+    def coordinates(self, run: compiled.Run) -> Vector:
         """QᵀF (nθ,) in whitened outputs, at the end of a run."""
         return np.asarray(run.normal.overlap.values) * self.rms
 
     def _run_held(
         self,
-        solver: Solver,
+        solver: Any,
         w: Any,
         structure: Structure,
         elimination: Elimination,
         fixed: Fixed,
         regularization: str | float,
-        progress: Progress | None,
-    ) -> Run:
-        nt = self.chunks.q.shape[2]
+        progress: Progress,
+    ) -> compiled.Run:
+        assert self.bound is not None, "physics alone is not trained one step ahead"
         matrix, target = elimination.hold(fixed)
-        arguments = (self.chunks, Hold(jnp.asarray(matrix), jnp.asarray(target / self.rms)))
-        nothing = Overlap(jnp.zeros((nt, self.bound.size)), jnp.zeros(nt))
+        hold = Hold(jnp.asarray(matrix), jnp.asarray(target / self.rms))
         evidence = regularization == "evidence"
         ridge = 1.0 if evidence else 0.0 if regularization == "none" else float(regularization)
-        criterion, samples = OneStep(self.bound), self.problem.target.size - nt
-        if isinstance(solver, LevenbergMarquardt):
-            return solver.minimise(
-                criterion, w, arguments, nothing, ridge=ridge, evidence=evidence, samples=samples, progress=progress
-            )
-        if evidence:
-            raise InputError("evidence regularization needs the Gauss-Newton matrix of the levenberg-marquardt solver.")
-        orthogonal = isinstance(structure, Orthogonal)
-        physics = self._physics(elimination, fixed, ridge, solved=orthogonal)
-        joint = Joint(self.bound, orthogonal)
-        found = solver.minimise(joint, w, self.chunks, physics, progress=progress)
-        normal = linearise(criterion, found.w, arguments, nothing)
-        coordinates = np.asarray(physics.start + physics.basis @ found.v) * self.rms
-        coefficients = None if orthogonal else self.problem.projection.from_coordinates(coordinates)
-        return Run(
-            found.w,
-            normal,
-            ridge,
-            float(effective_weights(normal, jnp.asarray(ridge))),
-            found.iterations,
-            found.code,
-            found.seconds,
-            coefficients,
-        )
+        if solver.gauss_newton:
+            return self._least_squares(solver, w, hold, ridge, evidence, progress)
+        if evidence or not self.engine.resident:
+            what = "evidence regularization" if evidence else "training on rows that are not in memory"
+            raise InputError(f"{what} needs the Gauss-Newton matrix of the levenberg-marquardt solver.")
+        from orthaug.fitting.solvers import gradient  # optax is slow to import, and few runs need it
 
-    def _physics(self, elimination: Elimination, fixed: Fixed, ridge: float, *, solved: bool) -> Physics:
-        """θ as an unknown from θ⁰ on: every free column scaled to the size of a row, fixed entries without a column.
+        physics = Physics.of(self.problem, elimination, fixed, ridge, self.rms, solved=structure.projects)
+        joint = JointCriterion(self.bound, structure.projects)
+        end = gradient.minimise(solver, joint, w, self.rows, physics, progress=progress)
+        normal = linearise(OneStep(self.bound), end.w, (self.rows, hold), self._nothing)
+        coordinates = np.asarray(physics.start + physics.basis @ end.v) * self.rms
+        coefficients = None if structure.projects else self.problem.projection.from_coordinates(coordinates)
+        effective = float(compiled.effective_weights(normal, jnp.asarray(ridge)))
+        return compiled.Run(end.w, normal, ridge, effective, end.iterations, end.ending, end.seconds, coefficients)
 
-        Where θ is `solved` (F1), it stands at its end and has no columns: the learner's path does not depend on it.
-        """
-        to_rows = elimination.to_coordinates / self.rms
-        initial = np.clip(self.problem.baseline.initial, elimination.lower, elimination.upper)
-        initial = np.array([fixed.get(i, value) for i, value in enumerate(initial)])
-        free = np.array([float(i not in fixed) for i in range(len(initial))])
-        rows, nt = len(self.problem.rows), len(initial)
-        scale = free * np.sqrt(rows) / np.linalg.norm(to_rows, axis=0) if nt else free
+    def _least_squares(
+        self, solver: Any, w: Any, hold: Hold, ridge: float, evidence: bool, progress: Progress
+    ) -> compiled.Run:
+        """Levenberg-Marquardt: compiled whole where the rows are in memory, otherwise driven from here."""
+        assert self.bound is not None
+        samples = self.problem.target.size - len(self.problem.baseline.names)
+        options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "progress": progress}
+        if self.engine.resident:
+            criterion, arguments = OneStep(self.bound), (self.rows, hold)
+            return compiled.minimise(solver, criterion, w, arguments, self._nothing, samples=samples, **options)
+        objective = Streamed(self.engine, self.bound, self.rows, hold, samples)
+        first = objective.fly(np.asarray(w), self._nothing)  # its overlap makes the next pass exact
+        if compiled.spanned(first.normal):
+            return compiled.Run(w, first.normal, ridge, 0.0, 0, Ending.SPANNED, 0.0)
+        limits: dict[str, Any] = {"iterations": solver.iterations, "tolerance": solver.tolerance, "damping": IDENTITY}
+        end = descend(objective, np.asarray(w), first.normal.overlap, **limits, **options)
+        normal: Normal = end.flown.normal
+        weights = jnp.asarray(end.flown.p)
+        return compiled.Run(weights, normal, end.ridge, end.effective, end.iterations, end.ending, end.seconds)
 
-        def padded(matrix: np.ndarray) -> np.ndarray:
-            return np.concatenate([matrix, np.zeros((nt - len(matrix), *matrix.shape[1:]))])
+    @property
+    def _nothing(self) -> Overlap:
+        """No overlap known yet."""
+        nt, size = len(self.problem.baseline.names), self.bound.size if self.bound else 0
+        return Overlap(jnp.zeros((nt, size)), jnp.zeros(nt))
 
-        penalty = elimination.rows
-        return Physics(
-            *(
-                jnp.asarray(a, dtype=float)
-                for a in (
-                    elimination.outputs / self.rms if solved else to_rows @ initial,
-                    to_rows * (0.0 if solved else scale),
-                    elimination.outputs / self.rms,
-                    padded(penalty.theta * scale) / self.rms,
-                    padded(penalty.learner),
-                    padded(penalty.target - penalty.theta @ initial) / self.rms,
-                    self.problem.target.size,
-                    ridge,
-                )
-            )
-        )
-
-    def loss(self, run: Run) -> float:
+    def loss(self, run: compiled.Run) -> float:
         """Mean of squared errors of a run, with each output in its standard deviation."""
         return self.mean_square(run.normal.loss)
 
@@ -179,57 +179,178 @@ class Task:
         """The criterion's `‖r‖²` as the mean of squared errors with each output in its standard deviation."""
         return float(loss) * self.rms**2 / self.problem.target.size
 
-    def learned(self, run: Run) -> Learned:
+    def learned(self, run: compiled.Run) -> Learned:
         """What a run left."""
         return Learned(
             bound=self.bound,
             weights=np.asarray(run.w),
             scaling=self.scaling,
             unit=self.unit,
-            values=self.values(run.w),
+            ending=run.ending,
+            iterations=run.iterations,
+            seconds=run.seconds,
             effective=run.effective,
             gram=self.gram(run),
             ridge=run.ridge * self.rms**2,
             middle=lambda noise: self.middle(run.w, noise),
-            code=run.code,
-            iterations=run.iterations,
-            seconds=run.seconds,
             coefficients=run.coefficients,
         )
 
-    def overlap(self, w: Any) -> Matrix:
-        """QᵀJ (nθ, nw) at the training rows, in whitened outputs."""
-        return np.asarray(share_of(self.bound, w, self.chunks).jacobian) * self.rms
+    def physics_learned(self) -> Learned:
+        """Physics alone, which is solved and not trained."""
+        change = self.problem.projection.to_coordinates
+        none = np.zeros(0)
+        return Learned(
+            bound=None,
+            weights=none,
+            scaling=self.scaling,
+            unit=self.unit,
+            gram=change.T @ change,
+            middle=lambda noise: self.middle(none, noise),
+        )
+
+    def median(self, members: list[Learned], best: int) -> Learned:
+        """The median of several: `g = φ c̄ + median_i(f_i + φ (c_i − c̄))`, each with its own c_i (F2).
+
+        It is again one function of the regressor, split like any other. Statistics that a median has none of its own
+        of are those of the `best` member.
+        """
+        factor, least_squares = self.problem.projection, self.problem.least_squares
+        coefficients = []
+        for member in members:
+            share = factor.from_coordinates(self.share(member).coordinates) if member.coefficients is None else None
+            coefficients.append(member.coefficients if share is None else least_squares - share)
+        centre = np.mean(coefficients, axis=0)
+        return replace(
+            members[best],
+            weights=np.stack([member.weights for member in members]),
+            tilt=np.array(coefficients) - centre,
+            effective=float(np.mean([member.effective for member in members])),
+            gram=None,
+            coefficients=centre if members[best].coefficients is not None else None,
+        )
+
+    def share(self, learned: Learned) -> Share:
+        """QᵀF, refined once, and ‖F‖²; not finite where the learner is not."""
+        f = np.zeros(len(self.problem.baseline.names))
+        if learned.bound is None:
+            return Share(f, 0.0)
+        for _ in range(2):
+            rest, square = self._sums(learned, f)
+            f = f + rest
+        return Share(f, square)
+
+    def left_share(self, learned: Learned, theta: Vector) -> Vector:
+        """Qᵀ(F − Φθ) (nθ,), in whitened outputs."""
+        return self._sums(learned, self.problem.projection.to_coordinates @ theta)[0]
+
+    def residual_gram(self, learned: Learned, c: Vector) -> Matrix:
+        """Σ r rᵀ (ny, ny) of the residual r = Y − F − Φc, in whitened outputs."""
+        problem = self.problem
+        physics = problem.target_coordinates - problem.projection.to_coordinates @ c
+        total = self.engine.sum(
+            _ResidualGram(learned.bound), self.rows, *self._weights(learned), jnp.asarray(physics / self.rms)
+        )
+        return np.asarray(total) * self.rms**2
+
+    def _sums(self, learned: Learned, shift: Vector) -> tuple[Vector, float]:
+        summed = _LearnerSums(learned.bound)
+        rest, square = self.engine.sum(summed, self.rows, *self._weights(learned), jnp.asarray(shift / self.rms))
+        return np.asarray(rest) * self.rms, float(square) * self.rms**2
 
     def values(self, w: Any) -> Float[np.ndarray, "N ny"]:
-        """f at the training rows, in the outputs' units."""
-        chunks = np.asarray(_values(self.bound, w, self.chunks.z))
-        return from_chunks(chunks, len(self.problem.rows)) * self.unit
+        """f at the training rows, in the outputs' units; the rows are in memory."""
+        if self.bound is None:
+            return np.zeros_like(self.problem.target)
+        return from_chunks(_row_values(self.bound, w, self.rows.z), len(self.problem.rows)) * self.unit
 
-    def gram(self, run: Run) -> Matrix:
+    def share_of(self, w: Vector) -> Vector:
+        """QᵀF (nθ,) of the learner with the weights w, in whitened outputs; the rows are in memory."""
+        return self.problem.projection.coordinates(self.values(w) * self.problem.weight)
+
+    def share_slope(self, w: Vector) -> Matrix:
+        """QᵀJ (nθ, nw) of the learner with the weights w, in whitened outputs."""
+        nt = len(self.problem.baseline.names)
+        if self.bound is None:
+            return np.zeros((nt, 0))
+        total = self.engine.sum(Blocks(self.bound), self.rows, jnp.asarray(w), self._nothing)
+        return np.asarray(total[:nt, nt + 1 :]) * self.rms
+
+    def _weights(self, learned: Learned) -> tuple[Any, Any]:
+        """Weights and tilt of a learned function, the tilt in the coordinates of the rows."""
+        if learned.tilt is None:
+            return jnp.asarray(learned.weights), None
+        return jnp.asarray(learned.weights), jnp.asarray(
+            learned.tilt @ self.problem.projection.to_coordinates.T / self.rms
+        )
+
+    def gram(self, run: compiled.Run) -> Matrix:
         """Gram matrix of `[Φ J]` in whitened outputs, from the run's last pass; a held run's has rows of its own."""
-        projection, normal = self.problem.projection, run.normal
+        normal = run.normal
         if run.held:
             nt = len(normal.overlap.values)
             free = Hold(jnp.zeros((nt, nt)), jnp.zeros(nt))
-            normal = linearise(OneStep(self.bound), run.w, (self.chunks, free), normal.overlap)
+            assert self.bound is not None
+            normal = Streamed(self.engine, self.bound, self.rows, free, 0).fly(np.asarray(run.w), normal.overlap).normal
         overlap = np.asarray(normal.overlap.jacobian) * self.rms
-        to_phi = projection.r / projection.scale
+        to_phi = self.problem.projection.to_coordinates
         inner = np.asarray(normal.hessian) * self.rms**2 + overlap.T @ overlap
         cross = to_phi.T @ overlap
         return np.block([[to_phi.T @ to_phi, cross], [cross.T, inner]])
 
     def middle(self, w: Any, noise: Matrix) -> Matrix:
         """ΣψᵀΣ_eψ of `[Φ J]` for the noise covariance of whitened outputs; one pass over the rows."""
-        projection = self.problem.projection
-        found = np.asarray(mixed_gram(self.bound, jnp.asarray(w), self.chunks, jnp.asarray(mixing(noise))))
-        nt = len(projection.scale)
-        change = np.eye(len(found)) * self.rms
-        change[:nt, :nt] = projection.r / projection.scale
-        return change.T @ found @ change
+        mix = jnp.asarray(mixing(noise))
+        total = np.asarray(self.engine.sum(MixedGram(self.bound), self.rows, jnp.asarray(w), mix))
+        to_phi = self.problem.projection.to_coordinates
+        nt = len(to_phi)
+        change = np.eye(len(total)) * self.rms
+        change[:nt, :nt] = to_phi
+        return change.T @ total @ change
+
+    def physics_middle(self, noise: Matrix) -> Matrix:
+        """ΣqᵀΣ_eq (nθ, nθ) of the rows q of Q, for the noise covariance of whitened outputs."""
+        mix = jnp.asarray(mixing(noise))
+        return np.asarray(self.engine.sum(MixedGram(None), self.rows, jnp.zeros(0), mix))
 
 
 @partial(jax.jit, static_argnames="bound")
-def _values(bound: Bound, w: Float[Array, "nw"], z: Float[Array, "k nz m"]) -> Float[Array, "k ny m"]:
+def _row_values(bound: Bound, w: Float[Array, "nw"], z: Float[Array, "k nz m"]) -> Float[Array, "k ny m"]:
     one_chunk = jax.vmap(lambda row: bound.values(w, row), in_axes=-1, out_axes=-1)
     return jax.lax.map(one_chunk, z)
+
+
+def _values(bound: Bound | None, chunk: Chunk, w: Any, tilt: Any) -> Float[Array, "ny m"]:
+    """F of one chunk; of an ensemble the median of its members, each with the physics that it adds."""
+    if bound is None:
+        return jnp.zeros_like(chunk.e)
+
+    def one(w: Any) -> Any:
+        return chunk.gain * jax.vmap(lambda z: bound.values(w, z), in_axes=-1, out_axes=-1)(chunk.z)
+
+    if tilt is None:
+        return one(w)
+    return jnp.median(jax.vmap(one)(w) + jnp.einsum("otm,it->iom", chunk.q, tilt), axis=0)
+
+
+@dataclass(frozen=True)
+class _LearnerSums:
+    """Qᵀ(F − Q shift) and ‖F‖² of one chunk."""
+
+    bound: Bound | None
+
+    def __call__(self, chunk: Chunk, w: Any, tilt: Any, shift: Any) -> tuple[Any, Any]:
+        values = _values(self.bound, chunk, w, tilt)
+        rest = values - jnp.einsum("otm,t->om", chunk.q, shift)
+        return jnp.einsum("otm,om->t", chunk.q, rest), jnp.sum(values**2)
+
+
+@dataclass(frozen=True)
+class _ResidualGram:
+    """Σ r rᵀ of one chunk, `r = P⊥Y − F + Q physics`."""
+
+    bound: Bound | None
+
+    def __call__(self, chunk: Chunk, w: Any, tilt: Any, physics: Any) -> Any:
+        residual = chunk.e - _values(self.bound, chunk, w, tilt) + jnp.einsum("otm,t->om", chunk.q, physics)
+        return residual @ residual.T

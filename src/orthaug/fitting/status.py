@@ -1,49 +1,82 @@
-"""How training ended, with cause and remedy."""
+"""How training ends: code, cause and remedy in one place."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
+from enum import IntEnum
 
-MESSAGES: Mapping[str, str] = MappingProxyType(
-    {
-        "exact": "",
-        "converged": "",
-        "iteration_limit": (
-            "training stopped at its limit of iterations while the loss was still falling; "
-            "the model is usable, more iterations may improve it"
-        ),
-        "no_descent": (
-            "no step lowered the loss; the start is already a minimum, or the learner's gradient is wrong. "
-            "Try another seed or another activation"
-        ),
-        "non_finite": (
-            "the loss is not finite at the start: (a) a learner input grows without bound, "
-            "(b) the learner returns NaN, or (c) channels differ by many orders of magnitude. "
-            "Rescale the channels or choose other learner inputs"
-        ),
-    }
-)
+
+class Ending(IntEnum):
+    """How a run ended. The number is what compiled loops carry, `code` is what programs read."""
+
+    code: str
+    cause: str
+    remedy: str
+
+    def __new__(cls, number: int, code: str, cause: str = "", remedy: str = "") -> Ending:
+        member = int.__new__(cls, number)
+        member._value_, member.code, member.cause, member.remedy = number, code, cause, remedy
+        return member
+
+    RUNNING = (
+        0,
+        "iteration_limit",
+        "training stopped at its limit of iterations while the loss was still falling",
+        "the model is usable, more iterations may improve it",
+    )
+    CONVERGED = 1, "converged"
+    NO_DESCENT = (
+        2,
+        "no_descent",
+        "no step lowered the loss; the start is already a minimum, or the learner's gradient is wrong",
+        "Try another seed or another activation",
+    )
+    NON_FINITE = (
+        3,
+        "non_finite",
+        "the loss is not finite at the start: (a) a learner input grows without bound, "
+        "(b) the learner returns NaN, or (c) channels differ by many orders of magnitude",
+        "Rescale the channels or choose other learner inputs",
+    )
+    SPANNED = 4, "converged"
+    """P⊥J = 0: the learner has nothing to learn beside the physics."""
+    EXACT = 5, "exact"
+    """No learner, no iteration."""
+
+    @property
+    def message(self) -> str:
+        """Cause and remedy as one text; empty where there is nothing to say."""
+        if not self.cause:
+            return ""
+        return f"{self.cause}{'. ' if self.remedy[0].isupper() else '; '}{self.remedy}"
+
+    @property
+    def usable(self) -> bool:
+        """Whether there is a model."""
+        return self is not Ending.NON_FINITE
 
 
 @dataclass(frozen=True)
 class Status:
-    """How training ended: `code` is one of `MESSAGES`, `message` its cause and remedy.
+    """How training ended.
 
     `loss` is the mean of squared errors with every output divided by its standard deviation.
     """
 
-    code: str
+    ending: Ending
     iterations: int
     seconds: float
     loss: float
 
     @property
+    def code(self) -> str:
+        return self.ending.code
+
+    @property
     def message(self) -> str:
-        return MESSAGES[self.code]
+        return self.ending.message
 
     @property
     def ok(self) -> bool:
         """Whether there is a usable model."""
-        return self.code != "non_finite"
+        return self.ending.usable

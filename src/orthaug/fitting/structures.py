@@ -10,22 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-import scipy.optimize
 from jaxtyping import Float
 
-from orthaug._base.checks import Matrix, Vector
+from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
 from orthaug.inference.measures import Measure, Training
-from orthaug.physics.problem import Problem
-
-Fixed = dict[int, float]
-"""Entries of θ that stand at a bound, with its value."""
 
 
-class Rows(NamedTuple):
+class PenaltyRows(NamedTuple):
     """Residual rows `target − theta·θ − learner·QᵀF`, in whitened outputs."""
 
     theta: Float[np.ndarray, "m nt"]
@@ -40,13 +35,22 @@ class Structure(Protocol):
     @property
     def name(self) -> str: ...
 
-    def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> Rows:
+    @property
+    def projects(self) -> bool: ...
+
+    @property
+    def identifies(self) -> bool: ...
+
+    @property
+    def measure(self) -> Measure: ...
+
+    def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> PenaltyRows:
         """The rows that join the criterion, given θ⁰ (nθ,) and the output's unit in whitened outputs."""
         ...
 
 
-def _no_rows(nt: int) -> Rows:
-    return Rows(np.zeros((0, nt)), np.zeros((0, nt)), np.zeros(0))
+def _no_rows(nt: int) -> PenaltyRows:
+    return PenaltyRows(np.zeros((0, nt)), np.zeros((0, nt)), np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -59,8 +63,10 @@ class Orthogonal:
 
     measure: Measure = Training()  # noqa: RUF009  (frozen)
     name: str = "orthogonal"
+    projects: ClassVar[bool] = True
+    identifies: ClassVar[bool] = True
 
-    def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> Rows:
+    def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> PenaltyRows:
         return _no_rows(len(names))
 
 
@@ -69,8 +75,11 @@ class Additive:
     """ŷ = φθ + f (eqs:additive_struct): θ takes what this learner happens to leave, so it is not unique."""
 
     name: str = "additive"
+    projects: ClassVar[bool] = False
+    identifies: ClassVar[bool] = True
+    measure: ClassVar[Measure] = Training()
 
-    def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> Rows:
+    def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> PenaltyRows:
         return _no_rows(len(names))
 
 
@@ -83,10 +92,13 @@ class OrthogonalPenalty:
 
     weight: float = 1.0
     name: str = "orthogonal-penalty"
+    projects: ClassVar[bool] = False
+    identifies: ClassVar[bool] = True
+    measure: ClassVar[Measure] = Training()
 
-    def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> Rows:
+    def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> PenaltyRows:
         nt = len(names)
-        return Rows(np.zeros((nt, nt)), np.sqrt(self.weight) * np.eye(nt), np.zeros(nt))
+        return PenaltyRows(np.zeros((nt, nt)), np.sqrt(self.weight) * np.eye(nt), np.zeros(nt))
 
 
 @dataclass(frozen=True)
@@ -98,8 +110,11 @@ class BaselinePenalty:
 
     weight: float = 1.0
     name: str = "baseline-penalty"
+    projects: ClassVar[bool] = False
+    identifies: ClassVar[bool] = False
+    measure: ClassVar[Measure] = Training()
 
-    def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> Rows:
+    def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> PenaltyRows:
         """The rows `√λ (θ⁰ − θ)/θ⁰`.
 
         Raises:
@@ -112,136 +127,4 @@ class BaselinePenalty:
                 "give it another `initial`, or use the orthogonal structure."
             )
         root = np.sqrt(self.weight) * unit
-        return Rows(root * np.diag(1 / initial), np.zeros((len(names), len(names))), root * np.ones(len(names)))
-
-
-@dataclass(frozen=True, eq=False)
-class Elimination:
-    """θ taken out of `‖p − f − Tθ‖² + ‖e − A θ − B f‖²`, with f = QᵀF, p = QᵀY, `T` = coordinates of θ.
-
-    `(A, B, e)` are the structure's rows. Bounds are met by an active set: some entries of θ stand at a
-    bound, the others are free and minimise the rest.
-    """
-
-    to_coordinates: Matrix
-    outputs: Vector
-    rows: Rows
-    lower: Vector
-    upper: Vector
-
-    @property
-    def bounded(self) -> bool:
-        """Whether any entry of θ has a bound."""
-        return bool(np.isfinite(self.lower).any() or np.isfinite(self.upper).any())
-
-    @property
-    def _theta(self) -> Matrix:
-        return np.concatenate([self.to_coordinates, self.rows.theta])
-
-    @property
-    def _learner(self) -> Matrix:
-        return np.concatenate([np.eye(len(self.outputs)), self.rows.learner])
-
-    @property
-    def _target(self) -> Vector:
-        return np.concatenate([self.outputs, self.rows.target])
-
-    def hold(self, fixed: Fixed) -> tuple[Matrix, Vector]:
-        """`(S, t)` with `min_θ (…) = ‖t − S f‖² + constant`: what remains for the learner to see, (nθ, nθ) and (nθ,).
-
-        S is zero where θ can follow any f: without penalty rows and with no entry at a bound.
-        """
-        nt = len(self.outputs)
-        if not len(self.rows.target) and not fixed:
-            return np.zeros((nt, nt)), np.zeros(nt)
-        free, offset = self._split(fixed)
-        basis = np.linalg.qr(free)[0]
-        stacked = np.column_stack([self._learner, self._target - offset])
-        stacked = stacked - basis @ (basis.T @ stacked)
-        small = np.linalg.qr(stacked, mode="r")[:nt]
-        small = np.concatenate([small, np.zeros((nt - len(small), nt + 1))])
-        return small[:, :nt], small[:, nt]
-
-    def theta(self, f: Vector, fixed: Fixed) -> Vector:
-        """The minimising θ (nθ,) for the learner's coordinates f (nθ,)."""
-        free, offset = self._split(fixed)
-        scale = np.linalg.norm(free, axis=0)
-        right = self._target - self._learner @ f - offset
-        theta = np.empty(len(f))
-        theta[[i for i in range(len(f)) if i not in fixed]] = (
-            np.linalg.lstsq(free / scale, right, rcond=None)[0] / scale
-        )
-        for i, value in fixed.items():
-            theta[i] = value
-        return theta
-
-    def active(self, f: Vector) -> Fixed:
-        """Which entries of θ stand at which bound, for the learner's coordinates f."""
-        if not self.bounded:
-            return {}
-        matrix, right = self._theta, self._target - self._learner @ f
-        scale = np.linalg.norm(matrix, axis=0)
-        found = scipy.optimize.lsq_linear(
-            matrix / scale, right, bounds=(self.lower * scale, self.upper * scale), method="bvls", tol=1e-14
-        )
-        return {
-            i: float(self.lower[i] if side < 0 else self.upper[i]) for i, side in enumerate(found.active_mask) if side
-        }
-
-    def _split(self, fixed: Fixed) -> tuple[Matrix, Vector]:
-        """The columns of the free entries, and what the fixed ones contribute."""
-        matrix = self._theta
-        free = [i for i in range(matrix.shape[1]) if i not in fixed]
-        return matrix[:, free], matrix[:, list(fixed)] @ np.array(list(fixed.values()), dtype=float)
-
-
-def eliminate(structure: Structure, problem: Problem) -> Elimination:
-    """The elimination of θ from a problem's criterion with a structure's rows and the baseline's bounds."""
-    baseline, projection, weight = problem.baseline, problem.projection, problem.weight
-    unit = float(weight[0]) if len(weight) == 1 else 1.0  # λ counts in the output's units where there is one
-    return Elimination(
-        to_coordinates=projection.r / projection.scale if projection.scale.size else projection.r,
-        outputs=projection.coordinates(problem.whitened_target),
-        rows=structure.penalty(baseline.names, baseline.initial, unit),
-        lower=baseline.bounds[0],
-        upper=baseline.bounds[1],
-    )
-
-
-class Split(NamedTuple):
-    """θ and θ_aux, and which entries of θ stand at a bound."""
-
-    theta: Vector
-    theta_aux: Vector
-    fixed: Fixed
-
-
-def split(
-    structure: Structure,
-    problem: Problem,
-    values: Float[np.ndarray, "N ny"],
-    coefficients: Vector | None = None,
-    fixed: Fixed | None = None,
-) -> Split:
-    """θ for the learner's whitened values F (N, ny), and its share θ_aux that the structure moves to θ.
-
-    Args:
-        coefficients: c = θ − θ_aux (nθ,) where training found it; None to solve for θ.
-        fixed: what stands at a bound, where training found that.
-    """
-    projection, baseline = problem.projection, problem.baseline
-    orthogonal = isinstance(structure, Orthogonal)
-    aux = projection.solve(values)
-    elimination = eliminate(structure, problem)
-    f = np.zeros(len(aux)) if orthogonal else projection.coordinates(values)
-    if coefficients is not None:
-        theta = coefficients + (aux if orthogonal else 0.0)
-        if fixed is None:  # an iterate need not satisfy what only its end satisfies
-            inside = np.clip(theta, *baseline.bounds)
-            fixed = elimination.active(f) | {i: value for i, value in enumerate(inside) if value != theta[i]}
-        theta = np.array([fixed.get(i, value) for i, value in enumerate(theta)])
-    elif (fixed := elimination.active(f)) or len(elimination.rows.target):
-        theta = elimination.theta(f, fixed)
-    else:  # refined least squares, as exact as double precision allows
-        theta = projection.solve(problem.whitened_target) - (0.0 if orthogonal else aux)
-    return Split(theta, aux if orthogonal else 0.0 * aux, fixed)
+        return PenaltyRows(root * np.diag(1 / initial), np.zeros((len(names), len(names))), root * np.ones(len(names)))

@@ -14,23 +14,22 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug.models.statistics import column_units
-from orthaug.physics.projection import Projection
+from orthaug.physics.projection import Factor
 
 
-def degrees_of_freedom(projection: Projection, effective: float) -> Vector:
+def degrees_of_freedom(rows: int, physics: Vector, effective: float) -> Vector:
     """Rows of each output less what the fit has used up of them, (ny,).
 
     The physics uses `Σ_k ‖Q_ki‖²` of output i (its share of nθ), the learner its effective weights.
     """
-    rows, ny, _ = projection.q.shape
-    return rows - np.sum(projection.q**2, axis=(0, 2)) - effective / ny
+    return rows - physics - effective / len(physics)
 
 
-def noise_covariance(residual: Float[np.ndarray, "N ny"], freedom: Vector) -> Matrix | None:
-    """Σ_e (ny, ny) in the outputs' units; None where the fit leaves no degree of freedom."""
+def noise_covariance(squares: Matrix, freedom: Vector) -> Matrix | None:
+    """Σ_e (ny, ny) in the outputs' units from Σ e eᵀ; None where the fit leaves no degree of freedom."""
     if np.any(freedom < 0.5):
         return None
-    return residual.T @ residual / np.sqrt(np.outer(freedom, freedom))
+    return squares / np.sqrt(np.outer(freedom, freedom))
 
 
 def whitening(noise: Matrix) -> Matrix | None:
@@ -45,22 +44,18 @@ def mixing(noise: Matrix) -> Matrix:
     return (vectors * np.sqrt(np.maximum(values, 0.0))).T
 
 
-def theta_covariance(projection: Projection, weight: Vector, noise: Matrix, fixed: Collection[int] = ()) -> Matrix:
+def theta_covariance(factor: Factor, middle: Matrix, fixed: Collection[int] = ()) -> Matrix:
     """Cov θ̂ (nθ, nθ) of θ̂ = Φ⁺Y. For one output this is the textbook s²(ΦᵀΦ)⁻¹.
 
-    Entries that stand at a bound (`fixed`) have NaN; the others' covariance holds with them fixed there.
+    Args:
+        middle: ΣqᵀΣ_eq (nθ, nθ) over the rows q of Q, in whitened outputs; for one output s² I.
+        fixed: entries that stand at a bound. They have NaN; the others' covariance holds with them fixed there.
     """
-    whitened = noise * np.outer(weight, weight)
-    nt = len(projection.scale)
+    nt = len(factor.scale)
     free = [i for i in range(nt) if i not in fixed]
-    factor = projection.covariance_factor(free)
-    if projection.q.shape[1] == 1:
-        found = whitened[0, 0] * factor @ factor.T
-    else:
-        middle = np.einsum("kit,ij,kjs->ts", projection.q, whitened, projection.q, optimize=True)
-        found = factor @ middle @ factor.T
+    root = factor.covariance_factor(free)
     covariance = np.full((nt, nt), np.nan)
-    covariance[np.ix_(free, free)] = found
+    covariance[np.ix_(free, free)] = root @ middle @ root.T
     return covariance
 
 

@@ -18,11 +18,11 @@ from orthaug._base.checks import Matrix, check_choice, check_count
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Record
-from orthaug.data.regressors import lag_matrix
 from orthaug.inference.covariance import mixing
+from orthaug.models.dynamics import Numbers
+from orthaug.models.lagged import Lagged
 from orthaug.models.model import Model
-from orthaug.models.predictor import Form, Numbers
-from orthaug.models.rows import Chunks, chunk_shape, from_chunks, in_chunks, learner_chunks, projected_gram
+from orthaug.models.rows import InMemory, chunk_shape, from_chunks, in_chunks, learner_rows, projected_gram
 from orthaug.models.statistics import half_inverse
 from orthaug.physics.problem import Problem
 
@@ -45,28 +45,20 @@ def joint_covariance(problem: Problem, model: Model, convention: str = "calibrat
     if model.numbers.tilt is not None:
         raise InputError("an ensemble has no gradient in its weights; use a single learner.")
     residual = np.concatenate([(t.measured - t.model)[t.start :] for t in model.predict(problem.record).trajectories])
-    noise = residual.T @ residual / len(residual) if convention == "paper" else model.noise
+    noise = residual.T @ residual / len(residual) if convention == "paper" else model.statistics.noise
     if noise is None:
         raise InputError("the fit has no noise covariance: there are no degrees of freedom left.")
     projection, nt, ny = problem.projection, len(problem.baseline.names), len(problem.outputs)
-    chunks = learner_chunks(model.form, model.numbers, problem.rows.x, problem.projection.q, problem.weight)
+    engine = InMemory()
+    rows = learner_rows(engine, model.form, model.numbers, problem.rows.x, problem.projection.q, problem.weight)
     whitened = noise * np.outer(problem.weight, problem.weight)
-    outer, middle = (_raw(model, chunks, mix) for mix in (np.eye(ny), mixing(whitened)))
+    bound, w = model.form.bound, jnp.asarray(model.numbers.weights)
+    outer, middle = (projected_gram(engine, bound, w, rows, jnp.asarray(m)) for m in (np.eye(ny), mixing(whitened)))
     change = np.eye(len(outer))
     change[:nt, :nt] = projection.r / projection.scale
     outer, middle = (change.T @ found @ change for found in (outer, middle))
     half = half_inverse(outer, nt)
     return (2.0 if convention == "paper" else 1.0) * half @ (half.T @ middle @ half) @ half.T
-
-
-def _raw(model: Model, chunks: Chunks, mix: Matrix) -> Matrix:
-    """Gram matrix of `[Q J̃]` with outputs multiplied by `mix`."""
-    bound = model.form.bound
-    if bound is None:
-        mixed = np.einsum("oi,kitm->kotm", mix, np.asarray(chunks.q))
-        q = np.moveaxis(mixed, 2, 0).reshape(mixed.shape[2], -1)
-        return q @ q.T
-    return np.asarray(projected_gram(bound, jnp.asarray(model.numbers.weights), chunks, jnp.asarray(mix)))
 
 
 def prediction_std(model: Model, record: Record) -> list[Matrix]:
@@ -77,7 +69,7 @@ def prediction_std(model: Model, record: Record) -> list[Matrix]:
     Raises:
         InputError: a model without statistics, other channels.
     """
-    joint = model.joint
+    joint = model.statistics.joint(len(model.theta))
     if joint is None or model.numbers.tilt is not None:
         raise InputError(
             "the model has no statistics to take standard errors from (an ensemble, or trained elsewhere)."
@@ -86,19 +78,19 @@ def prediction_std(model: Model, record: Record) -> list[Matrix]:
     record = model.fitting(record, need_outputs=True)
     found = []
     for experiment in record.experiments:
-        x = lag_matrix(experiment, model.form.layout, record, model.form.start)
+        x = model.form.regressors(experiment, record)
         shape = chunk_shape(len(x))
         chunks = jnp.asarray(in_chunks(x, shape, repeat=True))
         variance = np.asarray(_variances(model.form, model.numbers, chunks, root))
         values = np.full((len(experiment), len(model.outputs)), np.nan)
-        values[model.form.start :] = np.sqrt(np.maximum(from_chunks(variance, len(x)), 0.0))
+        values[model.form.first_row :] = np.sqrt(np.maximum(from_chunks(variance, len(x)), 0.0))
         found.append(values)
     return found
 
 
 @partial(jax.jit, static_argnames="form")
 def _variances(
-    form: Form, numbers: Numbers, x: Float[Array, "k nx m"], root: Float[Array, "n r"]
+    form: Lagged, numbers: Numbers, x: Float[Array, "k nx m"], root: Float[Array, "n r"]
 ) -> Float[Array, "k ny m"]:
     def one_chunk(rows: Any) -> Any:
         phi = jax.vmap(lambda row: form.baseline.phi(row, form.layout, form.outputs, jnp), -1, -1)(rows)

@@ -14,10 +14,11 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jnp
+from orthaug._base.warning import Warning
 from orthaug.inference.measures import Measure, Points, Support
 from orthaug.models.model import Model
-from orthaug.models.rows import learner_chunks, share_of
-from orthaug.models.statistics import Joint
+from orthaug.models.rows import InMemory, Overlaps, learner_rows
+from orthaug.models.statistics import JointCovariance
 from orthaug.physics.excitation import excitation, require_rank
 from orthaug.physics.projection import Projection
 
@@ -36,7 +37,7 @@ class MeasureSplit:
     support: float
     points: int
     condition: float | None
-    warnings: tuple[str, ...]
+    warnings: tuple[Warning, ...]
     price: Vector | None = None
     """Standard error of each θ over that under the training measure (nθ,)."""
 
@@ -53,7 +54,7 @@ class MeasureSplit:
         return {**found, "std_over_training": price}
 
 
-def split_under(measure: Measure, model: Model, support: Support, joint: Joint | None) -> MeasureSplit:
+def split_under(measure: Measure, model: Model, support: Support, joint: JointCovariance | None) -> MeasureSplit:
     """Split a model under a measure.
 
     Args:
@@ -93,7 +94,8 @@ def split_under(measure: Measure, model: Model, support: Support, joint: Joint |
     share = support.share(points)
     reach = f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the training data"
     learns = form.bound is not None
-    warnings = (f"{reach}: elsewhere θ rests on how the learner extrapolates.",) if share < SUPPORTED and learns else ()
+    told = Warning("measure_beyond_data", f"{reach}: elsewhere θ rests on how the learner extrapolates.")
+    warnings = (told,) if share < SUPPORTED and learns else ()
     return MeasureSplit(measure.name, theta, aux, covariance, defect, share, len(points.x), found.condition, warnings)
 
 
@@ -103,6 +105,7 @@ def learner_slope(model: Model, points: Points, projection: Projection, unit: Ma
     nt = len(model.theta)
     if bound is None or not bound.size:
         return np.zeros((nt, 0))
-    chunks = learner_chunks(model.form, numbers, points.x, projection.q, unit)
-    overlap = share_of(bound, jnp.asarray(numbers.weights), chunks)
+    engine = InMemory()
+    rows = learner_rows(engine, model.form, numbers, points.x, projection.q, unit)
+    overlap = engine.sum(Overlaps(bound), rows, jnp.asarray(numbers.weights))
     return projection.from_coordinates(np.asarray(overlap.jacobian))

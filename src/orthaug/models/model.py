@@ -14,10 +14,10 @@ from orthaug._base.checks import Matrix, Vector, as_signal
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Channel, Experiment, Record, same_step
-from orthaug.data.regressors import lag_matrix
-from orthaug.models.predictor import Form, Numbers, Parts, parts, push, regressor
+from orthaug.models.dynamics import Dynamics, Numbers, Parts
+from orthaug.models.lagged import Lagged
 from orthaug.models.response import Response, Trajectory
-from orthaug.models.statistics import Joint
+from orthaug.models.statistics import Statistics
 
 if TYPE_CHECKING:
     pass
@@ -28,47 +28,39 @@ _RUNAWAY = 1e6  # times the largest training output: a free run beyond this has 
 
 
 @partial(jax.jit, static_argnames="form")
-def _predict_rows(form: Form, numbers: Numbers, x: Float[Array, "m nx"]) -> Parts:
-    return jax.vmap(lambda row: parts(form, numbers, row))(x)
+def _predict_rows(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"]) -> Parts:
+    return jax.vmap(lambda row: form.at(numbers, row))(x)
 
 
 @partial(jax.jit, static_argnames="form")
-def _free_run(form: Form, numbers: Numbers, past: Float[Array, "na ny"], inputs: Float[Array, "T nu"]) -> Parts:
-    """One scan over the rows; `past` holds the outputs before the first one, newest first."""
-
-    def step(past: Any, row: Any) -> tuple[Any, Parts]:
-        found = parts(form, numbers, regressor(form, past, row))
-        return push(past, found.baseline + found.learner), found
-
-    return jax.lax.scan(step, past, inputs)[1]
+def _free_run(form: Dynamics, numbers: Numbers, state: Float[Array, "n0"], inputs: Float[Array, "T nu"]) -> Parts:
+    """One scan over the rows, from the state at the first one."""
+    return jax.lax.scan(lambda state, row: form.step(numbers, state, row), state, inputs)[1]
 
 
 @partial(jax.jit, static_argnames="form")
 def _ahead(
-    form: Form, numbers: Numbers, past: Float[Array, "m na ny"], inputs: Float[Array, "m T nu"], horizon: Any
+    form: Dynamics, numbers: Numbers, states: Float[Array, "m n0"], inputs: Float[Array, "m T nu"], horizon: Any
 ) -> Parts:
     """The last of `horizon` free-run steps from each of m starts."""
-    one = jax.vmap(lambda p, row: parts(form, numbers, regressor(form, p, row)))
+    one = jax.vmap(lambda state, row: form.step(numbers, state, row))
 
     def step(i: Any, carry: tuple[Any, Parts]) -> tuple[Any, Parts]:
-        found = one(carry[0], inputs[:, i])
-        return jax.vmap(push)(carry[0], found.baseline + found.learner), found
+        return one(carry[0], inputs[:, i])
 
-    nothing = jnp.zeros((past.shape[0], len(form.outputs)))
-    return jax.lax.fori_loop(0, horizon, step, (past, Parts(nothing, nothing, nothing)))[1]
+    nothing = jnp.zeros((states.shape[0], len(form.outputs)))
+    return jax.lax.fori_loop(0, horizon, step, (states, Parts(nothing, nothing, nothing)))[1]
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
     """A fitted model; `estimate` makes it, `orthaug.save` and `orthaug.load` keep it.
 
-    `weight` (ny,) is one over each output's deviation; outputs times it are whitened. With the following every function
-    of the model has an interval (`Joint`): `gram` (nθ + nw)², the Gram matrix of ∂ŷ/∂(c, w) over the training rows in
-    whitened outputs, `[Φ J]` one step ahead; `ridge`, the weights' prior precision beside it; `middle` = ΣψᵀΣ_eψ;
-    `noise` (ny, ny), the noise covariance; `freedom`, its degrees of freedom.
+    `weight` (ny,) is one over each output's deviation; outputs times it are whitened. With its `statistics` every
+    function of the model has an interval.
     """
 
-    form: Form
+    form: Lagged
     numbers: Numbers
     outputs: tuple[Channel, ...]
     inputs: tuple[Channel, ...]
@@ -78,11 +70,7 @@ class Model:
     largest_output: Vector
     weight: Vector
     time_column: str | None = None
-    gram: Matrix | None = None
-    noise: Matrix | None = None
-    ridge: float = 0.0
-    middle: Matrix | None = None
-    freedom: float = np.inf
+    statistics: Statistics = Statistics()  # noqa: RUF009  (frozen)
 
     def __repr__(self) -> str:
         learner = self.form.bound.learner if self.form.bound else "none"
@@ -93,16 +81,9 @@ class Model:
         """θ̂ (nθ,)."""
         return np.asarray(self.numbers.theta)
 
-    @property
-    def joint(self) -> Joint | None:
-        """Cov(c, w); None where training left no statistics."""
-        if self.gram is None or self.middle is None:
-            return None
-        return Joint(self.gram, self.ridge, self.middle, len(self.theta))
-
     def learner_at(self, x: Float[np.ndarray, "M nx"]) -> Float[np.ndarray, "M ny"]:
         """f, before any split, at regressors of the form's layout; in the outputs' units."""
-        return _in_batches(lambda rows: _predict_rows(self.form, self.numbers, rows), (x,)).raw
+        return self._predict_rows(x).raw
 
     @property
     def theta_aux(self) -> Vector:
@@ -124,11 +105,10 @@ class Model:
         record = self.fitting(record, need_outputs=True)
         trajectories = []
         for experiment in record.experiments:
-            first = self.form.start + horizon - 1
+            first = self.form.first_row + horizon - 1
             self._check_rows(experiment, first)
-            if horizon == 1 or not self.form.memory:
-                x = lag_matrix(experiment, self.form.layout, record, first)
-                found = _in_batches(lambda rows: _predict_rows(self.form, self.numbers, rows), (x,))
+            if horizon == 1 or not self.form.states:
+                found = self._predict_rows(self.form.regressors(experiment, record, first))
             else:
                 found = self._predict_ahead(experiment, record, int(horizon))
             trajectories.append(_trajectory(found, experiment, experiment.outputs, first))
@@ -148,10 +128,9 @@ class Model:
         record = self.fitting(record, need_outputs=False)
         trajectories = []
         for experiment in record.experiments:
-            self._check_rows(experiment, self.form.start)
+            self._check_rows(experiment, self.form.first_row)
             measured = experiment.outputs if record.outputs else None
-            past = self._initial(initial, measured)
-            found = self._run(past, experiment, record)
+            found = self._run(self._start(initial, measured), experiment, record)
             trajectories.append(self._bounded(found, experiment, measured))
         return Response(tuple(trajectories), None, self.outputs, record.sampling_time)
 
@@ -168,58 +147,57 @@ class Model:
             raise InputError(f"`initial` has {rows.shape[1]} columns; expected one per output, {ny}.")
         if len(rows) < self.form.memory:
             raise InputError(
-                f"`initial` has {len(rows)} rows; expected the first {self.form.start} outputs of the record."
+                f"`initial` has {len(rows)} rows; expected the first {self.form.first_row} outputs of the record."
             )
         return rows
 
-    def _run(self, past: Matrix, experiment: Experiment, record: Record) -> Parts:
-        inputs = lag_matrix(experiment, self.form.input_layout, record, self.form.start)
-        if not self.form.memory:
-            x = lag_matrix(experiment, self.form.layout, record, self.form.start)
-            return _in_batches(lambda rows: _predict_rows(self.form, self.numbers, rows), (x,))
+    def _run(self, state: Vector, experiment: Experiment, record: Record) -> Parts:
+        if not self.form.states:
+            return self._predict_rows(self.form.regressors(experiment, record))
+        inputs = self.form.inputs(experiment, record)
         steps = len(inputs)
         padded = np.zeros((_bucket(steps), inputs.shape[1]))
         padded[:steps] = inputs
-        found = _free_run(self.form, self.numbers, jnp.asarray(past), jnp.asarray(padded))
-        return Parts(*(np.asarray(part)[:steps] for part in found))
+        parts = _free_run(self.form, self.numbers, jnp.asarray(state), jnp.asarray(padded))
+        return Parts(*(np.asarray(part)[:steps] for part in parts))
+
+    def _predict_rows(self, x: Matrix) -> Parts:
+        return _in_batches(lambda rows: _predict_rows(self.form, self.numbers, rows), (x,))
 
     def _predict_ahead(self, experiment: Experiment, record: Record, horizon: int) -> Parts:
-        start = self.form.start
-        inputs = lag_matrix(experiment, self.form.input_layout, record, start)
+        first = self.form.first_row
+        inputs = self.form.inputs(experiment, record)
         windows = np.lib.stride_tricks.sliding_window_view(inputs, horizon, axis=0).swapaxes(1, 2)
-        outputs = experiment.outputs[: len(experiment) - horizon]
-        past = np.stack([outputs[start - i - 1 : len(outputs) - i] for i in range(self.form.memory)], axis=1)
+        states = self.form.start(experiment.outputs, np.arange(first, first + len(windows)))
         largest = max(1, _WINDOW_CELLS // max(1, windows[0].size))  # windows overlap: they are copied batch by batch
-        rows = (past[: len(windows)], windows)
-        return _in_batches(lambda p, u: _ahead(self.form, self.numbers, p, u, horizon), rows, largest)
+        return _in_batches(lambda s, u: _ahead(self.form, self.numbers, s, u, horizon), (states, windows), largest)
 
-    def _initial(self, initial: Any, measured: Matrix | None) -> Matrix:
-        """The last `_memory` outputs before the first usable row, newest first."""
-        start, memory, ny = self.form.start, self.form.memory, len(self.outputs)
+    def _start(self, initial: Any, measured: Matrix | None) -> Vector:
+        """The state at the first row with an output."""
         if isinstance(initial, str) and initial == "zero":
-            return np.zeros((memory, ny))
+            return np.zeros(self.form.states)
         if isinstance(initial, str) and initial == "measured":
             if measured is None:
                 raise InputError(
                     "the record has no measured outputs to start from; use initial='zero' or give the values."
                 )
-            rows = measured[:start]
+            rows = measured[: self.form.first_row]
         else:
-            rows = self.check_initial(initial)[:start]
-        return rows[len(rows) - memory :][::-1].copy()
+            rows = self.check_initial(initial)[: self.form.first_row]
+        return self.form.start(rows, [len(rows)])[0]
 
     def _bounded(self, found: Parts, experiment: Experiment, measured: Matrix | None) -> Trajectory:
         """A free run cut where it left all bounds."""
-        trajectory = _trajectory(found, experiment, measured, self.form.start)
+        trajectory = _trajectory(found, experiment, measured, self.form.first_row)
         with np.errstate(all="ignore"):
-            wild = ~(np.abs(trajectory.model[self.form.start :]) <= _RUNAWAY * self.largest_output)
+            wild = ~(np.abs(trajectory.model[self.form.first_row :]) <= _RUNAWAY * self.largest_output)
         if not wild.any():
             return trajectory
         step = int(np.argmax(wild.any(axis=1)))
         output = self.outputs[int(np.argmax(wild[step]))].name
         cut = Parts(*(np.where(np.arange(len(part))[:, None] < step, part, np.nan) for part in found))
-        bounded = _trajectory(cut, experiment, measured, self.form.start)
-        return replace(bounded, diverged=(step + self.form.start, output))
+        bounded = _trajectory(cut, experiment, measured, self.form.first_row)
+        return replace(bounded, diverged=(step + self.form.first_row, output))
 
     def _check_rows(self, experiment: Experiment, first: int) -> None:
         if len(experiment) <= first:

@@ -1,24 +1,96 @@
-"""The one row-sum that every solver and engine shares (F4): it knows blocks, not their meaning.
+"""Sums over rows, which are all that training and its statistics need of the data (F4), and the engine that makes them.
 
-Rows are laid out in chunks with the row index last, padded with zero weights to one shape, so that one
-compiled program serves any number of rows and nothing of size N × nw ever exists.
+Rows are laid out in chunks with the row index last, padded with zero weights to one shape, so that one compiled program
+serves any number of rows and nothing of size N × nw ever exists. What is summed is a function of one chunk; it knows
+blocks, not where the rows are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Array, Float
 
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax, jnp
+from orthaug.models.dynamics import Numbers
+from orthaug.models.lagged import Lagged
 from orthaug.models.learners import Bound
-from orthaug.models.predictor import Form, Numbers
 
 CHUNK_ROWS = 5000  # fastest of 500 … 10000 at 10⁴×81 and 10⁵×257, see benchmarks/
+
+
+class Chunk(NamedTuple):
+    """Some rows (…, m), or in memory all of them (k, …, m); zero gain and zero entries are padding."""
+
+    z: Float[Array, "*k nz m"]
+    """Scaled learner features."""
+    q: Float[Array, "*k ny nt m"]
+    """Orthonormal basis of the physics."""
+    e: Float[Array, "*k ny m"]
+    """P⊥Y, what the physics cannot express."""
+    gain: Float[Array, "*k ny m"]
+    """Unit of the learner's output in whitened rows."""
+
+
+class Overlap(NamedTuple):
+    """What an earlier pass found of the learner in the span of the physics."""
+
+    jacobian: Float[Array, "nt nw"]
+    """QᵀJ."""
+    values: Float[Array, "nt"]
+    """QᵀF."""
+
+
+@runtime_checkable
+class Engine(Protocol):
+    """Where rows are, and who adds up over them."""
+
+    @property
+    def resident(self) -> bool:
+        """Whether all rows are one `Chunk` on the device, so that a whole training run may be compiled around a sum."""
+        ...
+
+    def lay(self, z: Matrix, q: Any, e: Matrix, gain: Matrix) -> Any:
+        """Rows (N, …) as this engine keeps them."""
+        ...
+
+    def sum(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> Any:
+        """Σ function(chunk, *arguments) over all chunks; `function` is hashable, its result any pytree of arrays."""
+        ...
+
+
+@dataclass(frozen=True)
+class InMemory:
+    """All rows on the device, summed by one compiled loop over chunks."""
+
+    limit: int = CHUNK_ROWS
+    resident: bool = True
+
+    def lay(self, z: Matrix, q: Any, e: Matrix, gain: Matrix) -> Chunk:
+        shape = chunk_shape(len(z), self.limit)
+        padded = in_chunks(z, shape, repeat=True)  # zeros may be where the learner has no value
+        return Chunk(*map(jnp.asarray, (padded, *(in_chunks(piece, shape) for piece in (q, e, gain)))))
+
+    def sum(self, function: Callable[..., Any], rows: Chunk, *arguments: Any) -> Any:
+        return _compiled_sum(function, rows, arguments)
+
+
+@partial(jax.jit, static_argnames="function")
+def _compiled_sum(function: Callable[..., Any], rows: Chunk, arguments: tuple[Any, ...]) -> Any:
+    return row_sum(lambda chunk: function(chunk, *arguments), rows)
+
+
+def row_sum(function: Callable[[Any], Any], rows: Any) -> Any:
+    """Σ function(chunk) over the leading axis of every array in `rows`; any pytree in, any pytree out."""
+    first = jax.tree.map(lambda a: a[0], rows)
+    zero = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(function, first))
+    total, _ = jax.lax.scan(lambda acc, chunk: (jax.tree.map(jnp.add, acc, function(chunk)), None), zero, rows)
+    return total
 
 
 def chunk_shape(rows: int, limit: int = CHUNK_ROWS) -> tuple[int, int]:
@@ -48,93 +120,66 @@ def from_chunks(chunks: Float[np.ndarray, "k ... m"], rows: int) -> Float[np.nda
     return moved.reshape(-1, *moved.shape[2:])[:rows]
 
 
-def row_sum(function: Callable[[Any], Any], chunks: Any) -> Any:
-    """Σ function(chunk) over the leading axis of every array in `chunks`; any pytree in, any pytree out."""
-    first = jax.tree.map(lambda a: a[0], chunks)
-    zero = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(function, first))
-    total, _ = jax.lax.scan(lambda acc, chunk: (jax.tree.map(jnp.add, acc, function(chunk)), None), zero, chunks)
-    return total
-
-
 def gram(columns: Float[Array, "n rows"]) -> Float[Array, "n n"]:
     """A Aᵀ of named columns laid out as rows of A; one matrix product."""
     return columns @ columns.T
 
 
-class Chunks(NamedTuple):
-    """Rows of the prediction criterion in chunks of m rows; zero gain and zero entries are padding."""
-
-    z: Float[Array, "k nz m"]
-    """Scaled learner features."""
-    q: Float[Array, "k ny nt m"]
-    """Orthonormal basis of the physics."""
-    e: Float[Array, "k ny m"]
-    """P⊥Y, what the physics cannot express."""
-    gain: Float[Array, "k ny m"]
-    """Unit of the learner's output in whitened rows."""
-
-
-class Overlap(NamedTuple):
-    """What an earlier pass found of the learner in the span of the physics."""
-
-    jacobian: Float[Array, "nt nw"]
-    """QᵀJ."""
-    values: Float[Array, "nt"]
-    """QᵀF."""
-
-
-def learner_chunks(form: Form, numbers: Numbers, x: Matrix, q: Any, weight: Any) -> Chunks:
-    """Rows of regressors x (N, nx) as chunks, rows multiplied by `weight`; the learner in whitened outputs."""
-    shape = chunk_shape(len(x))
+def learner_rows(engine: Engine, form: Lagged, numbers: Numbers, x: Matrix, q: Any, weight: Any) -> Any:
+    """Regressors x (N, nx) as rows of the engine, multiplied by `weight`; the learner in whitened outputs."""
     z = np.asarray(form.features.evaluate(x, form.layout, np))
     scaled = (z - np.asarray(numbers.centre)) / np.asarray(numbers.halfwidth) if form.bound else np.zeros((len(x), 0))
     gain = np.broadcast_to(weight * np.asarray(numbers.gain), (len(x), len(form.outputs)))
-    pieces = (in_chunks(scaled, shape, repeat=True), *(in_chunks(p, shape) for p in (q, 0 * gain, gain)))
-    return Chunks(*map(jnp.asarray, pieces))
+    return engine.lay(scaled, q, 0 * gain, gain)
 
 
-@partial(jax.jit, static_argnames="bound")
-def share_of(bound: Bound, w: Float[Array, "nw"], chunks: Chunks) -> Overlap:
-    """QᵀJ and QᵀF of the learner in one pass."""
+@dataclass(frozen=True)
+class Overlaps:
+    """QᵀJ and QᵀF of the learner: one chunk's share of `Overlap`."""
 
-    def one_chunk(chunk: Chunks) -> Overlap:
-        values, jacobian = bound.jacobian(w, chunk.z, chunk.gain)
+    bound: Bound
+
+    def __call__(self, chunk: Chunk, w: Any) -> Overlap:
+        values, jacobian = self.bound.jacobian(w, chunk.z, chunk.gain)
         return Overlap(jnp.einsum("otm,wom->tw", chunk.q, jacobian), jnp.einsum("otm,om->t", chunk.q, values))
 
-    return row_sum(one_chunk, chunks)
 
+@dataclass(frozen=True)
+class MixedGram:
+    """Gram matrix of `[Q J]` with the outputs of every row multiplied by `mix`: `ΣψᵀΣ_eψ` for `Σ_e = mixᵀ mix`.
 
-@partial(jax.jit, static_argnames="bound")
-def mixed_gram(bound: Bound, w: Float[Array, "nw"], chunks: Chunks, mix: Float[Array, "ny ny"]) -> Float[Array, "n n"]:
-    """Gram matrix of `[Q J]` with the outputs of every row multiplied by `mix`: `ΣψᵀΣ_eψ` for `Σ_e = mixᵀ mix`."""
+    J less its `overlaps` with Q, if any are given; without a learner of Q alone.
+    """
 
-    def one_chunk(chunk: Chunks) -> Float[Array, "n n"]:
-        jacobian = bound.jacobian(w, chunk.z, chunk.gain)[1]
-        columns = jnp.concatenate([jnp.moveaxis(chunk.q, 1, 0), jacobian])
+    bound: Bound | None
+
+    def __call__(self, chunk: Chunk, w: Any, mix: Any, overlaps: tuple[Any, ...] = ()) -> Any:
+        columns = jnp.concatenate(_columns(self.bound, chunk, w, overlaps))
         return gram(jnp.einsum("oi,nim->nom", mix, columns).reshape(len(columns), -1))
 
-    return row_sum(one_chunk, chunks)
+
+@dataclass(frozen=True)
+class _LeftOver:
+    """QᵀJ of what is left of J without its `overlaps`."""
+
+    bound: Bound | None
+
+    def __call__(self, chunk: Chunk, w: Any, overlaps: tuple[Any, ...]) -> Any:
+        return jnp.einsum("tom,wom->tw", *_columns(self.bound, chunk, w, overlaps))
 
 
-@partial(jax.jit, static_argnames="bound")
-def projected_gram(
-    bound: Bound, w: Float[Array, "nw"], chunks: Chunks, mix: Float[Array, "ny ny"]
-) -> Float[Array, "n n"]:
+def _columns(bound: Bound | None, chunk: Chunk, w: Any, overlaps: tuple[Any, ...]) -> tuple[Any, Any]:
+    """Q (nt, ny, m) and J (nw, ny, m) of a chunk, J less its overlaps with Q."""
+    q = jnp.moveaxis(chunk.q, 1, 0)
+    jacobian = jnp.zeros((0, *q.shape[1:])) if bound is None else bound.jacobian(w, chunk.z, chunk.gain)[1]
+    for overlap in overlaps:
+        jacobian = jacobian - jnp.einsum("tw,tom->wom", overlap, q)
+    return q, jacobian
+
+
+def projected_gram(engine: Engine, bound: Bound | None, w: Any, rows: Any, mix: Any) -> Matrix:
     """Gram matrix of `[Q P⊥J]`, outputs multiplied by `mix`; J is projected twice, so that Q and it are orthogonal."""
-
-    def projected(chunk: Chunks, overlaps: tuple[Any, ...]) -> tuple[Any, Any]:
-        q = jnp.moveaxis(chunk.q, 1, 0)  # (nt, ny, m)
-        jacobian = bound.jacobian(w, chunk.z, chunk.gain)[1]
-        for overlap in overlaps:
-            jacobian = jacobian - jnp.einsum("tw,tom->wom", overlap, q)
-        return q, jacobian
-
-    def columns(chunk: Chunks) -> Float[Array, "n n"]:
-        mixed = jnp.einsum("oi,nim->nom", mix, jnp.concatenate(projected(chunk, overlaps)))
-        return gram(mixed.reshape(len(mixed), -1))
-
     overlaps: tuple[Any, ...] = ()
     for _ in range(2):
-        before = overlaps
-        overlaps = (*before, row_sum(lambda chunk, o=before: jnp.einsum("tom,wom->tw", *projected(chunk, o)), chunks))
-    return row_sum(columns, chunks)
+        overlaps = (*overlaps, engine.sum(_LeftOver(bound), rows, w, overlaps))
+    return np.asarray(engine.sum(MixedGram(bound), rows, w, mix, overlaps))

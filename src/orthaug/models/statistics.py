@@ -31,7 +31,7 @@ def half_inverse(gram: Matrix, nt: int) -> Float[np.ndarray, "n r"]:
 
 
 @dataclass(frozen=True, eq=False)
-class Joint:
+class JointCovariance:
     """Cov of all that training estimated, p = (c, w): `σ² M⁻¹` with `M = G + ridge` on the weights.
 
     G is the Gram matrix of ∂ŷ/∂p in whitened outputs. Only functions of the fitted model have a variance: directions of
@@ -60,3 +60,25 @@ class Joint:
         """Cov of `K p`, (m, m)."""
         reach = k @ self.root()
         return reach @ reach.T
+
+
+@dataclass(frozen=True, eq=False)
+class Statistics:
+    """What training leaves behind; None where it left nothing.
+
+    `gram` (nθ + nw)² is the Gram matrix of ∂ŷ/∂(c, w) over the training rows in whitened outputs, `[Φ J]` one step
+    ahead; `ridge` the weights' prior precision beside it; `middle` = ΣψᵀΣ_eψ; `noise` (ny, ny) the noise covariance in
+    the outputs' units; `freedom` its degrees of freedom.
+    """
+
+    gram: Matrix | None = None
+    middle: Matrix | None = None
+    noise: Matrix | None = None
+    ridge: float = 0.0
+    freedom: float = np.inf
+
+    def joint(self, nt: int) -> JointCovariance | None:
+        """Cov(c, w), θ in front with nt entries."""
+        if self.gram is None or self.middle is None:
+            return None
+        return JointCovariance(self.gram, self.ridge, self.middle, nt)

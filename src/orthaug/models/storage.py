@@ -22,9 +22,11 @@ from orthaug._base.folders import whole_folder
 from orthaug.data.expressions import Expression, Lag
 from orthaug.data.record import Channel
 from orthaug.data.regressors import Features
+from orthaug.models.dynamics import Numbers
+from orthaug.models.lagged import Lagged
 from orthaug.models.learners import MLP, Bound, Learner
 from orthaug.models.model import Model
-from orthaug.models.predictor import Form, Numbers
+from orthaug.models.statistics import Statistics
 from orthaug.physics.baseline import Baseline, Parameter, Term
 
 FORMAT = 1
@@ -55,11 +57,12 @@ def write(model: Model, folder: Path) -> None:
     arrays |= {
         "largest_output": model.largest_output,
         "weight": model.weight,
-        "scalars": np.array([model.ridge, model.freedom]),
+        "scalars": np.array([model.statistics.ridge, model.statistics.freedom]),
     }
+    kept = model.statistics
     arrays |= {
         name: value
-        for name, value in (("gram", model.gram), ("noise", model.noise), ("middle", model.middle))
+        for name, value in (("gram", kept.gram), ("noise", kept.noise), ("middle", kept.middle))
         if value is not None
     }
     packed = save_arrays({name: np.ascontiguousarray(value, dtype=np.float64) for name, value in arrays.items()})
@@ -171,7 +174,7 @@ def _rebuild(
             raise InputError(f"{path}: the learner has {bound.size} weights, the saved one {found}; give the same one.")
     features = Features(tuple(Expression(e["text"], tuple(e["constants"].items())) for e in declared["features"]))
     outputs, inputs_ = (tuple(Channel(**c) for c in declared[kind]) for kind in ("outputs", "inputs"))
-    form = Form(
+    form = Lagged(
         baseline, features, tuple(Lag(*lag) for lag in declared["layout"]), tuple(c.name for c in outputs), bound
     )
     return Model(
@@ -185,11 +188,13 @@ def _rebuild(
         measure=declared["measure"],
         largest_output=arrays["largest_output"],
         weight=arrays["weight"],
-        ridge=float(arrays["scalars"][0]),
-        freedom=float(arrays["scalars"][1]),
-        gram=arrays.get("gram"),
-        middle=arrays.get("middle"),
-        noise=arrays.get("noise"),
+        statistics=Statistics(
+            gram=arrays.get("gram"),
+            middle=arrays.get("middle"),
+            noise=arrays.get("noise"),
+            ridge=float(arrays["scalars"][0]),
+            freedom=float(arrays["scalars"][1]),
+        ),
     )
 
 

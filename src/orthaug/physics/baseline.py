@@ -95,6 +95,11 @@ class Baseline:
         return cls(entries, function=function)
 
     @property
+    def linear(self) -> bool:
+        """Whether the output is linear in θ: here always, by its form."""
+        return True
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Parameter names in order of first appearance."""
         return tuple(p.name for p in self.parameters)

@@ -5,7 +5,8 @@ Everything that can be wrong with data and physics together is found here, witho
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -45,8 +46,44 @@ class Problem:
         return tuple(channel.name for channel in self.record.outputs)
 
     @property
+    def used(self) -> tuple[Lag, ...]:
+        """The raw lags that the physics or the learner reads."""
+        read = {*self.baseline.lags, *self.features.lags}
+        return tuple(lag for lag in self.layout if lag in read)
+
+    @property
     def whitened_target(self) -> Float[np.ndarray, "N ny"]:
         return self.target * self.weight
+
+    @cached_property
+    def least_squares(self) -> Vector:
+        """Φ⁺Y (nθ,): θ̂ of physics alone, and of the orthogonal structure whatever the learner does (F1)."""
+        return self.projection.solve(self.whitened_target)
+
+    @cached_property
+    def target_coordinates(self) -> Vector:
+        """QᵀY (nθ,)."""
+        return self.projection.coordinates(self.whitened_target)
+
+    @cached_property
+    def unexplained(self) -> Float[np.ndarray, "N ny"]:
+        """P⊥Y, what the physics cannot express of the whitened outputs."""
+        return self.projection.orthogonal_part(self.whitened_target)
+
+    @cached_property
+    def freedom_used(self) -> Vector:
+        """Degrees of freedom that the physics uses up in each output, its share `Σ_k ‖Q_ki‖²` of nθ, (ny,)."""
+        return np.sum(self.projection.q**2, axis=(0, 2))
+
+    def physics_alone(self) -> Problem:
+        """The same without a learner; posed anew where the learner's lags took rows from the physics."""
+        if self.baseline.function is not None:
+            return replace(self, features=Features(()))
+        outputs, inputs = self.outputs, tuple(channel.name for channel in self.record.inputs)
+        own = in_order(self.baseline.lags, outputs, inputs)
+        if own == self.layout:
+            return self
+        return pose(self.record, self.baseline)
 
     def feature_rows(self) -> Matrix:
         """The learner's features (N, nz).
@@ -190,9 +227,3 @@ def _check_finite(values: np.ndarray, what: str, rows: Rows, record: Record) -> 
         if row < usable:
             raise InputError(f"{experiment.where(row + rows.start)}: {what} is not finite there.")
         row -= usable
-
-
-def used_lags(problem: Problem) -> tuple[Lag, ...]:
-    """The raw lags that the physics or the learner reads."""
-    read = {*problem.baseline.lags, *problem.features.lags}
-    return tuple(lag for lag in problem.layout if lag in read)

@@ -5,44 +5,76 @@ Everything here is orthogonal factorisation; `ΦᵀΦ` is never formed, let alon
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
-from orthaug._base.checks import Vector
+from orthaug._base.checks import Matrix, Vector
 
 
 @dataclass(frozen=True, eq=False)
-class Projection:
-    """Φ = Q R with its columns scaled by powers of two (exact), over rows weighted per output.
+class Factor:
+    """What stays of Φ where its rows do not: `r` (nθ, nθ), upper triangular, of the columns times `scale` (nθ,).
 
-    `q` (N, ny, nθ) has orthonormal columns, `r` (nθ, nθ) is upper triangular and `scale` (nθ,) holds
-    the powers: `Φ scale = q r`.
+    The scale is of powers of two, which is exact: `Φ scale = q r` with orthonormal q.
     """
+
+    r: Float[np.ndarray, "nt nt"]
+    scale: Vector
+
+    @classmethod
+    def of_blocks(cls, blocks: Iterable[Float[np.ndarray, "n ny nt"]]) -> Factor:
+        """From rows that come in blocks, one at a time: R of each stacked upon that of all before (tree QR)."""
+        r = scale = None
+        for block in blocks:
+            rows = block.reshape(-1, block.shape[-1])
+            if scale is None or r is None:
+                scale, r = _scale(rows), np.zeros((0, rows.shape[1]))
+            r = np.asarray(np.linalg.qr(np.concatenate([r, rows * scale]), mode="r"))
+        if r is None or scale is None:
+            raise ValueError("a factor needs at least one block of rows")
+        return cls(r, scale)
+
+    @property
+    def to_coordinates(self) -> Matrix:
+        """The matrix that takes θ to its coordinates in the basis Q, `R / scale` (nθ, nθ)."""
+        return self.r / self.scale if self.scale.size else self.r
+
+    def from_coordinates(self, coordinates: Float[np.ndarray, "nt *m"]) -> Float[np.ndarray, "nt *m"]:
+        """θ of coordinates in the basis Q: `R⁻¹q`, one vector or several as columns."""
+        if not coordinates.size:
+            return coordinates
+        return (self.scale * scipy.linalg.solve_triangular(self.r, coordinates, check_finite=False).T).T
+
+    def covariance_factor(self, free: Sequence[int] | None = None) -> Float[np.ndarray, "nf nt"]:
+        """A factor L with `L Lᵀ = (Φ_fᵀΦ_f)⁻¹` for the free columns, all by default; `L = Φ_f⁺Q`."""
+        chosen = list(range(len(self.scale))) if free is None else list(free)
+        basis, r = np.linalg.qr(self.r[:, chosen])
+        return self.scale[chosen, None] * scipy.linalg.solve_triangular(r, basis.T) if chosen else basis.T
+
+
+@dataclass(frozen=True, eq=False)
+class Projection(Factor):
+    """A factor with its rows, weighted per output: `phi` and the orthonormal `q`, both (N, ny, nθ)."""
 
     phi: Float[np.ndarray, "N ny nt"]
     q: Float[np.ndarray, "N ny nt"]
-    r: Float[np.ndarray, "nt nt"]
-    scale: Vector
 
     @classmethod
     def factor(cls, phi: Float[np.ndarray, "N ny nt"]) -> Projection:
         """Householder QR of the stacked (N·ny, nθ) matrix."""
         rows, ny, nt = phi.shape
         if nt == 0:
-            return cls(phi, phi, np.zeros((0, 0)), np.zeros(0))
+            return cls(np.zeros((0, 0)), np.zeros(0), phi, phi)
         stacked = phi.reshape(rows * ny, nt)
-        largest = np.abs(stacked).max(axis=0, initial=0.0)
-        scale = np.where(
-            largest > 0, 2.0 ** np.clip(-np.round(np.log2(np.where(largest > 0, largest, 1.0))), -1000, 1000), 1.0
-        )
+        scale = _scale(stacked)
         q, r = scipy.linalg.qr(  # pyright: ignore[reportAssignmentType]  (its stubs do not know `mode`)
             stacked * scale, mode="economic", overwrite_a=True, check_finite=False
         )
-        return cls(phi, np.ascontiguousarray(q).reshape(rows, ny, -1), r, scale)
+        return cls(r, scale, phi, np.ascontiguousarray(q).reshape(rows, ny, -1))
 
     def coordinates(self, values: Float[np.ndarray, "N ny"]) -> Vector:
         """Qᵀv, (nθ,): the part of stacked outputs that the physics can express."""
@@ -53,20 +85,15 @@ class Projection:
         theta = self.from_coordinates(self.coordinates(values))
         return theta + self.from_coordinates(self.coordinates(values - self.phi @ theta))
 
-    def from_coordinates(self, coordinates: Float[np.ndarray, "nt *m"]) -> Float[np.ndarray, "nt *m"]:
-        """θ of coordinates in the basis Q: `R⁻¹q`, one vector or several as columns."""
-        if not coordinates.size:
-            return coordinates
-        return (self.scale * scipy.linalg.solve_triangular(self.r, coordinates, check_finite=False).T).T
-
     def orthogonal_part(self, values: Float[np.ndarray, "N ny"]) -> Float[np.ndarray, "N ny"]:
         """P⊥v = v − QQᵀv, projected twice so that what is left is orthogonal to rounding."""
         for _ in range(2):
             values = values - self.q @ self.coordinates(values)
         return values
 
-    def covariance_factor(self, free: Sequence[int] | None = None) -> Float[np.ndarray, "nf nt"]:
-        """A factor L with `L Lᵀ = (Φ_fᵀΦ_f)⁻¹` for the free columns, all by default; `L = Φ_f⁺Q`."""
-        chosen = list(range(len(self.scale))) if free is None else list(free)
-        basis, r = np.linalg.qr(self.r[:, chosen])
-        return self.scale[chosen, None] * scipy.linalg.solve_triangular(r, basis.T) if chosen else basis.T
+
+def _scale(rows: Matrix) -> Vector:
+    """Powers of two that bring the largest entry of each column (n, nθ) near 1; 1 for a column of zeros."""
+    largest = np.abs(rows).max(axis=0, initial=0.0)
+    moves = largest > 0
+    return np.where(moves, 2.0 ** np.clip(-np.round(np.log2(np.where(moves, largest, 1.0))), -1000, 1000), 1.0)

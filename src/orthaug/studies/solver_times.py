@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from orthaug._base.jax import jax
-from orthaug.fitting.one_step import Task
+from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Orthogonal
@@ -46,7 +46,7 @@ def declared(name: str, example: str, share: float) -> Any:
 def one(example: str, solver: str, share: float, seed: int) -> dict[str, Any]:
     """A run's seconds and mean squared error; run once before, so that nothing is compiled in it."""
     given = static(1) if example == "static" else mass_spring_damper()
-    task = Task.of(pose(given.train, given.baseline), MLP())
+    task = OneStepTask.of(pose(given.train, given.baseline), MLP())
     start, chosen = task.bound.init(jax.random.key(seed)), declared(solver, example, share)
     task.run(declared(solver, example, 0.01), start, Orthogonal())
     run = task.run(chosen, start, Orthogonal())

@@ -1,6 +1,5 @@
 """Solvers: frozen declarations that minimise a criterion over the learner's weights."""
 
-from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+import lazy_loader
 
-__all__ = ["AdamLBFGS", "LevenbergMarquardt"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,147 @@
+"""θ taken out of the criterion, whatever the structure: penalties and bounds are one small quadratic in QᵀF (F1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy.optimize
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug.fitting.structures import PenaltyRows, Structure
+from orthaug.physics.problem import Problem
+
+Fixed = dict[int, float]
+"""Entries of θ that stand at a bound, with its value."""
+
+
+@dataclass(frozen=True, eq=False)
+class Elimination:
+    """θ taken out of `‖p − f − Tθ‖² + ‖e − A θ − B f‖²`, with f = QᵀF, p = QᵀY, `T` = coordinates of θ.
+
+    `(A, B, e)` are the structure's rows. Bounds are met by an active set: some entries of θ stand at a
+    bound, the others are free and minimise the rest.
+    """
+
+    to_coordinates: Matrix
+    outputs: Vector
+    rows: PenaltyRows
+    lower: Vector
+    upper: Vector
+
+    @property
+    def bounded(self) -> bool:
+        """Whether any entry of θ has a bound."""
+        return bool(np.isfinite(self.lower).any() or np.isfinite(self.upper).any())
+
+    @property
+    def _theta(self) -> Matrix:
+        return np.concatenate([self.to_coordinates, self.rows.theta])
+
+    @property
+    def _learner(self) -> Matrix:
+        return np.concatenate([np.eye(len(self.outputs)), self.rows.learner])
+
+    @property
+    def _target(self) -> Vector:
+        return np.concatenate([self.outputs, self.rows.target])
+
+    def hold(self, fixed: Fixed) -> tuple[Matrix, Vector]:
+        """`(S, t)` with `min_θ (…) = ‖t − S f‖² + constant`: what remains for the learner to see, (nθ, nθ) and (nθ,).
+
+        S is zero where θ can follow any f: without penalty rows and with no entry at a bound.
+        """
+        nt = len(self.outputs)
+        if not len(self.rows.target) and not fixed:
+            return np.zeros((nt, nt)), np.zeros(nt)
+        free, offset = self._split(fixed)
+        basis = np.linalg.qr(free)[0]
+        stacked = np.column_stack([self._learner, self._target - offset])
+        stacked = stacked - basis @ (basis.T @ stacked)
+        small = np.linalg.qr(stacked, mode="r")[:nt]
+        small = np.concatenate([small, np.zeros((nt - len(small), nt + 1))])
+        return small[:, :nt], small[:, nt]
+
+    def theta(self, f: Vector, fixed: Fixed) -> Vector:
+        """The minimising θ (nθ,) for the learner's coordinates f (nθ,)."""
+        free, offset = self._split(fixed)
+        scale = np.linalg.norm(free, axis=0)
+        right = self._target - self._learner @ f - offset
+        theta = np.empty(len(f))
+        theta[[i for i in range(len(f)) if i not in fixed]] = (
+            np.linalg.lstsq(free / scale, right, rcond=None)[0] / scale
+        )
+        for i, value in fixed.items():
+            theta[i] = value
+        return theta
+
+    def active(self, f: Vector) -> Fixed:
+        """Which entries of θ stand at which bound, for the learner's coordinates f."""
+        if not self.bounded:
+            return {}
+        matrix, right = self._theta, self._target - self._learner @ f
+        scale = np.linalg.norm(matrix, axis=0)
+        found = scipy.optimize.lsq_linear(
+            matrix / scale, right, bounds=(self.lower * scale, self.upper * scale), method="bvls", tol=1e-14
+        )
+        return {
+            i: float(self.lower[i] if side < 0 else self.upper[i]) for i, side in enumerate(found.active_mask) if side
+        }
+
+    def _split(self, fixed: Fixed) -> tuple[Matrix, Vector]:
+        """The columns of the free entries, and what the fixed ones contribute."""
+        matrix = self._theta
+        free = [i for i in range(matrix.shape[1]) if i not in fixed]
+        return matrix[:, free], matrix[:, list(fixed)] @ np.array(list(fixed.values()), dtype=float)
+
+
+def eliminate(structure: Structure, problem: Problem) -> Elimination:
+    """The elimination of θ from a problem's criterion with a structure's rows and the baseline's bounds."""
+    baseline, projection, weight = problem.baseline, problem.projection, problem.weight
+    unit = float(weight[0]) if len(weight) == 1 else 1.0  # λ counts in the output's units where there is one
+    return Elimination(
+        to_coordinates=projection.to_coordinates,
+        outputs=problem.target_coordinates,
+        rows=structure.penalty(baseline.names, baseline.initial, unit),
+        lower=baseline.bounds[0],
+        upper=baseline.bounds[1],
+    )
+
+
+class Split(NamedTuple):
+    """θ and θ_aux, and which entries of θ stand at a bound."""
+
+    theta: Vector
+    theta_aux: Vector
+    fixed: Fixed
+
+
+def split(
+    structure: Structure,
+    problem: Problem,
+    share: Vector,
+    coefficients: Vector | None = None,
+    fixed: Fixed | None = None,
+) -> Split:
+    """θ for the learner's share QᵀF (nθ,) in the physics, and its part θ_aux = Φ⁺F that the structure moves to θ.
+
+    Args:
+        coefficients: c = θ − θ_aux (nθ,) where training found it; None to solve for θ.
+        fixed: what stands at a bound, where training found that.
+    """
+    baseline = problem.baseline
+    aux = problem.projection.from_coordinates(share)
+    elimination = eliminate(structure, problem)
+    f = 0.0 * share if structure.projects else share
+    if coefficients is not None:
+        theta = coefficients + (aux if structure.projects else 0.0)
+        if fixed is None:  # an iterate need not satisfy what only its end satisfies
+            inside = np.clip(theta, *baseline.bounds)
+            fixed = elimination.active(f) | {i: value for i, value in enumerate(inside) if value != theta[i]}
+        theta = np.array([fixed.get(i, value) for i, value in enumerate(theta)])
+    elif (fixed := elimination.active(f)) or len(elimination.rows.target):
+        theta = elimination.theta(f, fixed)
+    else:  # refined least squares, as exact as double precision allows
+        theta = problem.least_squares - (0.0 if structure.projects else aux)
+    return Split(theta, aux if structure.projects else 0.0 * aux, fixed)

@@ -1,0 +1,71 @@
+"""The states that segments start from, as unknowns of their own, eliminated from the normal equations.
+
+A state is scored against the measured one, `‖L (x − measured)‖²`: past outputs have the errors of all others. It
+touches its own segment only, so a Schur complement per segment removes it. Without this, noise in a segment's measured
+lags would be a disturbance that the model has to explain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug.fitting.segments import Sensitivity
+
+
+class Start(NamedTuple):
+    """States to start a trial from, (k, n0, m), and how the best ones follow (c, w) to first order."""
+
+    values: Float[np.ndarray, "k n0 m"]
+    misfit: float = np.inf
+    """`‖r‖²` where they are the best, which a trial is compared with."""
+    unknowns: Vector | None = None
+    """(c, w) there; None before anything was linearised."""
+    offset: Float[np.ndarray, "k m n0"] | None = None
+    slope: Float[np.ndarray, "k m n0 n"] | None = None
+
+    def at(self, unknowns: Vector) -> Float[np.ndarray, "k n0 m"] | None:
+        """The best states to first order where (c, w) is `unknowns`; None where that is not known."""
+        if self.offset is None or self.slope is None or self.unknowns is None:
+            return None
+        moved = self.offset - self.slope @ (unknowns - self.unknowns)
+        return self.values + np.moveaxis(moved, 1, -1)
+
+
+@dataclass(frozen=True, eq=False)
+class InitialStates:
+    """What is known of the states before training: `measured` (k, n0, m), and whether they are `free` unknowns."""
+
+    measured: Float[np.ndarray, "k n0 m"]
+    free: bool
+
+    def loss(self, values: Float[np.ndarray, "k n0 m"], rows: Matrix) -> float:
+        """`‖L (measured − x)‖²`, L = `rows` (n0, n0)."""
+        with np.errstate(all="ignore"):
+            return float(np.sum(np.einsum("oi,kim->kom", rows, self.measured - values) ** 2))
+
+    def eliminate(
+        self, found: Sensitivity, values: Float[np.ndarray, "k n0 m"], rows: Matrix
+    ) -> tuple[Matrix, Vector, Float[np.ndarray, "k m n0"] | None, Float[np.ndarray, "k m n0 n"] | None]:
+        """Normal matrix and right-hand side of (c, w) with the states at their best, and how these follow (c, w).
+
+        The best states are `values + offset − slope · step` for a small step of (c, w).
+        """
+        shared = np.asarray(found.shared)
+        if not self.free:
+            return shared[:-1, :-1], shared[:-1, -1], None, None
+        own = np.moveaxis(np.asarray(found.own), -1, 1)  # (k, m, n0, n0+n+1)
+        n0 = own.shape[2]
+        prior = rows.T @ rows
+        missed = np.moveaxis(self.measured - values, -1, 1)
+        inner = own[..., :n0] + prior
+        across, right = own[..., n0:-1], own[..., -1] + missed @ prior
+        solved = np.linalg.solve(inner, np.concatenate([across, right[..., None]], axis=-1))
+        slope, offset = solved[..., :-1], solved[..., -1]
+        hessian = shared[:-1, :-1] - np.tensordot(across, slope, axes=([0, 1, 2], [0, 1, 2]))
+        gradient = shared[:-1, -1] - np.tensordot(across, offset, axes=([0, 1, 2], [0, 1, 2]))
+        return (hessian + hessian.T) / 2, gradient, offset, slope

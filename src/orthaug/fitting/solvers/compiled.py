@@ -1,0 +1,212 @@
+"""The Levenberg-Marquardt loop compiled whole, for a criterion whose rows are in memory: the fast path of the solver.
+
+The step solves `(H + (α + μ) I) d = g − α w`. Damping with the identity and Nielsen's update (Madsen, Nielsen and
+Tingleff 2004, algorithm 3.16) converges from Xavier starts on normalised data. One trial costs one pass over the rows,
+which is at once the next step's linearisation.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from orthaug._base.jax import jax, jnp
+from orthaug.fitting.normal_equations import Normal, linearise
+from orthaug.fitting.solvers.levenberg_marquardt import IDENTITY, LevenbergMarquardt, Progress
+from orthaug.fitting.status import Ending
+from orthaug.models.rows import Overlap
+
+_NOTHING_LEFT = 1e-22  # of ‖J‖²: what rounding leaves of a Jacobian in the span of the physics
+_SECONDS_PER_BURST = 0.5  # how often progress is told and Ctrl-C is heard
+
+
+class State(NamedTuple):
+    """The iterate with its linearisation; plain arrays, so a run can pause and go on."""
+
+    w: Float[Array, "nw"]
+    normal: Normal
+    damping: Float[Array, ""]
+    growth: Float[Array, ""]
+    ridge: Float[Array, ""]
+    iteration: Int[Array, ""]
+    accepted: Int[Array, ""]
+    small: Int[Array, ""]
+    code: Int[Array, ""]
+
+
+class Options(NamedTuple):
+    """Numbers of a run that the compiled program takes as arguments."""
+
+    tolerance: Float[Array, ""]
+    evidence: Any
+    samples: Float[Array, ""]
+
+
+class Run(NamedTuple):
+    """What one run from one start found."""
+
+    w: Float[Array, "nw"]
+    normal: Normal
+    ridge: float
+    effective: float
+    """Effective number of weights, `tr(H (H + αI)⁻¹)`."""
+    iterations: int
+    ending: Ending
+    seconds: float
+    coefficients: np.ndarray | None = None
+    """θ (nθ,) where the solver iterated on it too; None where it is eliminated."""
+    held: bool = False
+    """Whether a penalty or a bound held the learner, so that `normal` has its rows too."""
+
+
+def minimise(
+    solver: LevenbergMarquardt,
+    criterion: Callable[..., Normal],
+    w: Float[Array, "nw"],
+    arguments: tuple[Any, ...],
+    overlap: Overlap,
+    *,
+    ridge: float = 0.0,
+    evidence: bool = False,
+    samples: int,
+    progress: Progress | None = None,
+) -> Run:
+    """Minimise `‖r(w)‖² + α‖w‖²` from `w`.
+
+    Args:
+        criterion: hashable; `(w, *arguments, overlap) -> Normal`.
+        overlap: a first guess of the learner's share in the physics, zeros will do.
+        ridge: α in normalised units; with `evidence` where it starts.
+        evidence: choose α by MacKay's re-estimation after every accepted step.
+        samples: residuals less the physics' own parameters, for the noise variance.
+    """
+    began = time.perf_counter()
+    options = Options(jnp.asarray(solver.tolerance), jnp.asarray(evidence), jnp.asarray(float(samples)))
+    state = _start(criterion, w, arguments, overlap, jnp.asarray(ridge), options)
+    burst = 1
+    while int(state.code) == Ending.RUNNING and int(state.iteration) < solver.iterations:
+        tick = time.perf_counter()
+        stop = min(int(state.iteration) + burst, solver.iterations)
+        state = jax.block_until_ready(_advance(criterion, state, arguments, options, jnp.asarray(stop)))
+        spent = time.perf_counter() - tick
+        burst = burst_length(burst, spent)
+        if progress is not None:
+            progress(int(state.iteration), float(state.normal.loss))
+    return Run(
+        state.w,
+        state.normal,
+        float(state.ridge),
+        float(effective_weights(state.normal, state.ridge)),
+        int(state.iteration),
+        Ending(int(state.code)),
+        time.perf_counter() - began,
+    )
+
+
+def burst_length(burst: int, spent: float) -> int:
+    """How many steps to take at a time, when `burst` of them took `spent` seconds."""
+    return int(np.clip(burst * _SECONDS_PER_BURST / max(spent, 1e-6), 1, 4 * burst))
+
+
+@partial(jax.jit, static_argnames="criterion")
+def _start(criterion: Any, w: Any, arguments: tuple[Any, ...], overlap: Overlap, ridge: Any, options: Options) -> State:
+    normal = linearise(criterion, w, arguments, overlap)
+    curvature = jnp.max(jnp.diag(normal.hessian), initial=0.0)
+    finite = jnp.isfinite(normal.loss) & jnp.all(jnp.isfinite(normal.hessian))
+    return State(
+        w=w,
+        normal=normal,
+        damping=IDENTITY.first * jnp.maximum(curvature, 1e-300),
+        growth=jnp.asarray(2.0),
+        ridge=ridge,
+        iteration=jnp.asarray(0),
+        accepted=jnp.asarray(0),
+        small=jnp.asarray(0),
+        code=jnp.where(finite, jnp.where(spanned(normal), Ending.SPANNED, Ending.RUNNING), Ending.NON_FINITE),
+    )
+
+
+@partial(jax.jit, static_argnames="criterion")
+def _advance(criterion: Any, state: State, arguments: tuple[Any, ...], options: Options, stop: Any) -> State:
+    return jax.lax.while_loop(
+        lambda s: (s.code == Ending.RUNNING) & (s.iteration < stop),
+        lambda s: _trial(criterion, s, arguments, options),
+        state,
+    )
+
+
+def _trial(criterion: Any, state: State, arguments: tuple[Any, ...], options: Options) -> State:
+    """One damped step: accept it, or damp more."""
+    w, normal, alpha = state.w, state.normal, state.ridge
+    downhill = normal.gradient - alpha * w
+    shifted = normal.hessian + (alpha + state.damping) * jnp.eye(w.shape[0])
+    step = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(shifted), downhill)
+    trial = criterion(w + step, *arguments, normal.overlap)
+
+    before = normal.loss + alpha * (w @ w)
+    after = trial.loss + alpha * ((w + step) @ (w + step))
+    gain = (before - after) / (step @ (state.damping * step + downhill))
+    ok = jnp.isfinite(after) & (after < before) & jnp.all(jnp.isfinite(trial.hessian))
+
+    small = jnp.where(ok, jnp.where(before - after < options.tolerance * before, state.small + 1, 0), state.small)
+    accepted = state.accepted + ok
+    damping = jnp.where(ok, state.damping * jnp.maximum(1 / 3, 1 - (2 * gain - 1) ** 3), state.damping * state.growth)
+    stuck = damping > IDENTITY.largest * jnp.max(jnp.diag(normal.hessian), initial=1e-300)
+    code = jnp.where(small >= 2, Ending.CONVERGED, Ending.RUNNING)
+    arrived = (accepted > 0) | _level(normal, downhill, before)
+    code = jnp.where(stuck, jnp.where(arrived, Ending.CONVERGED, Ending.NO_DESCENT), code)
+    moved = jax.tree.map(lambda new, old: jnp.where(ok, new, old), (w + step, trial), (w, normal))
+    ridge = jax.lax.cond(
+        ok & options.evidence, lambda: _evidence(moved[0], moved[1], alpha, options.samples), lambda: alpha
+    )
+    return State(
+        w=moved[0],
+        normal=moved[1],
+        damping=damping,
+        growth=jnp.where(ok, 2.0, 2 * state.growth),
+        ridge=ridge,
+        iteration=state.iteration + 1,
+        accepted=accepted,
+        small=small,
+        code=code,
+    )
+
+
+def _level(normal: Normal, downhill: Any, objective: Any) -> Any:
+    """Residual and Jacobian are orthogonal to rounding (MINPACK's gtol): no step can descend from a minimum."""
+    size = jnp.sqrt(jnp.maximum(jnp.diag(normal.hessian), 0.0) * objective)
+    return jnp.all(jnp.abs(downhill) <= 1e-7 * size)
+
+
+def _evidence(w: Any, normal: Normal, alpha: Any, samples: Any) -> Any:
+    """MacKay's fixed point: `γ = tr(H(H + αI)⁻¹)`, `α = γ σ² / ‖w‖²` with `σ² = ‖r‖² / (N − γ)`."""
+    effective = effective_weights(normal, alpha)
+    variance = normal.loss / jnp.maximum(samples - effective, 1.0)
+    return jnp.clip(effective * variance / jnp.maximum(w @ w, 1e-300), 1e-12, 1e12)
+
+
+@jax.jit
+def effective_weights(normal: Normal, alpha: Any) -> Any:
+    """tr(H (H + αI)⁻¹), with directions that are rounding beside the columns of J counted as absent."""
+    n = normal.hessian.shape[0]
+    if n == 0:
+        return jnp.asarray(0.0)
+    values = jnp.linalg.eigvalsh(jnp.where(jnp.isfinite(normal.hessian), normal.hessian, 0.0))
+    floor = n * jnp.finfo(float).eps * _largest_column(normal)
+    return jnp.sum(jnp.where(values > floor, values / (values + alpha), 0.0))
+
+
+def spanned(normal: Normal) -> Any:
+    """P⊥J = 0: the learner lies in the span of the physics, as in the paper's Example 1."""
+    curvature = jnp.max(jnp.diag(normal.hessian), initial=0.0)
+    return curvature <= _NOTHING_LEFT * _largest_column(normal)
+
+
+def _largest_column(normal: Normal) -> Any:
+    """The largest ‖J_i‖², before the projection."""
+    return jnp.max(jnp.diag(normal.hessian) + jnp.sum(normal.overlap.jacobian**2, axis=0), initial=0.0)

@@ -1,0 +1,136 @@
+"""A model as a state and a step: what a free run, its training and its stability need to know, and no more.
+
+`x_{k+1}, ŷ_k = step(numbers, x_k, u_k)`. The lagged form (`models.lagged`) is the case whose state is the past outputs.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from orthaug._base.checks import Matrix
+from orthaug._base.jax import jax, jnp
+from orthaug.data.record import Experiment, Record
+
+AnyArray = Array | np.ndarray
+
+
+class Numbers(NamedTuple):
+    """The numbers of a model."""
+
+    theta: Float[AnyArray, "nt"]
+    theta_aux: Float[AnyArray, "nt"]
+    weights: Any
+    """One vector (nw,), or its leaves."""
+    centre: Float[AnyArray, "nz"]
+    halfwidth: Float[AnyArray, "nz"]
+    gain: Float[AnyArray, "ny"]
+    """Unit of the learner's output, in the outputs' units."""
+    tilt: Any = None
+    """(members, nθ) where the learner is the median of several, one row of weights each: the physics each one adds."""
+
+
+class Parts(NamedTuple):
+    """The output of a step in parts: `baseline` = φθ + fixed terms, `learner` = f − φθ_aux, `raw` = f; each (ny,)."""
+
+    baseline: Any
+    learner: Any
+    raw: Any
+
+    @property
+    def total(self) -> Any:
+        """ŷ (ny,)."""
+        return self.baseline + self.learner
+
+
+@runtime_checkable
+class Dynamics(Protocol):
+    """A model without its numbers; hashable, so that compiled programs are reused.
+
+    The state is one vector (n0,), the parameters are θ and the learner's weights, `unknowns` numbers together.
+    """
+
+    @property
+    def outputs(self) -> tuple[str, ...]: ...
+
+    @property
+    def linear(self) -> bool:
+        """Whether the output is linear in θ where state and inputs are given: then training eliminates θ (F1)."""
+        ...
+
+    @property
+    def first_row(self) -> int:
+        """The first row of an experiment that has an output."""
+        ...
+
+    @property
+    def states(self) -> int:
+        """n0, entries of the state."""
+        ...
+
+    @property
+    def unknowns(self) -> int:
+        """n = nθ + nw."""
+        ...
+
+    @property
+    def memory(self) -> int:
+        """How many rows of measured outputs `start` reads."""
+        ...
+
+    def start(self, outputs: Matrix, rows: Any) -> Float[np.ndarray, "r n0"]:
+        """The states at some rows, as the outputs (N, ny) measured before each of them give it."""
+        ...
+
+    def start_rows(self, weight: Matrix) -> Matrix:
+        """L (n0, n0): `‖L (x − start)‖²` is what a state x costs that differs from the measured one.
+
+        `weight` (ny, ny) multiplies the errors of an output. Zero rows leave an entry free.
+        """
+        ...
+
+    def inputs(self, experiment: Experiment, record: Record) -> Matrix:
+        """What the steps of an experiment read, (T, nu), from its first row with an output on."""
+        ...
+
+    def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
+        """The next state (n0,) and the output, from a state and the inputs (nu,) of one row."""
+        ...
+
+    def first_slopes(self, width: int) -> Any:
+        """∂state/∂(state at the start, c, w) at the start of `width` runs: the identity and zeros, in any layout."""
+        ...
+
+    def tangents(self, numbers: Numbers, state: Any, slopes: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
+        """A step of m runs side by side with its derivatives: (state, slopes, ŷ (ny, m), ∂ŷ/∂(start, c, w)).
+
+        The last one is (ny, n0 + n, m), `state` (n0, m), `inputs` (nu, m), `slopes` as `first_slopes` lays them out.
+        """
+        ...
+
+
+class Differentiated:
+    """`first_slopes` and `tangents` by automatic differentiation of `step`, for dynamics that know no faster way."""
+
+    def first_slopes(self: Dynamics, width: int) -> Any:
+        n0 = self.states
+        return jnp.broadcast_to(jnp.eye(n0, n0 + self.unknowns)[..., None], (n0, n0 + self.unknowns, width))
+
+    def tangents(self: Dynamics, numbers: Numbers, state: Any, slopes: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
+        """`S⁺ = A S + [0 B]` with A = ∂x⁺/∂x and B = ∂x⁺/∂(c, w), and the same for the output."""
+        nt = len(numbers.theta)
+
+        def both(state: Any, unknowns: Any, inputs: Any) -> Any:
+            own = numbers._replace(theta=unknowns[:nt], weights=unknowns[nt:])
+            following, parts = self.step(own, state, inputs)
+            return jnp.concatenate([following, parts.total])
+
+        unknowns = jnp.concatenate([jnp.asarray(numbers.theta), jnp.asarray(numbers.weights)])
+        value = jax.vmap(both, (-1, None, -1), -1)(state, unknowns, inputs)
+        to_state, to_unknowns = jax.vmap(jax.jacrev(both, (0, 1)), (-1, None, -1), -1)(state, unknowns, inputs)
+        n0 = self.states
+        slope = jnp.einsum("ijm,jnm->inm", to_state, slopes)
+        slope = slope + jnp.pad(to_unknowns, ((0, 0), (n0, 0), (0, 0)))
+        return value[:n0], slope[:n0], value[n0:], slope[n0:]

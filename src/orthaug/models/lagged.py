@@ -1,0 +1,152 @@
+"""The lagged form: ŷ_k = φ(x_k)θ + f(x_k) − φ(x_k)θ_aux of a regressor x of past outputs and inputs (eq:orth_param).
+
+As dynamics its state is the past outputs, newest first, and a step puts its own output in front of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from orthaug._base.checks import Matrix
+from orthaug._base.jax import jax, jnp
+from orthaug.data.expressions import Lag
+from orthaug.data.record import Experiment, Record
+from orthaug.data.regressors import Features, Layout, lag_matrix, largest_lag
+from orthaug.models.dynamics import Numbers, Parts
+from orthaug.models.learners import Bound
+from orthaug.physics.baseline import Baseline
+
+
+@dataclass(frozen=True)
+class Lagged:
+    """What a model of lagged signals computes, without its numbers: `Dynamics`."""
+
+    baseline: Baseline
+    features: Features
+    layout: Layout
+    outputs: tuple[str, ...]
+    bound: Bound | None
+
+    @property
+    def linear(self) -> bool:
+        return self.baseline.linear
+
+    @property
+    def first_row(self) -> int:
+        return largest_lag(self.layout)
+
+    @property
+    def states(self) -> int:
+        return self.memory * len(self.outputs)
+
+    @property
+    def unknowns(self) -> int:
+        return len(self.baseline.names) + (self.bound.size if self.bound else 0)
+
+    @property
+    def fed_back(self) -> tuple[tuple[int, int], ...]:
+        """(lag, number of the output) of every past output in the regressor, in its order."""
+        return tuple((lag.lag, self.outputs.index(lag.channel)) for lag in self.layout if lag.channel in self.outputs)
+
+    @property
+    def memory(self) -> int:
+        """na, how many past outputs the state holds of each output."""
+        return max((lag for lag, _ in self.fed_back), default=0)
+
+    @property
+    def used(self) -> tuple[Lag, ...]:
+        """The raw lags that the physics or the learner reads."""
+        read = {*self.baseline.lags, *self.features.lags}
+        return tuple(lag for lag in self.layout if lag in read or self.baseline.function is not None)
+
+    @property
+    def input_layout(self) -> Layout:
+        """The lagged inputs of the regressor, in its order."""
+        return tuple(lag for lag in self.layout if lag.channel not in self.outputs)
+
+    def start(self, outputs: Matrix, rows: Sequence[int] | Int[np.ndarray, "r"]) -> Float[np.ndarray, "r n0"]:
+        before = np.asarray(rows)[:, None] - 1 - np.arange(self.memory)
+        return outputs[before].reshape(len(before), self.states)
+
+    def start_rows(self, weight: Matrix) -> Matrix:
+        """Every past output was measured with the errors of all others."""
+        return np.kron(np.eye(self.memory), weight)
+
+    def inputs(self, experiment: Experiment, record: Record) -> Matrix:
+        return lag_matrix(experiment, self.input_layout, record, self.first_row)
+
+    def regressors(self, experiment: Experiment, record: Record, row: int | None = None) -> Matrix:
+        """Measured regressors x (T, nx) of an experiment, from a row on, by default the first that has one."""
+        return lag_matrix(experiment, self.layout, record, self.first_row if row is None else row)
+
+    def regressor(self, state: Any, inputs: Any, xp: Any = jnp) -> Any:
+        """x (nx, …) of a state (n0, …) and a row of lagged inputs (nu, …)."""
+        past = state.reshape(self.memory, len(self.outputs), *state.shape[1:])
+        lag, output = np.array(self.fed_back, dtype=int).reshape(-1, 2).T
+        return xp.concatenate([past[lag - 1, output], inputs])
+
+    def at(self, numbers: Numbers, x: Float[Array, "nx"]) -> Parts:
+        """The prediction at one regressor x (nx,), in parts."""
+        phi = self.baseline.phi(x, self.layout, self.outputs, jnp)
+        known = self.baseline.known(x, self.layout, self.outputs, jnp)
+        if self.bound is None:
+            raw = jnp.zeros(len(self.outputs))
+        else:
+            z = (self.features.evaluate(x, self.layout, jnp) - numbers.centre) / numbers.halfwidth
+            raw = _learned(self.bound, numbers, z, phi)
+        return Parts(known + phi @ numbers.theta, raw - phi @ numbers.theta_aux, raw)
+
+    def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
+        found = self.at(numbers, self.regressor(state, inputs))
+        return self._push(state, found.total), found
+
+    def _push(self, state: Any, y: Any) -> Any:
+        """The state (n0, …) one step later, when y (ny, …) is the newest output."""
+        return jnp.concatenate([y, state[: -len(self.outputs)]]) if self.memory else state
+
+    def first_slopes(self, width: int) -> Any:
+        """One block (ny, n0 + n, m) for each past output, newest first."""
+        n0, n, ny = self.states, self.unknowns, len(self.outputs)
+        blocks = jnp.eye(n0, n0 + n).reshape(self.memory, ny, n0 + n, 1)
+        return tuple(jnp.broadcast_to(blocks, (self.memory, ny, n0 + n, width)))
+
+    def tangents(self, numbers: Numbers, state: Any, slopes: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
+        """`S_k = G_k + Σ_i A_{k,i} S_{k−i}` with G_k = ∂g/∂(c, w) and A_{k,i} = ∂g/∂ŷ_{k−i}."""
+        value, slope, feedback = jax.vmap(partial(self._derivatives, numbers), in_axes=-1, out_axes=-1)(state, inputs)
+        slope = jnp.pad(slope, ((0, 0), (self.states, 0), (0, 0)))
+        for i, (lag, output) in enumerate(self.fed_back):
+            slope = slope + feedback[:, i, None] * slopes[lag - 1][output]
+        following = (slope, *slopes[:-1]) if self.memory else slopes
+        return self._push(state, value), following, value, slope
+
+    def _derivatives(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any, Any]:
+        """Value (ny,), ∂g/∂(c, w) (ny, n) and ∂g/∂ŷ of every lag that is fed back (ny, lags), at one step."""
+        leaves = [] if self.bound is None else self.bound.leaves(numbers.weights)
+        past = state.reshape(self.memory, len(self.outputs))
+
+        def predict(c: Any, leaves: list[Any], past: Any) -> Any:
+            return self.step(numbers._replace(theta=c, weights=leaves), past.reshape(-1), inputs)[1].total
+
+        value, pullback = jax.vjp(predict, numbers.theta, leaves, past)
+        slopes, feedback = [], []
+        for seed in jnp.eye(len(self.outputs)):
+            to_c, to_leaves, to_past = pullback(seed)
+            slopes.append(jnp.concatenate([to_c, *(jnp.ravel(leaf) for leaf in to_leaves)]))
+            feedback.append(jnp.stack([to_past[lag - 1, output] for lag, output in self.fed_back] or [jnp.zeros(())]))
+        # a kink without a derivative, such as sqrt(max(y, 0)) at 0, counts as flat
+        slope, back = (jnp.where(jnp.isfinite(d), d, 0.0) for d in (jnp.stack(slopes), jnp.stack(feedback)))
+        return value, slope, back
+
+
+def _learned(bound: Bound, numbers: Numbers, z: Any, phi: Any) -> Any:
+    """f (ny,) at scaled features z; of an ensemble the median of `f_i + φ tilt_i`."""
+    if numbers.tilt is None:
+        return numbers.gain * bound.values(numbers.weights, z)
+    each = jax.vmap(lambda w, tilt: numbers.gain * bound.values(w, z) + phi @ tilt)(numbers.weights, numbers.tilt)
+    return jnp.median(each, axis=0)
