@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Annotated, ClassVar
 
-from orthaug._base.checks import check_count
-from orthaug._base.errors import InputError
+from annotated_types import Ge
+
+from orthaug._base.errors import KeyedError
+from orthaug._base.registry import LIBRARY_ONLY, check_fields
 
 
 @dataclass(frozen=True)
 class Prediction:
     """Declaration: the error of the prediction `horizon` steps ahead; 1 is the paper's criterion (eq:cost_fun)."""
 
-    horizon: int = 1
+    horizon: Annotated[int, Ge(1)] = 1
 
     def __post_init__(self) -> None:
-        check_count(self.horizon, "horizon")
+        check_fields(self)
+
+    @property
+    def one_step(self) -> bool:
+        """Whether it is the error one step ahead, which is linear in θ."""
+        return self.horizon == 1
 
     @property
     def flown(self) -> Simulation | None:
@@ -37,17 +45,20 @@ class Simulation:
         exact_start: whether a segment starts exactly from what was measured; None for the rule above.
     """
 
-    segment: int = 512
-    washout: int = 40
-    start_iterations: int = 20
-    exact_start: bool | None = None
+    one_step: ClassVar[bool] = False
+
+    segment: Annotated[int, Ge(0)] = 512
+    washout: Annotated[int, Ge(0)] = 40
+    start_iterations: Annotated[int, Ge(0)] = 20
+    exact_start: bool | None = field(default=None, metadata=LIBRARY_ONLY)
 
     def __post_init__(self) -> None:
-        for name in ("segment", "washout", "start_iterations"):
-            check_count(getattr(self, name), name, least=0)
+        check_fields(self)
         if self.segment and self.washout >= self.segment:
-            raise InputError(
-                f"`washout` must be shorter than `segment`; got {self.washout} and {self.segment}: nothing is scored."
+            raise KeyedError(
+                f"`washout` must be shorter than `segment`; got {self.washout} and {self.segment}: nothing is scored.",
+                "washout",
+                f": found {self.washout}; expected less than the segment, {self.segment}",
             )
 
     @property

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from orthaug._base.jax import jax, jnp
+from orthaug._base.jax import Array, jax, jnp
 from orthaug.models.learners import Bound
 from orthaug.models.rows import Chunks, row_sum
 

@@ -9,15 +9,17 @@ its bounds is one small quadratic in `QᵀF` (`Elimination`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple, Protocol, runtime_checkable
+from dataclasses import dataclass, field
+from typing import Annotated, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import scipy.optimize
+from annotated_types import Ge
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
+from orthaug._base.registry import LIBRARY_ONLY, check_fields
 from orthaug.inference.measures import Measure, Training
 from orthaug.physics.problem import Problem
 
@@ -40,6 +42,21 @@ class Structure(Protocol):
     @property
     def name(self) -> str: ...
 
+    @property
+    def projects(self) -> bool:
+        """Whether θ is split so that the learner is orthogonal to the physics."""
+        ...
+
+    @property
+    def identifies(self) -> bool:
+        """Whether the data alone determine θ where nothing is learned."""
+        ...
+
+    @property
+    def measure(self) -> Measure:
+        """The points over which θ is split; training itself knows the training measure only."""
+        ...
+
     def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> Rows:
         """The rows that join the criterion, given θ⁰ (nθ,) and the output's unit in whitened outputs."""
         ...
@@ -57,8 +74,11 @@ class Orthogonal:
     fitted function is split over the measure's points at the end (F2).
     """
 
-    measure: Measure = Training()  # noqa: RUF009  (frozen)
-    name: str = "orthogonal"
+    name: ClassVar[str] = "orthogonal"
+    projects: ClassVar[bool] = True
+    identifies: ClassVar[bool] = True
+
+    measure: Measure = field(default=Training(), metadata=LIBRARY_ONLY)  # noqa: RUF009  (frozen)
 
     def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> Rows:
         return _no_rows(len(names))
@@ -68,7 +88,10 @@ class Orthogonal:
 class Additive:
     """ŷ = φθ + f (eqs:additive_struct): θ takes what this learner happens to leave, so it is not unique."""
 
-    name: str = "additive"
+    name: ClassVar[str] = "additive"
+    projects: ClassVar[bool] = False
+    identifies: ClassVar[bool] = True
+    measure: ClassVar[Measure] = Training()
 
     def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> Rows:
         return _no_rows(len(names))
@@ -81,8 +104,15 @@ class OrthogonalPenalty:
     `weight` is λ, against the sum of squares in the output's units.
     """
 
-    weight: float = 1.0
-    name: str = "orthogonal-penalty"
+    name: ClassVar[str] = "orthogonal-penalty"
+    projects: ClassVar[bool] = False
+    identifies: ClassVar[bool] = True
+    measure: ClassVar[Measure] = Training()
+
+    weight: Annotated[float, Ge(0)] = 1.0
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> Rows:
         nt = len(names)
@@ -96,8 +126,15 @@ class BaselinePenalty:
     `weight` is λ, against the sum of squares in the output's units.
     """
 
-    weight: float = 1.0
-    name: str = "baseline-penalty"
+    name: ClassVar[str] = "baseline-penalty"
+    projects: ClassVar[bool] = False
+    identifies: ClassVar[bool] = False
+    measure: ClassVar[Measure] = Training()
+
+    weight: Annotated[float, Ge(0)] = 1.0
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> Rows:
         """The rows `√λ (θ⁰ − θ)/θ⁰`.
@@ -230,7 +267,7 @@ def split(
         fixed: what stands at a bound, where training found that.
     """
     projection, baseline = problem.projection, problem.baseline
-    orthogonal = isinstance(structure, Orthogonal)
+    orthogonal = structure.projects
     aux = projection.solve(values)
     elimination = eliminate(structure, problem)
     f = np.zeros(len(aux)) if orthogonal else projection.coordinates(values)

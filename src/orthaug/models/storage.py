@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,12 @@ from safetensors.numpy import save as save_arrays
 from orthaug import __version__
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
+from orthaug._base.registry import frozen
 from orthaug.data.expressions import Expression, Lag
 from orthaug.data.record import Channel
 from orthaug.data.regressors import Features
-from orthaug.models.learners import MLP, Bound, Learner
+from orthaug.models.kinds import LEARNERS
+from orthaug.models.learners import Bound, Learner
 from orthaug.models.model import Model
 from orthaug.models.predictor import Form, Numbers
 from orthaug.physics.baseline import Baseline, Parameter, Term
@@ -119,9 +121,7 @@ def _declare(model: Model) -> dict[str, Any]:
     form = model.form
     learner: dict[str, Any] | None = None
     if form.bound is not None:
-        declared = form.bound.learner
-        learner = {"kind": "mlp", **asdict(declared)} if isinstance(declared, MLP) else {"kind": "callable"}
-        learner |= {"nz": form.bound.nz, "ny": form.bound.ny}
+        learner = _declare_learner(form.bound.learner) | {"nz": form.bound.nz, "ny": form.bound.ny}
     baseline = form.baseline
     return {
         "format": FORMAT,
@@ -144,6 +144,34 @@ def _declare(model: Model) -> dict[str, Any]:
     }
 
 
+def _declare_learner(learner: Learner) -> dict[str, Any]:
+    """Kind and fields of a learner that is registered; a Python callable has none that a file could hold."""
+    kind = LEARNERS.kind_of(learner)
+    if kind is None:
+        return {"kind": "callable"}
+    return {"kind": kind} | {name: getattr(learner, name) for name in _field_names(type(learner))}
+
+
+def _field_names(learner: type) -> list[str]:
+    return [field.name for field in fields(learner) if field.init]
+
+
+def _rebuilt_learner(kept: dict[str, Any], given: Learner | None, path: Path) -> Learner:
+    """The learner that a file declares, or for a callable the one that is given."""
+    kind = kept["kind"]
+    if kind in LEARNERS:
+        learner = LEARNERS[kind]
+        return learner(**{name: frozen(kept[name]) for name in _field_names(learner) if name in kept})
+    if given is not None:
+        return given
+    if kind != "callable":
+        raise InputError(
+            f"{path}: its learner is of the kind '{kind}', which is not registered here; register it, or give the "
+            "learner, load(…, learner=…)."
+        )
+    raise InputError(f"{path}: the learner was a Python callable; give it again, load(…, learner=…).")
+
+
 def _rebuild(
     declared: dict[str, Any],
     arrays: dict[str, np.ndarray],
@@ -160,12 +188,7 @@ def _rebuild(
         baseline = replace(baseline, parameters=tuple(Parameter(**p) for p in physics["parameters"]))
     bound, kept = None, declared["learner"]
     if kept is not None:
-        if kept["kind"] == "mlp":
-            inputs = None if kept["inputs"] is None else tuple(kept["inputs"])
-            learner = MLP(tuple(kept["hidden"]), kept["activation"], inputs)
-        elif learner is None:
-            raise InputError(f"{path}: the learner was a Python callable; give it again, load(…, learner=…).")
-        bound = Bound(learner, kept["nz"], kept["ny"])  # type: ignore[arg-type]
+        bound = Bound(_rebuilt_learner(kept, learner, path), kept["nz"], kept["ny"])
         found = arrays["numbers.weights"].shape[-1]
         if bound.size != found:
             raise InputError(f"{path}: the learner has {bound.size} weights, the saved one {found}; give the same one.")

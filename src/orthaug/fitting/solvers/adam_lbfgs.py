@@ -9,13 +9,13 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
-import optax
-from jaxtyping import Array, Float
+from annotated_types import Ge, Gt
+from jaxtyping import Float
 
-from orthaug._base.checks import check_count, check_number
-from orthaug._base.jax import jax, jnp
+from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.registry import check_fields
 from orthaug.fitting.joint import Joint, Physics
 from orthaug.fitting.solvers.levenberg_marquardt import CONVERGED, NON_FINITE, RUNNING, Progress, burst_length
 from orthaug.models.rows import Chunks
@@ -52,19 +52,23 @@ class AdamLBFGS:
         learning_rate: of Adam, per step in normalised unknowns.
     """
 
-    adam_iterations: int = 500
-    lbfgs_iterations: int = 1000
-    learning_rate: float = 1e-3
+    gauss_newton: ClassVar[bool] = False
+
+    adam_iterations: Annotated[int, Ge(0)] = 500
+    lbfgs_iterations: Annotated[int, Ge(0)] = 1000
+    learning_rate: Annotated[float, Gt(0)] = 1e-3
 
     def __post_init__(self) -> None:
-        check_count(self.adam_iterations, "adam_iterations", least=0)
-        check_count(self.lbfgs_iterations, "lbfgs_iterations", least=0)
-        check_number(self.learning_rate, "learning_rate", positive=True)
+        check_fields(self)
 
     @property
     def iterations(self) -> int:
         """Steps at most."""
         return self.adam_iterations + self.lbfgs_iterations
+
+    def at_most(self, iterations: int) -> AdamLBFGS:
+        """Itself: the pipeline is run whole."""
+        return self
 
     def minimise(
         self,
@@ -76,6 +80,8 @@ class AdamLBFGS:
         progress: Progress | None = None,
     ) -> GradientRun:
         """Minimise the joint criterion from θ⁰ and `w`; the loss told to `progress` is a mean square."""
+        import optax
+
         began = time.perf_counter()
         unknowns = (jnp.zeros_like(physics.start), w)
         loss = _value(criterion, unknowns, chunks, physics)
@@ -114,6 +120,8 @@ def _value(criterion: Joint, unknowns: Any, chunks: Chunks, physics: Physics) ->
 
 @partial(jax.jit, static_argnames="criterion")
 def _adam(criterion: Joint, state: _State, chunks: Chunks, physics: Physics, rate: Any, stop: Any) -> _State:
+    import optax
+
     optimizer = optax.adam(rate)
 
     def step(s: _State) -> _State:
@@ -127,6 +135,8 @@ def _adam(criterion: Joint, state: _State, chunks: Chunks, physics: Physics, rat
 
 @partial(jax.jit, static_argnames="criterion")
 def _lbfgs(criterion: Joint, state: _State, chunks: Chunks, physics: Physics, rate: Any, stop: Any) -> _State:
+    import optax
+
     optimizer = optax.lbfgs(memory_size=_MEMORY)
 
     def value(unknowns: Any) -> Any:

@@ -9,15 +9,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float, Int
+from annotated_types import Ge
+from jaxtyping import Float, Int
 
-from orthaug._base.checks import check_count, check_number
-from orthaug._base.jax import jax, jnp
+from orthaug._base.checks import check_number
+from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.registry import LIBRARY_ONLY, InSpec, check_fields
 from orthaug.fitting.normal_equations import Normal, linearise
 from orthaug.models.rows import Overlap
 
@@ -81,12 +83,18 @@ class LevenbergMarquardt:
         tolerance: two successive steps that lower the objective by less than this fraction end the run.
     """
 
-    iterations: int = 300
-    tolerance: float = 1e-6
+    gauss_newton: ClassVar[bool] = True
+
+    iterations: Annotated[int, Ge(0), InSpec(Ge(1))] = 300
+    tolerance: Annotated[float, Ge(0)] = field(default=1e-6, metadata=LIBRARY_ONLY)
 
     def __post_init__(self) -> None:
-        check_count(self.iterations, "iterations", least=0)
+        check_fields(self)
         check_number(self.tolerance, "tolerance")
+
+    def at_most(self, iterations: int) -> LevenbergMarquardt:
+        """The same with fewer iterations."""
+        return replace(self, iterations=min(self.iterations, iterations))
 
     def minimise(
         self,
