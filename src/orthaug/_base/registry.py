@@ -75,7 +75,7 @@ class Key:
         return next((one.name for one in self.metadata if isinstance(one, Option)), None)
 
 
-class Registry(Mapping[str, type]):
+class Registry(Mapping[str, Any]):
     """The declarations of one axis by the name of their kind, in the order in which they were added.
 
     Args:
@@ -103,7 +103,7 @@ class Registry(Mapping[str, type]):
         for kind, declaration in entries.items():
             self.add(kind, declaration)
 
-    def __getitem__(self, kind: str) -> type:
+    def __getitem__(self, kind: str) -> Any:
         return self._entries[kind]
 
     def __iter__(self) -> Iterator[str]:

@@ -24,7 +24,6 @@ from orthaug._base.jax import jax, jnp
 from orthaug._base.parallel import one_blas_thread
 from orthaug.data.record import Record
 from orthaug.data.regressors import lag_matrix
-from orthaug.models.learners import External
 from orthaug.models.model import Model
 from orthaug.models.predictor import Form, Numbers, parts
 
@@ -279,7 +278,7 @@ def _gradient_rows(form: Form, numbers: Numbers, x: Float[Array, "m nx"], step: 
 
     if of_phi:
         return jax.vmap(jax.jacfwd(lambda row: form.baseline.phi(row, form.layout, form.outputs, jnp)))(x)
-    external = form.bound is not None and isinstance(form.bound.learner, External)
+    external = form.bound is not None and not form.bound.differentiable
     return jax.vmap(differences if external else jax.jacrev(g))(x)
 
 

@@ -9,7 +9,7 @@ from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.learned import FreeStatistics, Learned
 from orthaug.fitting.solvers.levenberg_marquardt import SPANNED
 from orthaug.fitting.status import Status
-from orthaug.fitting.structures import BaselinePenalty, Fixed, Orthogonal, Split, Structure, split
+from orthaug.fitting.structures import Fixed, Split, Structure, split
 from orthaug.inference.covariance import degrees_of_freedom, noise_covariance, theta_covariance
 from orthaug.models.learners import Scaling
 from orthaug.models.model import Model
@@ -105,7 +105,7 @@ def _middle(learned: Learned, noise: Matrix | None, weight: Vector) -> Matrix | 
 
 def _unique(structure: Structure, learned: Learned) -> bool:
     """Whether the data alone determine θ."""
-    return isinstance(structure, Orthogonal) or (learned.bound is None and not isinstance(structure, BaselinePenalty))
+    return structure.projects or (learned.bound is None and structure.identifies)
 
 
 def _defect(problem: Problem, whitened: np.ndarray, theta_aux: Vector) -> float | None:

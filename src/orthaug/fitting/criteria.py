@@ -3,17 +3,54 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, Protocol, runtime_checkable
 
 from annotated_types import Ge
 
 from orthaug._base.errors import KeyedError
 from orthaug._base.registry import LIBRARY_ONLY, check_fields
 
+if TYPE_CHECKING:
+    from orthaug.data.record import Record
+    from orthaug.models.model import Model
+    from orthaug.models.response import Response
+
+
+@runtime_checkable
+class Criterion(Protocol):
+    """What `estimate(criterion=…)` takes."""
+
+    @property
+    def one_step(self) -> bool:
+        """Whether it is the error one step ahead, which is linear in θ."""
+        ...
+
+    @property
+    def simulates(self) -> bool:
+        """Whether runs are compared by free runs over whole experiments."""
+        ...
+
+    @property
+    def washout(self) -> int:
+        """Leading steps of a free run that are not scored."""
+        ...
+
+    @property
+    def flown(self) -> Simulation | None:
+        """The free run that training makes; None for one step ahead."""
+        ...
+
+    def response(self, model: Model, record: Record) -> Response:
+        """What a validation part judges a model by."""
+        ...
+
 
 @dataclass(frozen=True)
 class Prediction:
     """Declaration: the error of the prediction `horizon` steps ahead; 1 is the paper's criterion (eq:cost_fun)."""
+
+    simulates = False
+    washout = 0
 
     horizon: Annotated[int, Ge(1)] = 1
 
@@ -30,6 +67,10 @@ class Prediction:
         """The free run that gives it: segments of `horizon` steps whose last one is scored; None for one step."""
         return Simulation(self.horizon, self.horizon - 1, exact_start=True) if self.horizon > 1 else None
 
+    def response(self, model: Model, record: Record) -> Response:
+        """The prediction."""
+        return model.predict(record, self.horizon)
+
 
 @dataclass(frozen=True)
 class Simulation:
@@ -45,7 +86,8 @@ class Simulation:
         exact_start: whether a segment starts exactly from what was measured; None for the rule above.
     """
 
-    one_step: ClassVar[bool] = False
+    one_step = False
+    simulates = True
 
     segment: Annotated[int, Ge(0)] = 512
     washout: Annotated[int, Ge(0)] = 40
@@ -66,12 +108,13 @@ class Simulation:
         """Itself: the free run that training makes."""
         return self
 
+    def response(self, model: Model, record: Record) -> Response:
+        """The free run."""
+        return model.simulate(record)
+
     @property
     def estimates_pasts(self) -> bool:
         """Whether the outputs before a segment are unknowns."""
         if self.exact_start is not None:
             return not self.exact_start
         return self.washout > 0 or self.segment == 0
-
-
-Criterion = Prediction | Simulation

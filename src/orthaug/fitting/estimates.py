@@ -151,7 +151,7 @@ class Estimate:
         Raises:
             InputError: θ that is not `Φ⁺Y`: of another structure or measure, at a bound, or trained on the free run.
         """
-        plain = self.covariance is not None and self.measure is None and isinstance(self.criterion, Prediction)
+        plain = self.covariance is not None and self.measure is None and not self.criterion.simulates
         if not plain or self.at_bound:
             raise InputError(
                 "robust standard errors are those of θ = Φ⁺Y: an orthogonal structure under the training measure, "

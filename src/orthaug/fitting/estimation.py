@@ -17,12 +17,13 @@ from orthaug._base.parallel import spread
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
 from orthaug.fitting.conclusion import conclude, nothing_learned
-from orthaug.fitting.criteria import Criterion, Prediction, Simulation
+from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.ensemble import combine
 from orthaug.fitting.estimates import Estimate, Restart
 from orthaug.fitting.free_run import FreeRun
 from orthaug.fitting.learned import Learned
-from orthaug.fitting.one_step import Solver, Task
+from orthaug.fitting.one_step import Task
+from orthaug.fitting.rules import check_solver, check_starts
 from orthaug.fitting.solvers.levenberg_marquardt import (
     CONVERGED,
     NO_DESCENT,
@@ -31,6 +32,7 @@ from orthaug.fitting.solvers.levenberg_marquardt import (
     SPANNED,
     LevenbergMarquardt,
 )
+from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.status import Status
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.inference.measures import Training
@@ -110,11 +112,9 @@ def estimate(
     _check_splittable(structure, baseline, learner)
     flown = criterion.flown is not None
     choices = _regularizations(regularization, validation)
-    if ensemble and (restarts < 2 or initial is not None):
-        raise InputError("an ensemble needs `restarts` of 2 or more to be the median of.")
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
-    if seed + restarts >= 2**63:
-        raise InputError(f"`seed` must be below 2**63; got {seed}.")
+    check_starts(restarts if initial is None else 1, seed, ensemble=ensemble)
+    check_solver(solver, criterion, () if learner is None else choices)
     if initial is not None:
         task, w, start = _warm_start(record, baseline, lags, initial)
         starts = [_Start(0, w, choice) for choice in choices]
@@ -147,7 +147,7 @@ def _check_splittable(structure: Structure, baseline: Baseline, learner: Learner
 
 def _splits(structure: Structure) -> bool:
     """Whether θ is split off under another measure than that of training."""
-    return isinstance(structure, Orthogonal) and structure.measure != Training()
+    return structure.measure != Training()
 
 
 def orthogonalize(
@@ -252,8 +252,8 @@ def _train(
     )
     seconds = sum(run.seconds for run in runs)
     fit = replace(fit, criterion=criterion, restarts=restarts, status=replace(fit.status, seconds=seconds))
-    split_off = isinstance(structure, Orthogonal) and _splits(structure) and fit.status.ok and task.bound is not None
-    return fit.split(structure.measure) if split_off else fit  # type: ignore[attr-defined]
+    split_off = _splits(structure) and fit.status.ok and task.bound is not None
+    return fit.split(structure.measure) if split_off else fit
 
 
 def _concluded(task: Task | FreeRun, structure: Structure, run: Any, members: Sequence[Any] = ()) -> Estimate:
@@ -271,9 +271,7 @@ def _validation_error(fit: Estimate, validation: Record, criterion: Criterion) -
     """Mean squared error with each output in its training standard deviation; NaN without a model or a value."""
     if not fit.status.ok:
         return math.nan
-    free_run = isinstance(criterion, Simulation)
-    response = fit.model.simulate(validation) if free_run else fit.model.predict(validation, criterion.horizon)
-    rmse = response.scores().rmse
+    rmse = criterion.response(fit.model, validation).scores().rmse
     return float(np.mean((rmse * fit.problem.weight) ** 2))
 
 
@@ -298,10 +296,6 @@ def _check_arguments(
     check_type(learner, Learner | None, "learner", "a learner such as MLP(), or None")
     check_type(structure, Structure, "structure", "a structure such as Orthogonal()")
     check_type(criterion, Criterion, "criterion", "Prediction(…) or Simulation(…)")
-    if criterion.flown is not None and not isinstance(solver, LevenbergMarquardt):
-        raise InputError(
-            "only `LevenbergMarquardt` trains on a free run or more than one step ahead; take that solver."
-        )
     check_type(solver, Solver, "solver", "a solver such as LevenbergMarquardt()")
     check_type(initial, Estimate | Model | None, "initial", "an Estimate, a Model or None")
     check_type(validation, Record | None, "validation", "a Record or None")

@@ -24,7 +24,7 @@ from orthaug.fitting.pasts import Pasts
 from orthaug.fitting.segments import Segments, lay_segments, respond, sensitivity
 from orthaug.fitting.solvers.levenberg_marquardt import NON_FINITE, LevenbergMarquardt, Progress
 from orthaug.fitting.solvers.output_error import Outcome, independent_share, minimise
-from orthaug.fitting.structures import Elimination, Orthogonal, Structure, eliminate
+from orthaug.fitting.structures import Elimination, Structure, eliminate
 from orthaug.inference.covariance import noise_covariance, theta_block, whitening
 from orthaug.models.learners import Bound, Scaling
 from orthaug.models.predictor import Form, Numbers
@@ -72,7 +72,7 @@ class FreeRun:
         residual = problem.projection.orthogonal_part(problem.whitened_target)
         rms = task.rms if task is not None else max(float(np.sqrt(np.mean(residual**2))), 1e-10)
         whole, colour = segments, None
-        if isinstance(declared, Simulation) and criterion.segment:
+        if declared.simulates and criterion.segment:
             whole = lay_segments(problem.record, form, 0, criterion.washout)
             if segments.scored.shape[1] < _COLOURED_STEPS <= longest:
                 first = tuple(e.rows(0, _COLOUR_ROWS) for e in problem.record.experiments)
@@ -222,7 +222,7 @@ class Objective:
         past = np.asarray(free_run.segments.past)
         free = past.size > 0 and free_run.criterion.estimates_pasts
         elimination = eliminate(structure, free_run.problem)
-        return cls(free_run, elimination, isinstance(structure, Orthogonal), weight, Pasts(past, past, free))
+        return cls(free_run, elimination, structure.projects, weight, Pasts(past, past, free))
 
     @property
     def follows(self) -> bool:

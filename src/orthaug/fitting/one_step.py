@@ -10,20 +10,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.errors import InputError
 from orthaug._base.jax import jax, jnp
 from orthaug.fitting.joint import Joint, Physics
 from orthaug.fitting.learned import Learned
 from orthaug.fitting.normal_equations import Hold, OneStep, linearise
-from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
-from orthaug.fitting.solvers.levenberg_marquardt import NON_FINITE, LevenbergMarquardt, Progress, Run, effective_weights
+from orthaug.fitting.solvers.levenberg_marquardt import NON_FINITE, Progress, Run, effective_weights
+from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Elimination, Fixed, Orthogonal, Structure, eliminate
 from orthaug.inference.covariance import mixing
 from orthaug.models.learners import Bound, Learner, Scaling
 from orthaug.models.rows import Chunks, Overlap, chunk_shape, from_chunks, in_chunks, mixed_gram, share_of
 from orthaug.physics.problem import Problem
-
-Solver = LevenbergMarquardt | AdamLBFGS
 
 OUTPUT_UNIT = 10.0
 """The learner's output unit in standard deviations of the baseline's residual: the table is in docs/design.md."""
@@ -87,7 +84,7 @@ class Task:
         for _ in range(_ACTIVE_SETS):
             run = self._run_held(solver, w, structure, elimination, fixed, regularization, tell)
             seconds, iterations = seconds + run.seconds, iterations + run.iterations
-            found = {} if isinstance(structure, Orthogonal) else elimination.active(self.coordinates(run))
+            found = {} if structure.projects else elimination.active(self.coordinates(run))
             if found == fixed or run.code == NON_FINITE:
                 break
             w, fixed = run.w, found
@@ -115,13 +112,11 @@ class Task:
         evidence = regularization == "evidence"
         ridge = 1.0 if evidence else 0.0 if regularization == "none" else float(regularization)
         criterion, samples = OneStep(self.bound), self.problem.target.size - nt
-        if isinstance(solver, LevenbergMarquardt):
+        if solver.gauss_newton:
             return solver.minimise(
                 criterion, w, arguments, nothing, ridge=ridge, evidence=evidence, samples=samples, progress=progress
             )
-        if evidence:
-            raise InputError("evidence regularization needs the Gauss-Newton matrix of the levenberg-marquardt solver.")
-        orthogonal = isinstance(structure, Orthogonal)
+        orthogonal = structure.projects
         physics = self._physics(elimination, fixed, ridge, solved=orthogonal)
         joint = Joint(self.bound, orthogonal)
         found = solver.minimise(joint, w, self.chunks, physics, progress=progress)

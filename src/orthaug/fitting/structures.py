@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import Annotated, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import scipy.optimize
@@ -74,9 +74,9 @@ class Orthogonal:
     fitted function is split over the measure's points at the end (F2).
     """
 
-    name: ClassVar[str] = "orthogonal"
-    projects: ClassVar[bool] = True
-    identifies: ClassVar[bool] = True
+    name = "orthogonal"
+    projects = True
+    identifies = True
 
     measure: Measure = field(default=Training(), metadata=LIBRARY_ONLY)  # noqa: RUF009  (frozen)
 
@@ -88,10 +88,10 @@ class Orthogonal:
 class Additive:
     """ŷ = φθ + f (eqs:additive_struct): θ takes what this learner happens to leave, so it is not unique."""
 
-    name: ClassVar[str] = "additive"
-    projects: ClassVar[bool] = False
-    identifies: ClassVar[bool] = True
-    measure: ClassVar[Measure] = Training()
+    name = "additive"
+    projects = False
+    identifies = True
+    measure = Training()
 
     def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> Rows:
         return _no_rows(len(names))
@@ -104,10 +104,10 @@ class OrthogonalPenalty:
     `weight` is λ, against the sum of squares in the output's units.
     """
 
-    name: ClassVar[str] = "orthogonal-penalty"
-    projects: ClassVar[bool] = False
-    identifies: ClassVar[bool] = True
-    measure: ClassVar[Measure] = Training()
+    name = "orthogonal-penalty"
+    projects = False
+    identifies = True
+    measure = Training()
 
     weight: Annotated[float, Ge(0)] = 1.0
 
@@ -126,10 +126,10 @@ class BaselinePenalty:
     `weight` is λ, against the sum of squares in the output's units.
     """
 
-    name: ClassVar[str] = "baseline-penalty"
-    projects: ClassVar[bool] = False
-    identifies: ClassVar[bool] = False
-    measure: ClassVar[Measure] = Training()
+    name = "baseline-penalty"
+    projects = False
+    identifies = False
+    measure = Training()
 
     weight: Annotated[float, Ge(0)] = 1.0
 

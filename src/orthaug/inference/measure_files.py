@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 from annotated_types import Ge
@@ -43,7 +43,7 @@ class SampleFiles:
         every: keep each n-th row.
     """
 
-    name: ClassVar[str] = "samples"
+    name = "samples"
 
     files: Annotated[tuple[str, ...], Option("samples")] = ()
     rows: Range | tuple[Range, ...] | None = None
@@ -64,7 +64,7 @@ class WeightFiles:
     Rows before the first usable one have weights too, which are not used.
     """
 
-    name: ClassVar[str] = "weighted"
+    name = "weighted"
 
     files: Annotated[tuple[str, ...], Option("weights")] = ()
 

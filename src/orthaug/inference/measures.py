@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import Annotated, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from annotated_types import Len
@@ -91,7 +91,7 @@ class Training:
     """The training rows, each with the same weight: the paper's measure. `rows` (start, stop) takes a part of each."""
 
     rows: tuple[int, int] | None = field(default=None, metadata=LIBRARY_ONLY)
-    name: ClassVar[str] = "training"
+    name = "training"
 
     def points(self, support: Support) -> Points:
         if self.rows is None:
@@ -112,7 +112,7 @@ class Training:
 class Symmetrized:
     """The training rows and their mirror images −x: the paper's sign trick, done to the measure, not the experiment."""
 
-    name: ClassVar[str] = "symmetrized"
+    name = "symmetrized"
 
     def points(self, support: Support) -> Points:
         x = support.x
@@ -124,7 +124,7 @@ class Weighted:
     """The training rows with weights of one's own, (N,), in the order of the usable rows."""
 
     weights: Any
-    name: ClassVar[str] = "weighted"
+    name = "weighted"
 
     def points(self, support: Support) -> Points:
         x = support.x
@@ -142,7 +142,7 @@ class Samples:
 
     columns: Mapping[str, Any]
     weights: Any = None
-    name: ClassVar[str] = "samples"
+    name = "samples"
 
     def points(self, support: Support) -> Points:
         values: dict[Lag, Vector] = {}
@@ -184,7 +184,7 @@ class Uniform:
     """
 
     box: Annotated[Mapping[str, Annotated[Sequence[float], Len(2, 2)]], Option("box")] = field(default_factory=dict)
-    name: ClassVar[str] = "uniform"
+    name = "uniform"
 
     def points(self, support: Support) -> Points:
         low, high = self.limits(support)

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Protocol, runtime_checkable
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 import numpy as np
 from annotated_types import Ge
@@ -169,7 +169,7 @@ class External:
     It is called back from compiled code, so it may come from any toolbox; it has no weights.
     """
 
-    differentiable: ClassVar[bool] = False
+    differentiable = False
 
     function: Callable[[np.ndarray], np.ndarray]
     inputs: tuple[str, ...] | None = None

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 from annotated_types import Ge, Gt
 from jaxtyping import Float
@@ -52,7 +52,7 @@ class AdamLBFGS:
         learning_rate: of Adam, per step in normalised unknowns.
     """
 
-    gauss_newton: ClassVar[bool] = False
+    gauss_newton = False
 
     adam_iterations: Annotated[int, Ge(0)] = 500
     lbfgs_iterations: Annotated[int, Ge(0)] = 1000

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from annotated_types import Ge
@@ -83,7 +83,7 @@ class LevenbergMarquardt:
         tolerance: two successive steps that lower the objective by less than this fraction end the run.
     """
 
-    gauss_newton: ClassVar[bool] = True
+    gauss_newton = True
 
     iterations: Annotated[int, Ge(0), InSpec(Ge(1))] = 300
     tolerance: Annotated[float, Ge(0)] = field(default=1e-6, metadata=LIBRARY_ONLY)
