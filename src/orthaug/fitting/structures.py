@@ -74,11 +74,11 @@ class Orthogonal:
     fitted function is split over the measure's points at the end (F2).
     """
 
-    name = "orthogonal"
     projects = True
     identifies = True
 
     measure: Measure = field(default=Training(), metadata=LIBRARY_ONLY)  # noqa: RUF009  (frozen)
+    name: str = field(default="orthogonal", metadata=LIBRARY_ONLY)
 
     def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> Rows:
         return _no_rows(len(names))
@@ -88,7 +88,7 @@ class Orthogonal:
 class Additive:
     """ŷ = φθ + f (eqs:additive_struct): θ takes what this learner happens to leave, so it is not unique."""
 
-    name = "additive"
+    name: str = field(default="additive", metadata=LIBRARY_ONLY)
     projects = False
     identifies = True
     measure = Training()
@@ -104,12 +104,12 @@ class OrthogonalPenalty:
     `weight` is λ, against the sum of squares in the output's units.
     """
 
-    name = "orthogonal-penalty"
     projects = False
     identifies = True
     measure = Training()
 
     weight: Annotated[float, Ge(0)] = 1.0
+    name: str = field(default="orthogonal-penalty", metadata=LIBRARY_ONLY)
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -126,12 +126,12 @@ class BaselinePenalty:
     `weight` is λ, against the sum of squares in the output's units.
     """
 
-    name = "baseline-penalty"
     projects = False
     identifies = False
     measure = Training()
 
     weight: Annotated[float, Ge(0)] = 1.0
+    name: str = field(default="baseline-penalty", metadata=LIBRARY_ONLY)
 
     def __post_init__(self) -> None:
         check_fields(self)

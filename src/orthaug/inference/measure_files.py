@@ -43,8 +43,6 @@ class SampleFiles:
         every: keep each n-th row.
     """
 
-    name = "samples"
-
     files: Annotated[tuple[str, ...], Option("samples")] = ()
     rows: Range | tuple[Range, ...] | None = None
     every: Annotated[int, Ge(1)] = 1
@@ -63,8 +61,6 @@ class WeightFiles:
 
     Rows before the first usable one have weights too, which are not used.
     """
-
-    name = "weighted"
 
     files: Annotated[tuple[str, ...], Option("weights")] = ()
 

@@ -91,7 +91,7 @@ class Training:
     """The training rows, each with the same weight: the paper's measure. `rows` (start, stop) takes a part of each."""
 
     rows: tuple[int, int] | None = field(default=None, metadata=LIBRARY_ONLY)
-    name = "training"
+    name: str = field(default="training", metadata=LIBRARY_ONLY)
 
     def points(self, support: Support) -> Points:
         if self.rows is None:
@@ -112,7 +112,7 @@ class Training:
 class Symmetrized:
     """The training rows and their mirror images −x: the paper's sign trick, done to the measure, not the experiment."""
 
-    name = "symmetrized"
+    name: str = field(default="symmetrized", metadata=LIBRARY_ONLY)
 
     def points(self, support: Support) -> Points:
         x = support.x
@@ -124,7 +124,7 @@ class Weighted:
     """The training rows with weights of one's own, (N,), in the order of the usable rows."""
 
     weights: Any
-    name = "weighted"
+    name: str = "weighted"
 
     def points(self, support: Support) -> Points:
         x = support.x
@@ -142,7 +142,7 @@ class Samples:
 
     columns: Mapping[str, Any]
     weights: Any = None
-    name = "samples"
+    name: str = "samples"
 
     def points(self, support: Support) -> Points:
         values: dict[Lag, Vector] = {}
@@ -184,7 +184,7 @@ class Uniform:
     """
 
     box: Annotated[Mapping[str, Annotated[Sequence[float], Len(2, 2)]], Option("box")] = field(default_factory=dict)
-    name = "uniform"
+    name: str = field(default="uniform", metadata=LIBRARY_ONLY)
 
     def points(self, support: Support) -> Points:
         low, high = self.limits(support)
