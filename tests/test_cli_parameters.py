@@ -387,6 +387,8 @@ def fitted(tmp_path_factory) -> Path:
     columns = {name: rng.uniform(-1, 1, 60) for name in ("y[k-1]", "u[k-1]", "y[k-2]")}
     write_csv(folder / "points.csv", **columns, unused=np.full(60, np.nan))
     write_csv(folder / "weighted.csv", **columns, weight=rng.uniform(size=60))
+    write_csv(folder / "weights.csv", weight=rng.uniform(size=120))
+    write_csv(folder / "few.csv", weight=np.ones(60))
     write_csv(folder / "negative.csv", **columns, weight=-np.ones(60))
     write_csv(folder / "lacking.csv", **{name: columns[name] for name in ("y[k-1]", "u[k-1]")})
     return folder
@@ -403,6 +405,7 @@ SPLITS = {
     "symmetrized": ["--measure", "symmetrized"],
     "uniform": ["--measure", "uniform", "--box", "u[k-1]=-0.6:0.6", "--box", " y[k-2] = -1:1"],
     "samples": ["--measure", "samples", "--samples", "weighted.csv"],
+    "weighted": ["--measure", "weighted", "--weights", "weights.csv"],
 }
 
 
@@ -473,12 +476,44 @@ def test_samples_of_the_spec(inside, tmp_path):
     assert (result["measure"], result["measure_detail"]["points"]) == ("samples", 50)
 
 
+def test_weights_of_the_spec_are_those_of_split(inside, tmp_path):
+    """One experiment after another, each with weights for the lags at its start, which count for nothing."""
+    rng = np.random.default_rng(5)
+    write_csv(inside / "some.csv", weight=rng.uniform(0.1, 1, size=90))
+    text = SPEC.replace('kind = "none"\n', MLP).replace(
+        'train = { files = ["run.csv"]', 'train = { rows = [[0, 50], [60, 100]], files = ["run.csv"]'
+    )
+    Path("weights.toml").write_text(text + '[structure.measure]\nkind = "weighted"\nfiles = ["some.csv"]\n')
+    result = finite_json(run("fit", "weights.toml", "--json", "--out", tmp_path / "out").out)
+    assert (result["measure"], result["measure_detail"]["points"]) == ("weighted", 86)
+    changed = np.genfromtxt("some.csv", skip_header=1)
+    changed[[0, 1, 50, 51]] = 7.0
+    write_csv(inside / "some.csv", weight=changed)
+    again = finite_json(run("fit", "weights.toml", "--json", "--out", tmp_path / "out").out)
+    assert values(again["parameters"]) == values(result["parameters"])
+    write_csv(inside / "some.csv", weight=changed[:-1])
+    done = run("fit", "weights.toml", "--out", tmp_path / "out")
+    assert done.code == 2 and one_line(done.err, "weights.toml", "some.csv: 89 weights for 90 rows of training data")
+
+
 BAD_SPLITS = [
-    (["out", "run.csv", "--measure", "gauss"], "--measure must be one of training, symmetrized, uniform, samples; got"),
+    (
+        ["out", "run.csv", "--measure", "gauss"],
+        "--measure must be one of training, symmetrized, uniform, samples, weighted; got",
+    ),
     (["out", "run.csv", "--measure", "samples"], "--samples is missing"),
     (["out", "run.csv", "--measure", "samples", "--samples", "absent.csv"], "absent.csv: no such file"),
     (["out", "run.csv", "--measure", "samples", "--samples", "lacking.csv"], "lacking.csv: no column 'y[k-2]'"),
     (["out", "run.csv", "--measure", "samples", "--samples", "negative.csv"], "none negative"),
+    (["out", "run.csv", "--measure", "weighted"], "--weights is missing; expected the files that hold the weights"),
+    (["out", "run.csv", "--measure", "weighted", "--weights", "few.csv"], "few.csv: 60 weights for 120 rows"),
+    (["out", "run.csv", "--measure", "weighted", "--weights", "points.csv"], "points.csv: no column 'weight'"),
+    (["out", "run.csv", "--measure", "weighted", "--weights", "absent.csv"], "absent.csv: no such file"),
+    (["out", "run.csv", "--weights", "weights.csv"], "--weights: belongs to --measure weighted; found --measure train"),
+    (
+        ["out", "run.csv", "--measure", "weighted", "--samples", "points.csv"],
+        "--samples: belongs to --measure samples; found --measure weighted",
+    ),
     (["out", "run.csv", "--measure", "uniform", "--box", "u[k-1]"], "--box: found 'u[k-1]'; expected a raw lag and"),
     (["out", "run.csv", "--measure", "uniform", "--box", "u[k-1]=a:b"], "--box: found 'u[k-1]=a:b'"),
     (["out", "run.csv", "--measure", "uniform", "--box", "u[k-1]=1:2:3"], "--box: found 'u[k-1]=1:2:3'"),

@@ -7,6 +7,20 @@ class InputError(ValueError):
     """Bad input: names what was found and what was expected. The command line exits with 2."""
 
 
+class KeyedError(InputError):
+    """Bad input in one key of a declaration.
+
+    Args:
+        text: the whole sentence, as Python's user reads it.
+        key: the key at fault.
+        words: what follows the key where a spec or an option gave it, such as `: found 3; expected less than 2`.
+    """
+
+    def __init__(self, text: str, key: str, words: str) -> None:
+        super().__init__(text)
+        self.key, self.words = key, words
+
+
 class MissingColumnError(InputError):
     """A data file lacks a column or variable that is asked for."""
 

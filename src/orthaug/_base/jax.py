@@ -1,23 +1,85 @@
-"""The first import of every module that computes with JAX: double precision, or a worded refusal."""
+"""JAX in double precision, imported when it is first used: a declaration of a learner or solver costs no import.
+
+`jax` and `jnp` stand for the modules. `jax.jit` compiles at the first call, so that a module with compiled functions
+can be imported without JAX.
+"""
 
 from __future__ import annotations
 
+import functools
 import os
+import sys
+import threading
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 from orthaug._base.errors import PrecisionError
 
-if os.environ.get("JAX_ENABLE_X64", "").strip().lower() in {"0", "false", "f", "no", "n", "off"}:
-    raise PrecisionError(
-        "orthaug computes in double precision, but the environment has "
-        f"JAX_ENABLE_X64={os.environ['JAX_ENABLE_X64']}. Unset it, or set it to 1."
-    )
+if TYPE_CHECKING:
+    import jax
+    import jax.numpy as jnp
+    from jax import Array
+else:
+    Array = Any  # in annotations; at run time jaxtyping checks shape and type of whatever is an array
 
-import jax
-import jax.numpy as jnp
+__all__ = ["Array", "jax", "jnp", "use_compilation_cache"]
 
-jax.config.update("jax_enable_x64", True)
 
-__all__ = ["jax", "jnp", "use_compilation_cache"]
+def _real_jax() -> Any:
+    """JAX, with double precision turned on.
+
+    Raises:
+        PrecisionError: the environment forbids double precision.
+    """
+    asked = os.environ.get("JAX_ENABLE_X64", "")
+    if asked.strip().lower() in {"0", "false", "f", "no", "n", "off"}:
+        raise PrecisionError(
+            "orthaug computes in double precision, but the environment has "
+            f"JAX_ENABLE_X64={asked}. Unset it, or set it to 1."
+        )
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    return jax
+
+
+def _real_jnp() -> Any:
+    return _real_jax().numpy
+
+
+class _Late:
+    """A module that is imported when one of its names is first asked for."""
+
+    def __init__(self, real: Callable[[], Any], **own: Any) -> None:
+        self.__dict__.update(own, _real=real)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):  # what tools ask of any object
+            raise AttributeError(name)
+        value = self.__dict__[name] = getattr(self._real(), name)
+        return value
+
+
+def _late_jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+    """`jax.jit(function, **options)`, made at the first call."""
+    made: list[Callable[..., Any]] = []
+    one_at_a_time = threading.Lock()
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        if not made:
+            with one_at_a_time:
+                if not made:
+                    made.append(_real_jax().jit(function, **options))
+        return made[0](*args, **kwargs)
+
+    return call
+
+
+if not TYPE_CHECKING:
+    jax, jnp = _Late(_real_jax, jit=_late_jit), _Late(_real_jnp)
+    if "jax" in sys.modules:  # then it costs nothing, and what the user computes is in double precision too
+        _real_jax()
 
 
 def use_compilation_cache() -> None:

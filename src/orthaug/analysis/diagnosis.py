@@ -69,7 +69,7 @@ def diagnose(fit: Estimate) -> Diagnosis | None:
     what sensor noise asks for, and it does not suffer from the bias of the fit in question.
     """
     problem, model, simulated = fit.problem, fit.model, fit.criterion.flown is not None
-    skip = fit.criterion.washout if isinstance(fit.criterion, Simulation) else 0
+    skip = fit.criterion.washout
     one_step, free_run = model.predict(problem.record), model.simulate(problem.record)
     tests = _tests(problem, one_step)
     if any(test.white is None for test in tests) or np.all(_errors(one_step) * problem.weight < _ROUNDING):

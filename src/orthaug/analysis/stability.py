@@ -26,7 +26,6 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import lag_matrix
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged as Form
-from orthaug.models.learners import External
 from orthaug.models.model import Model
 
 _STEPS, _SAMPLES = 20_000, 2000  # most rows that are looked at, spread evenly; most points of the contraction check
@@ -280,7 +279,7 @@ def _gradient_rows(form: Form, numbers: Numbers, x: Float[Array, "m nx"], step: 
 
     if of_phi:
         return jax.vmap(jax.jacfwd(lambda row: form.baseline.phi(row, form.layout, form.outputs, jnp)))(x)
-    external = form.bound is not None and isinstance(form.bound.learner, External)
+    external = form.bound is not None and not form.bound.differentiable
     return jax.vmap(differences if external else jax.jacrev(g))(x)
 
 

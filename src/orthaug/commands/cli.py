@@ -147,7 +147,7 @@ def fit(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False) -> None:
     job = jobs.open_job(spec)
     outcome.check_inputs_kept(job, folder)
     _prepare_jax()
-    with _progress(job.run_count, job.iterations, job.spec.learner.kind != "none") as progress:
+    with _progress(job.run_count, job.iterations, job.spec.declared_learner() is not None) as progress:
         fitted = outcome.fit_job(job, progress)
     outcome.write_result(fitted, folder)
     if as_json:
@@ -178,7 +178,7 @@ def compare(
     _prepare_jax()
     from orthaug.commands import compare as comparing
 
-    with _progress(job.run_count * len(comparing.KINDS), job.iterations) as progress:
+    with _progress(job.run_count * len(comparing.compared()), job.iterations) as progress:
         found = comparing.compare(job, model or (), progress)
     comparing.write(found, folder)
     typer.echo(_json(found.result) if as_json else f"{comparing.text(found)}\n\nwritten to {folder}")
@@ -224,20 +224,25 @@ def split(
     model: ModelPath,
     data: Annotated[list[Path], typer.Argument(metavar="DATA…", help="The files that the model was trained on.")],
     measure: Annotated[
-        str, typer.Option("--measure", metavar="KIND", help="training, symmetrized, uniform or samples.")
+        str, typer.Option("--measure", metavar="KIND", help="training, symmetrized, uniform, samples or weighted.")
     ] = "training",
     rows: Annotated[str | None, typer.Option("--rows", metavar="A:B", help="Rows of each file, half-open.")] = None,
     box: Annotated[
         list[str] | None, typer.Option("--box", metavar="LAG=LOW:HIGH", help="Limits of the uniform measure.")
     ] = None,
-    samples: Annotated[Path | None, typer.Option("--samples", metavar="FILE", help="Points, a column per lag.")] = None,
+    samples: Annotated[str | None, typer.Option("--samples", metavar="FILE", help="Points, a column per lag.")] = None,
+    weights: Annotated[
+        str | None, typer.Option("--weights", metavar="FILE", help="A column `weight`, a row per row of DATA.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Parameters of a saved model under another measure, without training again."""
-    from orthaug.commands import runs
+    from orthaug.commands import measure_options, runs
 
     opened = runs.open_training(model, data, runs.read_rows(rows))
-    chosen = runs.read_measure(measure, opened, box or (), samples)
+    given = {"box": box or [], "samples": [samples] if samples else [], "weights": [weights] if weights else []}
+    place = measure_options.split_place(opened.model, opened.record)
+    chosen = measure_options.read_measure(measure, given, place)
     _prepare_jax()
     found = runs.split(opened, chosen)
     typer.echo(_json(found) if as_json else runs.split_text(found))

@@ -28,12 +28,12 @@ from orthaug.commands.outcome import (
     score_part,
 )
 from orthaug.data.record import same_step
+from orthaug.fitting.kinds import STRUCTURES
 from orthaug.models import storage
 from orthaug.models.model import Model
 from orthaug.reports import plots
 
 ALONE = "physics alone"
-KINDS = (ALONE, "additive", "orthogonal", "orthogonal-penalty", "baseline-penalty")
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +46,11 @@ class Comparison:
     result: dict[str, Any]
 
 
+def compared() -> tuple[str, ...]:
+    """What is fitted: physics alone, and every structure that is registered."""
+    return ALONE, *STRUCTURES
+
+
 def compare(job: Job, saved: Sequence[Path] = (), progress: Progress | None = None) -> Comparison:
     """Fit every structure as the spec trains, score each on every part, and put saved models beside them.
 
@@ -53,7 +58,7 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress | None = No
     the reason. With a validation part the structure of the lowest one-step error there is marked as chosen.
     """
     models = {str(path): _matching(path, job) for path in saved}
-    kinds = (ALONE,) if job.spec.learner.kind == "none" else KINDS
+    kinds = (ALONE,) if job.spec.declared_learner() is None else compared()
     fitted, left_out = {}, {}
     for number, kind in enumerate(kinds):
         try:

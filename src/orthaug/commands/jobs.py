@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,13 +12,14 @@ import numpy as np
 
 from orthaug._base.errors import InputError
 from orthaug.analysis.suspicion import check_suspects
-from orthaug.commands.spec import MeasureSection, Part, Spec, load_spec
+from orthaug.commands.spec import Part, Spec, load_spec
 from orthaug.data.expressions import Lag
-from orthaug.data.readers import read_record, read_samples
+from orthaug.data.readers import read_record
 from orthaug.data.record import Record, check_channels, same_step
 from orthaug.data.regressors import largest_lag
-from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty, Structure
-from orthaug.inference.measures import Measure, Samples, Support, Symmetrized, Training, Uniform
+from orthaug.fitting.structures import Orthogonal, Structure
+from orthaug.inference.measure_files import MeasurePlace
+from orthaug.inference.measures import Measure, Support, Training
 from orthaug.physics.excitation import excitation
 from orthaug.physics.parameters import PhysicsMap, with_initial
 from orthaug.physics.problem import Problem, check_defined, pose, regressor_of
@@ -101,11 +102,8 @@ class Job:
     @property
     def iterations(self) -> int:
         """Steps of a run at most."""
-        training = self.spec.training
-        if training.solver == "adam-lbfgs":
-            return training.adam_iterations + training.lbfgs_iterations
-        free_run = training.focus == "simulation" or training.horizon > 1
-        return training.iterations + (training.start_iterations if free_run else 0)
+        flown = self.spec.declared_criterion().flown
+        return self.spec.declared_solver().iterations + (flown.start_iterations if flown else 0)
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -141,7 +139,7 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
     train = _load(path, spec, spec.data.train, "train")
     validation = _load(path, spec, spec.data.validation, "validation") if spec.data.validation else None
     tests = tuple(_load(path, spec, part, f"tests.{name}") for name, part in spec.data.tests.items())
-    lags = spec.lag_orders() if spec.learner.kind != "none" else None
+    lags = spec.lag_orders() if spec.declared_learner() is not None else None
     try:
         layout, _ = regressor_of(baseline, lags, learner_inputs, tuple(spec.data.outputs), tuple(spec.data.inputs))
         first = largest_lag(layout)
@@ -150,8 +148,7 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
         problem = pose(train.record, baseline, lags, learner_inputs, require_full_rank=require_full_rank)
         problem.feature_rows()
         _check_segments(spec, problem)
-        section = spec.structure.measure
-        measure = measure_of(section.kind, [str(lag) for lag in problem.used], section, path.parent)
+        measure = measure_of(spec, problem, path.parent)
         _check_measure(measure, problem)
         job = Job(path, spec, train, validation, tests, problem, measure, physics, ())
         check_suspects(spec.suspects, problem)
@@ -191,32 +188,20 @@ def _thinned(name: str, every: int) -> str:
 
 
 def structure_of(spec: Spec, kind: str | None = None, measure: Measure | None = None) -> Structure:
-    """The structure that a spec declares, or another kind with its weight."""
-    weight = spec.structure.weight
-    known = {
-        "additive": Additive(),
-        "orthogonal": Orthogonal(measure or Training()),
-        "orthogonal-penalty": OrthogonalPenalty(weight),
-        "baseline-penalty": BaselinePenalty(weight),
-    }
-    return known[kind or spec.structure.kind]
+    """The structure that a spec declares, or another kind with its keys."""
+    return spec.declared_structure(kind, measure)
 
 
-def measure_of(kind: str, lags: Sequence[str], section: MeasureSection, folder: Path) -> Measure:
-    """The measure that a section declares; `lags` are the raw lags that the model reads."""
-    rows = section.rows
-    if kind == "samples":
-        files = [folder / file for file in section.files]
-        return Samples(*read_samples(files, lags, rows=rows, every=section.every))
-    if kind == "uniform":
-        return Uniform({lag: tuple(limits) for lag, limits in section.box.items()})
-    return Symmetrized() if kind == "symmetrized" else Training()
+def measure_of(spec: Spec, problem: Problem, folder: Path) -> Measure:
+    """The measure that a spec declares for its problem."""
+    lags = [str(lag) for lag in problem.used]
+    return spec.declared_measure(MeasurePlace(folder, lags, problem.record, problem.rows.start))
 
 
 def _check_measure(measure: Measure, problem: Problem) -> None:
     """Raise InputError for a measure that does not fit, or under which the physics is rank-deficient."""
     points = measure.points(Support(problem.record, problem.layout, problem.used))
-    if isinstance(measure, Training) or not problem.excitation.full_rank or not problem.baseline.names:
+    if measure == Training() or not problem.excitation.full_rank or not problem.baseline.names:
         return
     with np.errstate(all="ignore"):
         phi = np.asarray(problem.baseline.phi(points.x, problem.layout, problem.outputs, np))
@@ -280,23 +265,12 @@ def run_fit(
 
     On a `fold` of cross-validation: that record, one start, few iterations, and nothing to choose from.
     """
-    from orthaug.fitting.criteria import Prediction, Simulation
     from orthaug.fitting.estimation import estimate
-    from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
-    from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-    from orthaug.models.learners import MLP
 
     spec, training = job.spec, job.spec.training
-    learner = None
-    if spec.learner.kind == "mlp" and not alone:
-        learner = MLP(tuple(spec.learner.hidden), spec.learner.activation, spec.learner_inputs())
-    criterion = Prediction(training.horizon)
-    if training.focus == "simulation":
-        criterion = Simulation(training.segment, training.washout, training.start_iterations)
-    if training.solver == "adam-lbfgs":
-        solver = AdamLBFGS(training.adam_iterations, training.lbfgs_iterations, training.learning_rate)
-    else:
-        solver = LevenbergMarquardt(training.iterations if fold is None else min(training.iterations, FOLD_ITERATIONS))
+    learner = None if alone else spec.declared_learner()
+    solver = spec.declared_solver()
+    measure = job.measure if fold is None else None  # a fold is scored by predictions, which no measure changes
     validated = job.validation is not None and fold is None
     choices = training.regularizations(validated)
     return estimate(
@@ -304,9 +278,9 @@ def run_fit(
         job.problem.baseline,
         lags=spec.lag_orders() if learner is not None else None,
         learner=learner,
-        structure=Orthogonal() if alone else structure_of(spec, kind, job.measure),
-        criterion=criterion,
-        solver=solver,
+        structure=Orthogonal() if alone else structure_of(spec, kind, measure),
+        criterion=spec.declared_criterion(),
+        solver=solver if fold is None else solver.at_most(FOLD_ITERATIONS),
         regularization=choices if fold is None or not isinstance(choices, tuple) else choices[0],
         restarts=training.restarts if fold is None else 1,
         seed=training.seed,

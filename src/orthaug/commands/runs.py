@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from orthaug import __version__
-from orthaug._base.checks import check_choice
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_file
-from orthaug.data.readers import read_record, read_samples
+from orthaug.data.readers import read_record
 from orthaug.data.record import Record
 from orthaug.data.tables import check_readable, has_column
-from orthaug.inference.measures import Measure, Samples, Support, Symmetrized, Training, Uniform
+from orthaug.inference.measures import Measure, Support
 
 if TYPE_CHECKING:
     from orthaug.models.model import Model
@@ -106,38 +105,6 @@ def read_rows(text: str | None) -> tuple[int, int] | None:
     if not (start.isdecimal() and stop.isdecimal() and text.isascii()):
         raise InputError(f"--rows: found '{text}'; expected a half-open range of rows such as 0:1000.")
     return int(start), int(stop)
-
-
-def read_measure(kind: str, run: Run, box: Sequence[str], samples: Path | None) -> Measure:
-    """The measure that the options of `orthaug split` declare.
-
-    Raises:
-        InputError: an unknown kind, a box that is not `lag=low:high`, samples without a file.
-    """
-    check_choice(kind, ("training", "symmetrized", "uniform", "samples"), "--measure")
-    if samples is not None and kind != "samples":
-        raise InputError(f"--samples: belongs to --measure samples; found --measure {kind}.")
-    if kind == "samples":
-        if samples is None:
-            raise InputError("--samples is missing; give the CSV file that holds the points of the samples measure.")
-        return Samples(*read_samples([samples], [str(lag) for lag in run.model.form.used]))
-    if box and kind != "uniform":
-        raise InputError(f"--box: belongs to --measure uniform; found --measure {kind}.")
-    if kind != "uniform":
-        return Symmetrized() if kind == "symmetrized" else Training()
-    limits = {}
-    for text in box:
-        lag, equals, both = text.partition("=")
-        try:
-            low, high = (float(limit) for limit in both.split(":"))
-        except ValueError:
-            equals = ""
-        if not equals:
-            raise InputError(f"--box: found '{text}'; expected a raw lag and its limits, such as 'u[k]=-0.6:0.6'.")
-        if lag.strip() in limits:
-            raise InputError(f"--box: {lag.strip()} is given twice.")
-        limits[lag.strip()] = (low, high)
-    return Uniform(limits)
 
 
 def split(run: Run, measure: Measure) -> dict[str, Any]:

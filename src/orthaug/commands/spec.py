@@ -1,23 +1,37 @@
-"""The spec file: TOML in, checked declarations out (the contract's section "Spec file").
+"""The spec file: TOML in, checked declarations out.
 
-Every error is one line that names the file, the key, what was found and what was expected.
+The sections [learner], [structure], [structure.measure] and [training] have the keys that the registered kinds
+declare. Every error is one line that names the file, the key, what was found and what was expected.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import tomllib
+from dataclasses import fields, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, create_model, model_validator
 
-from orthaug._base.checks import nearest
 from orthaug._base.errors import InputError
+from orthaug._base.registry import resolve
+from orthaug.commands.sections import KindSection, Section, with_kinds
+from orthaug.commands.spec_errors import first_message
 from orthaug.data.record import Channel
 from orthaug.data.regressors import Lags
 from orthaug.data.tables import check_readable
+from orthaug.fitting.criteria import Criterion
+from orthaug.fitting.kinds import CRITERIA, SOLVERS, STRUCTURES
+from orthaug.fitting.rules import check_solver, check_starts
+from orthaug.fitting.solvers.solver import Solver
+from orthaug.fitting.structures import Structure
+from orthaug.inference.kinds import MEASURES
+from orthaug.inference.measure_files import MeasurePlace
+from orthaug.inference.measures import Measure
+from orthaug.models.kinds import LEARNERS
+from orthaug.models.learners import Learner
 from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.parameters import PhysicalParameter, PhysicsMap
 
@@ -29,10 +43,8 @@ Regularization = Literal["none", "evidence"] | Annotated[float, Field(ge=0, allo
 Range = Annotated[list[Count], Field(min_length=2, max_length=2)]
 
 
-class Section(BaseModel):
-    """A table of the spec; unknown keys are errors."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+def _as_list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]
 
 
 class Part(Section):
@@ -146,55 +158,61 @@ class DesignSection(Section):
     seed: Count = 0
 
 
-class LearnerSection(Section):
+class LearnerSection(KindSection):
     """The learned correction."""
 
-    kind: Literal["mlp", "none"] = "mlp"
-    hidden: list[Positive] = [16]
-    activation: Literal["tanh", "relu", "gelu", "sigmoid", "silu", "elu", "softplus", "identity"] = "tanh"
-    inputs: list[str] | None = None
+    kind: str = "mlp"
+
+    @model_validator(mode="after")
+    def _check(self) -> LearnerSection:
+        self.declared(LEARNERS, self.kind)
+        return self
 
 
-class MeasureSection(Section):
+class MeasureSection(KindSection):
     """The set of regressor points on which physics and learner are made orthogonal."""
 
-    kind: Literal["training", "symmetrized", "uniform", "samples"] = "training"
-    box: dict[str, Annotated[list[Finite], Field(min_length=2, max_length=2)]] = {}
-    files: list[str] = []
-    rows: Range | list[Range] | None = None
-    every: Positive = 1
+    kind: str = "training"
+
+    @model_validator(mode="after")
+    def _check(self) -> MeasureSection:
+        self.declared(MEASURES, self.kind)
+        return self
 
 
-class StructureSection(Section):
+class StructureSection(KindSection):
     """How physics and learner share the fitted function."""
 
-    kind: Literal["additive", "orthogonal", "orthogonal-penalty", "baseline-penalty"] = "orthogonal"
-    weight: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1.0
+    kind: str = "orthogonal"
     measure: MeasureSection = MeasureSection()
 
+    @model_validator(mode="after")
+    def _check(self) -> StructureSection:
+        self.declared(STRUCTURES, self.kind)
+        return self
 
-class TrainingSection(Section):
+
+class TrainingSection(KindSection):
     """Solver, criterion and regularisation."""
 
-    solver: Literal["levenberg-marquardt", "adam-lbfgs"] = "levenberg-marquardt"
-    iterations: Positive = 300
-    adam_iterations: Count = 500
-    lbfgs_iterations: Count = 1000
-    learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1e-3
-    focus: Literal["prediction", "simulation"] = "prediction"
-    horizon: Positive = 1
-    segment: Count = 512
-    washout: Count = 40
-    start_iterations: Count = 20
+    solver: str = "levenberg-marquardt"
+    focus: str = "prediction"
     restarts: Positive = 1
     ensemble: bool = False
     seed: Annotated[int, Field(ge=0, lt=2**63, strict=True)] = 0
     regularization: Regularization | Annotated[list[Regularization], Field(min_length=1)] | None = None
 
+    @model_validator(mode="after")
+    def _check(self) -> TrainingSection:
+        check_starts(self.restarts, self.seed, ensemble=self.ensemble)
+        solver, criterion = self.declared(SOLVERS, self.solver), self.declared(CRITERIA, self.focus)
+        check_solver(solver, criterion, _as_list(self.regularization))
+        return self
+
     def regularizations(self, validated: bool) -> str | float | tuple[str | float, ...]:
         """What to try: by default none, or with a validation part to choose by, none and evidence."""
         if self.regularization is None:
-            return ("none", "evidence") if validated and self.solver == "levenberg-marquardt" else "none"
+            return ("none", "evidence") if validated and SOLVERS[self.solver].gauss_newton else "none"
         return tuple(self.regularization) if isinstance(self.regularization, list) else self.regularization
 
 
@@ -219,38 +237,6 @@ class Spec(Section):
     validation: ValidationSection = ValidationSection()
 
     @model_validator(mode="after")
-    def _seeds_fit(self) -> Spec:
-        if self.training.seed + self.training.restarts >= 2**63:
-            raise ValueError(
-                f"`training.seed`: found {self.training.seed}; expected seeds below 2**63 for all restarts"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _free_run_scores_something(self) -> Spec:
-        training = self.training
-        if training.focus == "simulation" and 0 < training.segment <= training.washout:
-            raise ValueError(
-                f"`training.washout`: found {training.washout}; expected less than the segment, {training.segment}"
-            )
-        if (training.focus == "simulation" or training.horizon > 1) and training.solver == "adam-lbfgs":
-            raise ValueError("`training.solver` = adam-lbfgs trains one step ahead; expected levenberg-marquardt here")
-        return self
-
-    @model_validator(mode="after")
-    def _ensembles_have_members(self) -> Spec:
-        if self.training.ensemble and self.training.restarts < 2:
-            raise ValueError(f"`training.restarts`: found {self.training.restarts}; expected 2 or more for an ensemble")
-        return self
-
-    @model_validator(mode="after")
-    def _samples_have_files(self) -> Spec:
-        measure = self.structure.measure
-        if measure.kind == "samples" and not measure.files:
-            raise ValueError("`structure.measure.files` is missing; expected the files that hold the samples")
-        return self
-
-    @model_validator(mode="after")
     def _blocks_are_several(self) -> Spec:
         if self.validation.blocks == 1:
             raise ValueError("`validation.blocks`: found 1; expected 2 or more, or 0 for no cross-validation")
@@ -260,8 +246,6 @@ class Spec(Section):
     def _choices_need_validation(self) -> Spec:
         if isinstance(self.training.regularization, list) and self.data.validation is None:
             raise ValueError("`training.regularization` is a list; expected [data.validation] to choose by")
-        if self.training.solver == "adam-lbfgs" and "evidence" in _as_list(self.training.regularization):
-            raise ValueError("`training.regularization` = evidence; expected solver levenberg-marquardt with it")
         return self
 
     def channels(self, names: list[str]) -> tuple[Channel, ...]:
@@ -296,13 +280,49 @@ class Spec(Section):
         ]
         return PhysicsMap.of(parameters, self.physics.theta, self.baseline.constants)
 
+    def declared_learner(self) -> Learner | None:
+        """The learner; None for physics alone."""
+        return resolve(self.learner.declared(LEARNERS, self.learner.kind))
+
     def learner_inputs(self) -> tuple[str, ...] | None:
         """What the learner sees; None for all lags."""
-        return tuple(self.learner.inputs) if self.learner.inputs is not None and self.learner.kind != "none" else None
+        return getattr(self.declared_learner(), "inputs", None)
+
+    def declared_structure(self, kind: str | None = None, measure: Measure | None = None) -> Structure:
+        """The structure, or another kind with the same keys; under a measure where it splits θ by one."""
+        structure = resolve(self.structure.declared(STRUCTURES, kind or self.structure.kind))
+        takes = any(field.name == "measure" for field in fields(structure))
+        return replace(structure, measure=measure) if takes and measure is not None else structure
+
+    def declared_measure(self, place: MeasurePlace) -> Measure:
+        """The measure, with what it reads from files."""
+        section = self.structure.measure
+        return resolve(section.declared(MEASURES, section.kind), place)
+
+    def declared_criterion(self) -> Criterion:
+        """The criterion."""
+        return resolve(self.training.declared(CRITERIA, self.training.focus))
+
+    def declared_solver(self) -> Solver:
+        """The solver."""
+        return resolve(self.training.declared(SOLVERS, self.training.solver))
 
 
-def _as_list(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else [value]
+def spec_model() -> type[Spec]:
+    """`Spec` with the keys of every kind that is registered now."""
+    return _spec_model(
+        tuple(tuple(registry.items()) for registry in (LEARNERS, MEASURES, STRUCTURES, SOLVERS, CRITERIA))
+    )
+
+
+@lru_cache(maxsize=8)
+def _spec_model(registered: object) -> type[Spec]:
+    learner = with_kinds(LearnerSection, kind=LEARNERS)
+    measure = with_kinds(MeasureSection, kind=MEASURES)
+    structure = with_kinds(StructureSection, {"measure": (measure, measure())}, kind=STRUCTURES)
+    training = with_kinds(TrainingSection, solver=SOLVERS, focus=CRITERIA)
+    sections = {"learner": learner, "structure": structure, "training": training}
+    return create_model("Spec", __base__=Spec, **{name: (one, one()) for name, one in sections.items()})  # type: ignore[call-overload]
 
 
 def load_spec(path: Path) -> Spec:
@@ -318,84 +338,9 @@ def load_spec(path: Path) -> Spec:
         raise InputError(f"{path}: broken TOML: {' '.join(str(error).split())}.") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file; expected TOML in UTF-8.") from None
+    model = spec_model()
     try:
-        return Spec.model_validate(content)
+        return model.model_validate(content)
     except ValidationError as error:
-        message = _first_message(error, content)
+        message = first_message(error, content, model)
         raise InputError(f"{path}: {message}{'' if message.endswith('?') else '.'}") from None
-
-
-def _first_message(error: ValidationError, content: dict[str, Any]) -> str:
-    """The first error as `key: found …; expected …`."""
-    errors = error.errors()
-    # of a union every branch complains: what was meant is the branch whose type fits, there the deepest complaint
-    fitting = [e for e in errors if not e["type"].endswith("_type")]
-    first = max(fitting or errors[:1], key=lambda e: len(e["loc"]))
-    key = _key(first["loc"], content)
-    kind, found = first["type"], first["input"]
-    if kind == "extra_forbidden":
-        *parents, name = [part for part in first["loc"] if isinstance(part, str | int)]
-        known = _known_keys(parents)
-        return f"unknown key '{key}'{nearest(str(name), known) or ', known are ' + ', '.join(known)}"
-    if kind == "missing":
-        return f"the key '{key}' is missing"
-    if kind == "value_error":
-        return (
-            f"'{key}': {first['msg'].removeprefix('Value error, ')}"
-            if key
-            else first["msg"].removeprefix("Value error, ")
-        )
-    same_key = [e["msg"] for e in errors if _key(e["loc"], content) == key]
-    expected = " or ".join(dict.fromkeys(_plain(m) for m in same_key))
-    return f"'{key}': found {_shown(found)}; expected {expected}"
-
-
-def _shown(value: Any) -> str:
-    """A value as the file writes it, cut where it is long."""
-    text = json.dumps(value, default=str, ensure_ascii=False).replace("Infinity", "inf").replace("NaN", "nan")
-    return text if len(text) <= 80 else text[:77] + "…"
-
-
-def _plain(message: str) -> str:
-    """Pydantic's words in those of TOML."""
-    if "at least 1 item" in message or "at least 1 character" in message:
-        return "at least one entry" if "item" in message else "some text"
-    if "after validation" in message:
-        return "two numbers, [start, stop]"
-    message = message.removeprefix("Input should be ").replace("a valid ", "a ").replace("a integer", "an integer")
-    return "a table" if "dictionary" in message else message
-
-
-def _key(location: tuple[Any, ...], content: Any) -> str:
-    """The key's path in the file; pydantic's names of union branches are not part of it."""
-    text = ""
-    for i, part in enumerate(location):
-        if isinstance(part, int):
-            text += f"[{part}]"
-            content = content[part] if isinstance(content, list) and part < len(content) else None
-        elif isinstance(content, dict) and (part in content or i == len(location) - 1):
-            text += f".{part}" if text else part
-            content = content.get(part)
-    return text
-
-
-def _known_keys(parents: list[Any]) -> list[str]:
-    """The keys of the section at a path such as ["data", "tests", "steps"]."""
-    model: Any = Spec
-    for part in parents:
-        if isinstance(part, int) or not isinstance(model, type):
-            continue
-        field = model.model_fields.get(part)
-        model = _section_of(field.annotation) if field else model
-    return list(model.model_fields) if isinstance(model, type) else []
-
-
-def _section_of(annotation: Any) -> Any:
-    """The Section class inside an annotation such as `dict[str, Part] | None`."""
-    if isinstance(annotation, type) and issubclass(annotation, Section):
-        return annotation
-    for inner in getattr(annotation, "__args__", ()):
-        found = _section_of(inner)
-        if found is not None:
-            return found
-    return None

@@ -2,22 +2,60 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, Protocol, runtime_checkable
 
-from orthaug._base.checks import check_count
-from orthaug._base.errors import InputError
+from annotated_types import Ge
+
+from orthaug._base.errors import KeyedError
+from orthaug._base.registry import LIBRARY_ONLY, check_fields
+
+if TYPE_CHECKING:
+    from orthaug.data.record import Record
+    from orthaug.models.model import Model
+    from orthaug.models.response import Response
+
+
+@runtime_checkable
+class Criterion(Protocol):
+    """What `estimate(criterion=…)` takes."""
+
+    @property
+    def one_step(self) -> bool:
+        """Whether it is the error one step ahead, which is linear in θ."""
+        ...
+
+    @property
+    def simulates(self) -> bool:
+        """Whether runs are compared by free runs over whole experiments."""
+        ...
+
+    @property
+    def washout(self) -> int:
+        """Leading steps of a free run that are not scored."""
+        ...
+
+    @property
+    def flown(self) -> Simulation | None:
+        """The free run that training makes; None for one step ahead."""
+        ...
+
+    def response(self, model: Model, record: Record) -> Response:
+        """What a validation part judges a model by."""
+        ...
 
 
 @dataclass(frozen=True)
 class Prediction:
     """Declaration: the error of the prediction `horizon` steps ahead; 1 is the paper's criterion (eq:cost_fun)."""
 
-    horizon: int = 1
-    free_run: ClassVar[bool] = False
+    simulates = False
+    washout = 0
+
+    horizon: Annotated[int, Ge(1)] = 1
 
     def __post_init__(self) -> None:
-        check_count(self.horizon, "horizon")
+        check_fields(self)
 
     @property
     def one_step(self) -> bool:
@@ -28,6 +66,10 @@ class Prediction:
     def flown(self) -> Simulation | None:
         """The free run that gives it: segments of `horizon` steps whose last one is scored; None for one step."""
         return Simulation(self.horizon, self.horizon - 1, exact_start=True) if self.horizon > 1 else None
+
+    def response(self, model: Model, record: Record) -> Response:
+        """The prediction."""
+        return model.predict(record, self.horizon)
 
 
 @dataclass(frozen=True)
@@ -44,19 +86,21 @@ class Simulation:
         exact_start: whether a segment starts exactly from what was measured; None for the rule above.
     """
 
-    segment: int = 512
-    washout: int = 40
-    start_iterations: int = 20
-    exact_start: bool | None = None
-    free_run: ClassVar[bool] = True
-    one_step: ClassVar[bool] = False
+    one_step = False
+    simulates = True
+
+    segment: Annotated[int, Ge(0)] = 512
+    washout: Annotated[int, Ge(0)] = 40
+    start_iterations: Annotated[int, Ge(0)] = 20
+    exact_start: bool | None = field(default=None, metadata=LIBRARY_ONLY)
 
     def __post_init__(self) -> None:
-        for name in ("segment", "washout", "start_iterations"):
-            check_count(getattr(self, name), name, least=0)
+        check_fields(self)
         if self.segment and self.washout >= self.segment:
-            raise InputError(
-                f"`washout` must be shorter than `segment`; got {self.washout} and {self.segment}: nothing is scored."
+            raise KeyedError(
+                f"`washout` must be shorter than `segment`; got {self.washout} and {self.segment}: nothing is scored.",
+                "washout",
+                f": found {self.washout}; expected less than the segment, {self.segment}",
             )
 
     @property
@@ -64,12 +108,13 @@ class Simulation:
         """Itself: the free run that training makes."""
         return self
 
+    def response(self, model: Model, record: Record) -> Response:
+        """The free run."""
+        return model.simulate(record)
+
     @property
     def estimates_pasts(self) -> bool:
         """Whether the outputs before a segment are unknowns."""
         if self.exact_start is not None:
             return not self.exact_start
         return self.washout > 0 or self.segment == 0
-
-
-Criterion = Prediction | Simulation

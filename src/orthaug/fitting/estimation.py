@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from orthaug._base.checks import Vector, check_choice, check_count, check_type
 from orthaug._base.errors import InputError
-from orthaug._base.jax import jax, jnp
+from orthaug._base.jax import Array, jax, jnp
 from orthaug._base.parallel import spread
 from orthaug.data.record import Record
 from orthaug.data.regressors import Features, Lags
@@ -22,7 +22,9 @@ from orthaug.fitting.estimates import Estimate, Restart
 from orthaug.fitting.free_run import FreeRunTask
 from orthaug.fitting.learned import Learned, Task
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.solvers import AdamLBFGS, LevenbergMarquardt
+from orthaug.fitting.rules import check_solver, check_starts
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.inference.measures import Training
 from orthaug.models.learners import MLP, External, Learner, Scaling
@@ -31,7 +33,6 @@ from orthaug.models.rows import Engine, InMemory
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.problem import Problem, pose
 
-Solver = LevenbergMarquardt | AdamLBFGS
 Regularization = str | float
 Progress = Callable[[int, int, float], None]
 """Called now and then with the number of the restart, the iteration and the loss."""
@@ -141,11 +142,9 @@ def fit(
     _check_choices(learner, structure, criterion, solver, initial, validation)
     _check_splittable(structure, problem.baseline, learner)
     choices = _regularizations(regularization, validation)
-    if ensemble and (restarts < 2 or initial is not None):
-        raise InputError("an ensemble needs `restarts` of 2 or more to be the median of.")
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
-    if seed + restarts >= 2**63:
-        raise InputError(f"`seed` must be below 2**63; got {seed}.")
+    check_starts(restarts if initial is None else 1, seed, ensemble=ensemble)
+    check_solver(solver, criterion, () if learner is None else choices)
     problem = replace(problem, features=Features(())) if learner is None and initial is None else problem
     warm = None
     if initial is not None:
@@ -179,7 +178,7 @@ def _check_splittable(structure: Structure, baseline: Baseline, learner: Learner
 
 def _splits(structure: Structure) -> bool:
     """Whether θ is split off under another measure than that of training."""
-    return structure.projects and structure.measure != Training()
+    return structure.measure != Training()
 
 
 def orthogonalize(
@@ -297,9 +296,7 @@ def _validation_error(fit: Estimate, validation: Record) -> float:
     """Mean squared error with each output in its training standard deviation; NaN without a model or a value."""
     if not fit.status.ok:
         return math.nan
-    criterion, model = fit.criterion, fit.model
-    response = model.simulate(validation) if criterion.free_run else model.predict(validation, criterion.horizon)
-    rmse = response.scores().rmse
+    rmse = fit.criterion.response(fit.model, validation).scores().rmse
     return float(np.mean((rmse * fit.problem.weight) ** 2))
 
 
@@ -318,10 +315,6 @@ def _check_choices(learner: Any, structure: Any, criterion: Any, solver: Any, in
     check_type(learner, Learner | None, "learner", "a learner such as MLP(), or None")
     check_type(structure, Structure, "structure", "a structure such as Orthogonal()")
     check_type(criterion, Criterion, "criterion", "Prediction(…) or Simulation(…)")
-    if criterion.flown is not None and not solver.gauss_newton:
-        raise InputError(
-            "only `LevenbergMarquardt` trains on a free run or more than one step ahead; take that solver."
-        )
     check_type(solver, Solver, "solver", "a solver such as LevenbergMarquardt()")
     check_type(initial, Model | None, "initial", "a Model or None")
     check_type(validation, Record | None, "validation", "a Record or None")

@@ -20,7 +20,8 @@ from orthaug.fitting.learned import ErrorStatistics, Learned
 from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, errors_of
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.segments import Segments, lay_segments
-from orthaug.fitting.solvers.levenberg_marquardt import MARQUARDT, Descent, LevenbergMarquardt, Progress, descend
+from orthaug.fitting.solvers.descent import MARQUARDT, Descent, Progress
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Structure
 from orthaug.inference.covariance import noise_covariance, theta_block, whitening
@@ -83,7 +84,7 @@ class FreeRunTask:
         dynamics = Lagged(problem.baseline, problem.features, problem.layout, problem.outputs, task.bound)
         segments = lay_segments(record, dynamics, flown.segment, flown.washout)
         whole, colour = segments, None
-        if criterion.free_run and flown.segment:
+        if criterion.simulates and flown.segment:
             whole = lay_segments(record, dynamics, 0, flown.washout)
             if segments.steps < _COLOURED_STEPS <= longest:
                 first = tuple(e.rows(0, _COLOUR_ROWS) for e in record.experiments)
@@ -170,11 +171,10 @@ class FreeRunTask:
     ) -> tuple[FreeRunObjective, Descent]:
         """From p to the end; several outputs are weighted by their errors' covariance in a second leg."""
         ny = len(self.problem.outputs)
-        options: dict[str, Any] = {"tolerance": solver.tolerance, "evidence": evidence, "bounds": objective.bounds}
-        options |= {"damping": MARQUARDT}
-        first = solver.iterations if ny == 1 else solver.iterations // 2
+        options: dict[str, Any] = {"evidence": evidence, "bounds": objective.bounds, "damping": MARQUARDT}
+        first = solver if ny == 1 else solver.at_most(solver.iterations // 2)
         start = Start(objective.initial.measured)
-        end = descend(objective, p, start, iterations=first, ridge=ridge, progress=tell, **options)
+        end = first.descend(objective, p, start, ridge=ridge, progress=tell, **options)
         noise = self._noise(objective, end) if ny > 1 and end.ending.usable else None
         white = None if noise is None else whitening(noise)
         if noise is None or white is None:
@@ -182,11 +182,10 @@ class FreeRunTask:
         size = np.trace(objective.weight @ noise @ objective.weight.T) / ny  # so that the ridge keeps its place
         objective = replace(objective, weight=np.sqrt(size) * white)
         done = end.iterations
-        again = descend(
+        again = solver.at_most(solver.iterations - done).descend(
             objective,
             end.flown.p,
             Start(end.flown.states),
-            iterations=solver.iterations - done,
             ridge=end.ridge,
             progress=lambda i, loss: tell(done + i, loss),
             **options,

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from orthaug._base.jax import jax, jnp
+from orthaug._base.jax import Array, jax, jnp
 from orthaug.fitting.elimination import Elimination, Fixed
 from orthaug.models.learners import Bound
 from orthaug.models.rows import Chunk, row_sum

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol
 from orthaug._base.checks import Matrix, Vector
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.elimination import Fixed
-from orthaug.fitting.solvers.levenberg_marquardt import Progress
+from orthaug.fitting.solvers.descent import Progress
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Structure
 from orthaug.models.learners import Bound, Scaling

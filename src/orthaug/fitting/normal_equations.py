@@ -12,10 +12,10 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import jax, jnp
+from orthaug._base.jax import Array, jax, jnp
 from orthaug.models.learners import Bound
 from orthaug.models.rows import Chunk, Engine, Overlap, gram, row_sum
 

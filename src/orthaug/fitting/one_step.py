@@ -7,18 +7,18 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
-from orthaug._base.jax import jax, jnp
+from orthaug._base.jax import Array, jax, jnp
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.elimination import Elimination, Fixed, eliminate
 from orthaug.fitting.joint import JointCriterion, Physics
 from orthaug.fitting.learned import Learned
 from orthaug.fitting.normal_equations import Blocks, Hold, Normal, OneStep, Streamed, linearise
 from orthaug.fitting.solvers import compiled
-from orthaug.fitting.solvers.levenberg_marquardt import IDENTITY, Progress, descend
+from orthaug.fitting.solvers.descent import IDENTITY, Progress
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.inference.covariance import mixing
@@ -134,11 +134,9 @@ class OneStepTask:
         if evidence or not self.engine.resident:
             what = "evidence regularization" if evidence else "training on rows that are not in memory"
             raise InputError(f"{what} needs the Gauss-Newton matrix of the levenberg-marquardt solver.")
-        from orthaug.fitting.solvers import gradient  # optax is slow to import, and few runs need it
-
         physics = Physics.of(self.problem, elimination, fixed, ridge, self.rms, solved=structure.projects)
         joint = JointCriterion(self.bound, structure.projects)
-        end = gradient.minimise(solver, joint, w, self.rows, physics, progress=progress)
+        end = solver.minimise(joint, w, self.rows, physics, progress=progress)
         normal = linearise(OneStep(self.bound), end.w, (self.rows, hold), self._nothing)
         coordinates = np.asarray(physics.start + physics.basis @ end.v) * self.rms
         coefficients = None if structure.projects else self.problem.projection.from_coordinates(coordinates)
@@ -154,13 +152,12 @@ class OneStepTask:
         options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "progress": progress}
         if self.engine.resident:
             criterion, arguments = OneStep(self.bound), (self.rows, hold)
-            return compiled.minimise(solver, criterion, w, arguments, self._nothing, samples=samples, **options)
+            return solver.minimise(criterion, w, arguments, self._nothing, samples=samples, **options)
         objective = Streamed(self.engine, self.bound, self.rows, hold, samples)
         first = objective.fly(np.asarray(w), self._nothing)  # its overlap makes the next pass exact
         if compiled.spanned(first.normal):
             return compiled.Run(w, first.normal, ridge, 0.0, 0, Ending.SPANNED, 0.0)
-        limits: dict[str, Any] = {"iterations": solver.iterations, "tolerance": solver.tolerance, "damping": IDENTITY}
-        end = descend(objective, np.asarray(w), first.normal.overlap, **limits, **options)
+        end = solver.descend(objective, np.asarray(w), first.normal.overlap, damping=IDENTITY, **options)
         normal: Normal = end.flown.normal
         weights = jnp.asarray(end.flown.p)
         return compiled.Run(weights, normal, end.ridge, end.effective, end.iterations, end.ending, end.seconds)

@@ -10,9 +10,9 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
-from orthaug._base.jax import jax, jnp
+from orthaug._base.jax import Array, jax, jnp
 from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.rows import gram

@@ -3,20 +3,22 @@
 Every structure spans the same functions. It decides two things only: which rows join the criterion, and
 which part of `c = θ − θ_aux` is called θ afterwards. The rows are linear in θ and in the learner's
 coordinates `QᵀF`, so θ can always be eliminated, and what training sees of a structure, its penalty or
-its bounds is one small quadratic in `QᵀF` (`Elimination`).
+its bounds is one small quadratic in `QᵀF` (`fitting.elimination`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
+from dataclasses import dataclass, field
+from typing import Annotated, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
+from annotated_types import Ge
 from jaxtyping import Float
 
 from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
+from orthaug._base.registry import LIBRARY_ONLY, check_fields
 from orthaug.inference.measures import Measure, Training
 
 
@@ -36,13 +38,19 @@ class Structure(Protocol):
     def name(self) -> str: ...
 
     @property
-    def projects(self) -> bool: ...
+    def projects(self) -> bool:
+        """Whether θ is split so that the learner is orthogonal to the physics."""
+        ...
 
     @property
-    def identifies(self) -> bool: ...
+    def identifies(self) -> bool:
+        """Whether the data alone determine θ where nothing is learned."""
+        ...
 
     @property
-    def measure(self) -> Measure: ...
+    def measure(self) -> Measure:
+        """The points over which θ is split; training itself knows the training measure only."""
+        ...
 
     def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> PenaltyRows:
         """The rows that join the criterion, given θ⁰ (nθ,) and the output's unit in whitened outputs."""
@@ -61,10 +69,11 @@ class Orthogonal:
     fitted function is split over the measure's points at the end (F2).
     """
 
-    measure: Measure = Training()  # noqa: RUF009  (frozen)
-    name: str = "orthogonal"
-    projects: ClassVar[bool] = True
-    identifies: ClassVar[bool] = True
+    projects = True
+    identifies = True
+
+    measure: Measure = field(default=Training(), metadata=LIBRARY_ONLY)  # noqa: RUF009  (frozen)
+    name: str = field(default="orthogonal", metadata=LIBRARY_ONLY)
 
     def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> PenaltyRows:
         return _no_rows(len(names))
@@ -74,10 +83,10 @@ class Orthogonal:
 class Additive:
     """ŷ = φθ + f (eqs:additive_struct): θ takes what this learner happens to leave, so it is not unique."""
 
-    name: str = "additive"
-    projects: ClassVar[bool] = False
-    identifies: ClassVar[bool] = True
-    measure: ClassVar[Measure] = Training()
+    name: str = field(default="additive", metadata=LIBRARY_ONLY)
+    projects = False
+    identifies = True
+    measure = Training()
 
     def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> PenaltyRows:
         return _no_rows(len(names))
@@ -90,11 +99,15 @@ class OrthogonalPenalty:
     `weight` is λ, against the sum of squares in the output's units.
     """
 
-    weight: float = 1.0
-    name: str = "orthogonal-penalty"
-    projects: ClassVar[bool] = False
-    identifies: ClassVar[bool] = True
-    measure: ClassVar[Measure] = Training()
+    projects = False
+    identifies = True
+    measure = Training()
+
+    weight: Annotated[float, Ge(0)] = 1.0
+    name: str = field(default="orthogonal-penalty", metadata=LIBRARY_ONLY)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> PenaltyRows:
         nt = len(names)
@@ -108,11 +121,15 @@ class BaselinePenalty:
     `weight` is λ, against the sum of squares in the output's units.
     """
 
-    weight: float = 1.0
-    name: str = "baseline-penalty"
-    projects: ClassVar[bool] = False
-    identifies: ClassVar[bool] = False
-    measure: ClassVar[Measure] = Training()
+    projects = False
+    identifies = False
+    measure = Training()
+
+    weight: Annotated[float, Ge(0)] = 1.0
+    name: str = field(default="baseline-penalty", metadata=LIBRARY_ONLY)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> PenaltyRows:
         """The rows `√λ (θ⁰ − θ)/θ⁰`.

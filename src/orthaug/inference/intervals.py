@@ -12,11 +12,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, check_choice, check_count
 from orthaug._base.errors import InputError
-from orthaug._base.jax import jax, jnp
+from orthaug._base.jax import Array, jax, jnp
 from orthaug.data.record import Record
 from orthaug.inference.covariance import mixing
 from orthaug.models.dynamics import Numbers

@@ -9,12 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Annotated, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
+from annotated_types import Len
 
 from orthaug._base.checks import Matrix, Vector, nearest
 from orthaug._base.errors import InputError
+from orthaug._base.registry import LIBRARY_ONLY, Option
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout, lag_matrix, largest_lag, stack_rows
@@ -88,8 +90,8 @@ def _even(x: Matrix) -> Points:
 class Training:
     """The training rows, each with the same weight: the paper's measure. `rows` (start, stop) takes a part of each."""
 
-    rows: tuple[int, int] | None = None
-    name: str = "training"
+    rows: tuple[int, int] | None = field(default=None, metadata=LIBRARY_ONLY)
+    name: str = field(default="training", metadata=LIBRARY_ONLY)
 
     def points(self, support: Support) -> Points:
         if self.rows is None:
@@ -110,7 +112,7 @@ class Training:
 class Symmetrized:
     """The training rows and their mirror images −x: the paper's sign trick, done to the measure, not the experiment."""
 
-    name: str = "symmetrized"
+    name: str = field(default="symmetrized", metadata=LIBRARY_ONLY)
 
     def points(self, support: Support) -> Points:
         x = support.x
@@ -181,8 +183,8 @@ class Uniform:
         box: limits of raw lags, `{"force[k-1]": (-200, 200)}`; lags that are not named take the data's own range.
     """
 
-    box: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    name: str = "uniform"
+    box: Annotated[Mapping[str, Annotated[Sequence[float], Len(2, 2)]], Option("box")] = field(default_factory=dict)
+    name: str = field(default="uniform", metadata=LIBRARY_ONLY)
 
     def points(self, support: Support) -> Points:
         low, high = self.limits(support)

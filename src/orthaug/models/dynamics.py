@@ -8,13 +8,13 @@ from __future__ import annotations
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Experiment, Record
 
-AnyArray = Array | np.ndarray
+AnyArray = Any  # of NumPy or of JAX
 
 
 class Numbers(NamedTuple):

@@ -11,10 +11,10 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix
-from orthaug._base.jax import jax, jnp
+from orthaug._base.jax import Array, jax, jnp
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Experiment, Record
 from orthaug.data.regressors import Features, Layout, lag_matrix, largest_lag

@@ -11,33 +11,38 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Protocol, runtime_checkable
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Array, Float
+from annotated_types import Ge
+from jaxtyping import Float
 
-from orthaug._base.checks import Matrix, check_choice
+from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError
-from orthaug._base.jax import jax, jnp
+from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.registry import OneOf, check_fields
 
 Tree = Any  # a pytree of weight arrays
 
 ACTIVATIONS: dict[str, Callable[[Any], Any]] = {
-    "tanh": jnp.tanh,
-    "relu": jax.nn.relu,
-    "gelu": jax.nn.gelu,
-    "sigmoid": jax.nn.sigmoid,
-    "silu": jax.nn.silu,
-    "elu": jax.nn.elu,
-    "softplus": jax.nn.softplus,
+    "tanh": lambda a: jnp.tanh(a),
+    "relu": lambda a: jax.nn.relu(a),
+    "gelu": lambda a: jax.nn.gelu(a),
+    "sigmoid": lambda a: jax.nn.sigmoid(a),
+    "silu": lambda a: jax.nn.silu(a),
+    "elu": lambda a: jax.nn.elu(a),
+    "softplus": lambda a: jax.nn.softplus(a),
     "identity": lambda a: a,
 }
+"""By name; functions of an array that call JAX when they are called, so that a spec is read without it."""
 _GAIN = {"tanh": 5 / 3, "relu": math.sqrt(2.0)}  # Xavier gains; 1 for the others
 
 
 @runtime_checkable
 class Learner(Protocol):
     """What `estimate(learner=…)` takes: hashable, with `inputs` and these two methods.
+
+    A learner that JAX cannot differentiate has also `differentiable = False`.
 
     `inputs` are the expressions or raw lags it sees ("v[k-1]", "sin(y[k-1])"); None for all lags.
     """
@@ -67,8 +72,8 @@ class MLP:
         inputs: what it sees, as expressions or raw lags; None for all lags.
     """
 
-    hidden: tuple[int, ...] = (16,)
-    activation: str = "tanh"
+    hidden: tuple[Annotated[int, Ge(1)], ...] = (16,)
+    activation: Annotated[str, OneOf(ACTIVATIONS)] = "tanh"
     inputs: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
@@ -81,7 +86,7 @@ class MLP:
             object.__setattr__(self, "inputs", tuple(self.inputs))
         if any(isinstance(n, bool) or not isinstance(n, int) or n < 1 for n in self.hidden):
             raise InputError(f"`hidden` must be whole numbers of neurons, 1 or more; got {self.hidden}.")
-        check_choice(self.activation, ACTIVATIONS, "`activation`")
+        check_fields(self)
 
     def init(self, key: Array, nz: int, ny: int) -> Tree:
         sizes = (nz, *self.hidden, ny)
@@ -100,6 +105,14 @@ class MLP:
             z = activation(weight @ z + bias)
         weight, bias = tree[-1]
         return weight @ z + bias
+
+
+@dataclass(frozen=True)
+class PhysicsAlone:
+    """Declares that nothing is learned: the learner of a spec's `kind = "none"`, which is None in Python."""
+
+    def resolve(self, context: Any) -> None:
+        return None
 
 
 @dataclass(frozen=True)
@@ -155,6 +168,8 @@ class External:
 
     It is called back from compiled code, so it may come from any toolbox; it has no weights.
     """
+
+    differentiable = False
 
     function: Callable[[np.ndarray], np.ndarray]
     inputs: tuple[str, ...] | None = None
@@ -231,6 +246,11 @@ class Bound:
                 f"the learner returned shape {getattr(out, 'shape', type(out).__name__)} for one row; "
                 f"expected (ny,) = ({self.ny},)."
             )
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether JAX differentiates the learner; otherwise differences have to do."""
+        return getattr(self.learner, "differentiable", True)
 
     @property
     def size(self) -> int:

@@ -8,11 +8,11 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector, as_signal
 from orthaug._base.errors import InputError
-from orthaug._base.jax import jax, jnp
+from orthaug._base.jax import Array, jax, jnp
 from orthaug.data.record import Channel, Experiment, Record, same_step
 from orthaug.models.dynamics import Dynamics, Numbers, Parts
 from orthaug.models.lagged import Lagged

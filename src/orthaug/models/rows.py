@@ -13,10 +13,10 @@ from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
-from orthaug._base.jax import jax, jnp
+from orthaug._base.jax import Array, jax, jnp
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
 from orthaug.models.learners import Bound

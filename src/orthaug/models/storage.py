@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +19,14 @@ from safetensors.numpy import save as save_arrays
 from orthaug import __version__
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
+from orthaug._base.registry import frozen
 from orthaug.data.expressions import Expression, Lag
 from orthaug.data.record import Channel
 from orthaug.data.regressors import Features
 from orthaug.models.dynamics import Numbers
+from orthaug.models.kinds import LEARNERS
 from orthaug.models.lagged import Lagged
-from orthaug.models.learners import MLP, Bound, Learner
+from orthaug.models.learners import Bound, Learner
 from orthaug.models.model import Model
 from orthaug.models.statistics import Statistics
 from orthaug.physics.baseline import Baseline, Parameter, Term
@@ -54,12 +56,12 @@ def write(model: Model, folder: Path) -> None:
     """Write the two files into an existing folder."""
     numbers = {name: value for name, value in model.numbers._asdict().items() if value is not None}
     arrays = {f"numbers.{name}": np.asarray(value) for name, value in numbers.items()}
+    kept = model.statistics
     arrays |= {
         "largest_output": model.largest_output,
         "weight": model.weight,
-        "scalars": np.array([model.statistics.ridge, model.statistics.freedom]),
+        "scalars": np.array([kept.ridge, kept.freedom]),
     }
-    kept = model.statistics
     arrays |= {
         name: value
         for name, value in (("gram", kept.gram), ("noise", kept.noise), ("middle", kept.middle))
@@ -122,9 +124,7 @@ def _declare(model: Model) -> dict[str, Any]:
     form = model.form
     learner: dict[str, Any] | None = None
     if form.bound is not None:
-        declared = form.bound.learner
-        learner = {"kind": "mlp", **asdict(declared)} if isinstance(declared, MLP) else {"kind": "callable"}
-        learner |= {"nz": form.bound.nz, "ny": form.bound.ny}
+        learner = _declare_learner(form.bound.learner) | {"nz": form.bound.nz, "ny": form.bound.ny}
     baseline = form.baseline
     return {
         "format": FORMAT,
@@ -147,6 +147,34 @@ def _declare(model: Model) -> dict[str, Any]:
     }
 
 
+def _declare_learner(learner: Learner) -> dict[str, Any]:
+    """Kind and fields of a learner that is registered; a Python callable has none that a file could hold."""
+    kind = LEARNERS.kind_of(learner)
+    if kind is None:
+        return {"kind": "callable"}
+    return {"kind": kind} | {name: getattr(learner, name) for name in _field_names(type(learner))}
+
+
+def _field_names(learner: type) -> list[str]:
+    return [field.name for field in fields(learner) if field.init]
+
+
+def _rebuilt_learner(kept: dict[str, Any], given: Learner | None, path: Path) -> Learner:
+    """The learner that a file declares, or for a callable the one that is given."""
+    kind = kept["kind"]
+    if kind in LEARNERS:
+        learner = LEARNERS[kind]
+        return learner(**{name: frozen(kept[name]) for name in _field_names(learner) if name in kept})
+    if given is not None:
+        return given
+    if kind != "callable":
+        raise InputError(
+            f"{path}: its learner is of the kind '{kind}', which is not registered here; register it, or give the "
+            "learner, load(…, learner=…)."
+        )
+    raise InputError(f"{path}: the learner was a Python callable; give it again, load(…, learner=…).")
+
+
 def _rebuild(
     declared: dict[str, Any],
     arrays: dict[str, np.ndarray],
@@ -163,12 +191,7 @@ def _rebuild(
         baseline = replace(baseline, parameters=tuple(Parameter(**p) for p in physics["parameters"]))
     bound, kept = None, declared["learner"]
     if kept is not None:
-        if kept["kind"] == "mlp":
-            inputs = None if kept["inputs"] is None else tuple(kept["inputs"])
-            learner = MLP(tuple(kept["hidden"]), kept["activation"], inputs)
-        elif learner is None:
-            raise InputError(f"{path}: the learner was a Python callable; give it again, load(…, learner=…).")
-        bound = Bound(learner, kept["nz"], kept["ny"])  # type: ignore[arg-type]
+        bound = Bound(_rebuilt_learner(kept, learner, path), kept["nz"], kept["ny"])
         found = arrays["numbers.weights"].shape[-1]
         if bound.size != found:
             raise InputError(f"{path}: the learner has {bound.size} weights, the saved one {found}; give the same one.")

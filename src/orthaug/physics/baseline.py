@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.checks import check_unique
+from orthaug._base.checks import check_unique, is_number
 from orthaug._base.errors import InputError
 from orthaug.data.expressions import RESERVED, Expression, Lag, is_name, parse
 from orthaug.data.regressors import Layout, in_order
@@ -79,7 +79,7 @@ class Baseline:
                     f"'{name}' cannot name a constant; use letters, digits and underscores, not starting with a digit, "
                     f"and no keyword; {', '.join(sorted(RESERVED))} are taken."
                 )
-            if not _is_number(value):
+            if not is_number(value):
                 raise InputError(f"the constant '{name}' must be a finite number; got {value!r}.")
         terms = _agreed(terms)
         parameters = {t.parameter: _parameter(t) for t in terms if not t.fixed}
@@ -203,7 +203,7 @@ def _agreed(terms: Sequence[Term]) -> list[Term]:
         if not term.parameter.strip() or not term.parameter.isprintable():
             raise InputError(f"{term.parameter!r} cannot name a parameter; use visible characters on one line.")
         for what, value in (("initial value", term.initial), ("lower bound", term.min), ("upper bound", term.max)):
-            if value is not None and not _is_number(value):
+            if value is not None and not is_number(value):
                 raise InputError(f"the {what} of '{term.parameter}' must be a finite number; got {value!r}.")
         for attribute in _SHARED:
             value = getattr(term, attribute)
@@ -223,7 +223,3 @@ def _parameter(term: Term) -> Parameter:
     if not low < high:
         raise InputError(f"the bounds of '{term.parameter}' are empty or reversed: min = {low:g}, max = {high:g}.")
     return Parameter(term.parameter, float(term.initial or 0.0), term.unit or "", low, high)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float | np.number) and math.isfinite(value)

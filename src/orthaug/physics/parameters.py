@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.checks import Matrix, Vector, check_unique, nearest
+from orthaug._base.checks import Matrix, Vector, check_unique, is_number, nearest
 from orthaug._base.errors import InputError
 from orthaug.data.expressions import FUNCTIONS, RESERVED, Expression, is_name, parse
 from orthaug.physics.baseline import Baseline
@@ -179,10 +179,6 @@ def _at(expression: Expression, values: Mapping[str, Any]) -> Expression:
     return Expression(expression.text, tuple((name, values[name]) for name, _ in expression.constants))
 
 
-def _is_finite(value: Any) -> bool:
-    return not isinstance(value, bool) and isinstance(value, int | float | np.number) and math.isfinite(value)
-
-
 def _check_parameters(parameters: Sequence[PhysicalParameter], constants: Mapping[str, float]) -> None:
     if not parameters:
         raise InputError("the physics has no parameters; give at least one, such as m.")
@@ -194,12 +190,12 @@ def _check_parameters(parameters: Sequence[PhysicalParameter], constants: Mappin
                 f"starting with a digit, and no keyword; {', '.join(sorted(RESERVED))} are taken (k is the time index)."
             )
     for name, value in constants.items():
-        if not _is_finite(value):
+        if not is_number(value):
             raise InputError(f"the constant '{name}' must be a finite number; got {value!r}.")
     for p in parameters:
         if p.name in constants:
             raise InputError(f"'{p.name}' is a physical parameter and a constant; give one of them another name.")
-        if not _is_finite(p.initial):
+        if not is_number(p.initial):
             raise InputError(f"the initial value of '{p.name}' must be a finite number; got {p.initial!r}.")
         if any(isinstance(b, bool) or not isinstance(b, int | float | np.number) for b in (p.min, p.max)):
             raise InputError(f"the bounds of '{p.name}' must be numbers; got min = {p.min!r}, max = {p.max!r}.")

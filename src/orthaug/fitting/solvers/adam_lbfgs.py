@@ -1,11 +1,47 @@
-"""The paper's pipeline as a declaration: Adam, then L-BFGS, over θ and the learner's weights together."""
+"""The paper's pipeline: Adam, then L-BFGS, over θ and the learner's weights together, compiled whole.
+
+θ starts at θ⁰ in units of its columns, the weights where the caller says. Here it is optax's L-BFGS in one
+compiled loop; SciPy's L-BFGS-B, called back from Python, took 3 to 6 times longer on both of the paper's examples.
+"""
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
-from typing import ClassVar
+from functools import partial
+from typing import Annotated, Any, NamedTuple
 
-from orthaug._base.checks import check_count, check_number
+from annotated_types import Ge, Gt
+from jaxtyping import Float
+
+from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.registry import check_fields
+from orthaug.fitting.joint import JointCriterion, Physics
+from orthaug.fitting.solvers.compiled import burst_length
+from orthaug.fitting.solvers.descent import Progress
+from orthaug.fitting.status import Ending
+from orthaug.models.rows import Chunk
+
+_MEMORY = 20  # pairs that L-BFGS keeps
+_SMALL = 1e-14  # a relative decrease below this, five steps in a row, is rounding
+
+
+class GradientRun(NamedTuple):
+    """Where one run ended: θ's unknowns and the weights."""
+
+    v: Float[Array, "nt"]
+    w: Float[Array, "nw"]
+    iterations: int
+    ending: Ending
+    seconds: float
+
+
+class _State(NamedTuple):
+    unknowns: tuple[Float[Array, "nt"], Float[Array, "nw"]]
+    optimizer: Any
+    loss: Float[Array, ""]
+    iteration: Any
+    small: Any
 
 
 @dataclass(frozen=True)
@@ -18,18 +54,104 @@ class AdamLBFGS:
         learning_rate: of Adam, per step in normalised unknowns.
     """
 
-    adam_iterations: int = 500
-    lbfgs_iterations: int = 1000
-    learning_rate: float = 1e-3
+    gauss_newton = False
 
-    gauss_newton: ClassVar[bool] = False
+    adam_iterations: Annotated[int, Ge(0)] = 500
+    lbfgs_iterations: Annotated[int, Ge(0)] = 1000
+    learning_rate: Annotated[float, Gt(0)] = 1e-3
 
     def __post_init__(self) -> None:
-        check_count(self.adam_iterations, "adam_iterations", least=0)
-        check_count(self.lbfgs_iterations, "lbfgs_iterations", least=0)
-        check_number(self.learning_rate, "learning_rate", positive=True)
+        check_fields(self)
 
     @property
     def iterations(self) -> int:
         """Steps at most."""
         return self.adam_iterations + self.lbfgs_iterations
+
+    def at_most(self, iterations: int) -> AdamLBFGS:
+        """Itself: the pipeline is run whole."""
+        return self
+
+    def minimise(
+        self,
+        criterion: JointCriterion,
+        w: Float[Array, "nw"],
+        chunks: Chunk,
+        physics: Physics,
+        *,
+        progress: Progress | None = None,
+    ) -> GradientRun:
+        """Minimise the joint criterion from θ⁰ and `w`; the loss told to `progress` is a mean square."""
+        import optax
+
+        began = time.perf_counter()
+        unknowns = (jnp.zeros_like(physics.start), w)
+        loss = _value(criterion, unknowns, chunks, physics)
+        done, state = 0, _State(unknowns, None, loss, jnp.asarray(0), jnp.asarray(0))
+        phases = (
+            (self.adam_iterations, optax.adam(self.learning_rate)),
+            (self.lbfgs_iterations, optax.lbfgs(memory_size=_MEMORY)),
+        )
+        for limit, optimizer in phases:
+            state = _State(state.unknowns, optimizer.init(state.unknowns), state.loss, jnp.asarray(0), jnp.asarray(0))
+            burst, second = 1, optimizer is phases[1][1]
+            while int(state.iteration) < limit and bool(_going(state)):
+                tick = time.perf_counter()
+                stop = jnp.asarray(min(int(state.iteration) + burst, limit))
+                advance = _lbfgs if second else _adam
+                state = jax.block_until_ready(advance(criterion, state, chunks, physics, self.learning_rate, stop))
+                burst = burst_length(burst, time.perf_counter() - tick)
+                if progress is not None:
+                    progress(done + int(state.iteration), float(state.loss) * float(physics.samples))
+            done += int(state.iteration)
+        finite = bool(jnp.isfinite(state.loss))
+        ending = Ending.NON_FINITE if not finite else Ending.CONVERGED if int(state.small) >= 5 else Ending.RUNNING
+        v, w = state.unknowns
+        return GradientRun(v, w, done, ending, time.perf_counter() - began)
+
+
+def _going(state: _State) -> Any:
+    """Whether another step makes sense: the loss is finite and still falls."""
+    return jnp.isfinite(state.loss) & (state.small < 5)
+
+
+@partial(jax.jit, static_argnames="criterion")
+def _value(criterion: JointCriterion, unknowns: Any, chunks: Chunk, physics: Physics) -> Any:
+    return criterion(unknowns, chunks, physics)
+
+
+@partial(jax.jit, static_argnames="criterion")
+def _adam(criterion: JointCriterion, state: _State, chunks: Chunk, physics: Physics, rate: Any, stop: Any) -> _State:
+    import optax
+
+    optimizer = optax.adam(rate)
+
+    def step(s: _State) -> _State:
+        loss, gradient = jax.value_and_grad(criterion)(s.unknowns, chunks, physics)
+        update, inner = optimizer.update(gradient, s.optimizer)
+        unknowns: Any = optax.apply_updates(s.unknowns, update)
+        return _State(unknowns, inner, loss, s.iteration + 1, s.small)
+
+    return jax.lax.while_loop(lambda s: (s.iteration < stop) & _going(s), step, state)
+
+
+@partial(jax.jit, static_argnames="criterion")
+def _lbfgs(criterion: JointCriterion, state: _State, chunks: Chunk, physics: Physics, rate: Any, stop: Any) -> _State:
+    import optax
+
+    optimizer = optax.lbfgs(memory_size=_MEMORY)
+
+    def value(unknowns: Any) -> Any:
+        return criterion(unknowns, chunks, physics)
+
+    value_and_grad = optax.value_and_grad_from_state(value)
+
+    def step(s: _State) -> _State:
+        loss, gradient = value_and_grad(s.unknowns, state=s.optimizer)
+        update, inner = optimizer.update(gradient, s.optimizer, s.unknowns, value=loss, grad=gradient, value_fn=value)
+        unknowns: Any = optax.apply_updates(s.unknowns, update)
+        found = optax.tree.get(inner, "value")
+        small = jnp.where(loss - found <= _SMALL * loss, s.small + 1, 0)
+        return _State(unknowns, inner, found, s.iteration + 1, small)
+
+    return jax.lax.while_loop(lambda s: (s.iteration < stop) & _going(s), step, state)

@@ -13,11 +13,11 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
-from orthaug._base.jax import jax, jnp
+from orthaug._base.jax import Array, jax, jnp
 from orthaug.fitting.normal_equations import Normal, linearise
-from orthaug.fitting.solvers.levenberg_marquardt import IDENTITY, LevenbergMarquardt, Progress
+from orthaug.fitting.solvers.descent import IDENTITY, Progress
 from orthaug.fitting.status import Ending
 from orthaug.models.rows import Overlap
 
@@ -65,7 +65,6 @@ class Run(NamedTuple):
 
 
 def minimise(
-    solver: LevenbergMarquardt,
     criterion: Callable[..., Normal],
     w: Float[Array, "nw"],
     arguments: tuple[Any, ...],
@@ -74,6 +73,8 @@ def minimise(
     ridge: float = 0.0,
     evidence: bool = False,
     samples: int,
+    iterations: int,
+    tolerance: float,
     progress: Progress | None = None,
 ) -> Run:
     """Minimise `‖r(w)‖² + α‖w‖²` from `w`.
@@ -84,14 +85,15 @@ def minimise(
         ridge: α in normalised units; with `evidence` where it starts.
         evidence: choose α by MacKay's re-estimation after every accepted step.
         samples: residuals less the physics' own parameters, for the noise variance.
+        iterations, tolerance: as of `LevenbergMarquardt`.
     """
     began = time.perf_counter()
-    options = Options(jnp.asarray(solver.tolerance), jnp.asarray(evidence), jnp.asarray(float(samples)))
+    options = Options(jnp.asarray(tolerance), jnp.asarray(evidence), jnp.asarray(float(samples)))
     state = _start(criterion, w, arguments, overlap, jnp.asarray(ridge), options)
     burst = 1
-    while int(state.code) == Ending.RUNNING and int(state.iteration) < solver.iterations:
+    while int(state.code) == Ending.RUNNING and int(state.iteration) < iterations:
         tick = time.perf_counter()
-        stop = min(int(state.iteration) + burst, solver.iterations)
+        stop = min(int(state.iteration) + burst, iterations)
         state = jax.block_until_ready(_advance(criterion, state, arguments, options, jnp.asarray(stop)))
         spent = time.perf_counter() - tick
         burst = burst_length(burst, spent)

@@ -1,0 +1,228 @@
+"""Registries: the kinds of learners, structures, measures, criteria and solvers, each a declaration under a name.
+
+A declaration is a frozen dataclass. Its fields are the keys of its section in a spec: name, type, limits
+(`Annotated[int, Ge(1)]`) and default. A declaration that stands for something else, such as files that hold points,
+has a method `resolve(context)` that makes the real thing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import typing
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from annotated_types import Ge, Gt
+
+from orthaug._base.checks import check_choice, check_count, check_number, nearest
+from orthaug._base.errors import InputError, KeyedError
+
+LIBRARY_ONLY = {"library_only": True}
+"""Metadata of a dataclass field that is no key of the spec: `field(default=…, metadata=LIBRARY_ONLY)`."""
+
+
+@dataclass(frozen=True)
+class OneOf:
+    """In `Annotated`: one of these texts."""
+
+    choices: Collection[str]
+
+
+@dataclass(frozen=True)
+class InSpec:
+    """In `Annotated`: a limit that holds in a spec only."""
+
+    limit: Any
+
+
+@dataclass(frozen=True)
+class Option:
+    """In `Annotated`: the option of `orthaug split` that gives this key."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class Key:
+    """One key of a section, as a declaration's field has it."""
+
+    name: str
+    annotation: Any
+    default: Any
+
+    @property
+    def type(self) -> Any:
+        """The type without its limits."""
+        return typing.get_args(self.annotation)[0] if self.metadata else self.annotation
+
+    @property
+    def meaning(self) -> tuple[Any, ...]:
+        """Type and limits, which must agree wherever a section has the key."""
+        return self.type, *(one for one in self.metadata if not isinstance(one, Option))
+
+    @property
+    def metadata(self) -> tuple[Any, ...]:
+        """What stands beside the type in `Annotated`."""
+        return getattr(self.annotation, "__metadata__", ())
+
+    @property
+    def option(self) -> str | None:
+        """The command-line option that gives it."""
+        return next((one.name for one in self.metadata if isinstance(one, Option)), None)
+
+
+class Registry(Mapping[str, Any]):
+    """The declarations of one axis by the name of their kind, in the order in which they were added.
+
+    Args:
+        axis: what the kinds are kinds of, for messages.
+        entries: the first declarations.
+        reserved: keys that the section has beside those of the declarations.
+        beside: another registry whose keys stand in the same section.
+    """
+
+    def __init__(
+        self,
+        axis: str,
+        entries: Mapping[str, type],
+        *,
+        reserved: Collection[str] = ("kind",),
+        beside: Registry | None = None,
+    ) -> None:
+        self.axis = axis
+        self._reserved = frozenset(reserved)
+        self._entries: dict[str, type] = {}
+        self._section = [self]
+        if beside is not None:
+            self._section = beside._section
+            self._section.append(self)
+        for kind, declaration in entries.items():
+            self.add(kind, declaration)
+
+    def __getitem__(self, kind: str) -> Any:
+        return self._entries[kind]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def add(self, kind: str, declaration: type) -> None:
+        """Register a declaration.
+
+        Raises:
+            InputError: a name that is taken, no frozen dataclass, or a key that means something else already.
+        """
+        if kind in self._entries:
+            raise InputError(f"the {self.axis} '{kind}' is registered already; give it another name.")
+        if not dataclasses.is_dataclass(declaration) or not declaration.__dataclass_params__.frozen:  # type: ignore[attr-defined]
+            raise InputError(f"the {self.axis} '{kind}' must be a frozen dataclass; got {declaration!r}.")
+        for key in keys_of(declaration).values():
+            if key.name in self._reserved:
+                raise InputError(f"the {self.axis} '{kind}' has a key '{key.name}', which its section has already.")
+            for registry in self._section:
+                for other, known in registry._entries.items():
+                    same = keys_of(known).get(key.name)
+                    if same is not None and same.meaning != key.meaning:
+                        raise InputError(
+                            f"the {self.axis} '{kind}' and the {registry.axis} '{other}' declare the key '{key.name}' "
+                            f"differently: {key.annotation} and {same.annotation}; give one of them another name."
+                        )
+        self._entries[kind] = declaration
+
+    def remove(self, kind: str) -> None:
+        """Take a declaration out again."""
+        del self._entries[kind]
+
+    @contextmanager
+    def added(self, kind: str, declaration: type) -> Iterator[None]:
+        """A declaration that is registered inside a `with` block only."""
+        self.add(kind, declaration)
+        try:
+            yield
+        finally:
+            self.remove(kind)
+
+    def section_keys(self) -> dict[str, Key]:
+        """The keys of all kinds."""
+        found: dict[str, Key] = {}
+        for declaration in self._entries.values():
+            found = keys_of(declaration) | found
+        return found
+
+    def kind_of(self, declared: object) -> str | None:
+        """The name under which a declaration's class is registered; None for a foreign one."""
+        return next((kind for kind, declaration in self._entries.items() if type(declared) is declaration), None)
+
+    def kind_with(self, option: str) -> tuple[str, Key] | None:
+        """The kind that a command-line option belongs to, with the key that it gives."""
+        for kind, declaration in self._entries.items():
+            for key in keys_of(declaration).values():
+                if key.option == option:
+                    return kind, key
+        return None
+
+    def declare(self, kind: str, values: Mapping[str, Any]) -> Any:
+        """The declaration of a kind; `values` of keys that it does not have are left out.
+
+        Raises:
+            InputError: an unknown kind, a missing key, or what the declaration refuses.
+        """
+        if kind not in self._entries:
+            raise InputError(f"unknown {self.axis} '{kind}'{nearest(kind, self) or ', known are ' + ', '.join(self)}.")
+        known = keys_of(self._entries[kind])
+        for name, key in known.items():
+            if key.default is dataclasses.MISSING and name not in values:
+                raise KeyedError(f"the {self.axis} '{kind}' needs `{name}`.", name, f" is missing; {kind} needs it")
+        return self._entries[kind](**{name: frozen(value) for name, value in values.items() if name in known})
+
+
+@functools.cache
+def keys_of(declaration: type) -> dict[str, Key]:
+    """The keys that a declaration's fields are."""
+    hints = typing.get_type_hints(declaration, include_extras=True)
+    return {
+        field.name: Key(field.name, hints[field.name], _default(field))
+        for field in dataclasses.fields(declaration)
+        if field.init and not field.metadata.get("library_only")
+    }
+
+
+def resolve(declared: Any, context: Any = None) -> Any:
+    """What a declaration stands for: itself, or what its `resolve(context)` makes."""
+    return declared.resolve(context) if hasattr(declared, "resolve") else declared
+
+
+def check_fields(declared: Any) -> None:
+    """Raise InputError for a field outside of the limits of its type; for the `__post_init__` of declarations."""
+    for name, key in keys_of(type(declared)).items():
+        value, metadata = getattr(declared, name), key.metadata
+        low = next((one.ge for one in metadata if isinstance(one, Ge)), None)
+        positive = any(isinstance(one, Gt) for one in metadata)
+        choices = next((one.choices for one in metadata if isinstance(one, OneOf)), None)
+        if choices is not None:
+            check_choice(value, choices, f"`{name}`")
+        elif key.type is int and low is not None:
+            check_count(value, name, least=int(typing.cast(Any, low)))
+        elif key.type is float and (low is not None or positive):
+            check_number(value, name, positive=positive)
+
+
+def _default(field: dataclasses.Field[Any]) -> Any:
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return field.default
+
+
+def frozen(value: Any) -> Any:
+    """Lists, as files hold them, as tuples."""
+    if isinstance(value, list | tuple):
+        return tuple(frozen(one) for one in value)
+    if isinstance(value, Mapping):
+        return {name: frozen(one) for name, one in value.items()}
+    return value.item() if isinstance(value, np.generic) else value

@@ -1,0 +1,85 @@
+"""Tables of the spec as pydantic models: what all have in common, and the keys that a registry's kinds declare."""
+
+from __future__ import annotations
+
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union
+
+from pydantic import BaseModel, ConfigDict, Field, create_model
+
+from orthaug._base.registry import InSpec, Key, OneOf, Option, Registry
+
+
+class Section(BaseModel):
+    """A table of the spec; unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class KindSection(Section):
+    """A table whose keys are those of the kinds in a registry; keys of kinds that are not chosen have no effect."""
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...
+
+    def declared(self, registry: Registry, kind: str) -> Any:
+        """The declaration of a kind with the keys that the file gives."""
+        return registry.declare(kind, {name: getattr(self, name) for name in self.model_fields_set})
+
+
+Kinds = TypeVar("Kinds", bound=KindSection)
+
+
+def with_kinds(section: type[Kinds], other: dict[str, Any] | None = None, **registries: Registry) -> type[Kinds]:
+    """A section with the keys of all kinds of its registries.
+
+    Args:
+        section: has each key that chooses a kind, with the default kind.
+        other: further fields to replace.
+        registries: by the key that chooses the kind.
+    """
+    fields: dict[str, Any] = {}
+    for chooser, registry in registries.items():
+        fields[chooser] = (Literal[tuple(registry)], section.model_fields[chooser].default)
+        fields |= {name: _field(key) for name, key in registry.section_keys().items()}
+    return create_model(section.__name__, __base__=section, **(fields | (other or {})))
+
+
+def _field(key: Key) -> tuple[Any, Any]:
+    """A key as pydantic's type and default; one that its kind needs is None where another kind is chosen."""
+    if key.default is MISSING:
+        return Union[_in_file(key.annotation), None], None  # noqa: UP007  (the parts are known at run time only)
+    return _in_file(key.annotation), _thawed(key.default)
+
+
+def _in_file(annotation: Any) -> Any:
+    """The type of what a file holds for a declaration's type: lists for tuples, finite numbers."""
+    origin, inner = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is Annotated:
+        limits = []
+        for limit in annotation.__metadata__:
+            if isinstance(limit, OneOf):
+                return Literal[tuple(limit.choices)]
+            limits += [limit.limit] if isinstance(limit, InSpec) else [] if isinstance(limit, Option) else [limit]
+        plain = _in_file(inner[0])
+        return Annotated[(plain, *limits)] if limits else plain  # type: ignore[return-value]
+    if origin is tuple and inner[-1] is not Ellipsis:
+        return Annotated[list[_in_file(inner[0])], Field(min_length=len(inner), max_length=len(inner))]
+    if origin in (tuple, list, Sequence):
+        return list[_in_file(inner[0])]
+    if origin is Mapping:
+        return dict[inner[0], _in_file(inner[1])]
+    if origin in (Union, types.UnionType):
+        return Union[tuple(_in_file(one) for one in inner)]  # noqa: UP007
+    return Annotated[float, Field(allow_inf_nan=False)] if annotation is float else annotation
+
+
+def _thawed(value: Any) -> Any:
+    """Tuples as lists, as files hold them."""
+    if isinstance(value, tuple | list):
+        return [_thawed(one) for one in value]
+    return {name: _thawed(one) for name, one in value.items()} if isinstance(value, Mapping) else value

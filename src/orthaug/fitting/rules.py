@@ -1,0 +1,40 @@
+"""What restarts, solver, criterion and regularization demand of each other, for `estimate` and for the spec."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from orthaug._base.errors import KeyedError
+from orthaug.fitting.criteria import Criterion
+from orthaug.fitting.kinds import SOLVERS
+from orthaug.fitting.solvers.solver import Solver
+
+
+def check_starts(restarts: int, seed: int, *, ensemble: bool) -> None:
+    """Raise InputError for seeds that are too large, or an ensemble of one."""
+    if seed + restarts >= 2**63:
+        words = f": found {seed}; expected seeds below 2**63 for all restarts"
+        raise KeyedError(f"`seed` must be below 2**63; got {seed}.", "seed", words)
+    if ensemble and restarts < 2:
+        words = f": found {restarts}; expected 2 or more for an ensemble"
+        raise KeyedError("an ensemble needs `restarts` of 2 or more to be the median of.", "restarts", words)
+
+
+def check_solver(solver: Solver, criterion: Criterion, regularizations: Sequence[object]) -> None:
+    """Raise InputError where a solver without normal equations is asked for what needs them."""
+    if solver.gauss_newton:
+        return
+    name = SOLVERS.kind_of(solver)
+    able = " or ".join(kind for kind, known in SOLVERS.items() if known.gauss_newton)
+    if not criterion.one_step:
+        raise KeyedError(
+            "only `LevenbergMarquardt` trains on a free run or more than one step ahead; take that solver.",
+            "solver",
+            f" = {name} trains one step ahead; expected {able} here",
+        )
+    if "evidence" in regularizations:
+        raise KeyedError(
+            f"evidence regularization needs the Gauss-Newton matrix of the {able} solver.",
+            "regularization",
+            f" = evidence; expected solver {able} with it",
+        )

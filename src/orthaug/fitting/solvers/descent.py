@@ -1,0 +1,271 @@
+"""The Levenberg-Marquardt loop that the host drives, for any objective that can be tried and linearised.
+
+The step solves `(H + αE + μ D) d = g − αE p` with Nielsen's update of μ (Madsen, Nielsen and Tingleff 2004, algorithm
+3.16); the ridge α acts on the weights alone (E). D is the identity one step ahead, which converges from Xavier starts
+on normalised data, and diag H (Marquardt's scaling) on the free run. A trial costs one evaluation; derivatives follow
+only where it is accepted. A trial that is not finite is rejected like one that does not descend.
+
+Where the rows of a one-step criterion are in memory, the loop is compiled whole instead (`compiled`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+import scipy.linalg
+from jaxtyping import Bool
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug.fitting.status import Ending
+
+_SETTLED = 0.1  # of the objective: a step that lowers it by less belongs to the end of a run
+_SMALLEST_CURVATURE = 1e-14  # of the largest: what a direction that does nothing is damped with
+
+Progress = Callable[[int, float], None]
+"""Called now and then with the iteration and the loss."""
+
+
+class Damping(NamedTuple):
+    """The first μ and the largest, of the largest curvature with the identity, of 1 with Marquardt's scaling."""
+
+    first: float
+    largest: float
+    diagonal: bool
+
+
+IDENTITY = Damping(1e-5, 1e12, diagonal=False)  # docs/design.md has the comparison of first dampings
+MARQUARDT = Damping(1e-3, 1e16, diagonal=True)
+
+
+class Flown(Protocol):
+    """A trial: an objective at p."""
+
+    @property
+    def p(self) -> Vector: ...
+
+    @property
+    def loss(self) -> float:
+        """‖r‖²; not finite where there is none."""
+        ...
+
+
+class Linearised(Protocol):
+    """An objective and its derivative about an accepted trial."""
+
+    @property
+    def hessian(self) -> Matrix:
+        """JᵀJ."""
+        ...
+
+    @property
+    def gradient(self) -> Vector:
+        """Jᵀr, downhill."""
+        ...
+
+    @property
+    def start(self) -> Any:
+        """What the next trial starts from beside p; the objective's own affair."""
+        ...
+
+
+@runtime_checkable
+class Objective(Protocol):
+    """`‖r(p)‖²` of p = (θ, w), θ in front. Its functions are pure: a rejected trial leaves nothing behind."""
+
+    @property
+    def physics(self) -> int:
+        """How many leading entries of p are θ: they have bounds and no ridge."""
+        ...
+
+    def fly(self, p: Vector, start: Any) -> Any:
+        """A trial (`Flown`) at p, from the `start` that the last accepted one left."""
+        ...
+
+    def linearise(self, flown: Any) -> Any:
+        """The derivative (`Linearised`) about a trial."""
+        ...
+
+    def samples(self, flown: Any) -> tuple[float, float]:
+        """Number of residuals of a trial, and the share of them that is independent."""
+        ...
+
+
+class Descent(NamedTuple):
+    """Where a run ended: the last accepted trial with its derivative, None where the start has none."""
+
+    flown: Any
+    linear: Any | None
+    ridge: float
+    effective: float
+    iterations: int
+    ending: Ending
+    seconds: float
+
+
+class _Place(NamedTuple):
+    """An accepted trial, and what the rest of the run knows of the way there."""
+
+    flown: Any
+    linear: Any
+    ridge: float
+    damping: float
+    growth: float = 2.0
+    small: int = 0
+    accepted: int = 0
+    coloured: bool = False
+    """Whether the colour of the errors counts: once they no longer fall fast. Before, it is that of the misfit."""
+
+
+def descend(
+    objective: Objective,
+    p: Vector,
+    start: Any,
+    *,
+    iterations: int,
+    tolerance: float,
+    damping: Damping,
+    ridge: float = 0.0,
+    evidence: bool = False,
+    bounds: tuple[Vector, Vector] | None = None,
+    progress: Progress | None = None,
+) -> Descent:
+    """Minimise `‖r‖² + α‖w‖²` from p.
+
+    Args:
+        start: handed to the first trial.
+        ridge: α; with `evidence` where it starts.
+        bounds: of θ, each (physics,); the start is moved inside.
+    """
+    began = time.perf_counter()
+    limits = tuple(np.full(len(p), side) for side in (-np.inf, np.inf))
+    if bounds is not None:
+        for limit, side in zip(limits, bounds, strict=True):
+            limit[: objective.physics] = side
+    flown = objective.fly(np.clip(p, *limits), start)
+    linear = objective.linearise(flown) if np.isfinite(flown.loss) else None
+    if linear is None or not np.isfinite(linear.hessian).all():
+        return Descent(flown, None, ridge, 0.0, 0, Ending.NON_FINITE, time.perf_counter() - began)
+    largest = 1.0 if damping.diagonal else float(np.diag(linear.hessian).max(initial=1e-300))
+    place = _Place(flown, linear, ridge, damping.first * largest)
+    place = place._replace(ridge=_next_ridge(objective, place, evidence))
+    ending, done = Ending.RUNNING, 0
+    while ending is Ending.RUNNING and done < iterations:
+        place, ending = _trial(objective, place, limits, tolerance, damping, evidence)
+        done += 1
+        if progress is not None:
+            progress(done, place.flown.loss)
+    effective = effective_weights(place.linear.hessian, place.ridge, objective.physics)
+    return Descent(place.flown, place.linear, place.ridge, effective, done, ending, time.perf_counter() - began)
+
+
+def _trial(
+    objective: Objective, place: _Place, limits: Any, tolerance: float, damping: Damping, evidence: bool
+) -> tuple[_Place, Ending]:
+    """One damped step: accept it, or damp more."""
+    flown, linear, ridge = place.flown, place.linear, place.ridge
+    p = flown.p
+    penalty = np.concatenate([np.zeros(objective.physics), np.ones(len(p) - objective.physics)])
+    downhill = linear.gradient - ridge * penalty * p
+    step, expected = _step(linear.hessian + ridge * np.diag(penalty), downhill, place.damping, p, limits, damping)
+    moves = bool(np.isfinite(step).all() and step.any())
+    tried = objective.fly(p + step, linear.start) if moves else None
+    before = flown.loss + ridge * float(penalty @ p**2)
+    after = np.nan if tried is None else tried.loss + ridge * float(penalty @ (p + step) ** 2)
+    followed = objective.linearise(tried) if np.isfinite(after) and after < before else None
+    if tried is not None and followed is not None and np.isfinite(followed.hessian).all():
+        gain = (before - after) / expected if expected > 0 else 1.0
+        place = _Place(
+            flown=tried,
+            linear=followed,
+            ridge=ridge,
+            damping=place.damping * max(1 / 3, 1 - (2 * gain - 1) ** 3),
+            small=place.small + 1 if before - after < tolerance * before else 0,
+            accepted=place.accepted + 1,
+            coloured=place.coloured or before - after < _SETTLED * before,
+        )
+        place = place._replace(ridge=_next_ridge(objective, place, evidence))
+        return place, Ending.CONVERGED if place.small >= 2 else Ending.RUNNING
+    place = place._replace(damping=place.damping * place.growth, growth=2 * place.growth)
+    largest = 1.0 if damping.diagonal else float(np.diag(linear.hessian).max(initial=1e-300))
+    if place.damping > damping.largest * largest or not step.any():
+        level = _level(linear.hessian, downhill, before, _held(p, downhill, *limits))
+        return place, Ending.CONVERGED if place.accepted or level else Ending.NO_DESCENT
+    return place, Ending.RUNNING
+
+
+def _next_ridge(objective: Objective, place: _Place, evidence: bool) -> float:
+    if not evidence:
+        return place.ridge
+    flown, samples = place.flown, objective.samples(place.flown)
+    physics, hessian = objective.physics, place.linear.hessian
+    return _evidence(samples, flown.p, hessian, flown.loss, place.ridge, physics, place.coloured)
+
+
+def _step(
+    hessian: Matrix, downhill: Vector, damping: float, p: Vector, bounds: tuple[Vector, Vector], kind: Damping
+) -> tuple[Vector, float]:
+    """The damped step inside the bounds, and the decrease that the quadratic model expects of it."""
+    free = np.flatnonzero(~_held(p, downhill, *bounds))
+    curvature = np.diag(hessian)[free] if kind.diagonal else np.ones(len(free))
+    scale = np.maximum(curvature, _SMALLEST_CURVATURE * curvature.max(initial=0.0))
+    scale = np.where(scale > 0, scale, 1.0)
+    unit = 1 / np.sqrt(scale)  # solved with a unit diagonal: columns of very different size keep their digits
+    matrix = hessian[np.ix_(free, free)] * np.outer(unit, unit) + damping * np.eye(len(free))
+    step = np.zeros(len(p))
+    if not len(free):
+        return step, 0.0
+    try:
+        factor = scipy.linalg.cho_factor(matrix, check_finite=False)
+        step[free] = unit * scipy.linalg.cho_solve(factor, unit * downhill[free], check_finite=False)
+    except np.linalg.LinAlgError:  # curvature lost to rounding: more damping mends it
+        return np.full(len(p), np.nan), 0.0
+    step = np.clip(p + step, *bounds) - p
+    return step, float(2 * step @ downhill - step @ hessian @ step)
+
+
+def _held(p: Vector, downhill: Vector, lower: Vector, upper: Vector) -> Bool[np.ndarray, "n"]:
+    """Which entries stand at a bound that the descent would leave."""
+    return ((p <= lower) & (downhill < 0)) | ((p >= upper) & (downhill > 0))
+
+
+def _level(hessian: Matrix, downhill: Vector, objective: float, held: Bool[np.ndarray, "n"]) -> bool:
+    """Residual and Jacobian are orthogonal to rounding in every free entry: the start is a minimum."""
+    flat = np.abs(downhill) <= 1e-7 * np.sqrt(np.maximum(np.diag(hessian), 0.0) * objective)
+    return bool(np.all(flat | held))
+
+
+def weights_hessian(hessian: Matrix, physics: int) -> Matrix:
+    """The Hessian of the weights with θ eliminated, (nw, nw)."""
+    h_tt, h_tw, h_ww = hessian[:physics, :physics], hessian[:physics, physics:], hessian[physics:, physics:]
+    unit = np.sqrt(np.maximum(np.diag(h_tt), np.finfo(float).tiny))
+    inner = np.linalg.lstsq(h_tt / np.outer(unit, unit), h_tw / unit[:, None], rcond=1e-14)[0]
+    found = h_ww - (h_tw / unit[:, None]).T @ inner
+    return (found + found.T) / 2
+
+
+def effective_weights(hessian: Matrix, ridge: float, physics: int) -> float:
+    """tr(H (H + αI)⁻¹) of the weights, with directions that are rounding counted as absent."""
+    if len(hessian) == physics:
+        return 0.0
+    values = np.linalg.eigvalsh(weights_hessian(hessian, physics))
+    floor = len(hessian) * np.finfo(float).eps * np.max(np.diag(hessian)[physics:])
+    return float(np.sum(np.where(values > floor, values / (np.abs(values) + ridge), 0.0)))
+
+
+def _evidence(
+    samples: tuple[float, float], p: Vector, hessian: Matrix, loss: float, ridge: float, physics: int, coloured: bool
+) -> float:
+    """MacKay's fixed point `α = γσ²/(κ‖w‖²)`, κ the share of the residuals that is independent.
+
+    Residuals of a free run are coloured: N of them say as much as κN independent ones, which divides the weight
+    of the data against the prior.
+    """
+    count, share = samples
+    share = share if coloured else 1.0
+    effective = effective_weights(hessian, ridge, physics)
+    variance = loss / max(count - effective / share, 1.0)
+    size = float(np.sum(p[physics:] ** 2))
+    return float(np.clip(effective * variance / (share * max(size, 1e-300)), 1e-12, 1e12))

@@ -1,0 +1,9 @@
+"""The learners that a spec knows by name. A new one is a file with its declaration, and an entry here."""
+
+from __future__ import annotations
+
+from orthaug._base.registry import Registry
+from orthaug.models.learners import MLP, PhysicsAlone
+
+LEARNERS = Registry("learner", {"mlp": MLP, "none": PhysicsAlone}, reserved=("kind", "nz", "ny"))
+"""`nz` and `ny` stand beside a saved learner's own fields."""
