@@ -47,6 +47,7 @@ def one(example: str, solver: str, share: float, seed: int) -> dict[str, Any]:
     """A run's seconds and mean squared error; run once before, so that nothing is compiled in it."""
     given = static(1) if example == "static" else mass_spring_damper()
     task = OneStepTask.of(pose(given.train, given.baseline), MLP())
+    assert task.bound is not None
     start, chosen = task.bound.init(jax.random.key(seed)), declared(solver, example, share)
     task.run(declared(solver, example, 0.01), start, Orthogonal())
     run = task.run(chosen, start, Orthogonal())
