@@ -80,7 +80,7 @@ def fit_job(
         judged: whether to ask if the learner earns its place; `compare` asks for all structures together.
     """
     from orthaug.analysis.diagnosis import diagnose
-    from orthaug.analysis.stability import stability
+    from orthaug.analysis.free_run_stability import stability
 
     fit = run_fit(job, progress, kind=kind, alone=alone)
     warnings = [*job.warnings, *fit.warnings]
@@ -92,7 +92,7 @@ def fit_job(
         for part in job.parts:
             scores[part.name], responses = score_part(fit.model, part, warnings)
         diagnosis, steady = diagnose(fit), stability(fit.model, job.train.record)
-        warnings += steady.warnings
+        warnings += [warning.text for warning in steady.warnings]
         if diagnosis is None:
             warnings.append("the residual is not analysed: there are too few rows for that, or it is rounding only.")
         warnings += diagnosis.warnings if diagnosis is not None else ()
