@@ -172,10 +172,10 @@ class Suspect:
             raise InputError(
                 f"suspect '{self.name}' = {self.expression} is not finite at row {bad[0]} of the regressor."
             )
-        values[:, self._column_of(outputs)] = column
+        values[:, self.column_of(outputs)] = column
         return values
 
-    def _column_of(self, outputs: Sequence[str]) -> int:
+    def column_of(self, outputs: Sequence[str]) -> int:
         known = ", ".join(outputs)
         if self.output is None:
             if len(outputs) != 1:
