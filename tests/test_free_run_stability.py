@@ -19,7 +19,7 @@ from orthaug.analysis.free_run_stability import stability
 from orthaug.analysis.lipschitz import lipschitz
 from orthaug.analysis.local_dynamics import companions
 from orthaug.data.record import Record
-from orthaug.data.regressors import Lags
+from orthaug.data.regressors import Lags, stack_rows
 from orthaug.fitting.estimation import estimate, orthogonalize
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.models.learners import MLP
@@ -435,6 +435,38 @@ def test_as_dict_is_plain(network):
     assert plain["feedback"]["largest"] == found.feedback.largest and "jacobians" not in plain["feedback"]
     assert np.shape(plain["contraction"]["metric"]) == (6, 6)
     assert set(plain["lipschitz"]["worst"]["regressor"]) == {str(lag) for lag in model.form.layout}
+
+
+def test_what_exists_is_not_computed_again(network, monkeypatch):
+    model, record = network
+    plain, response = stability(model, record), model.simulate(record)
+    x = stack_rows(record, model.form.layout).x
+    for verb in ("predict", "simulate"):
+        monkeypatch.setattr(Model, verb, lambda *_: pytest.fail("computed again"))
+    assert stability(model, record, response=response, x=x).as_dict() == plain.as_dict()
+
+
+@pytest.mark.parametrize("scale", [0.01, 0.5, 1.0, 3.0, 20.0, 1e3])
+def test_the_search_tries_the_factors_of_a_plain_one(duffing, scale):
+    """Doubling and bisecting one free run at a time, as the docstring says it, comes to the same number."""
+    model, record = duffing
+    (e,) = record.experiments
+    record = Record.join([Record.from_arrays(scale * e.inputs[k:], e.outputs[k:]) for k in (0, 2500)])
+    mean = np.concatenate([e.inputs for e in record.experiments]).mean(axis=0)
+
+    def diverges(factor):
+        scaled = [replace(e, inputs=mean + factor * (e.inputs - mean)) for e in record.experiments]
+        return any(t.diverged for t in model.simulate(replace(record, experiments=tuple(scaled))).trajectories)
+
+    low = high = 1.0
+    while diverges(low):
+        low, high = low / 2, low
+    while not diverges(high):
+        low, high = high, 2 * high
+    while high > 1.05 * low:
+        middle = float(np.sqrt(low * high))
+        low, high = (low, middle) if diverges(middle) else (middle, high)
+    assert divergence_scaling(model, record) == high
 
 
 def test_channels_by_name(network):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -73,10 +74,24 @@ def check_count(value: Any, name: str, least: int = 1) -> int:
     return int(value)
 
 
+def is_number(value: Any) -> bool:
+    """Whether `value` is a finite real number; a truth value is none."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number beyond double precision
+        return False
+
+
+def finite_or_none(value: float) -> float | None:
+    """`value`, or None where it is not finite: JSON has no infinity."""
+    return value if math.isfinite(value) else None
+
+
 def check_number(value: Any, name: str, *, positive: bool = False) -> float:
     """Return `value` if it is a finite number, 0 or more (above 0 if `positive`), otherwise raise InputError."""
-    number = not isinstance(value, bool) and isinstance(value, int | float | np.number) and bool(np.isfinite(value))
-    if not number or value < 0 or (positive and value == 0):
+    if not is_number(value) or value < 0 or (positive and value == 0):
         raise InputError(
             f"`{name}` must be {'a positive number' if positive else 'a number, 0 or more'}; got {value!r}."
         )
