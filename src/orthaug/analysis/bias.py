@@ -58,7 +58,7 @@ class SuspectedBias:
     `bias` (nt,) is `Φ_μ⁺Δ_μ`, in the unit of θ per unit of the coefficient; `relative` the same divided by θ
     (None where θ is 0); `physical` the same for physical parameters, to first order; `expected` is `bias` times the
     guessed coefficient. `cosine` is `‖QᵀΔ‖/‖Δ‖` in [0, 1], 0 where the paper's `cond:special_PE` holds: None for
-    Δ = 0. `explained` is the squared cosine between P⊥Δ and the learner's values, and `found` the coefficient
+    Δ = 0. `explained` is the squared cosine between P⊥Δ and the learner's values, and `coefficient_found` that
     with which P⊥Δ fits them best: both None without a learner, or where Δ lies in the span of Φ.
     """
 
@@ -70,7 +70,7 @@ class SuspectedBias:
     physical: tuple[tuple[str, float], ...] | None
     cosine: float | None
     explained: float | None
-    found: float | None
+    coefficient_found: float | None
     certificate: Certificate | None
 
     @property
@@ -115,7 +115,7 @@ class SuspectedBias:
             "physical_bias": None if self.physical is None else dict(self.physical),
             "cosine": self.cosine,
             "explained": self.explained,
-            "coefficient_found": self.found,
+            "coefficient_found": self.coefficient_found,
             "certificate": None
             if certificate is None
             else {

@@ -161,6 +161,8 @@ def diverging(model: Model, record: Record, factors: Sequence[float]) -> Bool[np
     scales = np.concatenate([factors, np.repeat(factors[:1], SIDE_BY_SIDE - len(factors))])
     wild = np.zeros(SIDE_BY_SIDE, dtype=bool)
     for experiment in record.experiments:
+        if wild.all():
+            break
         inputs = lag_matrix(experiment, form.input_layout, record, form.start)
         past = experiment.outputs[form.start - form.memory : form.start][::-1]
         padded = np.zeros((max(256, 1 << (len(inputs) - 1).bit_length()), inputs.shape[1]))  # few programs
