@@ -496,5 +496,9 @@ def test_records_refused(duffing):
         feedback(model, record, along="both")
     with pytest.raises(InputError, match="lacks the output y"):
         stability(model, Record.from_arrays(noise(50)))
+    with pytest.raises(
+        InputError, match=r"`x` has shape \(2998, 2\); the usable regressors of the record have \(2998, 3"
+    ):
+        stability(model, record, x=stack_rows(record, model.form.layout).x[:, :2])
     with pytest.raises(InputError, match="no measured outputs to start from"):
         divergence_scaling(model, Record.from_arrays(noise(50)))

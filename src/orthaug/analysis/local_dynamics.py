@@ -79,6 +79,9 @@ def measured_by(model: Model, record: Record, x: Matrix | None = None) -> tuple[
     if x is None:
         runs = [lag_matrix(e, model.form.layout, record, start) for e in record.experiments]
     else:
+        wanted = sum(len(e) - start for e in record.experiments), len(model.form.layout)
+        if np.shape(x) != wanted:
+            raise InputError(f"`x` has shape {np.shape(x)}; the usable regressors of the record have {wanted}.")
         runs = np.split(x, np.cumsum([len(e) - start for e in record.experiments])[:-1])
     outputs = np.concatenate([e.outputs for e in record.experiments])
     return _numbered(model, runs), positive(outputs.std(axis=0))

@@ -97,7 +97,7 @@ def fit_job(
             answers[part.name] = responses
         one_step, free_run = answers[job.train.name]
         diagnosis = diagnose(fit, one_step=one_step, free_run=free_run)
-        steady = stability(fit.model, job.train.record, response=free_run, x=job.problem.rows.x)
+        steady = stability(fit.model, job.train.record, response=free_run, x=fit.problem.rows.x)
         warnings += [warning.text for warning in steady.warnings]
         if diagnosis is None:
             warnings.append("the residual is not analysed: there are too few rows for that, or it is rounding only.")
