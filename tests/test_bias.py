@@ -135,14 +135,14 @@ def test_what_of_the_learner_a_suspect_explains(machine):
     suspects = [FRICTION, Suspect.of("cubic", "force[k-1]"), Suspect.of("expression", "position[k-1]")]
     drag, cubic, _ = suspect_columns(suspects, machine.rows.x, machine.layout, machine.outputs)
     by_drag, by_cubic, in_span = table(machine, suspects, learned=-3.0 * drag, certify=False)
-    assert by_drag.explained == pytest.approx(1.0, abs=1e-12) and by_drag.found == pytest.approx(-3.0)
+    assert by_drag.explained == pytest.approx(1.0, abs=1e-12) and by_drag.coefficient_found == pytest.approx(-3.0)
     assert by_cubic.explained < 0.01
-    assert (in_span.explained, in_span.found) == (None, None) and in_span.cosine == pytest.approx(1.0)
+    assert (in_span.explained, in_span.coefficient_found) == (None, None) and in_span.cosine == pytest.approx(1.0)
     (mixed,) = table(machine, [FRICTION], learned=-3.0 * drag + 1e-7 * cubic, certify=False)
     rest = machine.projection.orthogonal_part
     f, d = rest((-3.0 * drag + 1e-7 * cubic) * machine.weight), rest(drag * machine.weight)
     assert mixed.explained == pytest.approx(np.vdot(f, d) ** 2 / np.vdot(f, f) / np.vdot(d, d), rel=1e-10)
-    assert mixed.found == pytest.approx(np.vdot(f, d) / np.vdot(d, d), rel=1e-10)
+    assert mixed.coefficient_found == pytest.approx(np.vdot(f, d) / np.vdot(d, d), rel=1e-10)
     (nothing,) = table(machine, [FRICTION], learned=np.zeros_like(drag), certify=False)
     assert nothing.explained is None
 

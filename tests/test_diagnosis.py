@@ -10,11 +10,13 @@ import pytest
 
 from orthaug.analysis.diagnosis import diagnose
 from orthaug.data.record import Record
+from orthaug.data.regressors import Lags
 from orthaug.fitting.criteria import Prediction, Simulation
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive
 from orthaug.models.learners import MLP
+from orthaug.models.model import Model
 from orthaug.physics.baseline import Baseline, Term
 from orthaug.studies import synthetic
 
@@ -165,16 +167,33 @@ def test_an_unmodelled_residual_is_told_with_its_size_and_advice():
     share = 100 * found.one_step[0].rms / second_order(0, equation=0.1, missing="lag of u").experiments[0].outputs.std()
     assert f"residual, {share:.2g} % of the output's deviation" in found.text
     assert "more lags, other learner inputs or neurons" in found.text
-    assert any("coloured" in warning for warning in found.warnings)
+    assert "coloured" in dict(found.warnings)["coloured_residual"]
 
 
 # --- the criterion that sensor noise asks for
 
 
+def test_the_physics_alone_may_start_earlier_than_the_model():
+    """The physics reads two lags and the learner four: both are tested on the rows that the model predicts."""
+    learned = {"learner": MLP(hidden=(3,)), "lags": Lags(na=4, nb=4), "solver": LevenbergMarquardt(30)}
+    found = of(second_order(0, sensor=0.3), **learned)
+    assert found.verdict == "sensor_noise" and found.one_step[0].n == 796
+
+
+def test_responses_that_exist_are_not_computed_again(monkeypatch):
+    fit = estimate(second_order(1, equation=0.1), PHYSICS, learner=None)
+    responses = {"one_step": fit.model.predict(fit.problem.record), "free_run": fit.model.simulate(fit.problem.record)}
+    plain = diagnose(fit).as_dict()
+    for verb in ("predict", "simulate"):
+        monkeypatch.setattr(Model, verb, lambda *_: pytest.fail("computed again"))
+    assert diagnose(fit, **responses).as_dict() == plain
+
+
 def test_one_step_with_sensor_noise_is_warned_and_told_the_criterion():
     found = of(second_order(0, sensor=0.3))
     (warning,) = found.warnings
-    assert "intervals do not cover" in warning and 'focus = "simulation"' in warning
+    assert warning.code == "sensor_noise" and "intervals do not cover" in warning.text
+    assert 'focus = "simulation"' in warning.text
     assert 'train with focus = "simulation"' in found.text and "inconsistent" in found.text
 
 
@@ -212,7 +231,8 @@ def test_a_free_run_trained_on_equation_noise_is_told_of_the_one_step_criterion(
     found = of(second_order(1, equation=0.1), criterion=Simulation(0, 40))
     assert found.verdict == "equation_noise" and "The one-step criterion is the more precise one here" in found.text
     (warning,) = found.warnings
-    assert "standard errors of θ" in warning and "errors of the free run are coloured" in warning
+    assert warning.code == "coloured_residual" and "standard errors of θ" in warning.text
+    assert "errors of the free run are coloured" in warning.text
 
 
 def test_several_steps_ahead_count_as_trained_on_the_free_run():

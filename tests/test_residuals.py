@@ -11,16 +11,10 @@ from scipy.signal import lfilter
 from threadpoolctl import threadpool_limits
 
 from orthaug._base.errors import InputError
-from orthaug.analysis.residuals import (
-    against_input,
-    against_regressor,
-    analyse,
-    autocorrelation,
-    cross_correlation,
-    ljung_box,
-    normality,
-    whitening,
-)
+from orthaug.analysis.correlation import autocorrelation, cross_correlation
+from orthaug.analysis.independence import against_input, against_regressor
+from orthaug.analysis.residuals import analyse
+from orthaug.analysis.whiteness import ljung_box, normality, whitening
 
 RECORDS, ROWS, WARM_UP = 2000, 1000, 300
 BETWEEN = (0.005, 0.016)  # of 2000 records that a test at 1 % may reject; ± 0.0022 is one standard deviation
@@ -328,8 +322,12 @@ def test_short_records_have_what_they_can(rows):
 @pytest.mark.parametrize("e", [np.arange(400.0), np.sin(np.arange(400) / 9), np.tile([1.0, -1.0], 200), np.eye(400)[7]])
 def test_residuals_without_noise_do_not_break_anything(e):
     rng = np.random.default_rng(24)
-    found = report(e, {"e": e, "u": rng.normal(size=400)}, {"e": e, "x": np.roll(e, 1)})
-    json.dumps(found.as_dict(), allow_nan=False)
+    tests = report(e, {"e": e, "u": rng.normal(size=400)}, {"e": e, "x": np.roll(e, 1)})
+    json.dumps(tests.as_dict(), allow_nan=False)
+    assert tests.n == 400 and tests.rms == pytest.approx(np.sqrt(np.mean(e**2)))
+    assert tests.cross["e"].lag == 0 and tests.cross["e"].largest == pytest.approx(1)
+    np.testing.assert_allclose(tests.cross["e"].values, np.concatenate([tests.acf[:0:-1], tests.acf]), atol=1e-12)
+    assert 0 <= tests.ljung_box.p <= 1 and 0 < tests.regressors["e"].share <= 1
 
 
 def test_results_do_not_depend_on_units():

@@ -22,10 +22,11 @@ from orthaug.analysis.validation import (
     trial_on,
 )
 from orthaug.data.record import Record
-from orthaug.data.regressors import Lags
+from orthaug.data.regressors import Lags, stack_rows
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.models.learners import MLP
+from orthaug.models.model import Model
 from orthaug.physics.baseline import Baseline, Term
 
 PHYSICS = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("g", "u[k-1]")])
@@ -115,23 +116,27 @@ def test_too_few_rows_for_the_blocks(lengths, blocks, start):
 # --- ranges
 
 
-def layout():
+def rows_of(record, layout=None):
+    return stack_rows(record, layout or layout_of()).x
+
+
+def layout_of():
     return fitted(system(0, 60), lags=Lags(na=2, nb=2), **SMALL).problem.layout
 
 
 def test_a_part_within_the_training_range_leaves_nothing():
     record = system(0, 300)
-    assert extrapolation("tests.in", record.rows(50, 200), record, layout()) == []
+    assert extrapolation("tests.in", rows_of(record.rows(50, 200)), rows_of(record), layout_of()) == []
 
 
 def test_the_range_that_is_left_is_told_once_for_a_channel():
     record, far = system(0, 300), system(1, 200, scale=2.0)
-    found = {e.lag: e for e in extrapolation("tests.far", far, record, layout())}
+    found = {e.lag: e for e in extrapolation("tests.far", rows_of(far), rows_of(record), layout_of())}
     assert set(found) == {"y[k-1]", "u[k-1]"}
     inside = record.experiments[0].inputs[1:-1, 0]
     outside = far.experiments[0].inputs[1:-1, 0]
     entry = found["u[k-1]"]
-    assert entry.training == (inside.min(), inside.max()) and entry.found == (outside.min(), outside.max())
+    assert entry.training == (inside.min(), inside.max()) and entry.reach == (outside.min(), outside.max())
     assert entry.share == pytest.approx(np.mean((outside < inside.min()) | (outside > inside.max())))
 
 
@@ -168,8 +173,9 @@ CASES = [
 
 @pytest.mark.parametrize(("trials", "code"), CASES, ids=str)
 def test_the_verdict_on_trials(trials, code):
-    found = judge([Trial(*trial) for trial in trials])
+    found = judge([Trial(*trial, block=trial[0] in BLOCK) for trial in trials])
     opening = {"helps": "The learner helps", "no_help": "The learner does not help", "hurts": "The learner hurts"}
+    assert [warning.code for warning in found.warnings] == ["learner_hurts"] * (code == "hurts")
     assert found.code == code and found.text.startswith(f"{opening[code]}. ") and found.text.endswith(".")
     content = json.loads(json.dumps(found.as_dict(), allow_nan=False))
     assert content["verdict"] == code and len(content["trials"]) == len(trials)
@@ -191,7 +197,7 @@ def test_a_part_that_is_worse_is_never_help():
 
 
 def test_the_text_gives_the_errors_and_how_many_blocks_are_better():
-    found = judge([Trial(BLOCK[0], 1.0, 0.3), Trial(BLOCK[1], 1.0, 1.1), Trial("tests.a", 0.8, 0.4)])
+    found = judge([Trial(BLOCK[0], 1.0, 0.3, True), Trial(BLOCK[1], 1.0, 1.1, True), Trial("tests.a", 0.8, 0.4)])
     error = math.sqrt((0.3**2 + 1.1**2) / 2)
     assert f"(2 blocks, 1 of them better): free-run NRMSE {error:.4g} with the learner, 1 with" in found.text
     assert "On tests.a: free-run NRMSE 0.4 with the learner, 0.8 with physics alone" in found.text
@@ -228,6 +234,13 @@ def test_the_error_of_a_free_run_is_that_of_simulate():
     assert trial_on("here", part, (7,), model, model) == Trial("here", *[free_run_error(model, part, 7)] * 2)
 
 
+def test_free_runs_that_exist_are_not_run_again(monkeypatch):
+    model, part = fitted(system(0, 200)).model, system(1, 100)
+    plain, response = trial_on("here", part, (7,), model, model), model.simulate(part)
+    monkeypatch.setattr(Model, "simulate", lambda *_: pytest.fail("run again"))
+    assert trial_on("here", part, (7,), model, model, alone_response=response, response=response) == plain
+
+
 def test_a_constant_output_is_not_taken_for_a_free_run_that_diverges():
     record = system(0, 200)
     rest = Record.from_arrays(np.zeros(50), np.zeros(50))
@@ -244,7 +257,7 @@ def validated(record, blocks=4, **options):
 
 
 def verdict(errors):
-    return judge([Trial(f"block {i + 1} of {len(errors)}", *pair) for i, pair in enumerate(errors)])
+    return judge([Trial(f"block {i + 1} of {len(errors)}", *pair, block=True) for i, pair in enumerate(errors)])
 
 
 def test_errors_are_those_of_fits_without_the_block():
@@ -304,7 +317,8 @@ def test_an_overfitted_learner_hurts_in_extrapolation(seed):
     record, far = system(seed, 60, noise=0.3), system(seed + 10, 200, noise=0.3, scale=3.0)
     fit = fitted(record, **GREEDY)
     trial = trial_on("tests.far", far, (0,), fitted(record).model, fit.model)
-    found = judge([trial], extrapolation("tests.far", far, record, fit.problem.layout))
+    x = rows_of(far, fit.problem.layout)
+    found = judge([trial], extrapolation("tests.far", x, fit.problem.rows.x, fit.problem.layout))
     assert trial.model > trial.alone
     assert found.text.startswith("The learner hurts in extrapolation") and "tests.far leaves" in found.text
 
@@ -315,4 +329,5 @@ def test_dominance_is_the_learners_part_against_the_physics():
     rows = fit.model.predict(record).trajectories[0]
     expected = np.linalg.norm(rows.learner[2:]) / np.linalg.norm(rows.baseline[2:])
     assert dominance(fit) == pytest.approx(expected) and expected > 0.01
+    assert dominance(fit, one_step=fit.model.predict(record)) == dominance(fit)
     assert dominance(fitted(record)) == 0

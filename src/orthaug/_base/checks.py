@@ -75,9 +75,18 @@ def check_count(value: Any, name: str, least: int = 1) -> int:
 
 
 def is_number(value: Any) -> bool:
-    """Whether `value` is a finite real number; True and False are none."""
-    real = not isinstance(value, bool | np.complexfloating) and isinstance(value, int | float | np.number)
-    return real and math.isfinite(value)
+    """Whether `value` is a finite real number; a truth value is none."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number beyond double precision
+        return False
+
+
+def finite_or_none(value: float) -> float | None:
+    """`value`, or None where it is not finite: JSON has no infinity."""
+    return value if math.isfinite(value) else None
 
 
 def check_number(value: Any, name: str, *, positive: bool = False) -> float:

@@ -1,7 +1,7 @@
-"""What unmodelled terms do to θ: bias per unit of each suspect, and whether any measure can remove it (F3).
+"""What unmodelled terms do to θ: bias per unit of each suspect, and whether any measure can remove it.
 
 With the truth `Y = Φθ* + Δ + E` (`eq:data_gen_sys_reformed_vect`) the estimate under a measure μ errs by
-`θ̂ − θ* = Φ_μ⁺(Δ_μ − ε_μ)` (eq:error_val and fact F3), ε the misfit of the whole model. Here Φ_μ and Δ_μ are the
+`θ̂ − θ* = Φ_μ⁺(Δ_μ − ε_μ)` (eq:error_val), ε the misfit of the whole model. Here Φ_μ and Δ_μ are the
 rows multiplied by the square root of their weight.
 """
 
@@ -28,7 +28,7 @@ WORKING_SET = 1000  # rows of the first linear program, and the most that are ad
 MOST_ROUNDS = 50
 IN_SPAN = 1e-10  # ‖P⊥Δ‖/‖Δ‖ below which Δ counts as physics
 
-Verdict = Literal["unremovable", "removable", "undecided", "orthogonal"]
+Removability = Literal["unremovable", "removable", "undecided", "orthogonal"]
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Certificate:
     `positive` the fraction of points where `(φᵀa)δ > 0`: a measure on the rest alone is not excluded.
     """
 
-    verdict: Verdict
+    verdict: Removability
     direction: tuple[float, ...] | None = None
     shares: tuple[float, ...] | None = None
     cosine: float | None = None
@@ -58,7 +58,7 @@ class SuspectedBias:
     `bias` (nt,) is `Φ_μ⁺Δ_μ`, in the unit of θ per unit of the coefficient; `relative` the same divided by θ
     (None where θ is 0); `physical` the same for physical parameters, to first order; `expected` is `bias` times the
     guessed coefficient. `cosine` is `‖QᵀΔ‖/‖Δ‖` in [0, 1], 0 where the paper's `cond:special_PE` holds: None for
-    Δ = 0. `explained` is the squared cosine between P⊥Δ and the learner's values, and `found` the coefficient
+    Δ = 0. `explained` is the squared cosine between P⊥Δ and the learner's values, and `coefficient_found` that
     with which P⊥Δ fits them best: both None without a learner, or where Δ lies in the span of Φ.
     """
 
@@ -70,34 +70,36 @@ class SuspectedBias:
     physical: tuple[tuple[str, float], ...] | None
     cosine: float | None
     explained: float | None
-    found: float | None
+    coefficient_found: float | None
     certificate: Certificate | None
 
     @property
     def sentence(self) -> str:
         """The certificate in words; empty where none was sought."""
-        found = self.certificate
-        if found is None:
+        certificate = self.certificate
+        if certificate is None:
             return ""
-        if found.verdict == "orthogonal":
+        if certificate.verdict == "orthogonal":
             return f"{self.suspect.name}: φᵀδ is zero on all of these points, so that it biases nothing there."
-        if found.verdict == "removable":
+        if certificate.verdict == "removable":
             return f"{self.suspect.name}: some weighting of these points leaves θ unbiased."
-        if found.verdict == "undecided":
+        if certificate.verdict == "undecided":
             return f"{self.suspect.name}: whether a weighting of these points leaves θ unbiased could not be decided."
-        assert found.shares is not None and found.positive is not None
+        assert certificate.shares is not None and certificate.positive is not None
         terms = [
-            f"{share:+.3g} {name}" for share, name in zip(found.shares, self.names, strict=True) if abs(share) > 5e-3
+            f"{share:+.3g} {name}"
+            for share, name in zip(certificate.shares, self.names, strict=True)
+            if abs(share) > 5e-3
         ]
         return (
             f"{self.suspect.name}: no weighting of these points leaves θ unbiased if it counts any of the "
-            f"{100 * found.positive:.3g} % where (φᵀa)δ is positive, for it is nowhere negative; "
+            f"{100 * certificate.positive:.3g} % where (φᵀa)δ is positive, for it is nowhere negative; "
             f"a = {' '.join(terms)} (columns scaled to root mean square 1). Only the least bias can be asked for."
         )
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, text and None, for JSON."""
-        found = self.certificate
+        certificate = self.certificate
 
         def by_name(values: tuple[float | None, ...] | None) -> dict[str, float | None] | None:
             return None if values is None else dict(zip(self.names, values, strict=True))
@@ -113,15 +115,15 @@ class SuspectedBias:
             "physical_bias": None if self.physical is None else dict(self.physical),
             "cosine": self.cosine,
             "explained": self.explained,
-            "coefficient_found": self.found,
+            "coefficient_found": self.coefficient_found,
             "certificate": None
-            if found is None
+            if certificate is None
             else {
-                "verdict": found.verdict,
-                "direction": by_name(found.direction),
-                "shares": by_name(found.shares),
-                "cosine": found.cosine,
-                "positive": found.positive,
+                "verdict": certificate.verdict,
+                "direction": by_name(certificate.direction),
+                "shares": by_name(certificate.shares),
+                "cosine": certificate.cosine,
+                "positive": certificate.positive,
                 "sentence": self.sentence,
             },
         }
@@ -169,7 +171,7 @@ def bias_table(
             raise InputError(f"suspect '{suspect.name}' is not finite on every row.")
         weighted = delta * gain
         bias = projection.solve(weighted)
-        cosine, explained, found = _overlaps(projection, weighted, tilde)
+        cosine, explained, coefficient = _overlaps(projection, weighted, tilde)
         entries.append(
             SuspectedBias(
                 suspect,
@@ -180,7 +182,7 @@ def bias_table(
                 None if physical is None else tuple((p, float(np.dot(row, bias))) for p, row in physical.items()),
                 cosine,
                 explained,
-                found,
+                coefficient,
                 find_certificate(projection, weighted) if certify else None,
             )
         )
@@ -207,7 +209,7 @@ def _overlaps(
 
 
 def find_certificate(projection: Projection, delta: Float[np.ndarray, "N ny"]) -> Certificate:
-    """Maximise `Σ (φᵀa)δ` subject to `(φᵀa)δ ≥ 0` on every point and `|a| ≤ 1`; F3.
+    """Maximise `Σ (φᵀa)δ` subject to `(φᵀa)δ ≥ 0` on every point and `|a| ≤ 1`.
 
     In the coordinates of Q, so that neither units nor conditioning of Φ matter; a row of several outputs counts
     the sum over them, weighted as in `projection`. The linear program is solved on a working set, to which the

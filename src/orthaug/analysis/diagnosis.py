@@ -1,21 +1,22 @@
-"""What the residual says about the noise, and which criterion the data ask for (DESIGN F7).
+"""What the residual says about the noise, and which criterion the data ask for.
 
-Noise in the equation leaves a white one-step residual. Noise on the measured output leaves a coloured one, makes
-one-step least squares inconsistent, and lets a free run explain the data as well as a prediction from measured lags.
+Noise in the equation leaves a white one-step residual. Noise on the measured output leaves a coloured one. It makes
+one-step least squares inconsistent, and a free run then explains the data as well as a prediction from measured lags.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from orthaug._base.checks import Vector
 from orthaug._base.parallel import one_blas_thread
+from orthaug._base.warning import Warning
 from orthaug.analysis.residuals import ResidualTest, analyse
-from orthaug.data.regressors import Lags, stack_rows
+from orthaug.data.regressors import Lags
 from orthaug.fitting.criteria import Simulation
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import estimate
@@ -31,7 +32,11 @@ _SHARE = 0.01  # of the residual's variance: what a regressor explains of it cou
 _ROUNDING = 1e-14  # of the output's deviation: a residual that says nothing
 _TOO_FAST = 0.05  # noise variance / smallest variance among the lagged outputs
 
-_COLOURED = "standard errors of θ are those of a white residual, but the {what} coloured: take them for a rough guide."
+_BIASED = Warning(
+    "sensor_noise",
+    "noise on the measured output biases the one-step θ, and its intervals do not cover that bias: "
+    'train with focus = "simulation".',
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +53,7 @@ class Diagnosis:
     free_run: tuple[ResidualTest, ...] | None
     ratio: float | None
     noise_in_lags: float | None
-    warnings: tuple[str, ...]
+    warnings: tuple[Warning, ...]
 
     def as_dict(self) -> dict[str, Any]:
         """Plain content for JSON."""
@@ -62,15 +67,17 @@ class Diagnosis:
         }
 
 
-def diagnose(fit: Estimate) -> Diagnosis | None:
+def diagnose(fit: Estimate, *, one_step: Response | None = None, free_run: Response | None = None) -> Diagnosis | None:
     """Analyse the residuals of a fit on its training data; None where they cannot be tested.
 
     A one-step fit whose residual is coloured is set beside the free run of the physics alone, trained on it: that is
     what sensor noise asks for, and it does not suffer from the bias of the fit in question.
+
+    Args:
+        one_step: the prediction of the training data, if it is there already; likewise their `free_run`.
     """
     problem, model, simulated = fit.problem, fit.model, fit.criterion.flown is not None
-    skip = fit.criterion.washout
-    one_step, free_run = model.predict(problem.record), model.simulate(problem.record)
+    one_step = model.predict(problem.record) if one_step is None else one_step
     tests = _tests(problem, one_step)
     if any(test.white is None for test in tests) or np.all(_errors(one_step) * problem.weight < _ROUNDING):
         return None
@@ -78,15 +85,17 @@ def diagnose(fit: Estimate) -> Diagnosis | None:
     complete = white and not any(_misfits(test) for test in tests)
     if not model.form.memory:
         return _static(fit, tests, white, complete)
+    free_run = model.simulate(problem.record) if free_run is None else free_run
+    skip = fit.criterion.washout if isinstance(fit.criterion, Simulation) else 0
     flown = [(free_run, skip)] if not any(t.diverged for t in free_run.trajectories) else []
     free_tests = _tests(problem, free_run, skip) if flown else None
     if not simulated and not white:
         flown += _physics_flown(fit)
     ratios = [_ratio(run, one_step, first) for run, first in flown]
     good = [
-        r
-        for r, (run, first) in zip(ratios, flown, strict=True)
-        if r and r < _AS_GOOD and _accounts(problem, run, first)
+        ratio
+        for ratio, (run, first) in zip(ratios, flown, strict=True)
+        if ratio and ratio < _AS_GOOD and _accounts(problem, run, first)
     ]
     sensor = not white and bool(good)
     ratio = min(good) if sensor else ratios[0] if ratios else None
@@ -95,15 +104,22 @@ def diagnose(fit: Estimate) -> Diagnosis | None:
     verdict = ("white" if free_white else "equation_noise") if complete else "sensor_noise" if sensor else "unmodelled"
     text, warnings = _words(verdict, fit, tests, ratio, noise, simulated)
     if fit.std is not None and not warnings and not (free_white if simulated else white):
-        warnings = (_COLOURED.format(what="errors of the free run are" if simulated else "one-step residual is"),)
+        warnings = (_coloured("errors of the free run are" if simulated else "one-step residual is"),)
     return Diagnosis(verdict, text, tests, free_tests, ratio, noise, warnings)
 
 
 def _static(fit: Estimate, tests: tuple[ResidualTest, ...], white: bool, complete: bool) -> Diagnosis:
-    text, warnings = _words("white" if complete else "unmodelled", fit, tests, None, None, False)
+    """The diagnosis of a model without past outputs."""
+    verdict = "white" if complete else "unmodelled"
+    text, warnings = _words(verdict, fit, tests, None, None, False)
     if fit.std is not None and not white:
-        warnings = (_COLOURED.format(what="one-step residual is"),)
-    return Diagnosis("white" if complete else "unmodelled", text, tests, None, None, None, warnings)
+        warnings = (_coloured("one-step residual is"),)
+    return Diagnosis(verdict, text, tests, None, None, None, warnings)
+
+
+def _coloured(what: str) -> Warning:
+    told = f"standard errors of θ are those of a white residual, but the {what} coloured: take them for a rough guide."
+    return Warning("coloured_residual", told)
 
 
 def _is_white(test: ResidualTest, small: float) -> bool:
@@ -134,10 +150,10 @@ def _physics_flown(fit: Estimate) -> list[tuple[Response, int]]:
     longest = max(len(e) for e in problem.record.experiments) - fit.model.form.first_row
     if longest <= 2 * criterion.washout:
         criterion = Simulation(segment=0, washout=0)
-    found = estimate(problem.record, problem.baseline, lags=_lags_of(fit), learner=None, criterion=criterion)
-    if not found.status.ok:
+    physics = estimate(problem.record, problem.baseline, lags=_lags_of(fit), learner=None, criterion=criterion)
+    if not physics.status.ok:
         return []
-    run = found.model.simulate(problem.record)
+    run = physics.model.simulate(problem.record)
     return [] if any(t.diverged for t in run.trajectories) else [(run, criterion.washout)]
 
 
@@ -156,16 +172,15 @@ def _lags_of(fit: Estimate) -> Lags | None:
 
 
 def _tests(problem: Problem, response: Response, skip: int = 0) -> tuple[ResidualTest, ...]:
-    """The tests of measured minus model on every usable row after the first `skip`."""
-    record, layout = problem.record, problem.layout
-    residuals, inputs, regressors = [], [], []
+    """The tests of measured minus model on every usable row of the problem after the first `skip`."""
+    record, start = problem.record, problem.rows.start
+    ends = np.cumsum([len(experiment) - start for experiment in record.experiments])
+    residuals, inputs = [], []
     for experiment, trajectory in zip(record.experiments, response.trajectories, strict=True):
-        first = trajectory.start
-        residuals.append((experiment.outputs - trajectory.model)[first:][skip:])
-        inputs.append(experiment.inputs[first:][skip:])
-        alone = replace(record, experiments=(experiment,))
-        regressors.append(stack_rows(alone, layout).x[skip:])
-    names = ([c.name for c in record.outputs], [c.name for c in record.inputs], [str(lag) for lag in layout])
+        residuals.append((experiment.outputs - trajectory.model)[start:][skip:])
+        inputs.append(experiment.inputs[start:][skip:])
+    regressors = [x[skip:] for x in np.split(problem.rows.x, ends[:-1])]
+    names = ([c.name for c in record.outputs], [c.name for c in record.inputs], [str(lag) for lag in problem.layout])
     with one_blas_thread():
         return analyse(residuals, inputs, regressors, *names, lags=LAGS)
 
@@ -210,7 +225,7 @@ def _words(
     ratio: float | None,
     noise: float | None,
     simulated: bool,
-) -> tuple[str, tuple[str, ...]]:
+) -> tuple[str, tuple[Warning, ...]]:
     """The text of a verdict, and the warnings that intervals of θ must carry."""
     if verdict == "white":
         return "The one-step residual is white: the intervals hold, and no criterion is better than this one.", ()
@@ -221,8 +236,8 @@ def _words(
     if verdict == "sensor_noise":
         closer = "as close" if ratio is None or ratio > 0.95 else f"{1 / ratio:.1f} times closer"
         own = "the free run is" if simulated else "the physics trained on the free run comes"
-        found = f"its largest autocorrelation is {colour:.2f}, and {own} {closer} without measured lags"
-        text = f"The one-step residual is coloured: {found}. That is noise on the measured output"
+        how = f"its largest autocorrelation is {colour:.2f}, and {own} {closer} without measured lags"
+        text = f"The one-step residual is coloured: {how}. That is noise on the measured output"
         if simulated:
             return f"{text}, which the simulation criterion suits.", ()
         text += '. One-step estimates of θ are then inconsistent: train with focus = "simulation"'
@@ -231,8 +246,7 @@ def _words(
                 f". The noise is {100 * noise:.0f} % of what tells the lagged outputs apart: the sampling is too fast "
                 "for one-step estimation"
             )
-        warning = "noise on the measured output biases the one-step θ, and its intervals do not cover that bias: "
-        return f"{text}.", (f'{warning}train with focus = "simulation".',) if fit.std is not None else ()
+        return f"{text}.", (_BIASED,) if fit.std is not None else ()
     told = [f"its largest autocorrelation is {colour:.2f}"]
     for test in tests:
         told += [f"the residual of {test.name} still follows {name}" for name in test.correlated_inputs]

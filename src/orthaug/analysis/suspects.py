@@ -6,18 +6,18 @@ leaves out by intention, known in form though not in size.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Matrix, check_number, check_unique, nearest
+from orthaug._base.checks import Matrix, check_number, check_unique, is_number, nearest
 from orthaug._base.errors import InputError
 from orthaug.data.expressions import Expression, Lag, is_name, parse
 from orthaug.data.regressors import Layout
+from orthaug.physics.problem import Problem
 
 
 class _Kind(NamedTuple):
@@ -44,13 +44,17 @@ _KINDS = {
     "expression": _Kind(lambda x, w: x),
 }
 KINDS = tuple(_KINDS)
+WIDTHS = tuple(kind for kind, entry in _KINDS.items() if entry.width)  # the kinds that need a width
+_VELOCITY = ("coulomb", "stribeck", "quadratic_drag", "cubic")
+_POSITION = ("cubic", "dead_zone")
+_INPUT = ("cubic", "dead_zone", "saturation")
 
 
 @dataclass(frozen=True)
 class Suspect:
     """A suspected term `coefficient * expression` of one output; make one of a known kind with `of`.
 
-    `expression` is in `orthaug.expressions`' language and may use the names in `constants` (kept as sorted
+    `expression` is in the language of `orthaug.data.expressions` and may use the names in `constants` (kept as sorted
     pairs). `coefficient` is a guess of its size, in the output's unit per unit of the expression, None where
     there is none. `output` may be left out where there is only one.
 
@@ -74,7 +78,7 @@ class Suspect:
         if self.output is not None and not isinstance(self.output, str):
             raise InputError(f"suspect '{self.name}': `output` must be the name of a channel; got {self.output!r}.")
         constants = _checked_constants(dict(self.constants), self.name)
-        if self.coefficient is not None and not _is_number(self.coefficient):
+        if self.coefficient is not None and not is_number(self.coefficient):
             raise InputError(f"suspect '{self.name}': `coefficient` must be a finite number; got {self.coefficient!r}.")
         object.__setattr__(self, "constants", constants)
         _ = self.parsed
@@ -172,10 +176,10 @@ class Suspect:
             raise InputError(
                 f"suspect '{self.name}' = {self.expression} is not finite at row {bad[0]} of the regressor."
             )
-        values[:, self._column_of(outputs)] = column
+        values[:, self.column_of(outputs)] = column
         return values
 
-    def _column_of(self, outputs: Sequence[str]) -> int:
+    def column_of(self, outputs: Sequence[str]) -> int:
         known = ", ".join(outputs)
         if self.output is None:
             if len(outputs) != 1:
@@ -218,6 +222,28 @@ def data_width(on: str, x: Matrix, layout: Layout, constants: Mapping[str, float
     return float(np.median(size[size > 0]))
 
 
+def usual_suspects(problem: Problem) -> tuple[Suspect, ...]:
+    """What is often missing: friction, drag, hardening, dead zone and saturation, an offset."""
+    layout, outputs = problem.layout, problem.outputs
+    pairs: list[tuple[str, str]] = []
+    for channel in dict.fromkeys(lag.channel for lag in layout):
+        lags = sorted(lag.lag for lag in layout if lag.channel == channel)
+        first = next(str(lag) for lag in layout if lag.channel == channel and lag.lag == lags[0])
+        pairs += [(kind, first) for kind in (_POSITION if channel in outputs else _INPUT)]
+        if channel in outputs and len(lags) > 1:
+            second = next(str(lag) for lag in layout if lag.channel == channel and lag.lag == lags[1])
+            pairs += [(kind, f"{first} - {second}") for kind in _VELOCITY]
+    suspects = []
+    for output in outputs:
+        own = output if len(outputs) > 1 else None
+        label = f" in {output}" if own else ""
+        for kind, on in pairs:
+            width = data_width(on, problem.rows.x, layout) if kind in WIDTHS else None
+            suspects.append(Suspect.of(kind, on, width=width, output=output, name=f"{kind} of {on}{label}"))
+        suspects.append(Suspect.of("offset", output=output, name=f"offset{label}"))
+    return tuple(suspects)
+
+
 def _evaluate(expression: Expression, x: Matrix, layout: Layout, what: str) -> np.ndarray:
     missing = [str(lag) for lag in expression.lags if lag not in layout]
     if missing:
@@ -231,10 +257,6 @@ def _checked_constants(constants: Mapping[str, float], suspect: str) -> tuple[tu
     for name, value in constants.items():
         if not isinstance(name, str) or not is_name(name):
             raise InputError(f"suspect '{suspect}': {name!r} cannot name a constant.")
-        if not _is_number(value):
+        if not is_number(value):
             raise InputError(f"suspect '{suspect}': the constant '{name}' must be a finite number; got {value!r}.")
     return tuple(sorted((name, float(value)) for name, value in constants.items()))
-
-
-def _is_number(value: Any) -> bool:
-    return not isinstance(value, bool) and isinstance(value, int | float | np.number) and math.isfinite(value)

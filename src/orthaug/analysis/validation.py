@@ -13,23 +13,30 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from orthaug._base.checks import Matrix, finite_or_none
 from orthaug._base.errors import InputError
 from orthaug._base.parallel import spread
+from orthaug._base.warning import Warning
 from orthaug.data.record import Experiment, Record
-from orthaug.data.regressors import Layout, stack_rows
+from orthaug.data.regressors import Layout
 from orthaug.fitting.estimates import Estimate
 from orthaug.models.model import Model
+from orthaug.models.response import Response
 
 _WORTH = 0.02  # of the error: less than this is neither help nor harm
 _FEWEST = 20  # usable rows of a block
 
 
 class Trial(NamedTuple):
-    """Free-run errors on one piece of data that was not fitted, in standard deviations; inf where a run diverges."""
+    """Free-run errors on one piece of data that was not fitted, in standard deviations; inf where a run diverges.
+
+    `block` is true for a block of cross-validation, and false for a part of its own.
+    """
 
     where: str
     alone: float
     model: float
+    block: bool = False
 
 
 @dataclass(frozen=True)
@@ -39,7 +46,7 @@ class Extrapolation:
     part: str
     lag: str
     training: tuple[float, float]
-    found: tuple[float, float]
+    reach: tuple[float, float]
     share: float
     """Of the part's rows that lie outside."""
 
@@ -47,7 +54,7 @@ class Extrapolation:
         low, high = self.training
         return (
             f"In {self.lag}, {self.part} leaves the training range of {low:.4g} to {high:.4g}: it goes from "
-            f"{self.found[0]:.4g} to {self.found[1]:.4g}, outside on {100 * self.share:.2g} % of its rows"
+            f"{self.reach[0]:.4g} to {self.reach[1]:.4g}, outside on {100 * self.share:.2g} % of its rows"
         )
 
 
@@ -65,20 +72,26 @@ class Verdict:
         """Why, and where the training range is left."""
         return " ".join([self.summary, *(f"{e}." for e in self.extrapolation)])
 
+    @property
+    def warnings(self) -> tuple[Warning, ...]:
+        """One where the learner hurts."""
+        return (Warning("learner_hurts", self.text),) if self.code == "hurts" else ()
+
     def as_dict(self) -> dict[str, Any]:
         """Plain content for JSON."""
         return {
             "verdict": self.code,
             "text": self.text,
             "trials": [
-                {"where": t.where, "physics_alone": _finite(t.alone), "model": _finite(t.model)} for t in self.trials
+                {"where": t.where, "physics_alone": finite_or_none(t.alone), "model": finite_or_none(t.model)}
+                for t in self.trials
             ],
             "extrapolation": [
                 {
                     "part": e.part,
                     "regressor": e.lag,
                     "training": list(e.training),
-                    "found": list(e.found),
+                    "found": list(e.reach),
                     "share": e.share,
                 }
                 for e in self.extrapolation
@@ -86,9 +99,19 @@ class Verdict:
         }
 
 
-def free_run_error(model: Model, record: Record, skip: int | tuple[int, ...] = 0, unit: Any = None) -> float:
-    """RMS of the free run's error, each output in its `unit`, by default its own deviation; inf where it diverges."""
-    response = model.simulate(record)
+def free_run_error(
+    model: Model,
+    record: Record,
+    skip: int | tuple[int, ...] = 0,
+    unit: Any = None,
+    *,
+    response: Response | None = None,
+) -> float:
+    """RMS of the free run's error, each output in its `unit`, by default its own deviation; inf where it diverges.
+
+    `response` is the model's free run of the record, if it is there already.
+    """
+    response = model.simulate(record) if response is None else response
     if any(trajectory.diverged for trajectory in response.trajectories):
         return math.inf
     scores = response.scores(skip)
@@ -97,9 +120,19 @@ def free_run_error(model: Model, record: Record, skip: int | tuple[int, ...] = 0
     return float(np.sqrt(np.mean(relative**2))) if np.isfinite(relative).all() else math.inf
 
 
-def trial_on(where: str, record: Record, skip: tuple[int, ...], alone: Model, model: Model) -> Trial:
-    """Both models' free runs on a record that was not fitted."""
-    return Trial(where, free_run_error(alone, record, skip), free_run_error(model, record, skip))
+def trial_on(
+    where: str,
+    record: Record,
+    skip: tuple[int, ...],
+    alone: Model,
+    model: Model,
+    *,
+    alone_response: Response | None = None,
+    response: Response | None = None,
+) -> Trial:
+    """Both models' free runs on a record that was not fitted; their responses, if they are there already."""
+    error = free_run_error(alone, record, skip, response=alone_response)
+    return Trial(where, error, free_run_error(model, record, skip, response=response))
 
 
 def blocked(record: Record, blocks: int, start: int) -> list[tuple[Record, Record]]:
@@ -166,11 +199,11 @@ def cross_validate(
         for fit in fits:
             check()
             try:
-                found = fit(training)
+                trained = fit(training)
             except InputError:  # the block took away what the physics needs
                 errors.append(math.inf)
                 continue
-            errors.append(free_run_error(found.model, held, unit=unit) if found.status.ok else math.inf)
+            errors.append(free_run_error(trained.model, held, unit=unit) if trained.status.ok else math.inf)
         return tuple(errors)
 
     return spread(one, folds)
@@ -184,9 +217,9 @@ def judge(trials: Sequence[Trial], extrapolation: Sequence[Extrapolation] = ()) 
     """
     if not trials:
         return None
-    blocks = [t for t in trials if t.where.startswith("block")]
+    blocks = [t for t in trials if t.block]
     groups = [("blocked cross-validation", blocks)] if blocks else []
-    groups += [(t.where, [t]) for t in trials if not t.where.startswith("block")]
+    groups += [(t.where, [t]) for t in trials if not t.block]
     sentences, codes = [], []
     for where, group in groups:
         alone, model = (math.sqrt(sum(getattr(t, k) ** 2 for t in group) / len(group)) for k in ("alone", "model"))
@@ -229,26 +262,29 @@ def _compare(alone: float, model: float) -> str:
     return "helps" if model < (1 - _WORTH) * alone else "no_help"
 
 
-def extrapolation(part: str, record: Record, training: Record, layout: Layout) -> list[Extrapolation]:
-    """Entries of the regressor in which a record leaves the range of the training data; one lag a channel."""
-    inside, outside = stack_rows(training, layout).x, stack_rows(record, layout).x
-    found: dict[str, Extrapolation] = {}
+def extrapolation(part: str, x: Matrix, training: Matrix, layout: Layout) -> list[Extrapolation]:
+    """Entries of the regressor in which a part leaves the range of the training data; one lag a channel.
+
+    Args:
+        part: its name.
+        x: its regressors (N, nx), in the order of the layout; `training` those of the training data.
+    """
+    leaving: dict[str, Extrapolation] = {}
     for j, lag in enumerate(layout):
-        low, high = float(inside[:, j].min()), float(inside[:, j].max())
-        beyond = (outside[:, j] < low) | (outside[:, j] > high)
-        if beyond.any() and lag.channel not in found:
-            reach = (float(outside[:, j].min()), float(outside[:, j].max()))
-            found[lag.channel] = Extrapolation(part, str(lag), (low, high), reach, float(beyond.mean()))
-    return list(found.values())
+        low, high = float(training[:, j].min()), float(training[:, j].max())
+        beyond = (x[:, j] < low) | (x[:, j] > high)
+        if beyond.any() and lag.channel not in leaving:
+            reach = (float(x[:, j].min()), float(x[:, j].max()))
+            leaving[lag.channel] = Extrapolation(part, str(lag), (low, high), reach, float(beyond.mean()))
+    return list(leaving.values())
 
 
-def dominance(fit: Estimate) -> float | None:
-    """‖F̃‖ / ‖Φθ̂‖ over the training rows, the learner's part against the physics'; None where the physics gives 0."""
-    parts = fit.model.components(fit.problem.record).trajectories
+def dominance(fit: Estimate, *, one_step: Response | None = None) -> float | None:
+    """‖F̃‖ / ‖Φθ̂‖ over the training rows, the learner's part against the physics'; None where the physics gives 0.
+
+    `one_step` is the prediction of these rows, if it is there already.
+    """
+    parts = (fit.model.components(fit.problem.record) if one_step is None else one_step).trajectories
     learner = math.sqrt(sum(float(np.nansum(t.learner**2)) for t in parts))
     physics = math.sqrt(sum(float(np.nansum(t.baseline**2)) for t in parts))
     return learner / physics if physics > 0 else None
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

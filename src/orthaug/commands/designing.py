@@ -11,8 +11,8 @@ from orthaug._base.checks import check_choice
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_file
 from orthaug.analysis.design import Design, design_input
-from orthaug.analysis.suspicion import declared
 from orthaug.commands.jobs import Job
+from orthaug.commands.suspects import declared
 
 
 def design(job: Job) -> Design:

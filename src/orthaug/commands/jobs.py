@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from orthaug._base.errors import InputError
-from orthaug.analysis.suspicion import check_suspects
 from orthaug.commands.spec import Part, Spec, load_spec
+from orthaug.commands.suspects import check_suspects
 from orthaug.data.expressions import Lag
 from orthaug.data.readers import read_record
 from orthaug.data.record import Record, check_channels, same_step

@@ -15,10 +15,12 @@ import numpy as np
 from orthaug import __version__
 from orthaug._base.errors import InputError
 from orthaug._base.folders import check_replaceable, whole_folder
-from orthaug.analysis.suspicion import shares, suspected
+from orthaug.analysis.measure_bias import bias_under, weigh
 from orthaug.commands.jobs import Job, LoadedPart, Progress, run_fit
+from orthaug.commands.suspects import declared
 from orthaug.inference.measures import Support
 from orthaug.physics.excitation import Excitation, identifiability
+from orthaug.reports.suspects import shares
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -53,7 +55,7 @@ def check_report(job: Job) -> dict[str, Any]:
             "columns": found.columns,
             "inseparable": [list(group) for group in found.collinear],
         },
-        "bias": suspected(job) if problem.excitation.full_rank else None,
+        "bias": _bias(job) if problem.excitation.full_rank else None,
         "warnings": list(job.warnings),
     }
 
@@ -80,22 +82,26 @@ def fit_job(
         judged: whether to ask if the learner earns its place; `compare` asks for all structures together.
     """
     from orthaug.analysis.diagnosis import diagnose
-    from orthaug.analysis.stability import stability
+    from orthaug.analysis.free_run_stability import stability
 
     fit = run_fit(job, progress, kind=kind, alone=alone)
     warnings = [*job.warnings, *fit.warnings]
     scores, responses, diagnosis, verdict, physical, bias, steady = {}, None, None, None, None, None, None
+    answers: dict[str, tuple[Response, Response]] = {}
     if fit.status.ok:
         physical = _physical(job, fit)
         warnings += physical.warnings if physical is not None else ()
-        bias = suspected(job, fit.theta, _learned(job, fit))
+        bias = _bias(job, fit)
         for part in job.parts:
             scores[part.name], responses = score_part(fit.model, part, warnings)
-        diagnosis, steady = diagnose(fit), stability(fit.model, job.train.record)
-        warnings += steady.warnings
+            answers[part.name] = responses
+        one_step, free_run = answers[job.train.name]
+        diagnosis = diagnose(fit, one_step=one_step, free_run=free_run)
+        steady = stability(fit.model, job.train.record, response=free_run, x=fit.problem.rows.x)
+        warnings += [warning.text for warning in steady.warnings]
         if diagnosis is None:
             warnings.append("the residual is not analysed: there are too few rows for that, or it is rounding only.")
-        warnings += diagnosis.warnings if diagnosis is not None else ()
+        warnings += [warning.text for warning in diagnosis.warnings] if diagnosis is not None else []
         if judged and not alone and fit.model.form.bound is not None:
             verdict = judge_fit(job, fit)
             if verdict is None and job.spec.validation.blocks != 0:
@@ -103,7 +109,7 @@ def fit_job(
                     "whether the learner helps is not judged: no part is held out, and the training data have too few "
                     "rows for cross-validation in so many blocks."
                 )
-            warnings += [verdict.text] if verdict is not None and verdict.code == "hurts" else []
+            warnings += [warning.text for warning in verdict.warnings] if verdict is not None else []
     spec = job.spec.model_dump(mode="json", exclude_unset=True)
     status = fit.status
     result = {
@@ -151,6 +157,7 @@ def judge_fit(
         alone: the physics alone; None to fit it.
     """
     from orthaug.analysis.validation import extrapolation, judge, trial_on
+    from orthaug.data.regressors import stack_rows
 
     held_out, wanted = job.parts[1:], job.spec.validation.blocks
     if blocks is None:
@@ -160,7 +167,8 @@ def judge_fit(
     trials, beyond = list(blocks), []
     for part in held_out:
         trials.append(trial_on(part.name, part.record, part.skips, alone, fit.model))
-        beyond += extrapolation(part.name, part.record, job.train.record, job.problem.layout)
+        x = stack_rows(part.record, job.problem.layout).x
+        beyond += extrapolation(part.name, x, job.problem.rows.x, job.problem.layout)
     return judge(trials, beyond)
 
 
@@ -175,7 +183,7 @@ def cross_validated(job: Job, blocks: int, kinds: Sequence[str | None]) -> dict[
     except InputError:
         return {kind: [] for kind in kinds}
     return {
-        kind: [Trial(f"block {i + 1} of {blocks}", fold[0], fold[1 + j]) for i, fold in enumerate(errors)]
+        kind: [Trial(f"block {i + 1} of {blocks}", fold[0], fold[1 + j], block=True) for i, fold in enumerate(errors)]
         for j, kind in enumerate(kinds)
     }
 
@@ -215,11 +223,17 @@ def _sensitivities(job: Job, found: PhysicalEstimate) -> dict[str, dict[str, flo
     }
 
 
-def _learned(job: Job, fit: Estimate) -> Any:
-    """f at the points of the spec's measure."""
-    if fit.model.form.bound is None:
-        return None
-    return fit.model.learner_at(job.measure.points(Support(job.train.record, job.problem.layout, job.used)).x)
+def _bias(job: Job, fit: Estimate | None = None) -> list[dict[str, Any]]:
+    """The table of suspects under the spec's measure, before a fit or after it."""
+    problem = job.problem
+    if not problem.baseline.names:
+        return []
+    weighed = weigh(problem, job.measure.points(Support(job.train.record, problem.layout, job.used)))
+    suspects = declared(job.spec.suspects, problem)
+    if fit is None:
+        return bias_under(weighed, problem, suspects, physics=job.physics)
+    learned = None if fit.model.form.bound is None else fit.model.learner_at(weighed.points.x)
+    return bias_under(weighed, problem, suspects, physics=job.physics, theta=fit.theta, learned=learned)
 
 
 def is_result(folder: Path) -> bool:

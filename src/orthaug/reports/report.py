@@ -8,7 +8,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthaug.analysis import suspicion
+from orthaug.reports import suspects
 
 if TYPE_CHECKING:
     from orthaug.fitting.estimates import Estimate
@@ -85,7 +85,7 @@ def check_text(report: dict[str, Any]) -> str:
             "",
             "Bias of each parameter if a term is missing from the physics. Size: its share of the output's deviation,",
             "1 % where no coefficient is given. Removable: whether some weighting of these points leaves no bias.",
-            *suspicion.text(report["bias"]),
+            *suspects.text(report["bias"]),
         ]
     lines += [f"warning: {text}" for text in report["warnings"]]
     return "\n".join(lines)

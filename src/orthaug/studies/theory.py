@@ -77,20 +77,20 @@ THEORY: tuple[Statement, ...] = (
     Statement(
         "cond:stable_sys",
         "The data-generating system forgets its initial state exponentially.",
-        "Of the fitted model: stability.contraction, stability.divergence_scaling, stability.feedback",
-        "tests/test_stability.py. The true system is not at hand: out of a program's scope",
+        "Of the fitted model: contraction.contraction, boundedness.divergence_scaling, feedback.feedback",
+        "tests/test_free_run_stability.py. The true system is not at hand: out of a program's scope",
     ),
     Statement(
         "cond:pred_stab",
         "The one-step predictor and its gradient in the parameters forget and bound their data.",
-        "stability.lipschitz: with finitely many lags a bounded slope is enough",
-        "test_stability.test_lipschitz_of_known_gradients",
+        "lipschitz.lipschitz: with finitely many lags a bounded slope is enough",
+        "test_free_run_stability.test_lipschitz_of_known_gradients",
     ),
     Statement(
         "Remark after thm:convergence",
         "The condition can be checked numerically after training; stable-by-design parametrisations are future work.",
-        "stability.stability, shown by `orthaug validate`",
-        "tests/test_stability.py; a parametrisation that is stable by design is not part of orthaug either",
+        "free_run_stability.stability, shown by `orthaug validate`",
+        "tests/test_free_run_stability.py; a parametrisation that is stable by design is not part of orthaug either",
     ),
     Statement(
         "thm:convergence",

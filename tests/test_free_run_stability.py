@@ -10,10 +10,16 @@ import pytest
 from scipy.optimize import minimize
 
 from orthaug._base.errors import InputError
-from orthaug.analysis import stability as module
-from orthaug.analysis.stability import companions, contraction, divergence_scaling, feedback, lipschitz, stability
+from orthaug.analysis import contraction as metrics
+from orthaug.analysis import feedback as radii
+from orthaug.analysis.boundedness import divergence_scaling
+from orthaug.analysis.contraction import contraction
+from orthaug.analysis.feedback import feedback
+from orthaug.analysis.free_run_stability import stability
+from orthaug.analysis.lipschitz import lipschitz
+from orthaug.analysis.local_dynamics import companions
 from orthaug.data.record import Record
-from orthaug.data.regressors import Lags
+from orthaug.data.regressors import Lags, stack_rows
 from orthaug.fitting.estimation import estimate, orthogonalize
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.models.learners import MLP
@@ -167,7 +173,7 @@ def test_an_unstable_linear_model():
     assert found.feedback.largest == pytest.approx(1.02) and found.feedback.share_above_one == 1
     assert found.contraction.rate >= 1.02 - 1e-6 and found.contraction.share == 0
     assert len(found.warnings) == 1
-    assert "radius is above 1 at 100 %" in found.warnings[0] and "At 100 % of the 58" in found.text
+    assert "radius is above 1 at 100 %" in found.warnings[0].text and "At 100 % of the 58" in found.text
 
 
 def test_a_pole_at_one_is_not_above():
@@ -213,7 +219,7 @@ def test_one_metric_for_several_matrices(n):
     a = rng.normal(size=(300, n, n))
     a = np.linalg.inv(s) @ (0.95 * a / np.linalg.norm(a, 2, axis=(1, 2))[:, None, None]) @ s
     assert np.linalg.norm(a, 2, axis=(1, 2)).max() > 3
-    assert module._sizes(module._best_metric(a), a).max() < 0.97
+    assert metrics._sizes(metrics._best_metric(a), a).max() < 0.97
 
 
 def test_the_least_rate_of_two_states():
@@ -222,11 +228,11 @@ def test_the_least_rate_of_two_states():
     a[:, 0, 0], a[:, 0, 1], a[:, 1, 0] = np.random.default_rng(7).uniform(1.2, 1.6, 200), -0.8, 1.0
 
     def rate(v):
-        return module._sizes(np.array([[1.0, v[0]], [0.0, np.exp(v[1])]]), a).max()
+        return metrics._sizes(np.array([[1.0, v[0]], [0.0, np.exp(v[1])]]), a).max()
 
     starts = [(b, c) for b in (-1.5, -0.5, 0.5) for c in (-2.0, -1.0, 0.0)]
     least = min(minimize(rate, start, method="Nelder-Mead").fun for start in starts)
-    assert least - 1e-6 <= module._sizes(module._metric(a), a).max() <= 1.01 * least
+    assert least - 1e-6 <= metrics._sizes(metrics._metric(a), a).max() <= 1.01 * least
 
 
 def test_some_matrices_that_cannot_contract_do_not_spoil_the_rest():
@@ -237,15 +243,15 @@ def test_some_matrices_that_cannot_contract_do_not_spoil_the_rest():
     a[:8] *= 3.0
     a = np.linalg.inv(s) @ a @ s
     unstable = np.mean(np.abs(np.linalg.eigvals(a)).max(axis=1) > 1)
-    assert np.mean(module._sizes(module._best_metric(a), a) < 1) >= 0.98 and unstable > 0
+    assert np.mean(metrics._sizes(metrics._best_metric(a), a) < 1) >= 0.98 and unstable > 0
 
 
 def test_slope_of_the_search():
     rng = np.random.default_rng(6)
     a = rng.normal(size=(20, 3, 3))
     before = np.log(np.linalg.norm(a, 2, axis=(1, 2)).max())
-    y = module._descend(a, 20.0)
-    assert np.log(module._sizes(y, a).max()) < before
+    y = metrics._descend(a, 20.0)
+    assert np.log(metrics._sizes(y, a).max()) < before
 
 
 def test_duffing_diverges_at_a_known_factor(duffing):
@@ -277,7 +283,7 @@ def test_small_margin_warns(duffing):
     hot = Record.from_arrays((e.inputs - e.inputs.mean()) * factor / 1.3, e.outputs)
     found = stability(model, hot)
     assert 1 < found.diverges_at < 1.5
-    assert any("leaves all bounds" in line for line in found.warnings)
+    assert "leaves all bounds" in dict(found.warnings)["small_margin"]
 
 
 def test_a_run_that_diverges(duffing):
@@ -290,7 +296,7 @@ def test_a_run_that_diverges(duffing):
     assert found.feedback.steps == row - 2 + 1 and found.feedback.points.row[-1] == row
     assert found.feedback.diverged == (f"y at experiment 0, row {row}",)
     assert 0 < found.diverges_at < 1
-    assert found.text.count("diverges") == 1 and f"row {row}" in found.warnings[0]
+    assert found.text.count("diverges") == 1 and f"row {row}" in found.warnings[0].text
     json.dumps(found.as_dict(), allow_nan=False)
 
 
@@ -335,7 +341,7 @@ def test_samples_are_bounded_and_the_same(duffing, monkeypatch):
     first, again = (contraction(model, record, box=50) for _ in range(2))
     assert first.rate == again.rate and (first.metric == again.metric).all()
     assert 2000 <= first.samples <= 2050
-    monkeypatch.setattr(module, "_STEPS", 500)
+    monkeypatch.setattr(radii, "MOST_STEPS", 500)
     found = feedback(model, record)
     assert len(found.radius) == 500 and found.steps == 2998
     assert found.points.row[0] == 2 and found.points.row[-1] == 2999
@@ -348,7 +354,7 @@ def test_a_long_past_is_not_looked_at():
         stability(model, Record.from_arrays(noise(100), noise(100)))
     found = stability(model, record)
     assert found.contraction is None and found.feedback.largest is None and found.feedback.skipped == 0
-    assert any("more than 200 past outputs" in line for line in found.warnings)
+    assert "more than 200 past outputs" in dict(found.warnings)["contraction_not_checked"]
     json.dumps(found.as_dict(), allow_nan=False)
 
 
@@ -358,7 +364,7 @@ def test_points_without_a_derivative():
     u = np.concatenate([np.zeros(5), 2 + 0.1 * noise(100)])
     found = stability(model, driven(model, u))
     assert found.feedback.skipped == 6 and len(found.feedback.radius) == 98
-    assert any("no finite derivative" in line for line in found.warnings)
+    assert "no finite derivative" in dict(found.warnings)["derivative_not_finite"]
     json.dumps(found.as_dict(), allow_nan=False)
 
 
@@ -431,6 +437,38 @@ def test_as_dict_is_plain(network):
     assert set(plain["lipschitz"]["worst"]["regressor"]) == {str(lag) for lag in model.form.layout}
 
 
+def test_what_exists_is_not_computed_again(network, monkeypatch):
+    model, record = network
+    plain, response = stability(model, record), model.simulate(record)
+    x = stack_rows(record, model.form.layout).x
+    for verb in ("predict", "simulate"):
+        monkeypatch.setattr(Model, verb, lambda *_: pytest.fail("computed again"))
+    assert stability(model, record, response=response, x=x).as_dict() == plain.as_dict()
+
+
+@pytest.mark.parametrize("scale", [0.01, 0.5, 1.0, 3.0, 20.0, 1e3])
+def test_the_search_tries_the_factors_of_a_plain_one(duffing, scale):
+    """Doubling and bisecting one free run at a time, as the docstring says it, comes to the same number."""
+    model, record = duffing
+    (e,) = record.experiments
+    record = Record.join([Record.from_arrays(scale * e.inputs[k:], e.outputs[k:]) for k in (0, 2500)])
+    mean = np.concatenate([e.inputs for e in record.experiments]).mean(axis=0)
+
+    def diverges(factor):
+        scaled = [replace(e, inputs=mean + factor * (e.inputs - mean)) for e in record.experiments]
+        return any(t.diverged for t in model.simulate(replace(record, experiments=tuple(scaled))).trajectories)
+
+    low = high = 1.0
+    while diverges(low):
+        low, high = low / 2, low
+    while not diverges(high):
+        low, high = high, 2 * high
+    while high > 1.05 * low:
+        middle = float(np.sqrt(low * high))
+        low, high = (low, middle) if diverges(middle) else (middle, high)
+    assert divergence_scaling(model, record) == high
+
+
 def test_channels_by_name(network):
     model, record = network
     (e,) = record.experiments
@@ -458,5 +496,9 @@ def test_records_refused(duffing):
         feedback(model, record, along="both")
     with pytest.raises(InputError, match="lacks the output y"):
         stability(model, Record.from_arrays(noise(50)))
+    with pytest.raises(
+        InputError, match=r"`x` has shape \(2998, 2\); the usable regressors of the record have \(2998, 3"
+    ):
+        stability(model, record, x=stack_rows(record, model.form.layout).x[:, :2])
     with pytest.raises(InputError, match="no measured outputs to start from"):
         divergence_scaling(model, Record.from_arrays(noise(50)))

@@ -1,0 +1,91 @@
+"""Does the free run stay within bounds where its inputs grow? The factor from which it leaves them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from orthaug._base.checks import check_number
+from orthaug._base.errors import InputError
+from orthaug.analysis.local_dynamics import diverging, first_row, state_size
+from orthaug.analysis.visited import MOST_STEPS
+from orthaug.data.record import Record
+from orthaug.models.model import Model
+
+_LARGEST_FACTOR = 1e4  # outputs of a stable linear model grow with its inputs, and 10⁶ times the largest is "diverged"
+_CLOSE = 1.05  # ratio of two factors at which the bisection ends
+
+Diverging = Callable[[list[float]], np.ndarray]
+
+
+def divergence_scaling(model: Model, record: Record, largest: float = 1024.0) -> float | None:
+    """Factor on the inputs from which the free run leaves all bounds (10⁶ times the largest training output).
+
+    It scales each input's deviation from its mean over the record; the measured outputs that the run starts from stay.
+    Doubled until a run diverges, then bisected to 5 %; what is returned did diverge, and others below it may. Of longer
+    records 20000 rows are used, the first of each experiment. None where no run up to `largest` diverges, as without
+    past outputs; at most 1 where the record's own run does, and 0 where it does with its inputs at their means.
+
+    Raises:
+        InputError: a record that does not fit the model, or a `largest` that is not above 1 and at most 10⁴.
+    """
+    if not 1 < check_number(largest, "largest", positive=True) <= _LARGEST_FACTOR:
+        raise InputError(f"`largest` must be a factor above 1 and at most {_LARGEST_FACTOR:g}; got {largest!r}.")
+    if not state_size(model):
+        return None
+    rows = max(MOST_STEPS // len(record.experiments), first_row(model) + 1)
+    first = replace(record, experiments=tuple(e.rows(None, rows) for e in record.experiments))
+    diverges = partial(diverging, model, first)
+    growing = _doubled(float(largest))
+    wild = diverges(growing)
+    if not wild.any():
+        return None
+    high = int(np.argmax(wild))
+    return _bisected(growing[high - 1], growing[high], diverges) if high else _below_one(diverges)
+
+
+def _doubled(largest: float) -> list[float]:
+    """1, 2, 4, …, `largest`."""
+    factors = [1.0]
+    while factors[-1] < largest:
+        factors.append(min(2 * factors[-1], largest))
+    return factors
+
+
+def _below_one(diverges: Diverging) -> float:
+    """The factor where a run with the record's own inputs diverges: below 10⁻⁴ the last one tried, or 0."""
+    falling = [1.0]
+    while falling[-1] >= 1 / _LARGEST_FACTOR:
+        falling.append(falling[-1] / 2)
+    *wild, at_rest = diverges([*falling[1:], 0.0])
+    if all(wild):
+        return 0.0 if at_rest else falling[-1]
+    low = wild.index(False) + 1
+    return _bisected(falling[low], falling[low - 1], diverges)
+
+
+def _bisected(low: float, high: float, diverges: Diverging) -> float:
+    """The lowest factor that is known to diverge once `low` and `high` are close; every middle is tried at once."""
+    middles = _middles(low, high)
+    if not middles:
+        return high
+    wild = dict(zip(middles, diverges(middles), strict=True))
+    while high > _CLOSE * low:
+        middle = _middle(low, high)
+        low, high = (low, middle) if wild[middle] else (middle, high)
+    return high
+
+
+def _middles(low: float, high: float) -> list[float]:
+    """All factors that a bisection between two, at most one double the other, can come to: 15 or fewer."""
+    if not high > _CLOSE * low:
+        return []
+    middle = _middle(low, high)
+    return [middle, *_middles(low, middle), *_middles(middle, high)]
+
+
+def _middle(low: float, high: float) -> float:
+    return float(np.sqrt(low * high))

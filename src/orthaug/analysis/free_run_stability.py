@@ -1,0 +1,117 @@
+"""Does a model's free run stay bounded and forget its start? All checks together, and what they say in words.
+
+They are evidence from sampled points, never a proof. Two of them look at A_k, the derivative of a step by the state:
+its spectral radius at every step (`feedback`), and a quadratic norm in which all sampled A_k contract (`contraction`).
+A third runs the model on larger and larger inputs (`boundedness`). The paper's `cond:pred_stab` is another matter: it
+asks for the one-step predictor, whose past is measured (`lipschitz`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import Matrix
+from orthaug._base.warning import Warning
+from orthaug.analysis.boundedness import divergence_scaling
+from orthaug.analysis.contraction import Contraction, contraction
+from orthaug.analysis.feedback import Feedback, feedback
+from orthaug.analysis.lipschitz import Lipschitz, lipschitz
+from orthaug.data.record import Record
+from orthaug.models.model import Model
+from orthaug.models.response import Response
+
+_PER_STEP = ("points", "jacobians", "radius", "unit")  # too long for JSON
+
+
+@dataclass(frozen=True, eq=False)
+class Stability:
+    """Evidence on the free run (None without past outputs); `diverges_at` is searched up to the factor `searched`."""
+
+    feedback: Feedback | None
+    contraction: Contraction | None
+    diverges_at: float | None
+    searched: float
+    lipschitz: Lipschitz
+    warnings: tuple[Warning, ...]
+    text: str
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain content for JSON, without what is there for every step; never NaN or infinity."""
+        content = asdict(replace(self, warnings=()), dict_factory=_plain)
+        return content | {"warnings": [warning._asdict() for warning in self.warnings]}
+
+
+def stability(
+    model: Model,
+    record: Record,
+    *,
+    response: Response | None = None,
+    x: Matrix | None = None,
+    box: int = 0,
+    largest: float = 1024.0,
+) -> Stability:
+    """All checks of a model on a record, with a text that says what they mean.
+
+    Args:
+        response: the model's free run of the record, if it is there already.
+        x: the record's usable regressors (N, nx) in the model's layout, if they are stacked already.
+        box, largest: as in `contraction` and `divergence_scaling`.
+
+    Raises:
+        InputError: as the single checks.
+    """
+    gradients, run = lipschitz(model, record, x=x), feedback(model, record, response=response)
+    contracts = contraction(model, record, box=box, along=run)
+    factor = divergence_scaling(model, record, largest)
+    checks = Stability(run, contracts, factor, float(largest), gradients, (), "")
+    says = list(_sentences(checks))
+    warnings = tuple(Warning(code, sentence) for sentence, code in says if code)
+    return replace(checks, warnings=warnings, text="\n".join(sentence for sentence, _ in says))
+
+
+def _plain(items: list[tuple[str, Any]]) -> dict[str, Any]:
+    return {
+        k: np.asarray(v).tolist() if isinstance(v, tuple | np.ndarray) else v for k, v in items if k not in _PER_STEP
+    }
+
+
+def _sentences(checks: Stability) -> Iterator[tuple[str, str]]:
+    """What the checks say, sentence by sentence; with the code of a warning, or nothing."""
+    run, contracts, factor, steepest = (
+        checks.feedback,
+        checks.contraction,
+        checks.diverges_at,
+        checks.lipschitz.gradient,
+    )
+    gradient = "no finite gradient" if steepest is None else f"a gradient of at most {steepest:.4g}"
+    yield f"The one-step predictor has {gradient} on measured rows; that says nothing about the free run.", ""
+    if run is None:
+        yield "The model uses no past outputs: its free run cannot diverge, and keeps nothing of its start.", ""
+        return
+    if run.diverged:
+        yield f"The free run diverges ({'; '.join(run.diverged)}); it is looked at up to there.", "free_run_diverges"
+    if run.share_above_one is not None:
+        above = f"above 1 at {100 * run.share_above_one:.3g} % of {len(run.radius)} steps of the free run"
+        peak = f"median {run.median:.4g}, largest {run.largest:.4g} at {run.worst}"
+        warns = "spectral_radius_above_one" if run.share_above_one > 0.01 else ""
+        yield f"The local spectral radius is {above}; {peak}.", warns
+    if run.skipped:
+        told = f"At {run.skipped} points more the model has no finite derivative; they are left out."
+        yield told, "derivative_not_finite"
+    if contracts is None:
+        told = "Contraction could not be checked: no finite derivatives, or more than 200 past outputs."
+        yield told, "contraction_not_checked"
+    elif contracts.rate < 1:
+        how = f"contracts in one metric (rate {contracts.rate:.4g}): evidence, not proof, that it forgets its start"
+        yield f"On all {contracts.samples} sampled points the free run {how}.", ""
+    else:
+        share = f"{100 * (1 - contracts.share):.3g} % of the {contracts.samples} sampled points"
+        worst = f"worst at {contracts.worst}, rate {contracts.rate:.4g}"
+        yield f"At {share} the free run does not contract in the best metric that was found, {worst}.", ""
+    stays, times = ("stays within", checks.searched) if factor is None else ("leaves", factor)
+    bounds = f"{stays} all bounds with the inputs' deviations from their means {times:.4g} times as large"
+    yield f"The free run {bounds}.", "small_margin" if factor is not None and factor < 1.5 else ""
