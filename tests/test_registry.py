@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -174,6 +176,17 @@ def test_the_kinds_of_a_file_are_the_classes_of_the_library():
         "adam-lbfgs",
         "levenberg-marquardt",
     ]
+
+
+def test_reading_a_spec_loads_no_jax():
+    """Declarations are there, and with them every key of the spec, before anything is compiled."""
+    program = (
+        "import sys, orthaug.commands.jobs, orthaug.commands.spec as spec\n"
+        "spec.spec_model()\n"
+        "print([name for name in ('jax', 'optax') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
 
 
 # --- what is refused
