@@ -22,6 +22,7 @@ from orthaug.physics.baseline import Baseline, Term
 
 SOLVER = LevenbergMarquardt(3)
 FILES = ["arrays.safetensors", "model.json"]
+FIRST = Path(__file__).parent / "fixtures" / "model_format1"
 
 
 def make_record() -> Record:
@@ -291,3 +292,17 @@ def test_an_interrupted_write_keeps_the_model_that_was_there(models, saved, monk
         with pytest.raises(KeyboardInterrupt):
             save(models["physics"], saved)
     same(load(saved), models["mlp"], ONE)
+
+
+def test_a_model_of_the_first_format_loads(tmp_path):
+    """Written by the code before learners were saved by registered kinds; the values are those it computed."""
+    model = load(FIRST)
+    assert model.form.bound is not None
+    assert model.form.bound.learner == MLP((2,), "gelu", ("u[k-1]", "y[k-1]"))
+    np.testing.assert_allclose(model.theta, [0.5374559346621786, 1.003487701524252], rtol=1e-15)
+    record = Record.from_arrays(u=np.array([0.3, -0.7, 1.1]), y=np.array([0.2, 0.5, -0.4]))
+    found = model.predict(record).trajectories[0].model[1:, 0]
+    np.testing.assert_allclose(found, [0.40008235013798166, -0.401744532272874], rtol=1e-13)
+    save(model, tmp_path / "again")
+    kept = [json.loads((folder / "model.json").read_text())["learner"] for folder in (tmp_path / "again", FIRST)]
+    assert kept[0] == kept[1]
