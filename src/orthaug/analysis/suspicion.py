@@ -16,7 +16,7 @@ from orthaug.physics.problem import Problem
 from orthaug.physics.projection import Projection
 
 if TYPE_CHECKING:
-    from orthaug.commands.jobs import Job
+    from orthaug.commands.job import Job
     from orthaug.commands.spec import SuspectSection
 
 CERTIFIED_ROWS = 200_000  # of a measure at most, over which certificates are sought

@@ -1,9 +1,8 @@
-"""What the commands do: a spec in, a result out. Parsing of arguments and printing is the CLI's."""
+"""A job: a spec with its data read and checked, and how it is trained, as declared or as a variant of that."""
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,11 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from orthaug._base.errors import InputError
+from orthaug._base.progress import SILENT, Progress
+from orthaug._base.warning import Warning
 from orthaug.analysis.suspicion import check_suspects
-from orthaug.commands.spec import MeasureSection, Part, Spec, load_spec
+from orthaug.commands.parts import Part, load_parts
+from orthaug.commands.spec import MeasureSection, Spec, load_spec
 from orthaug.data.expressions import Lag
-from orthaug.data.readers import read_record, read_samples
-from orthaug.data.record import Record, check_channels, same_step
+from orthaug.data.readers import read_samples
+from orthaug.data.record import Record, check_channels
 from orthaug.data.regressors import largest_lag
 from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty, Structure
 from orthaug.inference.measures import Measure, Samples, Support, Symmetrized, Training, Uniform
@@ -23,59 +25,42 @@ from orthaug.physics.excitation import excitation
 from orthaug.physics.parameters import PhysicsMap, with_initial
 from orthaug.physics.problem import Problem, check_defined, pose, regressor_of, used_lags
 from orthaug.physics.projection import Projection
+from orthaug.reports.result import DataResult
 
 if TYPE_CHECKING:
     from orthaug.fitting.estimates import Estimate
 
-Progress = Callable[[int, int, float], None]
 FOLD_ITERATIONS = 60  # enough to tell whether a learner helps, on every block of cross-validation
+ALONE = "physics alone"
 
 
 @dataclass(frozen=True, eq=False)
-class LoadedPart:
-    """A part of the data: its record, and how many leading samples of each recording are not scored."""
+class Variant:
+    """A variant of a job: another structure or physics alone, and a fold of the training data instead of all.
 
-    name: str
-    record: Record
-    skip: int
-    files: tuple[dict[str, Any], ...]
-    gaps: str = ""
-    """What was left out around missing samples, in words."""
+    On a fold of cross-validation there is one start, few iterations, and nothing to choose from.
+    """
 
-    def without_short(self, first: int) -> LoadedPart:
-        """Without stretches between missing samples that are too short for a row after the first `first`."""
-        record = self.record
-        if not record.missing:
-            return self
-        pairs = zip(record.experiments, self.skips, strict=True)
-        long = tuple(e for e, skip in pairs if len(e) > max(first, skip))
-        if not long:
-            most = max(len(e) for e in record.experiments)
-            raise InputError(
-                f"{record.experiments[0].source}: data.{self.name}: the longest stretch between missing samples has "
-                f"{_count(most, 'row')}, too few: the first "
-                f"{max(first, self.skip)} are lags or skipped."
-            )
-        record = replace(record, experiments=long)
-        usable = sum(len(experiment) - first for experiment in record.experiments)
-        lost = "row has missing cells and is" if record.missing == 1 else "rows have missing cells and are"
-        gaps = (
-            f"{self.name}: {record.missing} {lost} left out with all windows that touch them; "
-            f"{_count(usable, 'usable row')} remain, in {_count(len(record.experiments), 'stretch', 'stretches')}."
-        )
-        return replace(self, record=record, gaps=gaps)
+    kind: str | None = None
+    """Of the structure, or `ALONE`; None for the structure that the spec declares."""
+    fold: Record | None = None
 
     @property
-    def skips(self) -> tuple[int, ...]:
-        """How many leading samples of each experiment are not scored."""
-        return tuple(max(0, self.skip - experiment.offset) for experiment in self.record.experiments)
+    def alone(self) -> bool:
+        """Whether there is no learner."""
+        return self.kind == ALONE
 
-    def scored(self, start: int) -> Record:
-        """The record without rows that are neither scored nor lags of what is, for a first usable row `start`."""
-        kept = tuple(
-            e.rows(max(0, skip - start), None) for e, skip in zip(self.record.experiments, self.skips, strict=True)
-        )
-        return replace(self.record, experiments=kept)
+    @property
+    def structure_kind(self) -> str | None:
+        """Of the structure; physics alone is orthogonal to nothing."""
+        return "orthogonal" if self.alone else self.kind
+
+    def on(self, fold: Record) -> Variant:
+        """The same on a fold."""
+        return replace(self, fold=fold)
+
+
+AS_DECLARED = Variant()
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,13 +69,13 @@ class Job:
 
     path: Path
     spec: Spec
-    train: LoadedPart
-    validation: LoadedPart | None
-    tests: tuple[LoadedPart, ...]
+    train: Part
+    validation: Part | None
+    tests: tuple[Part, ...]
     problem: Problem
     measure: Measure
     physics: PhysicsMap | None
-    warnings: tuple[str, ...]
+    warnings: tuple[Warning, ...]
 
     @property
     def run_count(self) -> int:
@@ -110,7 +95,7 @@ class Job:
     @property
     def files(self) -> tuple[Path, ...]:
         """Every file that the job reads."""
-        return (self.path, *(self.path.parent / entry["file"] for part in self.parts for entry in part.files))
+        return (self.path, *(self.path.parent / entry.file for part in self.parts for entry in part.files))
 
     @property
     def used(self) -> tuple[Lag, ...]:
@@ -118,8 +103,23 @@ class Job:
         return used_lags(self.problem)
 
     @property
-    def parts(self) -> tuple[LoadedPart, ...]:
+    def parts(self) -> tuple[Part, ...]:
+        """Every part, the training data first."""
         return (self.train, *([self.validation] if self.validation else []), *self.tests)
+
+    @property
+    def declaration(self) -> dict[str, Any]:
+        """The spec as it was given, without defaults."""
+        return self.spec.model_dump(mode="json", exclude_unset=True)
+
+    @property
+    def data(self) -> DataResult:
+        """The files of each part, as results list them."""
+        return DataResult(
+            train=list(self.train.files),
+            validation=list(self.validation.files) if self.validation else None,
+            tests={part.name.removeprefix("tests."): list(part.files) for part in self.tests} or None,
+        )
 
 
 def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
@@ -138,9 +138,7 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
         baseline.check_channels(spec.data.outputs, spec.data.inputs)
     except InputError as error:
         raise type(error)(f"{path}: {error}") from None
-    train = _load(path, spec, spec.data.train, "train")
-    validation = _load(path, spec, spec.data.validation, "validation") if spec.data.validation else None
-    tests = tuple(_load(path, spec, part, f"tests.{name}") for name, part in spec.data.tests.items())
+    train, validation, tests = load_parts(path, spec)
     lags = spec.lag_orders() if spec.learner.kind != "none" else None
     try:
         layout, _ = regressor_of(baseline, lags, learner_inputs, tuple(spec.data.outputs), tuple(spec.data.inputs))
@@ -156,19 +154,11 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
         job = Job(path, spec, train, validation, tests, problem, measure, physics, ())
         check_suspects(spec.suspects, problem)
         for part in job.parts:
-            _check_scorable(part, problem.rows.start, train.record.sampling_time)
+            part.check_scorable(problem.rows.start, train.record.sampling_time)
             check_defined(problem, part.record)
     except InputError as error:
         raise type(error)(f"{path}: {error}") from None
-    declared = {"train": spec.data.train, "validation": spec.data.validation}
-    declared |= {f"tests.{name}": part for name, part in spec.data.tests.items()}
-    warnings = [_thinned(name, part.every) for name, part in declared.items() if part and part.every > 1]
-    warnings += [part.gaps for part in job.parts if part.gaps]
-    return replace(job, warnings=tuple(warnings))
-
-
-def _count(number: int, one: str, more: str = "") -> str:
-    return f"{number} {one if number == 1 else more or one + 's'}"
+    return replace(job, warnings=tuple(warning for part in job.parts for warning in part.warnings))
 
 
 def _check_segments(spec: Spec, problem: Problem) -> None:
@@ -184,10 +174,6 @@ def _check_segments(spec: Spec, problem: Problem) -> None:
         raise InputError(
             f"'training.horizon': found {training.horizon}; the longest experiment has {longest} usable rows."
         )
-
-
-def _thinned(name: str, every: int) -> str:
-    return f"{name}: one row in {every} is kept without a filter; content above the new Nyquist frequency folds back."
 
 
 def structure_of(spec: Spec, kind: str | None = None, measure: Measure | None = None) -> Structure:
@@ -223,69 +209,21 @@ def _check_measure(measure: Measure, problem: Problem) -> None:
     weighted = phi * (np.sqrt(points.weight)[:, None] * problem.weight)[:, :, None]
     if not np.isfinite(weighted).all():
         raise InputError(f"the physics is not finite on all points of the {measure.name} measure; narrow it.")
-    found = excitation(Projection.factor(weighted).r, problem.baseline.names)
-    if not found.full_rank:
-        groups = "; ".join(", ".join(group) for group in found.collinear)
+    weighted_excitation = excitation(Projection.factor(weighted).r, problem.baseline.names)
+    if not weighted_excitation.full_rank:
+        groups = "; ".join(", ".join(group) for group in weighted_excitation.collinear)
         raise InputError(f"under the {measure.name} measure the physics cannot tell {groups} apart; widen or move it.")
 
 
-def _load(path: Path, spec: Spec, part: Part, name: str) -> LoadedPart:
-    """Read a part's files; messages begin with the file that is at fault."""
-    unknown = [channel for channel in part.columns if channel not in (*spec.data.inputs, *spec.data.outputs)]
-    if unknown:
-        raise InputError(f"{path}: 'data.{name}.columns': '{unknown[0]}' is neither an input nor an output.")
-    records, files = [], []
-    for file in part.files:
-        record = read_record(
-            path.parent / file,
-            inputs=spec.channels(spec.data.inputs),
-            outputs=spec.channels(spec.data.outputs),
-            sampling_time=spec.data.sampling_time,
-            time=spec.data.time,
-            rows=part.rows,  # type: ignore[arg-type]  (lists of two, checked by the spec)
-            every=part.every,
-            columns=part.columns,
-            missing=spec.data.missing,
-        )
-        records.append(record)
-        digest = hashlib.sha256((path.parent / file).read_bytes()).hexdigest()
-        files.append({"file": file, "sha256": digest, "rows": len(record)})
-    return LoadedPart(name, Record.join(records), part.skip, tuple(files))
-
-
-def _check_scorable(part: LoadedPart, start: int, sampling_time: float) -> None:
-    if not same_step(part.record.sampling_time, sampling_time):
-        raise InputError(
-            f"data.{part.name}: sampled every {part.record.sampling_time:g} s, the training data every "
-            f"{sampling_time:g} s; one model has one sampling time."
-        )
-    for experiment, skip in zip(part.record.experiments, part.skips, strict=True):
-        first = max(start, skip)
-        if len(experiment) <= first:
-            raise InputError(
-                f"{experiment.source}: data.{part.name} has {len(experiment)} rows, too few; the first {first} are "
-                f"lags or skipped, so at least {first + 1} are needed."
-            )
-
-
-def run_fit(
-    job: Job,
-    progress: Progress | None = None,
-    *,
-    kind: str | None = None,
-    alone: bool = False,
-    fold: Record | None = None,
-) -> Estimate:
-    """Train as the spec says; with another `kind` of structure, or the physics `alone`.
-
-    On a `fold` of cross-validation: that record, one start, few iterations, and nothing to choose from.
-    """
+def run_fit(job: Job, variant: Variant = AS_DECLARED, progress: Progress = SILENT) -> Estimate:
+    """Train as the spec says, or a variant of that."""
     from orthaug.fitting.criteria import Prediction, Simulation
     from orthaug.fitting.estimation import estimate
     from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
     from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
     from orthaug.models.learners import MLP
 
+    kind, alone, fold = variant.kind, variant.alone, variant.fold
     spec, training = job.spec, job.spec.training
     learner = None
     if spec.learner.kind == "mlp" and not alone:
