@@ -72,14 +72,14 @@ def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitt
     """Train a variant of a job and score every part; whether the learner helps is not asked."""
     fit = run_fit(job, variant, progress)
     warnings: list[Any] = [*job.warnings, *fit.warnings]
-    nothing = dict.fromkeys(("physical_parameters", "physical_consistency", "sensitivities"))
-    content = nothing | {"scores": {}, "bias": None, "residuals": None, "stability": None}
-    responses = None
+    unknown = ("physical_parameters", "physical_consistency", "sensitivities", "bias", "residuals", "stability")
+    content: dict[str, Any] = dict.fromkeys(unknown)
+    scores, responses = {}, None
     if fit.status.ok:
         content |= _physical_content(job, fit, warnings)
         content["bias"] = suspected(job, fit.theta, _learned(job, fit))
         for part in job.parts:
-            content["scores"][part.name], responses = score_part(fit.model, part, warnings)
+            scores[part.name], responses = score_part(fit.model, part, warnings)
         content |= _analysed(job, fit, warnings)
     nothing_known = np.full(len(fit.theta), np.nan)
     content |= {
@@ -99,6 +99,7 @@ def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitt
         "measure_detail": fit.measure,
         "orthogonality_defect": fit.defect,
         "excitation": fit.excitation,
+        "scores": scores,
         "validation": None,
         "warnings": warnings,
     }

@@ -82,14 +82,9 @@ def with_initial(run: Run, initial: str | Any) -> Record:
 
 def warnings(response: Response) -> list[Warning]:
     """What the reader of a response must know."""
-    end = "it has no values from there on"
-    return [
-        Warning(
-            "free_run_diverged", f"the free run diverged in output '{t.diverged[1]}' at step {t.diverged[0]}; {end}."
-        )
-        for t in response.trajectories
-        if t.diverged
-    ]
+    told = "the free run diverged in output '{}' at step {}; it has no values from there on."
+    ends = (trajectory.diverged for trajectory in response.trajectories if trajectory.diverged)
+    return [Warning("free_run_diverged", told.format(output, step)) for step, output in ends]
 
 
 def write_csv(response: Response, out: Path | None) -> None:

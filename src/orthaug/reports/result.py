@@ -1,4 +1,4 @@
-"""The content of result.json: what `fit`, `check`, `compare`, `split` and `design` leave. Text, page and plots read it."""
+"""The content of result.json, and of what other commands print as JSON. Text, page and plots read it."""
 
 from __future__ import annotations
 
