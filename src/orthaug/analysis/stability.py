@@ -10,7 +10,7 @@ Two checks look at A_k: its spectral radius at every step, and a quadratic norm 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -33,7 +33,6 @@ _STEEPEST, _ACTIVE = 50, 64  # points of largest radius always among them; worst
 _BATCH, _WORK = 1024, 4e7  # rows per compiled call; most rows times (na ny)³
 _LONGEST_STATE, _LARGEST_SEARCH = 200, 12  # na ny with eigenvalues at all; with a metric better than Lyapunov's
 _LARGEST_FACTOR = 1e4  # outputs of a stable linear model grow with its inputs, and 10⁶ times the largest is "diverged"
-_PER_STEP = ("points", "jacobians", "radius", "unit")  # too long for JSON
 
 
 @dataclass(frozen=True)
@@ -128,10 +127,6 @@ class Stability:
     lipschitz: Lipschitz
     warnings: tuple[str, ...]
     text: str
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain content for JSON, without what is there for every step; never NaN or infinity."""
-        return asdict(self, dict_factory=_plain)
 
 
 def stability(model: Model, record: Record, *, box: int = 0, largest: float = 1024.0) -> Stability:
@@ -411,12 +406,6 @@ def _worst(model: Model, record: Record, points: Points, values: Vector) -> tupl
     if number < 0:
         return size, Place(None, None, "a point off the trajectory", regressor)
     return size, Place(number, row, f"experiment {number}, {record.experiments[number].where(row)}", regressor)
-
-
-def _plain(items: list[tuple[str, Any]]) -> dict[str, Any]:
-    return {
-        k: np.asarray(v).tolist() if isinstance(v, tuple | np.ndarray) else v for k, v in items if k not in _PER_STEP
-    }
 
 
 def _sentences(given: Stability) -> Iterator[tuple[str, bool]]:

@@ -65,26 +65,6 @@ class Verdict:
         """Why, and where the training range is left."""
         return " ".join([self.summary, *(f"{e}." for e in self.extrapolation)])
 
-    def as_dict(self) -> dict[str, Any]:
-        """Plain content for JSON."""
-        return {
-            "verdict": self.code,
-            "text": self.text,
-            "trials": [
-                {"where": t.where, "physics_alone": _finite(t.alone), "model": _finite(t.model)} for t in self.trials
-            ],
-            "extrapolation": [
-                {
-                    "part": e.part,
-                    "regressor": e.lag,
-                    "training": list(e.training),
-                    "found": list(e.found),
-                    "share": e.share,
-                }
-                for e in self.extrapolation
-            ],
-        }
-
 
 def free_run_error(model: Model, record: Record, skip: int | tuple[int, ...] = 0, unit: Any = None) -> float:
     """RMS of the free run's error, each output in its `unit`, by default its own deviation; inf where it diverges."""

@@ -7,7 +7,6 @@ learner, and shares its variance.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -45,12 +44,6 @@ class MeasureSplit:
         if self.price is None or not np.isfinite(self.price).all():
             return told
         return f"{told}; standard errors {', '.join(f'{r:.3g}' for r in self.price)} times the training measure's"
-
-    def as_dict(self) -> dict[str, Any]:
-        """What result.json tells of the measure."""
-        price = None if self.price is None else [float(ratio) for ratio in self.price]
-        found = {"kind": self.name, "points": self.points, "support": self.support, "condition": self.condition}
-        return {**found, "std_over_training": price}
 
 
 def split_under(measure: Measure, model: Model, support: Support, joint: Joint | None) -> MeasureSplit:
