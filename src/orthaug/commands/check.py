@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from orthaug.analysis.suspicion import suspected
+from orthaug.commands.bias import bias_of
 from orthaug.commands.job import Job
 from orthaug.physics.excitation import identifiability
 from orthaug.reports.result import CheckResult
@@ -19,7 +19,7 @@ def check_job(job: Job) -> CheckResult:
             "rows": len(problem.rows),
             "excitation": problem.excitation,
             "identifiability": identifiability(problem.baseline, problem.layout, problem.outputs, problem.rows.x),
-            "bias": suspected(job) if problem.excitation.full_rank else None,
+            "bias": bias_of(job) if problem.excitation.full_rank else None,
             "warnings": job.warnings,
         }
     )

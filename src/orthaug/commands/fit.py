@@ -13,11 +13,10 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.warning import Warning
-from orthaug.analysis.suspicion import suspected
+from orthaug.commands.bias import bias_of
 from orthaug.commands.folder import is_result
 from orthaug.commands.job import ALONE, AS_DECLARED, Job, Variant, run_fit
 from orthaug.commands.parts import Part
-from orthaug.inference.measures import Support
 from orthaug.reports.fields import WarningResult
 from orthaug.reports.result import (
     FitResult,
@@ -77,7 +76,7 @@ def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitt
     scores, responses = {}, None
     if fit.status.ok:
         content |= _physical_content(job, fit, warnings)
-        content["bias"] = suspected(job, fit.theta, _learned(job, fit))
+        content["bias"] = bias_of(job, fit)
         for part in job.parts:
             scores[part.name], responses = score_part(fit.model, part, warnings)
         content |= _analysed(job, fit, warnings)
@@ -135,13 +134,6 @@ def _sensitivities(job: Job, physical: PhysicalEstimate) -> dict[str, dict[str, 
         name: dict(zip(job.physics.theta_names, row, strict=True))
         for name, row in zip(physical.names, physical.sensitivities, strict=True)
     }
-
-
-def _learned(job: Job, fit: Estimate) -> Any:
-    """f at the points of the spec's measure."""
-    if fit.model.form.bound is None:
-        return None
-    return fit.model.learner_at(job.measure.points(Support(job.train.record, job.problem.layout, job.used)).x)
 
 
 def _analysed(job: Job, fit: Estimate, warnings: list[Any]) -> dict[str, Any]:
