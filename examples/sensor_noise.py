@@ -39,7 +39,8 @@ def main() -> dict[str, np.ndarray]:
     for name, criterion in (("one step", oa.Prediction()), ("free run", oa.Simulation())):
         fit = oa.estimate(data, BASELINE, learner=None, criterion=criterion)
         physical = fit.physical(PHYSICS)
-        told = ", ".join(f"{row['name']} = {row['value']:.5g} ± {row['std']:.2g}" for row in physical.as_rows())
+        rows = zip(physical.names, physical.value, physical.std, strict=True)
+        told = ", ".join(f"{parameter} = {value:.5g} ± {std:.2g}" for parameter, value, std in rows)
         print(f"{name}: {told}\n  {oa.diagnose(fit).text}")
         found[name] = physical.value
     return found

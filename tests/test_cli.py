@@ -1,4 +1,4 @@
-"""The commands as the contract states them: output, files, exit codes, and one worded line for every bad input."""
+"""The commands as their users rely on them: output, files, exit codes, and one worded line for every bad input."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from orthaug.commands import cli
 from orthaug.data.readers import read_record
 from orthaug.fitting.solvers import levenberg_marquardt
 from orthaug.models.storage import load
+from orthaug.reports.result import ScoreResult
 
 LevenbergMarquardt = levenberg_marquardt.LevenbergMarquardt
 
@@ -48,6 +49,7 @@ regressor = "u[k-1]"
 [learner]
 kind = "none"
 """
+MAIN = "from orthaug.commands.cli import main; main()"
 MLP = 'kind = "mlp"\nhidden = [4]\n[training]\niterations = 5\n'
 RESULT_KEYS = {
     *("schema", "orthaug", "spec", "data", "status", "restarts", "parameters", "physical_parameters", "structure"),
@@ -137,7 +139,7 @@ def finite_json(text: str):
 def shell(*arguments: object, cwd: Path, **environment: str) -> subprocess.CompletedProcess[str]:
     """The command in a process of its own, its compilation cache below `cwd`."""
     settings = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(cwd / "cache"), **environment}
-    command = [sys.executable, "-c", "from orthaug.cli import main; main()", *map(str, arguments)]
+    command = [sys.executable, "-c", MAIN, *map(str, arguments)]
     return subprocess.run(command, cwd=cwd, env=settings, capture_output=True, text=True, timeout=120, check=False)
 
 
@@ -170,7 +172,9 @@ def test_every_command_has_help(command):
 
 
 def test_help_and_bad_input_import_no_jax(project):
-    program = "import sys\nfrom orthaug.cli import main\ntry: main()\nexcept SystemExit: print('jax' in sys.modules)"
+    program = (
+        "import sys\nfrom orthaug.commands.cli import main\ntry: main()\nexcept SystemExit: print('jax' in sys.modules)"
+    )
     for arguments in (["--help"], ["fit", "absent.toml"], ["fit", "plant.toml"], ["check", "plant.toml"]):
         if arguments == ["fit", "plant.toml"]:
             project.write_text(SPEC.replace("u[k-1]", "v[k-1]"))
@@ -287,7 +291,7 @@ def test_fit_writes_the_folder_of_the_contract(fitted):
 def test_result_of_physics_alone(fitted):
     result = finite_json((fitted / "physics" / "result.json").read_text(encoding="utf-8"))
     assert set(result) >= RESULT_KEYS
-    assert (result["schema"], result["orthaug"]) == (1, orthaug.__version__)
+    assert (result["schema"], result["orthaug"]) == (2, orthaug.__version__)
     assert result["spec"]["data"]["outputs"] == ["y"]
     files = result["data"]["train"]
     assert [(f["file"], f["rows"], len(f["sha256"])) for f in files] == [("run.csv", 120, 64)]
@@ -340,7 +344,7 @@ def test_scores_are_the_library_s(fitted):
     record = read_record(fitted / "steps.csv", inputs=["u"], outputs=["y"], sampling_time=0.5)
     scores = finite_json((fitted / "mlp" / "result.json").read_text())["scores"]["tests.steps"]
     for kind, response in (("prediction", model.predict(record)), ("simulation", model.simulate(record))):
-        assert scores[kind] == response.scores(5).as_dict()
+        assert scores[kind] == ScoreResult.model_validate(response.scores(5)).content()
         error = response.model[5:, 0] - record.experiments[0].outputs[5:, 0]
         assert scores[kind]["rmse"][0] == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-12)
 
@@ -405,7 +409,7 @@ def test_a_constant_test_output_has_no_fit_but_a_sentence(project):
     result = finite_json(done.out)
     assert done.code == 0
     assert result["scores"]["tests.steps"]["prediction"]["nrmse"] is None
-    assert any("tests.steps" in w and "constant" in w for w in result["warnings"])
+    assert any(w["code"] == "constant_output" and "tests.steps" in w["text"] for w in result["warnings"])
 
 
 def test_a_free_run_that_diverges_is_no_error(project):
@@ -425,8 +429,8 @@ def test_a_free_run_that_diverges_is_no_error(project):
     assert scores["simulation"] == {"rmse": None, "nrmse": None, "fit": None}
     assert scores["prediction"]["rmse"][0] > 0
     assert result["scores"]["train"]["simulation"]["rmse"][0] >= 0
-    (warning,) = (text for text in result["warnings"] if "no simulation scores" in text)
-    for words in ("tests.steps", "diverged", "'y'", "step "):
+    (warning,) = (w["text"] for w in result["warnings"] if w["code"] == "free_run_diverged")
+    for words in ("tests.steps", "diverged", "'y'", "step ", "no simulation scores"):
         assert words in warning
     assert "diverged" in done.out
     done = run("simulate", "out", "steps.csv", "--out", "free.csv")
@@ -699,7 +703,7 @@ ARGUMENTS = [
     (["compare", "plant.toml", "--out", "theirs"], ["theirs", "not an orthaug result"]),
     (["compare", "plant.toml", "--out", "x", "--model", "theirs"], ["theirs", "no saved model there"]),
     (["design", "plant.toml"], ["Missing option", "--out"]),
-    (["export", "out", "--to", "c"], ["export", "not built yet"]),
+    (["export", "out", "--to", "c"], ["No such command 'export'"]),
     (["reproduce", "static_eror"], ["no study", "static_errors"]),
     (["fit", "plant.toml", "--out", "run.csv"], ["run.csv", "not a folder"]),
     (["fit", "plant.toml", "--out", "run.csv/out"], ["run.csv/out", "cannot be written", "is not a folder"]),
@@ -824,7 +828,7 @@ def test_single_precision_is_refused_in_words(fitted, tmp_path):
 
 
 def test_a_reader_that_goes_away_is_no_error(fitted, tmp_path):
-    command = f"{sys.executable} -c 'from orthaug.cli import main; main()' simulate {fitted}/physics {fitted}/long.csv"
+    command = f"{sys.executable} -c '{MAIN}' simulate {fitted}/physics {fitted}/long.csv"
     u, y = signals(20000, 5)
     write_csv(fitted / "long.csv", u=u, y=y)
     environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache")}

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from test_cli import MAIN, SPEC, make_project, one_line, run, signals, write_csv
 from test_cli import MLP as NETWORK
-from test_cli import SPEC, make_project, one_line, run, signals, write_csv
 
 from orthaug.models.storage import load
 
@@ -61,7 +61,7 @@ def test_ctrl_c_of_a_real_process(tmp_path, tmp_path_factory):
     cache = tmp_path_factory.mktemp("cache")
     before = contents(tmp_path)
     process = subprocess.Popen(
-        [sys.executable, "-c", "from orthaug.cli import main; main()", "fit", "plant.toml", "--out", "deep/out"],
+        [sys.executable, "-c", MAIN, "fit", "plant.toml", "--out", "deep/out"],
         cwd=tmp_path,
         env={**os.environ, "JAX_COMPILATION_CACHE_DIR": str(cache)},
         stdout=subprocess.PIPE,

@@ -155,7 +155,7 @@ def test_more_theta_than_parameters_test_the_physics(project, case):
     result = result_of(project, text)
     found = result["physical_consistency"]
     assert found["df"] == 1 and f"The data {verb} the physics' own constraint" in found["text"]
-    assert (found["p"] < 0.05) == (case == "contradict") == any("contradict" in w for w in result["warnings"])
+    assert (found["p"] < 0.05) == (case == "contradict") == any("contradict" in w["text"] for w in result["warnings"])
     if case == "agree":
         assert values(result["physical_parameters"])["m"] == pytest.approx(1, rel=1e-3)
 
@@ -304,7 +304,7 @@ def test_a_suspect_is_named_once_in_its_error(project):
 def test_a_suspect_without_effect_is_told_of(project):
     """Zero on all rows: it biases nothing here, but it must not vanish from the answer."""
     report = result_of(project, MACHINE + suspects('on = "0*force[k-1]"', 'kind = "offset"'), "check")
-    told = [entry["name"] for entry in report["bias"]] + report["warnings"]
+    told = [entry["name"] for entry in report["bias"]] + [warning["text"] for warning in report["warnings"]]
     assert any("0*force[k-1]" in text for text in told)
 
 

@@ -141,8 +141,9 @@ def test_one_step_with_sensor_noise_is_told(tmp_path):
     spec = project(tmp_path / "p", ALONE, **system(0, 600, sensor=0.3))
     printed, result = printed_fit(spec)
     assert result["residuals"]["verdict"] == "sensor_noise"
-    assert any("intervals do not cover" in text and 'focus = "simulation"' in text for text in result["warnings"])
-    assert result["residuals"]["text"] in printed and f"warning: {result['warnings'][0]}" in printed
+    told = [w["text"] for w in result["warnings"]]
+    assert any("intervals do not cover" in text and 'focus = "simulation"' in text for text in told)
+    assert result["residuals"]["text"] in printed and f"warning: {told[0]}" in printed
 
 
 def test_the_verdicts_are_printed(tmp_path):
@@ -212,14 +213,13 @@ def diverged(overfitted) -> dict:
 def test_a_free_run_that_diverges_is_null_with_a_warning(diverged):
     assert diverged["scores"]["tests.far"]["simulation"] == {"rmse": None, "nrmse": None, "fit": None}
     assert diverged["scores"]["tests.far"]["prediction"]["rmse"][0] > 0
-    assert any(
-        re.match(r"tests\.far: the free run diverged in output 'y' at step \d+", text) for text in diverged["warnings"]
-    )
+    (told,) = (w["text"] for w in diverged["warnings"] if w["code"] == "free_run_diverged")
+    assert re.match(r"tests\.far: the free run diverged in output 'y' at step \d+", told)
 
 
 def test_it_hurts_in_extrapolation(diverged):
     verdict = diverged["validation"]
-    assert verdict["verdict"] == "hurts" and verdict["text"] in diverged["warnings"]
+    assert verdict["verdict"] == "hurts" and {"code": "learner_hurts", "text": verdict["text"]} in diverged["warnings"]
     assert verdict["text"].startswith("The learner hurts in extrapolation") and "tests.far leaves" in verdict["text"]
     (trial,) = verdict["trials"]
     assert trial["where"] == "tests.far" and trial["model"] is None and 0 < trial["physics_alone"] < 1
@@ -254,7 +254,7 @@ def test_a_record_too_short_for_blocks_is_told(tmp_path, blocks):
         project(tmp_path / "p", SMALL, "[training]\niterations = 5\n", blocks, **system(0, rows, equation=0.1))
     )
     assert result["validation"] is None
-    assert any("too few" in text and "blocks" in text for text in result["warnings"])
+    assert any("too few" in w["text"] and "blocks" in w["text"] for w in result["warnings"])
 
 
 # --- compare

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from orthaug.analysis.suspects import Suspect, suspect_columns
 from orthaug.data.record import Record
 from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.problem import pose
+from orthaug.reports.result import DesignResult
 from orthaug.studies.synthetic import MassSpringDamper, mass_spring_damper
 
 SYSTEM = MassSpringDamper()
@@ -111,7 +111,7 @@ def test_the_same_seed_gives_the_same_signal(designed: Design) -> None:
     again = machine()
     assert np.array_equal(designed.signal, again.signal)
     assert designed.candidates == again.candidates
-    json.dumps(designed.as_dict(), allow_nan=False)
+    DesignResult.of(designed).to_json()
 
 
 @pytest.mark.parametrize("rate", [5000.0, 700.0])
@@ -273,4 +273,4 @@ def test_an_input_that_drives_the_model_away_is_only_left_out() -> None:
     found = first(amplitude=2.0, theta=[0.9, 1.0], suspects=[Suspect("s", "y[k-1]**3", coefficient=0.02)], iterations=2)
     assert any(row.cost == np.inf for row in found.candidates)
     assert np.isfinite(found.cost)
-    assert any(row["cost"] is None for row in found.as_dict()["candidates"])
+    assert any(row["cost"] is None for row in DesignResult.of(found).content()["candidates"])

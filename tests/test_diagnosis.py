@@ -18,6 +18,7 @@ from orthaug.fitting.structures import Additive
 from orthaug.models.learners import MLP
 from orthaug.models.model import Model
 from orthaug.physics.baseline import Baseline, Term
+from orthaug.reports.findings import DiagnosisResult
 from orthaug.studies import synthetic
 
 PHYSICS = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("g", "u[k-1]")])
@@ -56,7 +57,7 @@ def spring(rows, seed):
 def of(record, physics=PHYSICS, **options):
     """The diagnosis of a fit, of the physics alone unless told otherwise, which must be JSON without NaN."""
     found = diagnose(estimate(record, physics, **{"learner": None, **options}))
-    assert json.loads(json.dumps(found.as_dict(), allow_nan=False))["verdict"] == found.verdict
+    assert json.loads(DiagnosisResult.model_validate(found).to_json())["verdict"] == found.verdict
     return found
 
 
@@ -305,7 +306,8 @@ def test_a_free_run_that_diverges():
         u[k - 1] = -1.7 * y[k - 1] + rng.normal()
         y[k] = 2 * y[k - 1] + u[k - 1] + 0.1 * rng.normal()
     found = of(Record.from_arrays(u, y), Baseline.from_terms([Term("a", "y[k-1]"), Term("g", "u[k-1]")]))
-    assert found.free_run is None and found.as_dict()["free_run"] is None and found.as_dict()["noise_in_lags"] is None
+    content = DiagnosisResult.model_validate(found).content()
+    assert found.free_run is None and content["free_run"] is None and content["noise_in_lags"] is None
     assert found.verdict == "equation_noise"
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from orthaug.models.response import scores
+from orthaug.reports.result import ScoreResult
 
 
 def test_scores_are_their_formulas():
@@ -31,7 +32,7 @@ def test_fit_is_not_clipped(model, fit):
 def test_an_output_that_does_not_move_has_no_fit():
     found = scores(np.ones((4, 1)), np.zeros((4, 1)))
     assert found.rmse[0] == 1.0 and np.isnan(found.nrmse[0]) and np.isnan(found.fit[0])
-    assert found.as_dict() == {"rmse": [1.0], "nrmse": None, "fit": None}
+    assert ScoreResult.model_validate(found).content() == {"rmse": [1.0], "nrmse": None, "fit": None}
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e200])
@@ -40,12 +41,12 @@ def test_a_run_that_left_all_bounds_has_no_score(value):
     model[2, 1] = value
     found = scores(y, model)
     assert np.isfinite(found.rmse[0]) and np.isnan([found.rmse[1], found.nrmse[1], found.fit[1]]).all()
-    as_dict = found.as_dict()
-    assert as_dict["rmse"] == [pytest.approx(np.sqrt(14.0)), None]
+    content = ScoreResult.model_validate(found).content()
+    assert content["rmse"] == [pytest.approx(np.sqrt(14.0)), None]
     model[:, 0] = value
-    assert scores(y, model).as_dict() == {"rmse": None, "nrmse": None, "fit": None}
+    assert ScoreResult.model_validate(scores(y, model)).content() == {"rmse": None, "nrmse": None, "fit": None}
 
 
-def test_as_dict_holds_plain_numbers():
-    values = scores(np.arange(3.0)[:, None], np.zeros((3, 1))).as_dict()
+def test_a_result_holds_plain_numbers():
+    values = ScoreResult.model_validate(scores(np.arange(3.0)[:, None], np.zeros((3, 1)))).content()
     assert all(type(entry) is float for entries in values.values() for entry in entries)

@@ -245,7 +245,7 @@ def test_the_warning_counts_what_is_left_out(project):
     expected = (
         f"train: 10 rows have missing cells and are left out with all windows that touch them; {len(windows()[0])} "
     )
-    (warning,) = [text for text in fit(project)["warnings"] if "missing" in text]
+    (warning,) = [w["text"] for w in fit(project)["warnings"] if w["code"] == "missing_rows"]
     assert warning.startswith(expected + "usable rows remain, in 7 stretches")
     assert expected in run("check", project).out
 
@@ -253,7 +253,7 @@ def test_the_warning_counts_what_is_left_out(project):
 @pytest.mark.parametrize("cells", [{30: ""}, {0: ""}], ids=str)
 def test_the_warning_knows_the_singular(project, cells):
     write(project.parent / "run.csv", cells, {})
-    (warning,) = [text for text in fit(project)["warnings"] if "missing" in text]
+    (warning,) = [w["text"] for w in fit(project)["warnings"] if w["code"] == "missing_rows"]
     assert "1 row has" in warning and "1 stretches" not in warning
 
 
@@ -302,7 +302,7 @@ def test_a_test_part_is_scored_on_its_naive_rows(project, skip):
     phi, y, k = windows(seed=1)
     e = (y - phi @ theta)[k >= skip]
     assert result["scores"]["tests.other"]["prediction"]["rmse"][0] == pytest.approx(np.sqrt(np.mean(e**2)))
-    assert any(text.startswith("tests.other: 10 rows have missing cells") for text in result["warnings"])
+    assert any(w["text"].startswith("tests.other: 10 rows have missing cells") for w in result["warnings"])
 
 
 def test_the_free_run_of_a_test_part_starts_anew_after_a_gap(project):
@@ -329,7 +329,7 @@ def test_rows_and_every_of_a_part(project):
     project.write_text(text.replace('["run.csv"] }', '["run.csv"], rows = [0, 64] }'), encoding="utf-8")
     result = fit(project)
     counts = [len(windows(range(64))[0]), len(windows(range(10, 90))[0])]
-    warnings = [text for text in result["warnings"] if "missing" in text]
+    warnings = [w["text"] for w in result["warnings"] if w["code"] == "missing_rows"]
     assert [f"{count} usable rows remain" in text for count, text in zip(counts, warnings, strict=True)] == [True, True]
 
 

@@ -13,6 +13,7 @@ from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.models.learners import MLP
 from orthaug.physics.baseline import Baseline, Term
+from orthaug.reports.result import ScoreResult
 
 FEW = LevenbergMarquardt(iterations=5)
 NETWORK = MLP(hidden=(3,))
@@ -227,7 +228,7 @@ def test_divergence_is_named(factors, diverging):
     for part in (trajectory.model, trajectory.baseline, trajectory.learner, trajectory.learner_before):
         assert np.isnan(part[29:]).all()
     scores = model.simulate(Record.from_arrays(y=np.ones((60, 2)), outputs=["p", "q"])).scores()
-    assert scores.as_dict() == {"rmse": None, "nrmse": None, "fit": None}
+    assert ScoreResult.model_validate(scores).content() == {"rmse": None, "nrmse": None, "fit": None}
 
 
 def test_a_run_that_overflows():

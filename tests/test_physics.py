@@ -20,6 +20,7 @@ from orthaug.inference.covariance import interval
 from orthaug.inference.physical import profile, solve
 from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.parameters import PhysicalParameter, PhysicsMap, check_baseline, with_initial
+from orthaug.reports.result import physical_rows
 
 GAMMA = "(m + cd*Ts + ks*Ts**2)"
 EULER = {"theta1": f"(2*m + cd*Ts) / {GAMMA}", "theta2": f"-m / {GAMMA}", "theta3": f"Ts**2 / {GAMMA}"}
@@ -236,7 +237,7 @@ def test_rows_are_json():
     physics = spring()
     theta = physics.theta(TRUTH)
     found = solve(physics, theta, relative(theta), freedom=50)
-    rows = found.as_rows()
+    rows = [row.content() for row in physical_rows(found)]
     assert [row["name"] for row in rows] == ["m", "cd", "ks"]
     assert rows[2] == {
         "name": "ks",
@@ -247,7 +248,7 @@ def test_rows_are_json():
         "ci95": list(found.ci95[2]),
     }
     assert json.loads(json.dumps(rows, allow_nan=False)) == rows
-    missing = solve(physics, theta, None, freedom=50).as_rows()[0]
+    missing = physical_rows(solve(physics, theta, None, freedom=50))[0].content()
     assert missing["std"] is None and missing["ci95"] is None
 
 
@@ -378,7 +379,7 @@ def test_a_parameter_at_its_bound():
         "m stands at its bound 0 and has no standard error; those of the others hold with it there."
     )
     assert "own constraint, bounds included (chi2" in found.consistency.text
-    json.dumps(found.as_rows(), allow_nan=False)
+    json.dumps([row.content() for row in physical_rows(found)], allow_nan=False)
 
 
 def test_upper_bounds_and_all_at_bounds():

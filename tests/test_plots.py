@@ -85,11 +85,24 @@ def test_residual_shows_the_whole_record():
     assert axis.get_ylabel() == "residual of position [m]"
 
 
+def drawn(figure: Figure, path) -> bool:
+    """Whether a figure becomes a picture that is not blank."""
+    plots.save(figure, path)
+    return bool(matplotlib.image.imread(path)[..., :3].std() > 0.01)
+
+
 @pytest.mark.parametrize("name", FIGURES)
 def test_a_run_that_diverged_is_drawn_as_far_as_it_goes(tmp_path, name):
-    plots.save(FIGURES[name][0](response(diverged=True), "diverged"), tmp_path / "figure.png")
+    figure = FIGURES[name][0](response(diverged=True), "diverged")
+    curve = figure.axes[1 if name == "output" else 0].lines[0]
+    last = np.asarray(curve.get_xdata())[np.isfinite(curve.get_ydata())][-1]
+    assert last == pytest.approx(0.1 * 49)  # the last sample before it diverges
+    assert drawn(figure, tmp_path / "figure.png")
 
 
 @pytest.mark.parametrize("name", FIGURES)
 def test_a_short_record(tmp_path, name):
-    plots.save(FIGURES[name][0](response(rows=3), "one sample"), tmp_path / "figure.png")
+    figure = FIGURES[name][0](response(rows=3), "one sample")
+    values = [line.get_ydata() for axis in figure.axes for line in axis.lines if len(line.get_ydata()) != 2]
+    assert all(np.isfinite(shown).sum() == 1 for shown in values) and values
+    assert drawn(figure, tmp_path / "figure.png")

@@ -286,7 +286,13 @@ def test_an_unknown_pipeline_is_refused():
 
 
 def command(*arguments: str) -> list[str]:
-    return [sys.executable, "-c", "import sys; from orthaug.cli import main; sys.exit(main())", "reproduce", *arguments]
+    return [
+        sys.executable,
+        "-c",
+        "import sys; from orthaug.commands.cli import main; sys.exit(main())",
+        "reproduce",
+        *arguments,
+    ]
 
 
 @pytest.mark.parametrize(

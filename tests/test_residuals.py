@@ -15,6 +15,7 @@ from orthaug.analysis.correlation import autocorrelation, cross_correlation
 from orthaug.analysis.independence import against_input, against_regressor
 from orthaug.analysis.residuals import analyse
 from orthaug.analysis.whiteness import ljung_box, normality, whitening
+from orthaug.reports.findings import ResidualTestResult
 
 RECORDS, ROWS, WARM_UP = 2000, 1000, 300
 BETWEEN = (0.005, 0.016)  # of 2000 records that a test at 1 % may reject; ± 0.0022 is one standard deviation
@@ -298,7 +299,7 @@ def test_a_residual_that_is_constant_or_without_bounds_has_no_tests(value):
     assert found.cross == {"u": None} and found.regressors == {"x": None}
     assert found.correlated_inputs == found.curved_regressors == ()
     assert (found.rms is None) == (not abs(value) < 1e100)
-    json.dumps(found.as_dict(), allow_nan=False)
+    ResidualTestResult.model_validate(found).to_json()
 
 
 @pytest.mark.parametrize("value", [0.0, 0.1, np.nan, np.inf])
@@ -314,7 +315,7 @@ def test_a_signal_that_does_not_move_or_exist_has_no_test(value):
 def test_short_records_have_what_they_can(rows):
     rng = np.random.default_rng(23)
     found = report(rng.normal(size=rows), {"u": rng.normal(size=rows)}, {"x": rng.normal(size=rows)})
-    json.dumps(found.as_dict(), allow_nan=False)
+    ResidualTestResult.model_validate(found).to_json()
     assert found.n == rows and (found.white is None) == (rows < 20)
     assert (found.regressors["x"] is None) == (rows < 10)
 
@@ -323,7 +324,7 @@ def test_short_records_have_what_they_can(rows):
 def test_residuals_without_noise_do_not_break_anything(e):
     rng = np.random.default_rng(24)
     tests = report(e, {"e": e, "u": rng.normal(size=400)}, {"e": e, "x": np.roll(e, 1)})
-    json.dumps(tests.as_dict(), allow_nan=False)
+    ResidualTestResult.model_validate(tests).to_json()
     assert tests.n == 400 and tests.rms == pytest.approx(np.sqrt(np.mean(e**2)))
     assert tests.cross["e"].lag == 0 and tests.cross["e"].largest == pytest.approx(1)
     np.testing.assert_allclose(tests.cross["e"].values, np.concatenate([tests.acf[:0:-1], tests.acf]), atol=1e-12)
@@ -352,7 +353,7 @@ def test_every_output_has_its_tests_as_plain_content():
     for i, test in enumerate(found):
         assert test.ljung_box == ljung_box([one[:, i] for one in e])
         assert test.acf_band == pytest.approx(2.5758 / np.sqrt(500), rel=1e-4)
-        content = json.loads(json.dumps(test.as_dict(), allow_nan=False))
+        content = json.loads(ResidualTestResult.model_validate(test).to_json())
         assert list(content["cross"]) == ["a", "b"] and list(content["regressors"]) == ["s", "t", "v", "w"]
         assert len(content["acf"]) == 26 and len(content["cross"]["b"]["values"]) == 51
         assert content["white"] is test.white and content["ljung_box"]["freedom"] == 25

@@ -63,4 +63,4 @@ def test_free_run_of_the_linear_physics(result, part, expected):
 def test_the_physics_is_determined_by_the_data(result):
     assert result["status"]["code"] == "exact"
     assert result["excitation"]["rank"] == len(REGRESSORS)
-    assert [text for text in result["warnings"] if "white residual" not in text] == []
+    assert [w for w in result["warnings"] if "white residual" not in w["text"]] == []

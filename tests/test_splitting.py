@@ -19,6 +19,7 @@ from orthaug.inference.measures import Samples, Symmetrized, Training, Uniform, 
 from orthaug.models.learners import MLP
 from orthaug.models.storage import load, save
 from orthaug.physics.baseline import Baseline, Term
+from orthaug.reports.result import MeasureResult
 from orthaug.studies.synthetic import static
 
 QUICK = LevenbergMarquardt(iterations=15)
@@ -187,7 +188,9 @@ def test_a_split_says_what_it_is(curve):
     found = curve.split(WIDE)
     assert (found.model.structure, found.model.measure, found.measure.name) == ("orthogonal", "uniform", "uniform")
     assert "measure     uniform, 1048576 points, 100 % of it within reach" in found.summary()
-    assert found.measure.as_dict()["kind"] == "uniform" and found.warnings == curve.warnings
+    assert (
+        MeasureResult.model_validate(found.measure).content()["kind"] == "uniform" and found.warnings == curve.warnings
+    )
 
 
 def test_a_measure_beyond_the_data_is_warned_of(curve):

@@ -28,6 +28,7 @@ from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.models.learners import MLP
 from orthaug.models.model import Model
 from orthaug.physics.baseline import Baseline, Term
+from orthaug.reports.findings import ValidationResult
 
 PHYSICS = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("g", "u[k-1]")])
 BEYOND = Extrapolation("tests.far", "u[k-1]", (-1.0, 1.0), (-2.5, 2.0), 0.25)
@@ -177,7 +178,7 @@ def test_the_verdict_on_trials(trials, code):
     opening = {"helps": "The learner helps", "no_help": "The learner does not help", "hurts": "The learner hurts"}
     assert [warning.code for warning in found.warnings] == ["learner_hurts"] * (code == "hurts")
     assert found.code == code and found.text.startswith(f"{opening[code]}. ") and found.text.endswith(".")
-    content = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    content = json.loads(ValidationResult.model_validate(found).to_json())
     assert content["verdict"] == code and len(content["trials"]) == len(trials)
 
 
@@ -206,7 +207,7 @@ def test_the_text_gives_the_errors_and_how_many_blocks_are_better():
 def test_harm_outside_the_training_range_is_called_so():
     found = judge([Trial("tests.far", 1.0, 2.0)], [BEYOND])
     assert found.text.startswith("The learner hurts in extrapolation. ") and str(BEYOND) in found.text
-    assert found.as_dict()["extrapolation"][0]["regressor"] == "u[k-1]"
+    assert ValidationResult.model_validate(found).content()["extrapolation"][0]["regressor"] == "u[k-1]"
 
 
 def test_harm_elsewhere_is_not_blamed_on_extrapolation():
@@ -217,7 +218,9 @@ def test_harm_elsewhere_is_not_blamed_on_extrapolation():
 def test_what_diverges_is_null_in_json_and_told():
     found = judge([Trial("tests.a", 1.0, INF)])
     assert "diverges" in found.text
-    assert found.as_dict()["trials"] == [{"where": "tests.a", "physics_alone": 1.0, "model": None}]
+    assert ValidationResult.model_validate(found).content()["trials"] == [
+        {"where": "tests.a", "physics_alone": 1.0, "model": None}
+    ]
 
 
 # --- errors of free runs

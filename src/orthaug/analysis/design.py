@@ -62,13 +62,6 @@ class Design:
     cost: float
     candidates: tuple[Candidate, ...]
 
-    def as_dict(self) -> dict[str, Any]:
-        """Plain numbers, text and None, for JSON; without the signal."""
-        plain = {key: getattr(self, key) for key in ("kind", "relative_error", "condition", "cost")}
-        by_name = {key: dict(zip(self.names, getattr(self, key).tolist(), strict=True)) for key in ("bias", "std")}
-        rows = [{k: None if v == math.inf else v for k, v in row._asdict().items()} for row in self.candidates]
-        return plain | by_name | {"samples": len(self.signal), "candidates": rows}
-
 
 def design_input(
     baseline: Baseline,

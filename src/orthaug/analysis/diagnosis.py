@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -54,17 +53,6 @@ class Diagnosis:
     ratio: float | None
     noise_in_lags: float | None
     warnings: tuple[Warning, ...]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain content for JSON."""
-        return {
-            "verdict": self.verdict,
-            "text": self.text,
-            "one_step": [test.as_dict() for test in self.one_step],
-            "free_run": None if self.free_run is None else [test.as_dict() for test in self.free_run],
-            "free_run_to_one_step": self.ratio,
-            "noise_in_lags": self.noise_in_lags,
-        }
 
 
 def diagnose(fit: Estimate, *, one_step: Response | None = None, free_run: Response | None = None) -> Diagnosis | None:

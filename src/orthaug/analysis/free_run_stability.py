@@ -9,10 +9,7 @@ asks for the one-step predictor, whose past is measured (`lipschitz`).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
-from typing import Any
-
-import numpy as np
+from dataclasses import dataclass, replace
 
 from orthaug._base.checks import Matrix
 from orthaug._base.warning import Warning
@@ -23,8 +20,6 @@ from orthaug.analysis.lipschitz import Lipschitz, lipschitz
 from orthaug.data.record import Record
 from orthaug.models.model import Model
 from orthaug.models.response import Response
-
-_PER_STEP = ("points", "jacobians", "radius", "unit")  # too long for JSON
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +33,6 @@ class Stability:
     lipschitz: Lipschitz
     warnings: tuple[Warning, ...]
     text: str
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain content for JSON, without what is there for every step; never NaN or infinity."""
-        content = asdict(replace(self, warnings=()), dict_factory=_plain)
-        return content | {"warnings": [warning._asdict() for warning in self.warnings]}
 
 
 def stability(
@@ -71,12 +61,6 @@ def stability(
     says = list(_sentences(checks))
     warnings = tuple(Warning(code, sentence) for sentence, code in says if code)
     return replace(checks, warnings=warnings, text="\n".join(sentence for sentence, _ in says))
-
-
-def _plain(items: list[tuple[str, Any]]) -> dict[str, Any]:
-    return {
-        k: np.asarray(v).tolist() if isinstance(v, tuple | np.ndarray) else v for k, v in items if k not in _PER_STEP
-    }
 
 
 def _sentences(checks: Stability) -> Iterator[tuple[str, str]]:

@@ -3,35 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug.analysis.bias import SuspectedBias, bias_table
 from orthaug.analysis.suspects import Suspect, suspect_columns, usual_suspects
-from orthaug.inference.measures import Points
+from orthaug.inference.weighed import Weighed
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import Problem
-from orthaug.physics.projection import Projection
 
 CERTIFIED_ROWS = 200_000  # of a measure at most, over which certificates are sought for suspects that no one named
-
-
-class Weighed(NamedTuple):
-    """A measure's points, the `unit` (M, ny) that their rows are multiplied by, and the physics so weighted."""
-
-    points: Points
-    unit: Matrix
-    projection: Projection
-
-
-def weigh(problem: Problem, points: Points) -> Weighed:
-    """The physics over points, weighted by the square root of their weight and by one over each output's deviation."""
-    unit = np.sqrt(points.weight)[:, None] * problem.weight
-    with np.errstate(all="ignore"):
-        phi = np.asarray(problem.baseline.phi(points.x, problem.layout, problem.outputs, np))
-    return Weighed(points, unit, Projection.factor(phi * unit[:, :, None]))
 
 
 def bias_under(

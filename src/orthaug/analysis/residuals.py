@@ -51,10 +51,6 @@ class ResidualTest:
     largest_share: float | None
     """Largest |r_e| beyond lag 0, largest |r_eu| over all inputs and causal lags, largest share over all regressors."""
 
-    def as_dict(self) -> dict[str, Any]:
-        """The fields as plain content for JSON: lists, numbers, strings and None, never NaN."""
-        return _plain(self)
-
 
 def analyse(
     residuals: Sequence[Matrix],
@@ -145,13 +141,3 @@ def _channels(experiments: Sequence[Matrix], names: Sequence[str], what: str, le
             shape = f"{np.shape(one)}; its residuals and names make {(rows, len(names))}"
             raise InputError(f"`{what}` of experiment {i} has the shape {shape}.")
     return {name: [np.asarray(one, dtype=float)[:, j] for one in experiments] for j, name in enumerate(names)}
-
-
-def _plain(value: Any) -> Any:
-    """Lists for arrays and tuples, dictionaries for mappings and dataclasses, None for what is not finite."""
-    if isinstance(value, Mapping) or hasattr(value, "__dataclass_fields__"):
-        return {key: _plain(entry) for key, entry in getattr(value, "__dict__", value).items()}
-    if isinstance(value, np.ndarray | tuple | list):
-        return [_plain(entry) for entry in value]
-    value = value.item() if isinstance(value, np.generic) else value
-    return None if isinstance(value, float) and not np.isfinite(value) else value

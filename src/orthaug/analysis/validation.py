@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from orthaug._base.checks import Matrix, finite_or_none
+from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError
 from orthaug._base.parallel import spread
 from orthaug._base.warning import Warning
@@ -76,27 +76,6 @@ class Verdict:
     def warnings(self) -> tuple[Warning, ...]:
         """One where the learner hurts."""
         return (Warning("learner_hurts", self.text),) if self.code == "hurts" else ()
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain content for JSON."""
-        return {
-            "verdict": self.code,
-            "text": self.text,
-            "trials": [
-                {"where": t.where, "physics_alone": finite_or_none(t.alone), "model": finite_or_none(t.model)}
-                for t in self.trials
-            ],
-            "extrapolation": [
-                {
-                    "part": e.part,
-                    "regressor": e.lag,
-                    "training": list(e.training),
-                    "found": list(e.reach),
-                    "share": e.share,
-                }
-                for e in self.extrapolation
-            ],
-        }
 
 
 def free_run_error(

@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import json
-import signal
 import sys
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,9 +13,9 @@ import typer.core
 from orthaug import __version__
 from orthaug._base.checks import check_choice
 from orthaug._base.errors import InputError, TrainingError
+from orthaug.commands.bars import study_bars, training_bar
 
 if TYPE_CHECKING:
-    from orthaug.commands.jobs import Progress
     from orthaug.models.response import Response
 
 
@@ -97,14 +93,14 @@ def _options(
 @app.command()
 def demo(out: OutFolder = None) -> None:
     """Fit the paper's example and compare with the truth."""
-    from orthaug.commands.outcome import check_output
+    from orthaug.commands.folder import check_folder
 
     folder = out or Path("orthaug-out/demo")
-    check_output(folder)
+    check_folder(folder)
     _prepare_jax()
     from orthaug.commands import demo as demonstration
 
-    with _progress(2 * demonstration.RESTARTS, demonstration.ITERATIONS) as progress:
+    with training_bar(2 * demonstration.RESTARTS, demonstration.ITERATIONS) as progress:
         text = demonstration.run(folder, progress)
     typer.echo(text)
     typer.echo(f"\nwritten to {folder}")
@@ -117,19 +113,20 @@ def check(
     figure: Annotated[Path | None, typer.Option("--figure", metavar="PNG", help="Heat map of the biases.")] = None,
 ) -> None:
     """Report excitation and identifiability; trains nothing."""
-    from orthaug.commands import jobs, outcome
+    from orthaug.commands.check import check_job
+    from orthaug.commands.folder import check_file
+    from orthaug.commands.job import open_job
     from orthaug.physics.excitation import require_rank
-    from orthaug.reports import report
+    from orthaug.reports.text import check_text
 
-    job = jobs.open_job(spec, require_full_rank=False)
-    found = outcome.plain(outcome.check_report(job))
-    typer.echo(_json(found) if as_json else report.check_text(found))
-    if figure is not None and found["bias"]:
-        from orthaug.commands import runs
+    job = open_job(spec, require_full_rank=False)
+    result = check_job(job)
+    typer.echo(result.to_json() if as_json else check_text(result))
+    if figure is not None and result.bias:
         from orthaug.reports import plots
 
-        runs.check_output(figure, *job.files)
-        plots.save(outcome.bias_heat_map(found["bias"]), figure)
+        check_file(figure, *job.files)
+        plots.save(plots.bias_figure(result.bias), figure)
     try:
         require_rank(job.problem.excitation, job.problem.rows.y.size)
     except InputError as error:
@@ -139,21 +136,23 @@ def check(
 @app.command()
 def fit(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False) -> None:
     """Fit a spec, print a summary and write the result folder."""
-    from orthaug.commands import jobs, outcome
-    from orthaug.reports import report
+    from orthaug.commands.fit import fit_job, write_result
+    from orthaug.commands.folder import check_folder, check_inputs_kept
+    from orthaug.commands.job import open_job
+    from orthaug.reports.text import fit_text
 
     folder = out or Path("orthaug-out") / spec.stem
-    outcome.check_output(folder)
-    job = jobs.open_job(spec)
-    outcome.check_inputs_kept(job, folder)
+    check_folder(folder)
+    job = open_job(spec)
+    check_inputs_kept(job, folder)
     _prepare_jax()
-    with _progress(job.run_count, job.iterations, job.spec.declared_learner() is not None) as progress:
-        fitted = outcome.fit_job(job, progress)
-    outcome.write_result(fitted, folder)
+    with training_bar(job.run_count, job.iterations, job.spec.declared_learner() is not None) as progress:
+        fitted = fit_job(job, progress)
+    write_result(fitted, folder)
     if as_json:
-        typer.echo(_json(fitted.result))
+        typer.echo(fitted.result.to_json())
     else:
-        typer.echo(report.fit_text(fitted.fit, fitted.result))
+        typer.echo(fit_text(fitted.fit, fitted.result))
         typer.echo(f"\nwritten to {folder}")
     if not fitted.fit.status.ok:
         raise TrainingError(f"{fitted.fit.status.message}. The account is in {folder / 'result.json'}.")
@@ -169,19 +168,22 @@ def compare(
     as_json: AsJson = False,
 ) -> None:
     """Physics alone and every structure, one table."""
-    from orthaug.commands import jobs, outcome
+    from orthaug.commands.folder import check_folder, check_inputs_kept
+    from orthaug.commands.job import open_job
+    from orthaug.reports.text import compare_text
 
     folder = out or Path("orthaug-out") / spec.stem
-    outcome.check_output(folder)
-    job = jobs.open_job(spec)
-    outcome.check_inputs_kept(job, folder)
+    check_folder(folder)
+    job = open_job(spec)
+    check_inputs_kept(job, folder)
     _prepare_jax()
     from orthaug.commands import compare as comparing
 
-    with _progress(job.run_count * len(comparing.compared()), job.iterations) as progress:
-        found = comparing.compare(job, model or (), progress)
-    comparing.write(found, folder)
-    typer.echo(_json(found.result) if as_json else f"{comparing.text(found)}\n\nwritten to {folder}")
+    with training_bar(job.run_count * len(comparing.compared()), job.iterations) as progress:
+        comparison = comparing.compare(job, model or (), progress)
+    comparing.write(comparison, folder)
+    text = compare_text(comparison.result, comparison.verdicts)
+    typer.echo(comparison.result.to_json() if as_json else f"{text}\n\nwritten to {folder}")
 
 
 @app.command()
@@ -192,11 +194,12 @@ def simulate(
     initial: Initial = None,
 ) -> None:
     """Free run of a saved model on a data file."""
-    from orthaug.commands import runs
+    from orthaug.commands import run
+    from orthaug.commands.folder import check_file
 
-    opened = runs.open_run(model, data)
-    start = runs.read_initial(initial, opened)
-    runs.check_output(out, data, Path(initial or data))
+    opened = run.open_run(model, data)
+    start = run.read_initial(initial, opened)
+    check_file(out, data, Path(initial or data))
     _prepare_jax()
     _write_response(opened.model.simulate(opened.record, initial=start), out)
 
@@ -210,11 +213,12 @@ def predict(
     initial: Initial = None,
 ) -> None:
     """H-step-ahead prediction of a saved model."""
-    from orthaug.commands import runs
+    from orthaug.commands import run
+    from orthaug.commands.folder import check_file
 
-    opened = runs.open_run(model, data, need_outputs=True)
-    record = runs.with_initial(opened, runs.read_initial(initial, opened))
-    runs.check_output(out, data, Path(initial or data))
+    opened = run.open_run(model, data, need_outputs=True)
+    record = run.with_initial(opened, run.read_initial(initial, opened))
+    check_file(out, data, Path(initial or data))
     _prepare_jax()
     _write_response(opened.model.predict(record, horizon=horizon), out)
 
@@ -237,15 +241,16 @@ def split(
     as_json: AsJson = False,
 ) -> None:
     """Parameters of a saved model under another measure, without training again."""
-    from orthaug.commands import measure_options, runs
+    from orthaug.commands import split as splitting
+    from orthaug.commands.measure_options import read_measure, split_place
+    from orthaug.reports.text import split_text
 
-    opened = runs.open_training(model, data, runs.read_rows(rows))
+    opened = splitting.open_training(model, data, splitting.read_rows(rows))
     given = {"box": box or [], "samples": [samples] if samples else [], "weights": [weights] if weights else []}
-    place = measure_options.split_place(opened.model, opened.record)
-    chosen = measure_options.read_measure(measure, given, place)
+    chosen = read_measure(measure, given, split_place(opened.model, opened.record))
     _prepare_jax()
-    found = runs.split(opened, chosen)
-    typer.echo(_json(found) if as_json else runs.split_text(found))
+    result = splitting.split(opened, chosen)
+    typer.echo(result.to_json() if as_json else split_text(result))
 
 
 @app.command()
@@ -255,13 +260,28 @@ def design(
     as_json: AsJson = False,
 ) -> None:
     """An input within limits under which suspected terms and noise disturb the parameters least."""
-    from orthaug.commands import designing, jobs, outcome, runs
+    from orthaug.commands import design as designing
+    from orthaug.commands.folder import check_file
+    from orthaug.commands.job import open_job
+    from orthaug.reports.result import DesignResult
+    from orthaug.reports.text import design_text
 
-    job = jobs.open_job(spec, require_full_rank=False)
-    runs.check_output(out, *job.files)
-    found = designing.design(job)
-    designing.write(job, found, out)
-    typer.echo(_json(outcome.plain(found.as_dict())) if as_json else f"{designing.text(found)}\n\nwritten to {out}")
+    job = open_job(spec, require_full_rank=False)
+    check_file(out, *job.files)
+    designed = designing.design_for(job)
+    designing.write(job, designed, out)
+    result = DesignResult.of(designed)
+    typer.echo(result.to_json() if as_json else f"{design_text(result)}\n\nwritten to {out}")
+
+
+@app.command()
+def schema(
+    command: Annotated[str, typer.Argument(metavar="[COMMAND]", help="fit, check, compare, split or design.")] = "fit",
+) -> None:
+    """The JSON schema of what a command writes."""
+    from orthaug.reports.result import RESULTS, schema_of
+
+    typer.echo(_json(schema_of(check_choice(command, RESULTS, "COMMAND"))))
 
 
 @app.command()
@@ -279,20 +299,10 @@ def reproduce(
     entries = reproduction.chosen(name)
     check_choice(pipeline, reproduction.PIPELINES, "--pipeline")
     _prepare_jax()
-    with _study_progress() as progress:
-        found = reproduction.reproduce(entries, pipeline=pipeline, small=small, progress=progress)
-    reproduction.write(found, folder, pipeline)
-    typer.echo(f"{reproduction.text(found)}\n\nwritten to {folder}/index.html")
-
-
-def _unbuilt(name: str) -> None:
-    @app.command(name, hidden=True, context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
-    def refuse(context: typer.Context) -> None:
-        raise InputError(f"`orthaug {name}` is not built yet in this version.")
-
-
-for _name in ("export",):
-    _unbuilt(_name)
+    with study_bars() as progress:
+        reproduced = reproduction.reproduce(entries, pipeline=pipeline, small=small, progress=progress)
+    reproduction.write(reproduced, folder, pipeline)
+    typer.echo(f"{reproduction.text(reproduced)}\n\nwritten to {folder}/index.html")
 
 
 def _prepare_jax() -> None:
@@ -306,88 +316,12 @@ def _fail(message: str, code: int) -> None:
     sys.exit(code)
 
 
-@contextmanager
-def _progress(runs: int, iterations: int, wanted: bool = True) -> Iterator[Progress | None]:
-    """A progress bar on standard error where that is a terminal; Ctrl-C is told what it stopped."""
-    if not wanted:
-        yield None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    reached = "the start of training"
-    with (
-        _deferred_interrupt() as interrupted,
-        Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar,
-    ):
-        task = bar.add_task("compiling", total=runs * iterations)
-        done: dict[int, int] = {}
-
-        def tell(run: int, iteration: int, loss: float) -> None:
-            nonlocal reached
-            done[run] = iteration
-            reached = f"run {run + 1} of {runs}, iteration {iteration}, loss {loss:.3g}"
-            bar.update(task, completed=sum(done.values()), description=reached)
-            if interrupted.is_set():
-                raise KeyboardInterrupt(reached)
-
-        try:
-            yield tell
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(reached) from None
-        if interrupted.is_set():
-            raise KeyboardInterrupt("the scoring of the model")
-
-
-@contextmanager
-def _study_progress() -> Iterator[Callable[[str, int, int], None]]:
-    """A bar per study on standard error where that is a terminal; Ctrl-C stops after the run at hand."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with (
-        _deferred_interrupt() as interrupted,
-        Progress(*columns, console=console, disable=not console.is_terminal) as bar,
-    ):
-        tasks: dict[str, Any] = {}
-
-        def tell(title: str, done: int, total: int) -> None:
-            if title not in tasks:
-                tasks[title] = bar.add_task(title, total=total)
-            bar.update(tasks[title], completed=done)
-            if interrupted.is_set():
-                raise KeyboardInterrupt(f"'{title}', {done} of {total} runs done and kept for the next time")
-
-        yield tell
-
-
-@contextmanager
-def _deferred_interrupt() -> Iterator[threading.Event]:
-    """Ctrl-C sets the event, so that it never lands inside compiled code; a second one interrupts at once."""
-    event = threading.Event()
-
-    def note(signum: int, frame: object) -> None:
-        if event.is_set():
-            raise KeyboardInterrupt
-        event.set()
-
-    previous = signal.signal(signal.SIGINT, note)
-    try:
-        yield event
-    finally:
-        signal.signal(signal.SIGINT, previous)
-
-
 def _write_response(response: Response, out: Path | None) -> None:
-    from orthaug.commands import runs
+    from orthaug.commands import run
 
-    for text in runs.warnings(response):
-        sys.stderr.write(f"warning: {text}\n")
-    runs.write_csv(response, out)
+    for warning in run.warnings(response):
+        sys.stderr.write(f"warning: {warning.text}\n")
+    run.write_csv(response, out)
 
 
 def _json(content: Any) -> str:

@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from orthaug._base.folders import whole_folder
-from orthaug.commands.jobs import open_job
-from orthaug.commands.outcome import Fitted, fill_result, fit_job, is_result
+from orthaug._base.progress import SILENT, Progress
+from orthaug.commands.fit import Fitted, fill_result, fit_job
+from orthaug.commands.folder import is_result
+from orthaug.commands.job import open_job
 from orthaug.fitting.estimates import Estimate
-from orthaug.fitting.estimation import Progress, estimate
+from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive
 from orthaug.studies.synthetic import Example, mass_spring_damper
@@ -56,7 +58,7 @@ restarts = {RESTARTS}
 """
 
 
-def run(folder: Path, progress: Progress | None = None) -> str:
+def run(folder: Path, progress: Progress = SILENT) -> str:
     """Generate the record, fit both structures, write data, spec and orthogonal fit; return the comparison."""
     example = mass_spring_damper()
     with whole_folder(folder, is_result) as partial:
@@ -72,15 +74,14 @@ def run(folder: Path, progress: Progress | None = None) -> str:
     return _comparison(example, orthogonal, additive)
 
 
-def _additive(example: Example, seed: int, progress: Progress | None) -> Estimate:
-    tell = None if progress is None else lambda _, i, loss: progress(RESTARTS + seed, i, loss)
+def _additive(example: Example, seed: int, progress: Progress) -> Estimate:
     return estimate(
         example.train,
         example.baseline,
         structure=Additive(),
         solver=LevenbergMarquardt(ITERATIONS),
         seed=seed,
-        progress=tell,
+        progress=progress.after(runs=RESTARTS + seed),
     )
 
 

@@ -38,7 +38,7 @@ def read_measure(kind: str, given: Mapping[str, Sequence[str]], place: MeasurePl
 
 def split_place(model: Any, record: Any) -> MeasurePlace:
     """Where a saved model's measure is declared: files relative to here, on the data that it was trained on."""
-    return MeasurePlace(Path(), [str(lag) for lag in model.form.used], record, model.form.start)
+    return MeasurePlace(Path(), [str(lag) for lag in model.form.used], record, model.form.first_row)
 
 
 def _option_of(kind: str, name: str) -> str:

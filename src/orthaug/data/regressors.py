@@ -93,6 +93,12 @@ def lag_matrix(experiment: Experiment, layout: Layout, record: Record, start: in
     return matrix
 
 
+def lag_rows(record: Record, layout: Layout) -> Matrix:
+    """The regressors of all rows from the largest lag on, experiment after experiment, (N, len(layout))."""
+    start = largest_lag(layout)
+    return np.concatenate([lag_matrix(experiment, layout, record, start) for experiment in record.experiments])
+
+
 @dataclass(frozen=True, eq=False)
 class Rows:
     """The usable rows of a record, stacked over experiments: regressors `x` (N, nx), outputs `y` (N, ny)."""
@@ -120,9 +126,9 @@ def stack_rows(record: Record, layout: Layout) -> Rows:
                 f"{name} has {len(experiment)} rows, too few: the largest lag is {start}, "
                 f"so at least {start + 1} are needed."
             )
-    x = [lag_matrix(experiment, layout, record, start) for experiment in record.experiments]
+    x = lag_rows(record, layout)
     y = [experiment.outputs[start:] for experiment in record.experiments]
-    return Rows(np.concatenate(x), np.concatenate(y), layout, start)
+    return Rows(x, np.concatenate(y), layout, start)
 
 
 @dataclass(frozen=True)

@@ -124,7 +124,7 @@ class Estimate:
                 f"{', '.join(self.at_bound)} stand at a bound, which a split under the {measure.name} measure would "
                 "leave; drop the bounds, or keep the training measure."
             )
-        support = Support(self.problem.record, self.problem.layout, self.model.form.used)
+        support = Support(self.problem.record, self.problem.layout, self.model.form.used, self.problem.rows.x)
         joint = self.model.statistics.joint(len(self.theta))
         found = split_under(measure, self.model, support, joint)
         if found.covariance is not None:
@@ -194,11 +194,12 @@ class Estimate:
 
     def summary(self) -> str:
         """A page of text: status, parameters, excitation, warnings."""
-        return "\n".join(summary_lines(self))
+        warnings = ["", *(f"warning: {warning}" for warning in self.warnings)] if self.warnings else []
+        return "\n".join([*summary_lines(self), *warnings])
 
 
 def summary_lines(fit: Estimate) -> Sequence[str]:
-    """The lines of `Estimate.summary`."""
+    """The lines of `Estimate.summary` before its warnings."""
     status, baseline = fit.status, fit.problem.baseline
     bound = fit.model.form.bound
     learner = (
@@ -235,6 +236,4 @@ def summary_lines(fit: Estimate) -> Sequence[str]:
             f"{parameter.name:<{width}}  {fit.theta[i]:14.8g}  {spread}  {reach}  "
             f"{parameter.initial:11.5g}  {parameter.unit}".rstrip()
         )
-    if fit.warnings:
-        lines += ["", *(f"warning: {text}" for text in fit.warnings)]
     return lines

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Annotated, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -41,11 +42,13 @@ class Support:
     record: Record
     layout: Layout
     used: tuple[Lag, ...]
+    stacked: Matrix | None = None
+    """The training regressors, where they are stacked already."""
 
-    @property
+    @cached_property
     def x(self) -> Matrix:
         """The training regressors (N, nx)."""
-        return stack_rows(self.record, self.layout).x
+        return stack_rows(self.record, self.layout).x if self.stacked is None else self.stacked
 
     def share(self, points: Points) -> float:
         """The measure's weight within reach of the training data.

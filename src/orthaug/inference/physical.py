@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy.optimize
@@ -55,13 +55,6 @@ class PhysicalEstimate:
     sensitivities: Matrix | None
     """∂ln p̂ / ∂ln θ̂ (np, nθ): 10 says that 1 % in θ moves p by 10 %. NaN for p̂ = 0, 0 for one at a bound."""
     warnings: tuple[str, ...] = ()
-
-    def as_rows(self) -> list[dict[str, Any]]:
-        """A row for each parameter, as `result.json` has them; None for what does not exist."""
-        columns = (self.names, self.units, self.initial.tolist(), self.value.tolist(), self.std, self.ci95)
-        keys = ("name", "unit", "initial", "value", "std", "ci95")
-        rows = [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]
-        return [row | {"ci95": list(row["ci95"]) if row["ci95"] else None} for row in rows]
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,6 @@ learner, and shares its variance.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -16,10 +15,11 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import jnp
 from orthaug._base.warning import Warning
 from orthaug.inference.measures import Measure, Points, Support
+from orthaug.inference.weighed import weigh_model
 from orthaug.models.model import Model
 from orthaug.models.rows import InMemory, Overlaps, learner_rows
 from orthaug.models.statistics import JointCovariance
-from orthaug.physics.excitation import excitation, require_rank
+from orthaug.physics.excitation import require_rank
 from orthaug.physics.projection import Projection
 
 SUPPORTED = 0.9  # share of a measure within reach of the data, below which it is warned of
@@ -47,12 +47,6 @@ class MeasureSplit:
             return told
         return f"{told}; standard errors {', '.join(f'{r:.3g}' for r in self.price)} times the training measure's"
 
-    def as_dict(self) -> dict[str, Any]:
-        """What result.json tells of the measure."""
-        price = None if self.price is None else [float(ratio) for ratio in self.price]
-        found = {"kind": self.name, "points": self.points, "support": self.support, "condition": self.condition}
-        return {**found, "std_over_training": price}
-
 
 def split_under(measure: Measure, model: Model, support: Support, joint: JointCovariance | None) -> MeasureSplit:
     """Split a model under a measure.
@@ -65,17 +59,11 @@ def split_under(measure: Measure, model: Model, support: Support, joint: JointCo
     Raises:
         InputError: a measure that does not fit the model, or under which the physics is rank-deficient.
     """
-    points = measure.points(support)
+    weighed = weigh_model(measure, support, model.form, model.weight)
+    points, unit, projection = weighed.points, weighed.unit, weighed.projection
     form, numbers = model.form, model.numbers
-    with np.errstate(all="ignore"):
-        phi = np.asarray(form.baseline.phi(points.x, form.layout, form.outputs, np))
-    if not np.isfinite(phi).all():
-        raise InputError(f"the physics is not finite on all points of the {measure.name} measure; narrow it.")
-    unit = np.sqrt(points.weight)[:, None] * model.weight
-    projection = Projection.factor(phi * unit[:, :, None])
-    found = excitation(projection.r, form.baseline.names)
     try:
-        require_rank(found, phi.shape[0] * phi.shape[1])
+        require_rank(weighed.excitation, unit.size)
     except InputError as error:
         raise type(error)(f"under the {measure.name} measure {error}") from None
     raw = model.learner_at(points.x)
@@ -96,7 +84,8 @@ def split_under(measure: Measure, model: Model, support: Support, joint: JointCo
     learns = form.bound is not None
     told = Warning("measure_beyond_data", f"{reach}: elsewhere θ rests on how the learner extrapolates.")
     warnings = (told,) if share < SUPPORTED and learns else ()
-    return MeasureSplit(measure.name, theta, aux, covariance, defect, share, len(points.x), found.condition, warnings)
+    condition = weighed.excitation.condition
+    return MeasureSplit(measure.name, theta, aux, covariance, defect, share, len(points.x), condition, warnings)
 
 
 def learner_slope(model: Model, points: Points, projection: Projection, unit: Matrix) -> Matrix:

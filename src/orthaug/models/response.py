@@ -22,22 +22,13 @@ if TYPE_CHECKING:
 class Scores:
     """Per output: `rmse` in the output's unit, `nrmse` = RMSE / std(y), `fit` = 100 (1 − NRMSE) in %, not clipped.
 
-    Entries are NaN where a score does not exist (a run that diverged, an output that does not move);
-    `as_dict` turns them into None.
+    Entries are NaN where a score does not exist (a run that diverged, an output that does not move).
     """
 
     rmse: Vector
     nrmse: Vector
     fit: Vector
     samples: int
-
-    def as_dict(self) -> dict[str, list[float | None] | None]:
-        """Plain lists for JSON; None instead of a list where no output has a score."""
-        entries = {"rmse": self.rmse, "nrmse": self.nrmse, "fit": self.fit}
-        return {
-            key: None if np.isnan(values).all() else [None if np.isnan(v) else float(v) for v in values]
-            for key, values in entries.items()
-        }
 
 
 def scores(measured: Matrix, model: Matrix) -> Scores:

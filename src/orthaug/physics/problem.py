@@ -15,7 +15,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug.data.expressions import Lag, parse
 from orthaug.data.record import Record
-from orthaug.data.regressors import Features, Lags, Layout, Rows, in_order, stack_rows
+from orthaug.data.regressors import Features, Lags, Layout, Rows, in_order, lag_matrix, stack_rows
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.excitation import Excitation, excitation, require_rank
 from orthaug.physics.projection import Projection
@@ -142,12 +142,15 @@ def pose(
 
 def check_defined(problem: Problem, record: Record) -> None:
     """Raise InputError where physics or learner inputs are not finite on another record's measured rows."""
-    rows = stack_rows(record, problem.layout)
-    with np.errstate(all="ignore"):
-        phi = np.asarray(problem.baseline.phi(rows.x, problem.layout, problem.outputs, np))
-        known = np.asarray(problem.baseline.known(rows.x, problem.layout, problem.outputs, np))
-    _check_physics(phi, known, problem.baseline, rows, record)
-    _feature_rows(problem.features, rows, problem.layout, record)
+    layout, outputs, start = problem.layout, problem.outputs, problem.rows.start
+    for experiment in record.experiments:
+        alone = replace(record, experiments=(experiment,))
+        rows = Rows(lag_matrix(experiment, layout, record, start), experiment.outputs[start:], layout, start)
+        with np.errstate(all="ignore"):
+            phi = np.asarray(problem.baseline.phi(rows.x, layout, outputs, np))
+            known = np.asarray(problem.baseline.known(rows.x, layout, outputs, np))
+        _check_physics(phi, known, problem.baseline, rows, alone)
+        _feature_rows(problem.features, rows, layout, alone)
 
 
 def _feature_rows(features: Features, rows: Rows, layout: Layout, record: Record) -> Matrix:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from orthaug.analysis.residuals import ResidualTest
 from orthaug.models.response import Response
+from orthaug.reports.findings import ResidualTestResult, SuspectResult
+from orthaug.reports.result import RowResult
 
 # Okabe-Ito: told apart by every reader
 _BLACK, _GREY, _BLUE, _ORANGE, _GREEN = "#000000", "#B8B8B8", "#0072B2", "#E69F00", "#009E73"
@@ -76,14 +76,14 @@ def components_figure(response: Response, title: str) -> Figure:
     return figure
 
 
-def residual_analysis_figure(tests: Sequence[ResidualTest], title: str) -> Figure:
+def residual_analysis_figure(tests: Sequence[ResidualTestResult], title: str) -> Figure:
     """Of each residual: autocorrelation, correlation with the inputs, means over its most telling regressor."""
     figure = Figure(figsize=(_SIZE[0] * 1.3, 0.5 + 2.6 * len(tests)), layout="constrained")
     axes = figure.subplots(len(tests), 3, squeeze=False)
     figure.suptitle(f"{title}: 99 % bands", fontsize=10)
     for row, test in zip(axes, tests, strict=True):
         if test.acf is not None and test.acf_band is not None:
-            row[0].bar(np.arange(1, len(test.acf)), test.acf[1:], color=_BLUE, width=0.6)
+            row[0].bar(np.arange(1, len(test.acf)), _floats(test.acf[1:]), color=_BLUE, width=0.6)
             row[0].axhspan(-test.acf_band, test.acf_band, color=_GREY, alpha=0.5)
         row[0].set_ylabel(f"residual of {test.name}")
         row[0].set_xlabel("lag")
@@ -91,30 +91,35 @@ def residual_analysis_figure(tests: Sequence[ResidualTest], title: str) -> Figur
         shown = [(name, cross) for name, cross in test.cross.items() if cross is not None]
         for (name, cross), color in zip(shown, _CYCLE, strict=False):
             reach = len(cross.values) // 2
-            row[1].plot(np.arange(-reach, reach + 1), cross.values, ".-", color=color, linewidth=0.8, label=name)
+            row[1].plot(
+                np.arange(-reach, reach + 1), _floats(cross.values), ".-", color=color, linewidth=0.8, label=name
+            )
         if shown:
-            band = max(cross.band for _, cross in shown)
+            band = max(cross.band or 0.0 for _, cross in shown)
             row[1].axhspan(-band, band, color=_GREY, alpha=0.5)
             row[1].legend(fontsize=8, frameon=False)
         row[1].set_xlabel("lag behind the input")
         row[1].set_title("correlation with the inputs", fontsize=9)
-        curved = {name: found for name, found in test.regressors.items() if found is not None}
-        if curved:
-            name = max(curved, key=lambda key: curved[key].share)
-            found = curved[name]
-            row[2].errorbar(found.centres, found.means, 2.576 * found.errors, fmt="o", color=_GREEN, markersize=3)
+        curves = {name: (curve.share or 0.0, curve) for name, curve in test.regressors.items() if curve is not None}
+        if curves:
+            name = max(curves, key=lambda key: curves[key][0])
+            share, curve = curves[name]
+            centres, means, errors = (_floats(values) for values in (curve.centres, curve.means, curve.errors))
+            row[2].errorbar(centres, means, 2.576 * errors, fmt="o", color=_GREEN, markersize=3)
             row[2].axhline(0.0, color=_BLACK, linewidth=0.6)
             row[2].set_xlabel(name)
-            row[2].set_title(f"mean over {name}, {100 * found.share:.2g} % explained", fontsize=9)
+            row[2].set_title(f"mean over {name}, {100 * share:.2g} % explained", fontsize=9)
         for axis in row:
             axis.grid(alpha=0.25)
             axis.spines[["top", "right"]].set_visible(False)
     return figure
 
 
-def bias_figure(names: Sequence[str], suspects: Sequence[str], shares: np.ndarray, title: str) -> Figure:
-    """Heat map of the bias of each parameter by each suspect, in per cent; `shares` (n suspects, n parameters)."""
-    width, height = 2.6 + 0.8 * len(names) + 0.05 * max(map(len, suspects)), 1.2 + 0.28 * len(suspects)
+def bias_figure(suspects: Sequence[SuspectResult]) -> Figure:
+    """Heat map of the bias of each parameter by each suspect, in per cent."""
+    names, labels = list(suspects[0].percent), [suspect.name for suspect in suspects]
+    shares = np.array([_floats([suspect.percent[name] for name in names]) for suspect in suspects])
+    width, height = 2.6 + 0.8 * len(names) + 0.05 * max(map(len, labels)), 1.2 + 0.28 * len(suspects)
     figure = Figure(figsize=(max(width, _SIZE[0]), height), layout="constrained")
     axis = figure.subplots()
     signed = np.sign(shares) * np.log10(1 + np.abs(shares))  # biases of 0.1 % and of 100 % both show
@@ -126,42 +131,42 @@ def bias_figure(names: Sequence[str], suspects: Sequence[str], shares: np.ndarra
             color = "white" if dark else _BLACK
             axis.text(j, i, f"{shares[i, j]:+.2g}", ha="center", va="center", fontsize=7, color=color)
     axis.set_xticks(range(len(names)), names)
-    axis.set_yticks(range(len(suspects)), suspects, fontsize=8)
+    axis.set_yticks(range(len(suspects)), labels, fontsize=8)
     axis.tick_params(length=0)
     axis.spines[:].set_visible(False)
+    title = "bias of each parameter [%] by terms that may be missing (without a guess: of 1 % of the output)"
     figure.suptitle(title, fontsize=10)
     return figure
 
 
-def comparison_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
+def comparison_figure(rows: Sequence[RowResult]) -> Figure:
     """Scores and parameters of several ways of modelling, from the rows of a comparison.
 
     Upper panel: free-run and one-step NRMSE on the last part. Below, a panel per parameter with 95 % intervals.
     """
-    names = [Path(row["name"]).name for row in rows]
-    parameters = [parameter["name"] for parameter in rows[0]["parameters"]]
+    names = [Path(row.name).name for row in rows]
+    parameters = rows[0].parameters
     figure = Figure(figsize=(_SIZE[0], 2.2 + 1.3 * len(parameters)), layout="constrained")
     axes = figure.subplots(1 + len(parameters), 1, sharex=True, squeeze=False)[:, 0]
     place = np.arange(len(rows))
     for kind, marker, color in zip(_KINDS, "os", (_BLUE, _ORANGE), strict=True):
         label = "one step" if kind == "prediction" else "free run"
         axes[0].plot(place, [_mean_nrmse(row, kind) for row in rows], marker, color=color, label=label)
-    part = list(rows[0]["scores"])[-1] if rows[0]["scores"] else ""
+    part = list(rows[0].scores)[-1] if rows[0].scores else ""
     axes[0].set_title(f"NRMSE on {part}, and parameters with their 95 % intervals (hollow: none)", fontsize=10, pad=20)
     axes[0].set_ylabel("NRMSE")
     axes[0].set_ylim(0, 1.15 * np.nanmax([0.0, *(_mean_nrmse(row, kind) for row in rows for kind in _KINDS)]) or 1.0)
     _legend(axes[0])
-    for axis, name in zip(axes[1:], parameters, strict=True):
+    for axis, parameter in zip(axes[1:], parameters, strict=True):
         for i, row in enumerate(rows):
-            entry = next((p for p in row["parameters"] if p["name"] == name), None)
-            if entry is None or entry["value"] is None:
+            entry = next((p for p in row.parameters if p.name == parameter.name), None)
+            if entry is None or entry.value is None:
                 continue
-            interval = entry["ci95"] if entry["ci95"] and None not in entry["ci95"] else None
+            interval = entry.ci95 if entry.ci95 and None not in entry.ci95 else None
             if interval:
                 axis.plot([i, i], interval, "_-", color=_GREEN, markersize=14)
-            axis.plot([i], [entry["value"]], "o", color=_GREEN, markerfacecolor=_GREEN if interval else "white")
-        unit = rows[0]["parameters"][parameters.index(name)]["unit"]
-        axis.set_ylabel(f"{name} [{unit}]" if unit else name)
+            axis.plot([i], [entry.value], "o", color=_GREEN, markerfacecolor=_GREEN if interval else "white")
+        axis.set_ylabel(f"{parameter.name} [{parameter.unit}]" if parameter.unit else parameter.name)
     for axis in axes:
         axis.margins(y=0.15)
         axis.grid(alpha=0.25)
@@ -172,12 +177,17 @@ def comparison_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
     return figure
 
 
-def _mean_nrmse(row: Mapping[str, Any], kind: str) -> float:
+def _mean_nrmse(row: RowResult, kind: str) -> float:
     """RMS over outputs of the last part's NRMSE; NaN where there is none."""
-    if not row["scores"]:
+    if not row.scores:
         return float("nan")
-    found = list(row["scores"].values())[-1][kind]["nrmse"]
-    return float("nan") if found is None or None in found else float(np.sqrt(np.mean(np.square(found))))
+    nrmse = list(row.scores.values())[-1].kinds[kind].nrmse
+    return float("nan") if nrmse is None or None in nrmse else float(np.sqrt(np.mean(np.square(_floats(nrmse)))))
+
+
+def _floats(values: Sequence[float | None]) -> np.ndarray:
+    """The numbers of a result, NaN for None."""
+    return np.array(values, dtype=float)
 
 
 def save(figure: Figure, path: Path) -> None:

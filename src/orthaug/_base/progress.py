@@ -1,0 +1,44 @@
+"""What training tells while it runs, on its way from a run's iteration to whoever shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+Tell = Callable[[int, int, float], None]
+"""Called now and then with the number of the run, its iteration and the loss; it may raise to stop the training."""
+
+
+def _nothing(run: int, iteration: int, loss: float) -> None:
+    """Nobody listens."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Tells `(run, iteration, loss)`, runs and iterations counted on from those that were told before.
+
+    Examples:
+        >>> told = Progress(lambda run, iteration, loss: print(run, iteration, loss))
+        >>> told.after(runs=3)(0, 1, 0.5)
+        3 1 0.5
+        >>> told.of(2)(20, 0.5)
+        2 20 0.5
+    """
+
+    tell: Tell = _nothing
+    runs: int = 0
+    iterations: int = 0
+
+    def __call__(self, run: int, iteration: int, loss: float) -> None:
+        self.tell(self.runs + run, self.iterations + iteration, loss)
+
+    def after(self, *, runs: int = 0, iterations: int = 0) -> Progress:
+        """The same for what follows so many runs or iterations."""
+        return replace(self, runs=self.runs + runs, iterations=self.iterations + iterations)
+
+    def of(self, run: int) -> Callable[[int, float], None]:
+        """What one run tells: its iteration and the loss."""
+        return lambda iteration, loss: self(run, iteration, loss)
+
+
+SILENT = Progress()

@@ -1,0 +1,88 @@
+"""Progress on standard error, and Ctrl-C that waits for compiled code to end."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from orthaug._base.progress import SILENT, Progress
+
+
+@contextmanager
+def training_bar(runs: int, iterations: int, wanted: bool = True) -> Iterator[Progress]:
+    """A progress bar on standard error where that is a terminal; Ctrl-C is told what it stopped."""
+    if not wanted:
+        yield SILENT
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    reached = "the start of training"
+    with (
+        _deferred_interrupt() as interrupted,
+        Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar,
+    ):
+        task = bar.add_task("compiling", total=runs * iterations)
+        done: dict[int, int] = {}
+
+        def tell(run: int, iteration: int, loss: float) -> None:
+            nonlocal reached
+            done[run] = iteration
+            reached = f"run {run + 1} of {runs}, iteration {iteration}, loss {loss:.3g}"
+            bar.update(task, completed=sum(done.values()), description=reached)
+            if interrupted.is_set():
+                raise KeyboardInterrupt(reached)
+
+        try:
+            yield Progress(tell)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(reached) from None
+        if interrupted.is_set():
+            raise KeyboardInterrupt("the scoring of the model")
+
+
+@contextmanager
+def study_bars() -> Iterator[Callable[[str, int, int], None]]:
+    """A bar per study on standard error where that is a terminal; Ctrl-C stops after the run at hand."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with (
+        _deferred_interrupt() as interrupted,
+        Progress(*columns, console=console, disable=not console.is_terminal) as bar,
+    ):
+        tasks: dict[str, Any] = {}
+
+        def tell(title: str, done: int, total: int) -> None:
+            if title not in tasks:
+                tasks[title] = bar.add_task(title, total=total)
+            bar.update(tasks[title], completed=done)
+            if interrupted.is_set():
+                raise KeyboardInterrupt(f"'{title}', {done} of {total} runs done and kept for the next time")
+
+        yield tell
+
+
+@contextmanager
+def _deferred_interrupt() -> Iterator[threading.Event]:
+    """Ctrl-C sets the event, so that it never lands inside compiled code; a second one interrupts at once."""
+    event = threading.Event()
+
+    def note(signum: int, frame: object) -> None:
+        if event.is_set():
+            raise KeyboardInterrupt
+        event.set()
+
+    previous = signal.signal(signal.SIGINT, note)
+    try:
+        yield event
+    finally:
+        signal.signal(signal.SIGINT, previous)

@@ -1,0 +1,24 @@
+"""What suspected terms would do to the parameters of a job, before a fit and after it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from orthaug.analysis.measure_bias import bias_under
+from orthaug.commands.job import Job
+from orthaug.commands.suspects import declared
+
+if TYPE_CHECKING:
+    from orthaug.fitting.estimates import Estimate
+
+
+def bias_of(job: Job, fit: Estimate | None = None) -> list[dict[str, Any]]:
+    """The table of suspects under the spec's measure; after a fit with its θ and what its learner explains."""
+    problem = job.problem
+    if not problem.baseline.names:
+        return []
+    suspects, theta = declared(job.spec.suspects, problem), None if fit is None else fit.theta
+    learned = None
+    if fit is not None and fit.model.form.bound is not None:
+        learned = fit.model.learner_at(job.weighed.points.x)
+    return bias_under(job.weighed, problem, suspects, physics=job.physics, theta=theta, learned=learned)

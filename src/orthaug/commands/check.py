@@ -1,0 +1,25 @@
+"""What `orthaug check` does: excitation, identifiability and suspected biases; nothing is trained."""
+
+from __future__ import annotations
+
+from orthaug.commands.bias import bias_of
+from orthaug.commands.job import Job
+from orthaug.physics.excitation import identifiability
+from orthaug.reports.result import CheckResult
+
+
+def check_job(job: Job) -> CheckResult:
+    """Excitation on the data, identifiability of the physics, and what each suspect would do to θ."""
+    problem = job.problem
+    return CheckResult.model_validate(
+        {
+            "data": job.data,
+            "parameters": problem.baseline.names,
+            "regressor": [str(lag) for lag in problem.layout],
+            "rows": len(problem.rows),
+            "excitation": problem.excitation,
+            "identifiability": identifiability(problem.baseline, problem.layout, problem.outputs, problem.rows.x),
+            "bias": bias_of(job) if problem.excitation.full_rank else None,
+            "warnings": job.warnings,
+        }
+    )

@@ -1,0 +1,268 @@
+"""What `orthaug fit` does: train a job, score and judge it, and write the folder that holds the result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from orthaug._base.errors import InputError
+from orthaug._base.folders import whole_folder
+from orthaug._base.progress import SILENT, Progress
+from orthaug._base.warning import Warning
+from orthaug.commands.bias import bias_of
+from orthaug.commands.folder import is_result
+from orthaug.commands.job import ALONE, AS_DECLARED, Job, Variant, run_fit
+from orthaug.commands.parts import Part
+from orthaug.data.regressors import lag_rows
+from orthaug.reports.fields import WarningResult
+from orthaug.reports.result import (
+    FitResult,
+    ParameterResult,
+    PartScores,
+    ScoreResult,
+    parameter_rows,
+    physical_rows,
+)
+
+if TYPE_CHECKING:
+    from orthaug.analysis.validation import Trial, Verdict
+    from orthaug.fitting.estimates import Estimate
+    from orthaug.inference.physical import PhysicalEstimate
+    from orthaug.models.model import Model
+    from orthaug.models.response import Response
+
+DEFAULT_BLOCKS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A fit with the content of result.json: parameters, scores on every part, what was found."""
+
+    job: Job
+    fit: Estimate
+    result: FitResult
+    responses: Mapping[str, tuple[Response, Response]]
+    """One-step prediction and free run of every part, by its name; none where training failed."""
+
+
+def fit_job(job: Job, progress: Progress = SILENT) -> Fitted:
+    """Train as the spec says, score every part, and ask whether the learner earns its place."""
+    fitted = fit_variant(job, AS_DECLARED, progress)
+    fit, warnings = fitted.fit, list(fitted.result.warnings)
+    if not fit.status.ok or fit.model.form.bound is None:
+        return fitted
+    verdict = judge_fit(fitted)
+    if verdict is None and job.spec.validation.blocks != 0:
+        told = (
+            "whether the learner helps is not judged: no part is held out, and the training data have too few "
+            "rows for cross-validation in so many blocks."
+        )
+        warnings.append(WarningResult(code="not_judged", text=told))
+    if verdict is not None:
+        warnings += [WarningResult.model_validate(warning) for warning in verdict.warnings]
+    result = FitResult.model_validate({**dict(fitted.result), "validation": verdict, "warnings": warnings})
+    return replace(fitted, result=result)
+
+
+def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitted:
+    """Train a variant of a job and score every part; whether the learner helps is not asked."""
+    fit = run_fit(job, variant, progress)
+    warnings: list[Any] = [*job.warnings, *fit.warnings]
+    unknown = ("physical_parameters", "physical_consistency", "sensitivities", "bias", "residuals", "stability")
+    content: dict[str, Any] = dict.fromkeys(unknown)
+    scores, responses = {}, {}
+    if fit.status.ok:
+        content |= _physical_content(job, fit, warnings)
+        content["bias"] = bias_of(job, fit)
+        for part in job.parts:
+            scores[part.name], responses[part.name] = score_part(fit.model, part, warnings)
+        one_step, free_run = responses[job.train.name]
+        content |= _analysed(fit, one_step, free_run, warnings)
+    nothing_known = np.full(len(fit.theta), np.nan)
+    content |= {
+        "spec": job.declaration,
+        "data": job.data,
+        "status": fit.status,
+        "restarts": fit.restarts,
+        "parameters": parameter_rows(
+            fit.problem.baseline.parameters,
+            fit.theta if fit.status.ok else nothing_known,
+            fit.std,
+            fit.interval,
+            fit.one_step_theta,
+        ),
+        "structure": fit.model.structure,
+        "measure": fit.model.measure if fit.model.structure == "orthogonal" else None,
+        "measure_detail": fit.measure,
+        "orthogonality_defect": fit.defect,
+        "excitation": fit.excitation,
+        "scores": scores,
+        "validation": None,
+        "warnings": warnings,
+    }
+    return Fitted(job, fit, FitResult.model_validate(content), responses)
+
+
+def _physical_content(job: Job, fit: Estimate, warnings: list[Any]) -> dict[str, Any]:
+    """The physical parameters of θ̂ and what belongs to them, where the spec has a map; warnings are added."""
+    if job.physics is None:
+        return {}
+    physical = fit.physical(job.physics)
+    warnings += physical.warnings
+    return {
+        "physical_parameters": _physical_rows(job, physical, fit),
+        "physical_consistency": physical.consistency,
+        "sensitivities": _sensitivities(job, physical),
+    }
+
+
+def _physical_rows(job: Job, physical: PhysicalEstimate, fit: Estimate) -> list[ParameterResult]:
+    """The physical parameters, with profile intervals where the spec asks for them."""
+    assert job.physics is not None and job.spec.physics is not None
+    if not job.spec.physics.profile or physical.covariance is None:
+        return physical_rows(physical)
+    return physical_rows(physical, {name: fit.physical_profile(job.physics, name) for name in physical.names})
+
+
+def _sensitivities(job: Job, physical: PhysicalEstimate) -> dict[str, dict[str, float]] | None:
+    """∂ln p / ∂ln θ by name."""
+    if job.physics is None or physical.sensitivities is None:
+        return None
+    return {
+        name: dict(zip(job.physics.theta_names, row, strict=True))
+        for name, row in zip(physical.names, physical.sensitivities, strict=True)
+    }
+
+
+def _analysed(fit: Estimate, one_step: Response, free_run: Response, warnings: list[Any]) -> dict[str, Any]:
+    """What the residuals and the free run's sensitivity say; warnings are added."""
+    from orthaug.analysis.diagnosis import diagnose
+    from orthaug.analysis.free_run_stability import stability
+
+    problem = fit.problem
+    diagnosis = diagnose(fit, one_step=one_step, free_run=free_run)
+    steady = stability(fit.model, problem.record, response=free_run, x=problem.rows.x)
+    warnings += steady.warnings
+    if diagnosis is None:
+        told = "the residual is not analysed: there are too few rows for that, or it is rounding only."
+        warnings.append(Warning("residual_not_analysed", told))
+    else:
+        warnings += diagnosis.warnings
+    return {"residuals": diagnosis, "stability": steady}
+
+
+def judge_fit(fitted: Fitted, blocks: Sequence[Trial] | None = None, alone: Fitted | None = None) -> Verdict | None:
+    """Whether the learner earns its place: free runs against physics alone on what was not fitted.
+
+    Args:
+        blocks: trials of blocked cross-validation; None to make them where there is no validation or test part, or
+            where the spec asks for them.
+        alone: the physics alone; None to fit it.
+    """
+    from orthaug.analysis.validation import extrapolation, judge, trial_on
+
+    job, model = fitted.job, fitted.fit.model
+    held_out, wanted = job.parts[1:], job.spec.validation.blocks
+    if blocks is None:
+        wanted = (0 if held_out else DEFAULT_BLOCKS) if wanted is None else wanted
+        blocks = cross_validated(job, wanted, [AS_DECLARED])[0] if wanted else ()
+    physics = run_fit(job, Variant(ALONE)).model if alone is None else alone.fit.model
+    trials, beyond = list(blocks), []
+    for part in held_out:
+        ran = None if alone is None else alone.responses[part.name][1]
+        response = fitted.responses[part.name][1]
+        trials.append(
+            trial_on(part.name, part.record, part.skips, physics, model, alone_response=ran, response=response)
+        )
+        x = lag_rows(part.record, job.problem.layout)
+        beyond += extrapolation(part.name, x, job.problem.rows.x, job.problem.layout)
+    return judge(trials, beyond)
+
+
+def cross_validated(job: Job, blocks: int, variants: Sequence[Variant]) -> list[list[Trial]]:
+    """Trials of every variant on every block; none where the record is too short for that."""
+    from orthaug.analysis.validation import Trial, cross_validate
+
+    def fit_of(variant: Variant) -> Any:
+        return lambda fold: run_fit(job, variant.on(fold))
+
+    fits = [fit_of(variant) for variant in (Variant(ALONE), *variants)]
+    try:
+        errors = cross_validate(job.train.record, fits, blocks=blocks, start=job.problem.rows.start)
+    except InputError:
+        return [[] for _ in variants]
+    return [
+        [Trial(f"block {i + 1} of {blocks}", fold[0], fold[1 + j]) for i, fold in enumerate(errors)]
+        for j in range(len(variants))
+    ]
+
+
+def score_part(model: Model, part: Part, warnings: list[Any]) -> tuple[PartScores, tuple[Response, Response]]:
+    """Scores of a part and the responses they come from; what does not exist is None, with one of the `warnings`."""
+    responses = model.predict(part.record), model.simulate(part.record)
+    scores = {}
+    for kind, response in zip(("prediction", "simulation"), responses, strict=True):
+        runaway = next((t.diverged for t in response.trajectories if t.diverged), None)
+        scored = response.scores(part.skips)
+        scores[kind] = ScoreResult() if runaway is not None else scored
+        if runaway is not None:
+            step, output = runaway
+            told = f"{part.name}: the free run diverged in output '{output}' at step {step}; no simulation scores."
+            warnings.append(Warning("free_run_diverged", told))
+        elif np.isnan(scored.rmse).any():
+            warnings.append(Warning("not_finite", f"{part.name}: the {kind} is not finite on some rows; no scores."))
+        elif np.isnan(scored.nrmse).any():
+            told = f"{part.name}: an output is constant over the scored samples; no NRMSE and FIT of its {kind}."
+            warnings.append(Warning("constant_output", told))
+    return PartScores.model_validate(scores), responses
+
+
+def write_result(fitted: Fitted, folder: Path) -> None:
+    """result.json, model/ and figures/, whole or not at all; without a model where training failed."""
+    with whole_folder(folder, is_result) as partial:
+        fill_result(fitted, partial)
+
+
+def fill_result(fitted: Fitted, folder: Path) -> None:
+    """Write the files of a result into an existing folder."""
+    from orthaug.models import storage
+    from orthaug.reports import page
+
+    (folder / "result.json").write_text(fitted.result.to_json() + "\n", encoding="utf-8")
+    if not fitted.fit.status.ok:
+        return
+    (folder / "model").mkdir()
+    storage.write(fitted.fit.model, folder / "model")
+    (folder / "figures").mkdir()
+    _draw(fitted, folder / "figures")
+    text = page.page(fitted.job.path.stem, fitted.result, folder / "figures")
+    (folder / "report.html").write_text(text, encoding="utf-8")
+
+
+def _draw(fitted: Fitted, folder: Path) -> None:
+    from orthaug.reports import plots
+
+    last = fitted.job.parts[-1].name
+    one_step, free = fitted.responses[last]
+    result, structure = fitted.result, fitted.fit.model.structure
+    where = f"{last}, {structure}"
+    drawn = {
+        "prediction": plots.output_figure(one_step, f"one-step prediction, {where}"),
+        "simulation": plots.output_figure(free, f"free run, {where}"),
+        "residual": plots.residual_figure(one_step, f"one-step residual, {where}"),
+    }
+    if result.residuals is not None:
+        for kind, tests in (("one-step", result.residuals.one_step), ("free-run", result.residuals.free_run)):
+            if tests is not None:
+                title = f"{kind} residual on the training data, {structure}"
+                drawn[f"residuals_{kind.replace('-', '_')}"] = plots.residual_analysis_figure(tests, title)
+    if result.bias:
+        drawn["bias"] = plots.bias_figure(result.bias)
+    if fitted.fit.model.form.bound is not None:
+        drawn["components"] = plots.components_figure(one_step, f"parts of the one-step prediction, {where}")
+    for name, figure in drawn.items():
+        plots.save(figure, folder / f"{name}.png")

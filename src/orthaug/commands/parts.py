@@ -1,0 +1,123 @@
+"""Parts of the data: their files read, checked, and cut to what can be scored."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from orthaug._base.errors import InputError
+from orthaug._base.warning import Warning
+from orthaug.commands import spec as declared
+from orthaug.data.readers import read_record
+from orthaug.data.record import Record, same_step
+from orthaug.reports.result import FileResult
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A part of the data: its record, and how many leading samples of each recording are not scored."""
+
+    name: str
+    record: Record
+    skip: int
+    files: tuple[FileResult, ...]
+    warnings: tuple[Warning, ...] = ()
+    """Rows that were thinned out, or left out around missing samples."""
+
+    def without_short(self, first: int) -> Part:
+        """Without stretches between missing samples that are too short for a row after the first `first`."""
+        record = self.record
+        if not record.missing:
+            return self
+        pairs = zip(record.experiments, self.skips, strict=True)
+        long = tuple(e for e, skip in pairs if len(e) > max(first, skip))
+        if not long:
+            most = max(len(e) for e in record.experiments)
+            raise InputError(
+                f"{record.experiments[0].source}: data.{self.name}: the longest stretch between missing samples has "
+                f"{_count(most, 'row')}, too few: the first "
+                f"{max(first, self.skip)} are lags or skipped."
+            )
+        record = replace(record, experiments=long)
+        usable = sum(len(experiment) - first for experiment in record.experiments)
+        lost = "row has missing cells and is" if record.missing == 1 else "rows have missing cells and are"
+        gaps = Warning(
+            "missing_rows",
+            f"{self.name}: {record.missing} {lost} left out with all windows that touch them; "
+            f"{_count(usable, 'usable row')} remain, in {_count(len(record.experiments), 'stretch', 'stretches')}.",
+        )
+        return replace(self, record=record, warnings=(*self.warnings, gaps))
+
+    @property
+    def skips(self) -> tuple[int, ...]:
+        """How many leading samples of each experiment are not scored."""
+        return tuple(max(0, self.skip - experiment.offset) for experiment in self.record.experiments)
+
+    def scored(self, start: int) -> Record:
+        """The record without rows that are neither scored nor lags of what is, for a first usable row `start`."""
+        kept = tuple(
+            e.rows(max(0, skip - start), None) for e, skip in zip(self.record.experiments, self.skips, strict=True)
+        )
+        return replace(self.record, experiments=kept)
+
+    def check_scorable(self, start: int, sampling_time: float) -> None:
+        """Raise InputError where an experiment has no row to score, or another sampling time."""
+        if not same_step(self.record.sampling_time, sampling_time):
+            raise InputError(
+                f"data.{self.name}: sampled every {self.record.sampling_time:g} s, the training data every "
+                f"{sampling_time:g} s; one model has one sampling time."
+            )
+        for experiment, skip in zip(self.record.experiments, self.skips, strict=True):
+            first = max(start, skip)
+            if len(experiment) <= first:
+                raise InputError(
+                    f"{experiment.source}: data.{self.name} has {len(experiment)} rows, too few; the first {first} are "
+                    f"lags or skipped, so at least {first + 1} are needed."
+                )
+
+
+def load_parts(path: Path, spec: declared.Spec) -> tuple[Part, Part | None, tuple[Part, ...]]:
+    """Training, validation and test parts of the spec at `path`, as their files hold them."""
+    train = _load(path, spec, spec.data.train, "train")
+    validation = _load(path, spec, spec.data.validation, "validation") if spec.data.validation else None
+    tests = tuple(_load(path, spec, part, f"tests.{name}") for name, part in spec.data.tests.items())
+    return train, validation, tests
+
+
+def _load(path: Path, spec: declared.Spec, part: declared.Part, name: str) -> Part:
+    """Read a part's files; messages begin with the file that is at fault, as the spec names it once it is read."""
+    unknown = [channel for channel in part.columns if channel not in (*spec.data.inputs, *spec.data.outputs)]
+    if unknown:
+        raise InputError(f"{path}: 'data.{name}.columns': '{unknown[0]}' is neither an input nor an output.")
+    records, files = [], []
+    for file in part.files:
+        record = read_record(
+            path.parent / file,
+            inputs=spec.channels(spec.data.inputs),
+            outputs=spec.channels(spec.data.outputs),
+            sampling_time=spec.data.sampling_time,
+            time=spec.data.time,
+            rows=part.rows,  # type: ignore[arg-type]  (lists of two, checked by the spec)
+            every=part.every,
+            columns=part.columns,
+            missing=spec.data.missing,
+        )
+        digest = hashlib.sha256((path.parent / file).read_bytes()).hexdigest()
+        files.append(FileResult(file=file, sha256=digest, rows=len(record)))
+        records.append(record)
+    record = Record.join(records)
+    sources = (file for one, file in zip(records, part.files, strict=True) for _ in one.experiments)
+    told = tuple(replace(e, source=file) for e, file in zip(record.experiments, sources, strict=True))
+    record = replace(record, experiments=told)
+    warnings = (_thinned(name, part.every),) if part.every > 1 else ()
+    return Part(name, record, part.skip, tuple(files), warnings)
+
+
+def _thinned(name: str, every: int) -> Warning:
+    kept = f"one row in {every} is kept without a filter"
+    return Warning("thinned", f"{name}: {kept}; content above the new Nyquist frequency folds back.")
+
+
+def _count(number: int, one: str, more: str = "") -> str:
+    return f"{number} {one if number == 1 else more or one + 's'}"

@@ -1,0 +1,71 @@
+"""The physics over a measure's points, weighted and factorised: what splits, suspects and checks of a measure share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.errors import InputError
+from orthaug.inference.measures import Measure, Points, Support, Training
+from orthaug.models.lagged import Lagged
+from orthaug.physics.baseline import Baseline
+from orthaug.physics.excitation import Excitation, excitation
+from orthaug.physics.problem import Problem
+from orthaug.physics.projection import Projection
+
+
+@dataclass(frozen=True, eq=False)
+class Weighed:
+    """A measure's `points`, and the physics there with every row multiplied by `unit` (M, ny).
+
+    The unit is the square root of a point's weight over the deviation of the output.
+    """
+
+    measure: Measure
+    points: Points
+    unit: Matrix
+    projection: Projection
+    excitation: Excitation
+
+
+def weigh(measure: Measure, support: Support, baseline: Baseline, outputs: tuple[str, ...], weight: Vector) -> Weighed:
+    """The physics over a measure's points.
+
+    Args:
+        weight: one over the deviation of each output, (ny,).
+
+    Raises:
+        InputError: a measure that does not fit the data, or on whose points the physics is not finite.
+    """
+    points = measure.points(support)
+    with np.errstate(all="ignore"):
+        phi = np.asarray(baseline.phi(points.x, support.layout, outputs, np))
+    if not np.isfinite(phi).all():
+        raise InputError(f"the physics is not finite on all points of the {measure.name} measure; narrow it.")
+    unit = np.sqrt(points.weight)[:, None] * weight
+    projection = Projection.factor(phi * unit[:, :, None])
+    return Weighed(measure, points, unit, projection, excitation(projection.r, baseline.names))
+
+
+def weigh_model(measure: Measure, support: Support, form: Lagged, weight: Vector) -> Weighed:
+    """The same for a model's physics."""
+    return weigh(measure, support, form.baseline, form.outputs, weight)
+
+
+def weigh_problem(measure: Measure, problem: Problem) -> Weighed:
+    """The same for a posed problem; under the training measure its own factor, not another one."""
+    if measure != Training():
+        return weigh(measure, support_of(problem), problem.baseline, problem.outputs, problem.weight)
+    rows, own = len(problem.rows), problem.projection
+    even = np.full(rows, 1 / rows)
+    size = np.sqrt(even[0])
+    projection = replace(own, r=own.r * size, phi=own.phi * size)
+    unit = np.sqrt(even)[:, None] * problem.weight
+    return Weighed(measure, Points(problem.rows.x, even), unit, projection, problem.excitation)
+
+
+def support_of(problem: Problem) -> Support:
+    """What a measure may draw on where a problem is posed."""
+    return Support(problem.record, problem.layout, problem.used, problem.rows.x)

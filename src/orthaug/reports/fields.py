@@ -1,0 +1,72 @@
+"""What results are made of: plain numbers and lists that JSON can hold, read from the library's objects."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
+
+from orthaug._base.warning import Warning
+
+
+def _number(value: Any) -> Any:
+    """A float, or None for what is not finite: JSON has no NaN."""
+    if isinstance(value, float | int | np.number):
+        return float(value) if math.isfinite(value) else None
+    return value
+
+
+def _plain(value: Any) -> Any:
+    """Python's own numbers and lists for NumPy's."""
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+
+
+Number = Annotated[float | None, BeforeValidator(_number)]
+Whole = Annotated[int, BeforeValidator(_plain)]
+Flag = Annotated[bool, BeforeValidator(_plain)]
+Numbers = Annotated[list[Number], BeforeValidator(_plain)]
+Wholes = Annotated[list[int], BeforeValidator(_plain)]
+ByName = dict[str, Number]
+
+
+class Content(BaseModel):
+    """A table of a result. It reads an object's attributes, or the JSON that it wrote."""
+
+    model_config = ConfigDict(from_attributes=True, populate_by_name=True, frozen=True)
+
+    absent: ClassVar[frozenset[str]] = frozenset()
+    """Keys that are left out where they hold None; all others are written as null."""
+
+    @model_serializer(mode="wrap")
+    def _without_absent(self, handler: SerializerFunctionWrapHandler):
+        return {key: value for key, value in handler(self).items() if value is not None or key not in self.absent}
+
+    def content(self) -> dict[str, Any]:
+        """Dictionaries, lists, text, numbers and None."""
+        return self.model_dump(mode="json", by_alias=True)
+
+    def to_json(self) -> str:
+        """The content as text; never NaN."""
+        return json.dumps(self.content(), indent=1, ensure_ascii=False, allow_nan=False)
+
+
+class WarningResult(Content):
+    """What the reader must know: a `code` for programs and a sentence. It reads a `Warning`."""
+
+    code: str
+    text: str
+
+    @model_validator(mode="before")
+    @classmethod
+    def _coded(cls, given: Any) -> Any:
+        return Warning("note", given) if isinstance(given, str) else given  # until every warning has its code

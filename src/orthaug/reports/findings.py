@@ -1,0 +1,216 @@
+"""The parts of a result that analyse it: suspects, residuals, stability, and whether the learner helps."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from orthaug.reports.fields import ByName, Content, Flag, Number, Numbers, WarningResult, Whole, Wholes
+
+
+class CertificateResult(Content):
+    """Whether some weighting of the points leaves no bias."""
+
+    verdict: str
+    direction: ByName | None
+    shares: ByName | None
+    cosine: Number
+    positive: Number
+    sentence: str
+
+
+class PhysicalBias(Content):
+    """What the guessed coefficient does to a physical parameter."""
+
+    bias: Number
+    relative: Number
+
+
+class SuspectResult(Content):
+    """What a term that may be missing does to θ."""
+
+    name: str
+    expression: str
+    output: str | None
+    coefficient: Number
+    bias: ByName
+    relative_bias: ByName | None
+    expected_bias: ByName | None
+    physical_bias: ByName | None
+    cosine: Number
+    explained: Number
+    coefficient_found: Number
+    certificate: CertificateResult | None
+    relative_physical_bias: ByName | None
+    size: Number
+    expected_physical_bias: dict[str, PhysicalBias] | None
+
+    @property
+    def percent(self) -> dict[str, float | None]:
+        """The bias of every θ and physical parameter, in per cent of its value.
+
+        It is what the guessed coefficient gives; without a guess, what the term gives where it makes up 1 % of the
+        outputs' deviation over the measure.
+        """
+        coefficient = self.coefficient
+        if coefficient is None:
+            coefficient = 0.01 / self.size if self.size else None
+        relative = {**(self.relative_bias or {}), **(self.relative_physical_bias or {})}
+        shares = {k: None if v is None or coefficient is None else 100 * v * coefficient for k, v in relative.items()}
+        exact = {k: 100 * e.relative for k, e in (self.expected_physical_bias or {}).items() if e.relative}
+        return shares | exact
+
+
+class LjungBoxResult(Content):
+    """Whether the residual is white."""
+
+    statistic: Number
+    freedom: Whole
+    p: Number
+
+
+class NormalityResult(Content):
+    """Whether the whitened residual is normal."""
+
+    statistic: Number
+    p: Number
+    skewness: Number
+    kurtosis: Number
+
+
+class CrossResult(Content):
+    """A residual against an input."""
+
+    values: Numbers
+    band: Number
+    p: Number
+    lag: Whole
+    largest: Number
+
+
+class RegressorResult(Content):
+    """A residual over a regressor, by bins."""
+
+    p: Number
+    share: Number
+    centres: Numbers
+    means: Numbers
+    errors: Numbers
+    counts: Wholes
+
+
+class ResidualTestResult(Content):
+    """All tests of one output's residual."""
+
+    name: str
+    n: Whole
+    level: Number
+    mean: Number
+    rms: Number
+    acf: Numbers | None
+    acf_band: Number
+    ljung_box: LjungBoxResult | None
+    white: Flag | None
+    order: Whole | None
+    cross: dict[str, CrossResult | None]
+    correlated_inputs: list[str]
+    regressors: dict[str, RegressorResult | None]
+    curved_regressors: list[str]
+    normality: NormalityResult | None
+    largest_acf: Number
+    largest_cross: Number
+    largest_share: Number
+
+
+class DiagnosisResult(Content):
+    """What the residuals say about the noise."""
+
+    verdict: str
+    text: str
+    one_step: list[ResidualTestResult]
+    free_run: list[ResidualTestResult] | None
+    free_run_to_one_step: Number = Field(validation_alias="ratio")
+    noise_in_lags: Number
+
+
+class PlaceResult(Content):
+    """A point of the data or beside them."""
+
+    experiment: int | None
+    row: int | None
+    where: str
+    regressor: ByName
+
+
+class FeedbackResult(Content):
+    """The local spectral radius along the free run."""
+
+    largest: Number
+    median: Number
+    share_above_one: Number
+    worst: PlaceResult | None
+    steps: Whole
+    skipped: Whole
+    diverged: list[str]
+
+
+class ContractionResult(Content):
+    """The best norm in which the sampled points contract."""
+
+    rate: Number
+    bound: Number
+    share: Number
+    samples: Whole
+    overshoot: Number
+    metric: list[Numbers]
+    worst: PlaceResult
+
+
+class LipschitzResult(Content):
+    """The largest gradients of the one-step predictor."""
+
+    gradient: Number
+    gradient_scaled: Number
+    worst: PlaceResult | None
+    phi: Number
+    phi_scaled: Number
+    phi_worst: PlaceResult | None
+    rows: Whole
+
+
+class StabilityResult(Content):
+    """Evidence on the free run."""
+
+    feedback: FeedbackResult | None
+    contraction: ContractionResult | None
+    diverges_at: Number
+    searched: Number
+    lipschitz: LipschitzResult
+    warnings: list[WarningResult]
+    text: str
+
+
+class TrialResult(Content):
+    """Free-run errors on data that were not fitted."""
+
+    where: str
+    physics_alone: Number = Field(validation_alias="alone")
+    model: Number
+
+
+class ExtrapolationResult(Content):
+    """How far a part leaves the training data."""
+
+    part: str
+    regressor: str = Field(validation_alias="lag")
+    training: Numbers
+    found: Numbers
+    share: Number
+
+
+class ValidationResult(Content):
+    """Whether the learner earns its place."""
+
+    verdict: str = Field(validation_alias="code")
+    text: str
+    trials: list[TrialResult]
+    extrapolation: list[ExtrapolationResult]

@@ -1,0 +1,311 @@
+"""The content of result.json, and of what other commands print as JSON. Text, page and plots read it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import BeforeValidator, Field
+
+from orthaug import __version__
+from orthaug.physics.baseline import Parameter
+from orthaug.reports.fields import ByName, Content, Flag, Number, Numbers, WarningResult, Whole
+from orthaug.reports.findings import DiagnosisResult, StabilityResult, SuspectResult, ValidationResult
+
+if TYPE_CHECKING:
+    from orthaug.analysis.design import Design
+    from orthaug.inference.physical import PhysicalEstimate
+
+SCHEMA = 2
+
+
+class _Headed(Content):
+    """What every result begins with."""
+
+    schema_number: Literal[2] = Field(SCHEMA, validation_alias="schema", serialization_alias="schema")
+    orthaug: str = __version__
+
+
+class FileResult(Content):
+    """A data file that was read."""
+
+    file: str
+    sha256: str
+    rows: int
+
+
+class DataResult(Content):
+    """The files of each part."""
+
+    absent: ClassVar = frozenset({"validation", "tests"})
+
+    train: list[FileResult]
+    validation: list[FileResult] | None = None
+    tests: dict[str, list[FileResult]] | None = None
+
+    @property
+    def parts(self) -> dict[str, list[FileResult]]:
+        """Every part by its name."""
+        held_out = {} if self.validation is None else {"validation": self.validation}
+        return {"train": self.train, **held_out, **(self.tests or {})}
+
+
+class StatusResult(Content):
+    """How training ended."""
+
+    code: str
+    message: str
+    iterations: Whole
+    seconds: Number
+    loss: Number
+
+
+class RestartResult(Content):
+    """One run from its own initial weights."""
+
+    seed: Whole
+    loss: Number
+    iterations: Whole
+    code: str
+    chosen: Flag
+    regularization: str | float
+    validation: Number
+
+
+class ParameterResult(Content):
+    """A parameter with its interval."""
+
+    absent: ClassVar = frozenset({"one_step", "profile95"})
+
+    name: str
+    unit: str
+    initial: Number
+    value: Number
+    one_step: Number = None
+    std: Number = None
+    ci95: Numbers | None = None
+    profile95: Numbers | None = None
+
+
+class ConsistencyResult(Content):
+    """Whether θ̂ obeys what the physics fixes among θ."""
+
+    chi2: Number
+    df: Whole
+    p: Number
+    text: str
+
+
+class MeasureResult(Content):
+    """The measure that θ was split under."""
+
+    kind: str = Field(validation_alias="name")
+    points: Whole
+    support: Number
+    condition: Number
+    std_over_training: Numbers | None = Field(validation_alias="price")
+
+
+class ExcitationResult(Content):
+    """How well the data tell the parameters apart."""
+
+    rank: Whole
+    columns: Whole
+    condition: Number
+
+
+class GroupedExcitation(ExcitationResult):
+    """The same, with the groups that the data do not tell apart."""
+
+    collinear: list[list[str]]
+
+
+class IdentifiabilityResult(Content):
+    """Whether any data could tell the parameters apart."""
+
+    identifiable: Flag = Field(validation_alias="full_rank")
+    rank: Whole
+    columns: Whole
+    inseparable: list[list[str]] = Field(validation_alias="collinear")
+
+
+def _where_any(values: Any) -> Any:
+    """None instead of a list where no output has a score."""
+    return None if isinstance(values, np.ndarray) and np.isnan(values).all() else values
+
+
+Score = Annotated[Numbers | None, BeforeValidator(_where_any)]
+
+
+class ScoreResult(Content):
+    """One number per output; None where there is none."""
+
+    rmse: Score = None
+    nrmse: Score = None
+    fit: Score = None
+
+
+class PartScores(Content):
+    """The scores of a part."""
+
+    prediction: ScoreResult
+    simulation: ScoreResult
+
+    @property
+    def kinds(self) -> dict[str, ScoreResult]:
+        """By horizon: one step ahead, and the free run."""
+        return {"prediction": self.prediction, "simulation": self.simulation}
+
+
+class FitResult(_Headed):
+    """What `orthaug fit` leaves."""
+
+    spec: dict[str, Any]
+    data: DataResult
+    status: StatusResult
+    restarts: list[RestartResult]
+    parameters: list[ParameterResult]
+    physical_parameters: list[ParameterResult] | None
+    physical_consistency: ConsistencyResult | None
+    sensitivities: dict[str, ByName] | None
+    structure: str
+    measure: str | None
+    measure_detail: MeasureResult | None
+    orthogonality_defect: Number
+    excitation: ExcitationResult
+    scores: dict[str, PartScores]
+    bias: list[SuspectResult] | None
+    residuals: DiagnosisResult | None
+    stability: StabilityResult | None
+    validation: ValidationResult | None
+    warnings: list[WarningResult]
+
+
+class CheckResult(_Headed):
+    """What `orthaug check` tells."""
+
+    data: DataResult
+    parameters: list[str]
+    regressor: list[str]
+    rows: Whole
+    excitation: GroupedExcitation
+    identifiability: IdentifiabilityResult
+    bias: list[SuspectResult] | None
+    warnings: list[WarningResult]
+
+
+class RowResult(Content):
+    """One way of modelling in a comparison."""
+
+    name: str
+    status: str
+    seconds: Number
+    weights: Whole
+    parameters: list[ParameterResult]
+    orthogonality_defect: Number
+    scores: dict[str, PartScores]
+    residuals: DiagnosisResult | None
+    warnings: list[WarningResult]
+    learner_to_physics: Number
+    validation: ValidationResult | None
+
+
+class CompareResult(_Headed):
+    """What `orthaug compare` leaves."""
+
+    spec: dict[str, Any]
+    data: DataResult
+    comparison: list[RowResult]
+    chosen: str | None
+    left_out: dict[str, str]
+    warnings: list[WarningResult]
+
+
+class SplitResult(_Headed):
+    """What `orthaug split` tells."""
+
+    parameters: list[ParameterResult]
+    theta_aux: Numbers
+    measure: str
+    measure_detail: MeasureResult
+    orthogonality_defect: Number
+    warnings: list[WarningResult]
+
+
+class CandidateResult(Content):
+    """A signal that was tried."""
+
+    name: str
+    cost: Number
+    bias: Number
+    std: Number
+    condition: Number
+
+
+class DesignResult(Content):
+    """What `orthaug design` tells."""
+
+    kind: str
+    relative_error: Number
+    condition: Number
+    cost: Number
+    bias: ByName
+    std: ByName
+    samples: Whole
+    candidates: list[CandidateResult]
+
+    @classmethod
+    def of(cls, design: Design) -> DesignResult:
+        """The content of a design, without its signal."""
+        by_name = {key: dict(zip(design.names, getattr(design, key), strict=True)) for key in ("bias", "std")}
+        return cls.model_validate({**vars(design), **by_name, "samples": len(design.signal)})
+
+
+RESULTS: dict[str, type[Content]] = {
+    "fit": FitResult,
+    "check": CheckResult,
+    "compare": CompareResult,
+    "split": SplitResult,
+    "design": DesignResult,
+}
+"""By command."""
+
+
+def schema_of(command: str) -> dict[str, Any]:
+    """The JSON schema of what a command writes."""
+    return RESULTS[command].model_json_schema(mode="serialization")
+
+
+def parameter_rows(
+    parameters: Sequence[Parameter],
+    values: Any,
+    std: Any = None,
+    interval: Any = None,
+    one_step: Any = None,
+) -> list[ParameterResult]:
+    """θ as results list it; what stands at a bound has no interval."""
+    return [
+        ParameterResult.model_validate(
+            {
+                "name": parameter.name,
+                "unit": parameter.unit,
+                "initial": parameter.initial,
+                "value": values[i],
+                "one_step": None if one_step is None else one_step[i],
+                "std": None if std is None else std[i],
+                "ci95": None if interval is None or np.isnan(interval[i]).any() else interval[i],
+            }
+        )
+        for i, parameter in enumerate(parameters)
+    ]
+
+
+def physical_rows(
+    estimate: PhysicalEstimate, profiles: dict[str, tuple[float, float]] | None = None
+) -> list[ParameterResult]:
+    """The physical parameters as results list them, with the profile intervals that were made."""
+    columns = (estimate.names, estimate.units, estimate.initial, estimate.value, estimate.std, estimate.ci95)
+    keys = ("name", "unit", "initial", "value", "std", "ci95")
+    rows = [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]
+    return [ParameterResult.model_validate(row | {"profile95": (profiles or {}).get(row["name"])}) for row in rows]

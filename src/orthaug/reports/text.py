@@ -1,0 +1,228 @@
+"""Results in words: what the commands print."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from orthaug.reports.fields import WarningResult
+from orthaug.reports.findings import SuspectResult
+from orthaug.reports.result import (
+    CheckResult,
+    CompareResult,
+    DesignResult,
+    FitResult,
+    ParameterResult,
+    RowResult,
+    SplitResult,
+)
+
+if TYPE_CHECKING:
+    from orthaug.analysis.validation import Verdict
+    from orthaug.fitting.estimates import Estimate
+
+SHOWN = 8  # signals of a design that are listed
+
+
+def fit_text(fit: Estimate, result: FitResult) -> str:
+    """Parameters, scores on every part, what the residual says, whether the learner earns its place, warnings."""
+    from orthaug.fitting.estimates import summary_lines
+
+    if not fit.status.ok:
+        return ""
+    blocks = [list(summary_lines(fit))]
+    if result.physical_parameters:
+        blocks.append(_physical_lines(result))
+    blocks.append(_score_lines(fit, result))
+    told = [finding.text for finding in (result.residuals, result.validation) if finding]
+    blocks += [told, _warning_lines(w for w in dict.fromkeys(result.warnings) if w.text not in told)]
+    return "\n\n".join("\n".join(lines) for lines in blocks if lines)
+
+
+def check_text(result: CheckResult) -> str:
+    """Excitation, identifiability, and what would bias the parameters."""
+    data, physics = result.excitation, result.identifiability
+    condition = f"{data.condition:.4g}" if data.condition is not None else "infinite"
+    lines = [
+        f"parameters       {', '.join(result.parameters) or 'none'}",
+        f"regressor        {', '.join(result.regressor)}",
+        f"usable rows      {result.rows}",
+        f"excitation       rank {data.rank} of {data.columns} on the data, condition {condition}",
+        f"identifiability  rank {physics.rank} of {physics.columns} at random points: "
+        + ("the parameters can be told apart" if physics.identifiable else "no data can tell the parameters apart"),
+    ]
+    for group in physics.inseparable:
+        lines.append(f"  inseparable by any data: {', '.join(group)}")
+    if physics.identifiable:
+        for group in data.collinear:
+            lines.append(f"  not excited separately by these data: {', '.join(group)}")
+    if result.bias:
+        lines += [
+            "",
+            "Bias of each parameter if a term is missing from the physics. Size: its share of the output's deviation,",
+            "1 % where no coefficient is given. Removable: whether some weighting of these points leaves no bias.",
+            *_suspect_lines(result.bias),
+        ]
+    return "\n".join([*lines, *_warning_lines(result.warnings)])
+
+
+def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
+    """Two tables, parameters with standard errors and scores on every part; then what is told of each row."""
+    lines = [*_table(_parameter_cells(result)), "", *_table(_score_cells(result.comparison))]
+    if result.chosen:
+        lines += ["", "* lowest one-step error on the validation part"]
+    told = [f"{row.name}: {row.residuals.text}" for row in result.comparison if row.residuals is not None]
+    lines += ["", *told] if told else []
+    told = [f"{kind}: {verdict.summary}" for kind, verdict in verdicts.items()]
+    beyond = dict.fromkeys(f"{e}." for verdict in verdicts.values() for e in verdict.extrapolation)
+    lines += ["", *told, *beyond] if told else []
+    lines.append("")
+    lines += [f"left out: {kind}: {why}" for kind, why in result.left_out.items()]
+    lines += _warning_lines(result.warnings)
+    for row in result.comparison:
+        lines += [f"warning: {row.name}: {w.text}" for w in row.warnings if w not in result.warnings]
+    return "\n".join(lines).rstrip()
+
+
+def split_text(result: SplitResult) -> str:
+    """θ under the measure, with intervals."""
+    detail, width = result.measure_detail, _width(result.parameters)
+    support = "–" if detail.support is None else f"{100 * detail.support:.0f} %"
+    lines = [
+        f"measure     {result.measure}, {detail.points} points, {support} of it within reach of the data",
+        f"{'parameter':<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  unit",
+        *(f"{_value_cells(row, row.ci95, width)}  {row.unit}".rstrip() for row in result.parameters),
+    ]
+    return "\n".join([*lines, *_warning_lines(result.warnings)])
+
+
+def design_text(result: DesignResult) -> str:
+    """The design and what else was tried."""
+    rows = [["signal", "error", "bias", "std", "condition"]]
+    for one in result.candidates[:SHOWN]:
+        error = None if one.cost is None else float(np.sqrt(one.cost))
+        rows.append([one.name, *map(_or_infinite, (error, one.bias, one.std, one.condition))])
+    lines = [
+        f"input       {result.kind}",
+        f"predicted   relative error of θ {_or_infinite(result.relative_error)}, "
+        f"condition {_or_infinite(result.condition, 3)}",
+        "",
+        f"{'parameter':<12}  {'bias':>12}  {'std':>12}",
+        *(
+            f"{name:<12}  {_or_infinite(bias):>12}  {_or_infinite(result.std[name]):>12}"
+            for name, bias in result.bias.items()
+        ),
+        "",
+        "what was tried, relative errors of θ:",
+        *_table(rows),
+    ]
+    return "\n".join(lines)
+
+
+def _or_infinite(value: float | None, digits: int = 4) -> str:
+    return "inf" if value is None else f"{value:.{digits}g}"
+
+
+def _warning_lines(warnings: Iterable[WarningResult]) -> list[str]:
+    return [f"warning: {warning.text}" for warning in warnings]
+
+
+def _suspect_lines(suspects: Sequence[SuspectResult]) -> list[str]:
+    """What each suspect does, biases in per cent."""
+    rows = [["suspect", "size", *suspects[0].percent, "cosine", "removable"]]
+    for suspect in suspects:
+        guess, certificate = suspect.coefficient, suspect.certificate
+        cosine = "–" if suspect.cosine is None else f"{suspect.cosine:.3f}"
+        verdict = certificate.verdict if certificate else ""
+        answer = {"unremovable": "no", "removable": "yes", "orthogonal": "yes"}.get(verdict, "–")
+        size = "1 %" if guess is None else "–" if suspect.size is None else f"{100 * abs(guess) * suspect.size:.2g} %"
+        biases = ("–" if share is None else f"{share:+.2g} %" for share in suspect.percent.values())
+        rows.append([suspect.name, size, *biases, cosine, answer])
+    return _table(rows)
+
+
+def _physical_lines(result: FitResult) -> list[str]:
+    rows = result.physical_parameters or []
+    width = _width(rows)
+    lines = [f"{'physical':<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  {'initial':>11}  unit"]
+    for row in rows:
+        cells = _value_cells(row, row.profile95 or row.ci95, width)
+        lines.append(f"{cells}  {row.initial:11.5g}  {row.unit}".rstrip())
+    if result.physical_consistency:
+        lines.append(result.physical_consistency.text)
+    return lines
+
+
+def _width(rows: Sequence[ParameterResult]) -> int:
+    return max([9, *(len(row.name) for row in rows)])
+
+
+def _value_cells(row: ParameterResult, interval: Sequence[float | None] | None, width: int) -> str:
+    """Name, value, standard error and interval."""
+    spread = f"{row.std:11.4g}" if row.std is not None else f"{'–':>11}"
+    reach = f"[{_limit(interval[0])}, {_limit(interval[1])}]" if interval is not None else f"{'–':^29}"
+    return f"{row.name:<{width}}  {row.value:14.8g}  {spread}  {reach}"
+
+
+def _limit(value: float | None) -> str:
+    return f"{'–':>13}" if value is None else f"{value:13.7g}"
+
+
+def _score_lines(fit: Estimate, result: FitResult) -> list[str]:
+    """The scores as a table, one line per part, kind and output."""
+    rows = [["part", "horizon", "output", "RMSE", "NRMSE", "FIT %"]]
+    for part, scores in result.scores.items():
+        for kind, score in scores.kinds.items():
+            for i, channel in enumerate(fit.model.outputs):
+                cells = (None if values is None else values[i] for values in (score.rmse, score.nrmse, score.fit))
+                rmse, nrmse, percent = ("–" if c is None else f"{c:.6g}" for c in cells)
+                rows.append([part, kind, channel.name, f"{rmse} {channel.unit}".strip(), nrmse, percent])
+    return _table(rows) if len(rows) > 1 else []
+
+
+def _parameter_cells(result: CompareResult) -> list[list[str]]:
+    names = [parameter.name for parameter in result.comparison[0].parameters]
+    rows = [["structure", *names, "‖QᵀF̃‖/‖F‖", "‖F̃‖/‖Φθ̂‖", "weights", "time [s]"]]
+    for row in result.comparison:
+        defect, share = row.orthogonality_defect, row.learner_to_physics
+        rows.append(
+            [
+                row.name + (" *" if row.name == result.chosen else ""),
+                *(_estimate(parameter) for parameter in row.parameters),
+                "–" if defect is None else f"{defect:.1e}",
+                "–" if share is None else f"{share:.2g}",
+                str(row.weights),
+                "–" if row.seconds is None else f"{row.seconds:.2f}",
+            ]
+        )
+    return rows
+
+
+def _score_cells(rows: Sequence[RowResult]) -> list[list[str]]:
+    cells = [["structure", "part", "one-step NRMSE", "free-run NRMSE", "free-run FIT %"]]
+    for row in rows:
+        for part, scores in row.scores.items():
+            shown = (scores.prediction.nrmse, scores.simulation.nrmse, scores.simulation.fit)
+            cells.append([row.name, part, *(_numbers(values) for values in shown)])
+    return cells
+
+
+def _estimate(parameter: ParameterResult) -> str:
+    if parameter.value is None:
+        return "–"
+    spread = f" ± {parameter.std:.2g}" if parameter.std is not None else ""
+    return f"{parameter.value:.6g}{spread}"
+
+
+def _numbers(values: Sequence[float | None] | None) -> str:
+    return "–" if values is None else ", ".join("–" if v is None else f"{v:.4g}" for v in values)
+
+
+def _table(rows: list[list[str]]) -> list[str]:
+    """Rows of cells as lines; rows of other models may have other parameters."""
+    width = max(len(row) for row in rows)
+    rows = [row + [""] * (width - len(row)) for row in rows]
+    widths = [max(len(row[i]) for row in rows) for i in range(width)]
+    return ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
