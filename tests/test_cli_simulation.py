@@ -213,8 +213,8 @@ def diverged(overfitted) -> dict:
 def test_a_free_run_that_diverges_is_null_with_a_warning(diverged):
     assert diverged["scores"]["tests.far"]["simulation"] == {"rmse": None, "nrmse": None, "fit": None}
     assert diverged["scores"]["tests.far"]["prediction"]["rmse"][0] > 0
-    (told,) = (w["text"] for w in diverged["warnings"] if w["code"] == "free_run_diverged")
-    assert re.match(r"tests\.far: the free run diverged in output 'y' at step \d+", told)
+    told = [w["text"] for w in diverged["warnings"] if w["code"] == "free_run_diverged"]
+    assert any(re.match(r"tests\.far: the free run diverged in output 'y' at step \d+", text) for text in told)
 
 
 def test_it_hurts_in_extrapolation(diverged):
