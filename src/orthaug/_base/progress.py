@@ -9,8 +9,16 @@ Tell = Callable[[int, int, float], None]
 """Called now and then with the number of the run, its iteration and the loss; it may raise to stop the training."""
 
 
+RunTell = Callable[[int, float], None]
+"""The same of one run: called with its iteration and the loss."""
+
+
+def quiet(iteration: int, loss: float) -> None:
+    """Nobody listens to a run."""
+
+
 def _nothing(run: int, iteration: int, loss: float) -> None:
-    """Nobody listens."""
+    """Nobody listens to any."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +44,7 @@ class Progress:
         """The same for what follows so many runs or iterations."""
         return replace(self, runs=self.runs + runs, iterations=self.iterations + iterations)
 
-    def of(self, run: int) -> Callable[[int, float], None]:
+    def of(self, run: int) -> RunTell:
         """What one run tells: its iteration and the loss."""
         return lambda iteration, loss: self(run, iteration, loss)
 

@@ -196,7 +196,7 @@ def cross_validated(job: Job, blocks: int, variants: Sequence[Variant]) -> list[
     except InputError:
         return [[] for _ in variants]
     return [
-        [Trial(f"block {i + 1} of {blocks}", fold[0], fold[1 + j]) for i, fold in enumerate(errors)]
+        [Trial(f"block {i + 1} of {blocks}", fold[0], fold[1 + j], block=True) for i, fold in enumerate(errors)]
         for j in range(len(variants))
     ]
 

@@ -14,6 +14,7 @@ from orthaug._base.checks import Vector, check_choice, check_count, check_type
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, jnp
 from orthaug._base.parallel import spread
+from orthaug._base.progress import SILENT, Tell
 from orthaug.data.record import Record
 from orthaug.data.regressors import Features, Lags
 from orthaug.fitting.conclusion import conclude
@@ -34,8 +35,6 @@ from orthaug.physics.baseline import Baseline
 from orthaug.physics.problem import Problem, pose
 
 Regularization = str | float
-Progress = Callable[[int, int, float], None]
-"""Called now and then with the number of the restart, the iteration and the loss."""
 
 
 def estimate(
@@ -53,7 +52,7 @@ def estimate(
     ensemble: bool = False,
     initial: Estimate | Model | None = None,
     validation: Record | None = None,
-    progress: Progress | None = None,
+    progress: Tell = SILENT,
 ) -> Estimate:
     """Fit `y_k = φ(x_k)θ + learner(x_k) + e_k` by prediction error (eq:cost_fun) or by the error of a free run.
 
@@ -126,7 +125,7 @@ def fit(
     ensemble: bool = False,
     initial: Model | None = None,
     validation: Record | None = None,
-    progress: Progress | None = None,
+    progress: Tell = SILENT,
     engine: Engine = InMemory(),  # noqa: B008  (frozen)
 ) -> Estimate:
     """`estimate` for a problem that is posed already, for what the learner is to see.
@@ -235,7 +234,7 @@ def _train(
     structure: Structure,
     solver: Solver,
     validation: Record | None,
-    progress: Progress | None,
+    progress: Tell,
     ensemble: bool = False,
 ) -> Estimate:
     """Run from every start and conclude with the best, by training loss or by the criterion's validation error."""
@@ -245,8 +244,7 @@ def _train(
 
         def tell(iteration: int, loss: float) -> None:
             check()
-            if progress is not None:
-                progress(i, iteration, loss)
+            progress(i, iteration, loss)
 
         return task.run(solver, start.weights, structure, start.regularization, tell)
 

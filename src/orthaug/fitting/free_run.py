@@ -13,6 +13,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
+from orthaug._base.progress import RunTell, quiet
 from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.elimination import eliminate
 from orthaug.fitting.initial_states import InitialStates, Start
@@ -20,7 +21,7 @@ from orthaug.fitting.learned import ErrorStatistics, Learned
 from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, errors_of
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.segments import Segments, lay_segments
-from orthaug.fitting.solvers.descent import MARQUARDT, Descent, Progress
+from orthaug.fitting.solvers.descent import MARQUARDT, Descent
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Structure
@@ -110,7 +111,7 @@ class FreeRunTask:
         w: Any,
         structure: Structure,
         regularization: str | float = "none",
-        progress: Progress | None = None,
+        progress: RunTell = quiet,
     ) -> Flight:
         """One run from the weights `w`: a short one-step training, then the free run; the arguments as in `estimate`.
 
@@ -136,8 +137,7 @@ class FreeRunTask:
             begun, seconds = begun + shorter.iterations, seconds + shorter.seconds
 
         def tell(iteration: int, loss: float) -> None:
-            if progress is not None:
-                progress(begun + iteration, loss * self.task.rms**2 / self._residuals)
+            progress(begun + iteration, loss * self.task.rms**2 / self._residuals)
 
         begin = places[int(np.argmin(losses))]
         objective, end = self._descend(objective, begin, solver, ridge, evidence, tell)
@@ -167,7 +167,7 @@ class FreeRunTask:
         solver: LevenbergMarquardt,
         ridge: float,
         evidence: bool,
-        tell: Progress,
+        tell: RunTell,
     ) -> tuple[FreeRunObjective, Descent]:
         """From p to the end; several outputs are weighted by their errors' covariance in a second leg."""
         ny = len(self.problem.outputs)

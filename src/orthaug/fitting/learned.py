@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.progress import RunTell, quiet
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.elimination import Fixed
-from orthaug.fitting.solvers.descent import Progress
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Structure
 from orthaug.models.learners import Bound, Scaling
@@ -74,7 +74,7 @@ class Task(Protocol):
         w: Any,
         structure: Structure,
         regularization: str | float = "none",
-        progress: Progress | None = None,
+        progress: RunTell = quiet,
     ) -> Any:
         """One run from the weights `w`, with `ending`, `iterations` and `seconds`; arguments as in `estimate`."""
         ...

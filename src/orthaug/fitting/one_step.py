@@ -12,13 +12,14 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.progress import RunTell, quiet
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.elimination import Elimination, Fixed, eliminate
 from orthaug.fitting.joint import JointCriterion, Physics
 from orthaug.fitting.learned import Learned
 from orthaug.fitting.normal_equations import Blocks, Hold, Normal, OneStep, Streamed, linearise
 from orthaug.fitting.solvers import compiled
-from orthaug.fitting.solvers.descent import IDENTITY, Progress
+from orthaug.fitting.solvers.descent import IDENTITY
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.inference.covariance import mixing
@@ -84,7 +85,7 @@ class OneStepTask:
         w: Any,
         structure: Structure | None = None,
         regularization: str | float = "none",
-        progress: Progress | None = None,
+        progress: RunTell = quiet,
     ) -> compiled.Run:
         """One run from the weights `w`; the arguments as in `estimate`, `structure` None for no penalty.
 
@@ -94,8 +95,7 @@ class OneStepTask:
         structure = Orthogonal() if structure is None else structure
 
         def tell(iteration: int, loss: float) -> None:
-            if progress is not None:
-                progress(iteration, self.mean_square(loss))
+            progress(iteration, self.mean_square(loss))
 
         elimination = eliminate(structure, self.problem)
         fixed: Fixed = {}
@@ -122,7 +122,7 @@ class OneStepTask:
         elimination: Elimination,
         fixed: Fixed,
         regularization: str | float,
-        progress: Progress,
+        progress: RunTell,
     ) -> compiled.Run:
         assert self.bound is not None, "physics alone is not trained one step ahead"
         matrix, target = elimination.hold(fixed)
@@ -144,7 +144,7 @@ class OneStepTask:
         return compiled.Run(end.w, normal, ridge, effective, end.iterations, end.ending, end.seconds, coefficients)
 
     def _least_squares(
-        self, solver: Any, w: Any, hold: Hold, ridge: float, evidence: bool, progress: Progress
+        self, solver: Any, w: Any, hold: Hold, ridge: float, evidence: bool, progress: RunTell
     ) -> compiled.Run:
         """Levenberg-Marquardt: compiled whole where the rows are in memory, otherwise driven from here."""
         assert self.bound is not None

@@ -15,10 +15,10 @@ from annotated_types import Ge, Gt
 from jaxtyping import Float
 
 from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.progress import RunTell, quiet
 from orthaug._base.registry import check_fields
 from orthaug.fitting.joint import JointCriterion, Physics
 from orthaug.fitting.solvers.compiled import burst_length
-from orthaug.fitting.solvers.descent import Progress
 from orthaug.fitting.status import Ending
 from orthaug.models.rows import Chunk
 
@@ -79,7 +79,7 @@ class AdamLBFGS:
         chunks: Chunk,
         physics: Physics,
         *,
-        progress: Progress | None = None,
+        progress: RunTell = quiet,
     ) -> GradientRun:
         """Minimise the joint criterion from θ⁰ and `w`; the loss told to `progress` is a mean square."""
         import optax
@@ -101,8 +101,7 @@ class AdamLBFGS:
                 advance = _lbfgs if second else _adam
                 state = jax.block_until_ready(advance(criterion, state, chunks, physics, self.learning_rate, stop))
                 burst = burst_length(burst, time.perf_counter() - tick)
-                if progress is not None:
-                    progress(done + int(state.iteration), float(state.loss) * float(physics.samples))
+                progress(done + int(state.iteration), float(state.loss) * float(physics.samples))
             done += int(state.iteration)
         finite = bool(jnp.isfinite(state.loss))
         ending = Ending.NON_FINITE if not finite else Ending.CONVERGED if int(state.small) >= 5 else Ending.RUNNING

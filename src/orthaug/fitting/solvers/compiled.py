@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.progress import RunTell, quiet
 from orthaug.fitting.normal_equations import Normal, linearise
-from orthaug.fitting.solvers.descent import IDENTITY, Progress
+from orthaug.fitting.solvers.descent import IDENTITY
 from orthaug.fitting.status import Ending
 from orthaug.models.rows import Overlap
 
@@ -75,7 +76,7 @@ def minimise(
     samples: int,
     iterations: int,
     tolerance: float,
-    progress: Progress | None = None,
+    progress: RunTell = quiet,
 ) -> Run:
     """Minimise `‖r(w)‖² + α‖w‖²` from `w`.
 
@@ -97,8 +98,7 @@ def minimise(
         state = jax.block_until_ready(_advance(criterion, state, arguments, options, jnp.asarray(stop)))
         spent = time.perf_counter() - tick
         burst = burst_length(burst, spent)
-        if progress is not None:
-            progress(int(state.iteration), float(state.normal.loss))
+        progress(int(state.iteration), float(state.normal.loss))
     return Run(
         state.w,
         state.normal,

@@ -11,7 +11,6 @@ Where the rows of a one-step criterion are in memory, the loop is compiled whole
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -19,13 +18,11 @@ import scipy.linalg
 from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.progress import RunTell, quiet
 from orthaug.fitting.status import Ending
 
 _SETTLED = 0.1  # of the objective: a step that lowers it by less belongs to the end of a run
 _SMALLEST_CURVATURE = 1e-14  # of the largest: what a direction that does nothing is damped with
-
-Progress = Callable[[int, float], None]
-"""Called now and then with the iteration and the loss."""
 
 
 class Damping(NamedTuple):
@@ -130,7 +127,7 @@ def descend(
     ridge: float = 0.0,
     evidence: bool = False,
     bounds: tuple[Vector, Vector] | None = None,
-    progress: Progress | None = None,
+    progress: RunTell = quiet,
 ) -> Descent:
     """Minimise `‖r‖² + α‖w‖²` from p.
 
@@ -155,8 +152,7 @@ def descend(
     while ending is Ending.RUNNING and done < iterations:
         place, ending = _trial(objective, place, limits, tolerance, damping, evidence)
         done += 1
-        if progress is not None:
-            progress(done, place.flown.loss)
+        progress(done, place.flown.loss)
     effective = effective_weights(place.linear.hessian, place.ridge, objective.physics)
     return Descent(place.flown, place.linear, place.ridge, effective, done, ending, time.perf_counter() - began)
 
