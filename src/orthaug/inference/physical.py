@@ -19,6 +19,7 @@ from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector, nearest
 from orthaug._base.errors import InputError
+from orthaug._base.warning import Warning
 from orthaug.inference.covariance import interval
 from orthaug.physics.excitation import excitation
 from orthaug.physics.parameters import PhysicsMap, magnitude, tied
@@ -54,7 +55,7 @@ class PhysicalEstimate:
     """None where θ̂ has no covariance or nothing is left over to test."""
     sensitivities: Matrix | None
     """∂ln p̂ / ∂ln θ̂ (np, nθ): 10 says that 1 % in θ moves p by 10 %. NaN for p̂ = 0, 0 for one at a bound."""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Warning, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,11 +190,13 @@ def solve(
     if outside:
         warnings.append(_outside(fit, value))
     elif not found.full_rank:
-        warnings.append(f"At the solution {tied(found)}; the physical parameters have no standard errors.")
+        told = f"At the solution {tied(found)}; the physical parameters have no standard errors."
+        warnings.append(Warning("physical_parameters_tied", told))
     if not fit.known:
-        warnings.append("theta has no finite covariance, so the physical parameters have no standard errors.")
+        told = "theta has no finite covariance, so the physical parameters have no standard errors."
+        warnings.append(Warning("no_standard_errors", told))
     if consistency is not None and consistency.p < CONTRADICTION:
-        warnings.append(consistency.text)
+        warnings.append(Warning("physics_contradicted", consistency.text))
     std = np.full(len(value), np.nan) if spread is None else np.sqrt(np.diag(spread))
     return PhysicalEstimate(
         names=physics.names,
@@ -244,31 +247,32 @@ def _consistency(chi2: float, df: int, freedom: float, held: bool) -> Consistenc
     return Consistency(chi2, df, float(p), f"The data {verb} the physics' own {what} (chi2 = {chi2:.3g}, p = {p:.2g}).")
 
 
-def _at_bounds(physics: PhysicsMap, value: Vector, held: Bool[np.ndarray, "n"]) -> list[str]:
+def _at_bounds(physics: PhysicsMap, value: Vector, held: Bool[np.ndarray, "n"]) -> list[Warning]:
+    told = "{} stands at its bound {:g} and has no standard error; those of the others hold with it there."
     return [
-        f"{name} stands at its bound {v:g} and has no standard error; those of the others hold with it there."
+        Warning("at_a_bound", told.format(name, v))
         for name, v, at_bound in zip(physics.names, value, held, strict=True)
         if at_bound
     ]
 
 
-def _elsewhere(physics: PhysicsMap, others: Sequence[Vector]) -> list[str]:
-    return [
-        "theta is explained as well by "
-        + ", ".join(f"{name} = {v:.6g}" for name, v in zip(physics.names, p, strict=True))
-        + "; bounds or better initial values choose between the solutions."
-        for p in others[:1]
-    ]
+def _elsewhere(physics: PhysicsMap, others: Sequence[Vector]) -> list[Warning]:
+    if not others:
+        return []
+    listed = ", ".join(f"{name} = {v:.6g}" for name, v in zip(physics.names, others[0], strict=True))
+    told = f"theta is explained as well by {listed}; bounds or better initial values choose between the solutions."
+    return [Warning("several_solutions", told)]
 
 
-def _outside(fit: _Fit, value: Vector) -> str:
+def _outside(fit: _Fit, value: Vector) -> Warning:
     nearby = fit.physics.theta(value)
     worst = int(np.argmax(np.abs(nearby - fit.target) / magnitude(fit.target)))
-    return (
+    told = (
         f"No physical parameters give the estimated theta: nearest is {fit.physics.theta_names[worst]} = "
         f"{nearby[worst]:.6g} instead of {fit.target[worst]:.6g}. They have no standard errors; check the expressions "
         "of theta, and whether theta is biased."
     )
+    return Warning("physics_not_met", told)
 
 
 def profile(

@@ -13,10 +13,7 @@ from pydantic import (
     ConfigDict,
     SerializerFunctionWrapHandler,
     model_serializer,
-    model_validator,
 )
-
-from orthaug._base.warning import Warning
 
 
 def _number(value: Any) -> Any:
@@ -65,8 +62,3 @@ class WarningResult(Content):
 
     code: str
     text: str
-
-    @model_validator(mode="before")
-    @classmethod
-    def _coded(cls, given: Any) -> Any:
-        return Warning("note", given) if isinstance(given, str) else given  # until every warning has its code
