@@ -9,7 +9,7 @@ import numpy as np
 from orthaug._base.jax import jax, jnp
 from orthaug.fitting.normal_equations import Hold, OneStep
 from orthaug.models.learners import Bound, Learner
-from orthaug.models.rows import Chunks, Overlap, chunk_shape, in_chunks
+from orthaug.models.rows import Chunk, Overlap, chunk_shape, in_chunks
 
 
 class Problem(NamedTuple):
@@ -24,7 +24,7 @@ class Problem(NamedTuple):
     """P⊥Y (N, ny)."""
     gain: np.ndarray
     """(N, ny)."""
-    chunks: Chunks
+    rows: Chunk
     hold: Hold
 
     @property
@@ -32,9 +32,9 @@ class Problem(NamedTuple):
         return self.criterion.bound
 
     @property
-    def arguments(self) -> tuple[Chunks, Hold]:
+    def arguments(self) -> tuple[Chunk, Hold]:
         """What the solver hands to the criterion."""
-        return self.chunks, self.hold
+        return self.rows, self.hold
 
     @property
     def nothing(self) -> Overlap:
@@ -54,9 +54,9 @@ def problem(
         e = e - q @ np.tensordot(q, e, axes=([0, 1], [0, 1]))
     gain = np.ones_like(y) if gain is None else gain
     shape = chunk_shape(rows, limit)
-    chunks = Chunks(*(jnp.asarray(in_chunks(values, shape)) for values in (z, q, e, gain)))
+    laid = Chunk(*(jnp.asarray(in_chunks(values, shape)) for values in (z, q, e, gain)))
     hold = Hold(jnp.zeros((nt, nt)), jnp.zeros(nt))
-    return Problem(OneStep(Bound(learner, z.shape[1], ny)), z, q, e, gain, chunks, hold)
+    return Problem(OneStep(Bound(learner, z.shape[1], ny)), z, q, e, gain, laid, hold)
 
 
 def linear_columns(given: Problem) -> np.ndarray:

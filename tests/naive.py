@@ -50,7 +50,7 @@ def signals_of(experiment: Experiment, record: Record) -> dict[str, np.ndarray]:
 def predicted(model: Model, record: Record, horizon: int = 1) -> np.ndarray:
     """Each output (N, ny) from outputs measured up to `horizon` samples before it; NaN where there are none."""
     (experiment,) = record.experiments
-    start, outputs = model.form.start, model.form.outputs
+    start, outputs = model.form.first_row, model.form.outputs
     found = np.full((len(experiment), len(outputs)), np.nan)
     for k in range(start + horizon - 1, len(experiment)):
         signals = signals_of(experiment, record)
@@ -65,7 +65,7 @@ def predicted(model: Model, record: Record, horizon: int = 1) -> np.ndarray:
 def simulated(model: Model, record: Record, initial: np.ndarray) -> np.ndarray:
     """A free run (N, ny); `initial` (start, ny) are the outputs before the first usable row."""
     (experiment,) = record.experiments
-    start, outputs = model.form.start, model.form.outputs
+    start, outputs = model.form.first_row, model.form.outputs
     signals = {c.name: experiment.inputs[:, i] for i, c in enumerate(record.inputs)}
     own = np.full((len(experiment), len(outputs)), np.nan)
     own[:start] = initial

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
 import pytest
 
@@ -11,8 +9,8 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Record
 from orthaug.fitting.estimation import estimate
-from orthaug.fitting.one_step import Task
-from orthaug.fitting.solvers import adam_lbfgs
+from orthaug.fitting.one_step import OneStepTask
+from orthaug.fitting.solvers import adam_lbfgs as gradient
 from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
 from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
 from orthaug.models.learners import MLP, Function
@@ -66,15 +64,17 @@ def test_linear_learner_ends_at_least_squares(structure):
     np.testing.assert_allclose(found.model.predict(RECORD).trajectories[0].model[:, 0], fitted, atol=1e-6)
 
 
-@dataclass(frozen=True)
-class Spy(AdamLBFGS):
-    """Keeps what the solver is called with."""
+@pytest.fixture
+def seen(monkeypatch):
+    """What the solver is called with."""
+    calls, original = [], gradient.minimise
 
-    seen: list = field(default_factory=list, compare=False)
+    def minimise(solver, criterion, w, rows, physics, *, progress=None):
+        calls.append((criterion, w, rows, physics))
+        return original(solver, criterion, w, rows, physics, progress=progress)
 
-    def minimise(self, criterion, w, chunks, physics, *, progress=None):
-        self.seen.append((criterion, w, chunks, physics))
-        return super().minimise(criterion, w, chunks, physics, progress=progress)
+    monkeypatch.setattr(gradient, "minimise", minimise)
+    return calls
 
 
 def raw_criterion(structure, task, theta, w):
@@ -93,15 +93,15 @@ def raw_criterion(structure, task, theta, w):
 
 
 @pytest.mark.parametrize("structure", STRUCTURES, ids=lambda s: s.name)
-def test_the_joint_criterion_is_the_plain_formula(structure):
-    task, spy = Task.of(pose(RECORD, BASELINE), NET), Spy(0, 1)
-    task.run(spy, task.bound.init(jax.random.key(0)), structure)
-    ((criterion, w, chunks, physics),) = spy.seen
+def test_the_joint_criterion_is_the_plain_formula(structure, seen):
+    task = OneStepTask.of(pose(RECORD, BASELINE), NET)
+    task.run(AdamLBFGS(0, 1), task.bound.init(jax.random.key(0)), structure)
+    ((criterion, w, rows, physics),) = seen
     y = signals()[1]
     for v in (np.zeros(2), np.array([0.3, -2.0])):
         coordinates = np.asarray(physics.start + physics.basis @ v) * task.rms
         theta = task.problem.projection.from_coordinates(coordinates)
-        found = float(criterion((jnp.asarray(v), w), chunks, physics)) * (task.rms * y.std()) ** 2
+        found = float(criterion((jnp.asarray(v), w), rows, physics)) * (task.rms * y.std()) ** 2
         assert found == pytest.approx(raw_criterion(structure, task, theta, w), rel=1e-10)
         if isinstance(structure, Orthogonal):  # θ is solved, not an unknown (F1)
             np.testing.assert_allclose(theta, task.problem.projection.solve(task.problem.whitened_target), rtol=1e-10)
@@ -109,15 +109,15 @@ def test_the_joint_criterion_is_the_plain_formula(structure):
             np.testing.assert_allclose(theta, INITIAL, rtol=1e-12)
 
 
-def test_a_ridge_is_the_same_as_for_levenberg_marquardt():
+def test_a_ridge_is_the_same_as_for_levenberg_marquardt(seen):
     """α counts against squared errors in units of the baseline's RMS residual."""
-    task, values = Task.of(pose(RECORD, BASELINE), NET), []
+    task, values = OneStepTask.of(pose(RECORD, BASELINE), NET), []
     w = task.bound.init(jax.random.key(0))
     for ridge in (0.0, 0.7):
-        spy = Spy(0, 1)
-        task.run(spy, w, Additive(), ridge)
-        ((criterion, _, chunks, physics),) = spy.seen
-        values.append(float(criterion((jnp.zeros(2), w), chunks, physics)))
+        task.run(AdamLBFGS(0, 1), w, Additive(), ridge)
+        criterion, _, rows, physics = seen.pop()
+        assert not seen
+        values.append(float(criterion((jnp.zeros(2), w), rows, physics)))
     assert values[1] - values[0] == pytest.approx(0.7 * float(w @ w) / 80, rel=1e-10)
 
 
@@ -129,7 +129,7 @@ def test_lbfgs_goes_on_from_adam(structure):
 
 
 def test_the_loss_never_rises_under_lbfgs(monkeypatch):
-    monkeypatch.setattr(adam_lbfgs, "burst_length", lambda burst, spent: 1)
+    monkeypatch.setattr(gradient, "burst_length", lambda burst, spent: 1)
     told = []
     fit(Additive(), AdamLBFGS(0, 40), progress=lambda run, iteration, loss: told.append((iteration, loss)))
     iterations, losses = zip(*told, strict=True)
@@ -142,7 +142,7 @@ def test_the_loss_never_rises_under_lbfgs(monkeypatch):
 def test_bursts_change_nothing(monkeypatch, structure, burst):
     found = []
     for length in (burst, 10**6):
-        monkeypatch.setattr(adam_lbfgs, "burst_length", lambda b, spent, length=length: length)
+        monkeypatch.setattr(gradient, "burst_length", lambda b, spent, length=length: length)
         found.append(fit(structure, AdamLBFGS(20, 20)))
     np.testing.assert_array_equal(found[0].model.numbers.weights, found[1].model.numbers.weights)
     np.testing.assert_array_equal(found[0].theta, found[1].theta)

@@ -18,11 +18,10 @@ import pytest
 import orthaug
 from orthaug.commands import cli
 from orthaug.data.readers import read_record
-from orthaug.fitting.solvers import levenberg_marquardt
+from orthaug.fitting.solvers import compiled
+from orthaug.fitting.status import Ending
 from orthaug.models.storage import load
 from orthaug.reports.result import ScoreResult
-
-LevenbergMarquardt = levenberg_marquardt.LevenbergMarquardt
 
 SPEC = """
 [data]
@@ -443,19 +442,19 @@ def test_a_free_run_that_diverges_is_no_error(project):
 
 
 def small_run(monkeypatch, ending):
-    """`LevenbergMarquardt.minimise` replaced by one that ends as told."""
-    original = LevenbergMarquardt.minimise
+    """The solver's compiled loop replaced by one that ends as told."""
+    original = compiled.minimise
 
-    def minimise(self, *args, progress=None, **options):
-        return ending(lambda: original(self, *args, progress=progress, **options), progress)
+    def minimise(*args, progress=None, **options):
+        return ending(lambda: original(*args, progress=progress, **options), progress)
 
-    monkeypatch.setattr(LevenbergMarquardt, "minimise", minimise)
+    monkeypatch.setattr(compiled, "minimise", minimise)
 
 
 @pytest.mark.parametrize("as_json", [True, False])
 def test_training_that_fails_leaves_an_account_without_a_model(project, monkeypatch, as_json):
     project.write_text(SPEC.replace('kind = "none"\n', MLP))
-    small_run(monkeypatch, lambda go, _: go()._replace(code=levenberg_marquardt.NON_FINITE))
+    small_run(monkeypatch, lambda go, _: go()._replace(ending=Ending.NON_FINITE))
     done = run("fit", project, "--out", "out", *(["--json"] if as_json else []))
     assert done.code == 1
     assert one_line(done.err, "training failed", "not finite", "Rescale the channels", "result.json")

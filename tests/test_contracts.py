@@ -16,7 +16,7 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
 from orthaug.fitting.estimation import estimate, orthogonalize
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.status import MESSAGES
+from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Additive, Orthogonal
 from orthaug.models.learners import MLP, EquinoxModule, Function
 from orthaug.physics.baseline import Baseline, Term
@@ -169,8 +169,9 @@ def test_every_combination(structure, regularization, ny, learner):
         )
         for _ in range(2)
     )
-    assert first.status.code in MESSAGES
-    assert set(MESSAGES) == {"converged", "iteration_limit", "no_descent", "non_finite", "exact"}
+    codes = {ending.code for ending in Ending}
+    assert first.status.code in codes
+    assert codes == {"converged", "iteration_limit", "no_descent", "non_finite", "exact"}
     assert (first.status.code == "exact") == (learner == "none")
     assert np.isfinite(first.status.loss) and 0 <= first.status.loss < 1
     assert np.isfinite(first.theta).all() and np.isfinite(first.model.numbers.weights).all()

@@ -8,8 +8,9 @@ from helpers import linear_columns, problem
 
 from orthaug._base.jax import jax, jnp
 from orthaug.fitting.normal_equations import Normal
-from orthaug.fitting.solvers import levenberg_marquardt as lm
+from orthaug.fitting.solvers import compiled
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.status import Ending
 from orthaug.models.learners import MLP, Function
 from orthaug.models.rows import Overlap
 
@@ -35,7 +36,7 @@ def test_linear_learner_ends_at_least_squares(ny):
     given = regression(ny=ny)
     run = minimise(given)
     expected = np.linalg.lstsq(linear_columns(given), given.e.ravel(), rcond=None)[0]
-    assert run.code == lm.CONVERGED and run.iterations < 50
+    assert run.ending is Ending.CONVERGED and run.iterations < 50
     np.testing.assert_allclose(run.w, expected, atol=1e-8)
     np.testing.assert_allclose(run.effective, len(expected), rtol=1e-9)
 
@@ -47,7 +48,7 @@ def test_linear_learner_ends_at_ridge_regression(ridge):
     hessian = columns.T @ columns
     run = minimise(given, ridge=ridge)
     expected = np.linalg.solve(hessian + ridge * np.eye(len(hessian)), columns.T @ given.e.ravel())
-    assert run.code == lm.CONVERGED and run.ridge == ridge
+    assert run.ending is Ending.CONVERGED and run.ridge == ridge
     np.testing.assert_allclose(run.w, expected, atol=1e-8)
     np.testing.assert_allclose(run.effective, np.trace(np.linalg.solve(hessian + ridge * np.eye(5), hessian)))
 
@@ -77,7 +78,7 @@ def test_evidence_of_a_linear_learner():
     given = regression(noise=1.0)
     run = minimise(given, solver=LevenbergMarquardt(tolerance=1e-12), ridge=1.0, evidence=True)
     w, alpha, gamma = mackay(linear_columns(given), given.e.ravel(), SAMPLES)
-    assert run.code == lm.CONVERGED
+    assert run.ending is Ending.CONVERGED
     np.testing.assert_allclose(run.ridge, alpha, rtol=1e-4)
     np.testing.assert_allclose(run.effective, gamma, rtol=1e-4)
     np.testing.assert_allclose(run.w, w, atol=1e-5)
@@ -89,7 +90,7 @@ def test_evidence_reaches_its_fixed_point_equations():
     w, values = np.asarray(run.w), np.linalg.eigvalsh(run.normal.hessian)
     gamma = np.sum(values / (values + run.ridge))
     variance = float(run.normal.loss) / (SAMPLES - gamma)
-    assert run.code == lm.CONVERGED
+    assert run.ending is Ending.CONVERGED
     np.testing.assert_allclose(run.effective, gamma, rtol=1e-4)
     np.testing.assert_allclose(run.ridge, gamma * variance / (w @ w), rtol=1e-4)
     assert np.linalg.norm(run.normal.gradient - run.ridge * w) < 1e-4 * np.linalg.norm(run.ridge * w)
@@ -98,7 +99,7 @@ def test_evidence_reaches_its_fixed_point_equations():
 def test_start_that_is_not_finite():
     given = regression(MLP(hidden=(5,)))
     run = minimise(given, w=jnp.full(given.bound.size, jnp.nan))
-    assert (run.code, run.iterations) == (lm.NON_FINITE, 0)
+    assert (run.ending, run.iterations) == (Ending.NON_FINITE, 0)
 
 
 IN_THE_SPAN = Function(lambda w, z: (w @ z[:2])[None], lambda key: jax.random.normal(key, (2,)))
@@ -115,7 +116,7 @@ def in_the_span(noise):
 @pytest.mark.parametrize("noise", [0.1, 0.0])
 def test_learner_in_the_span_of_the_physics(noise, options):
     run = minimise(in_the_span(noise), **options)
-    assert (run.code, run.iterations) == (lm.SPANNED, 0)
+    assert (run.ending, run.iterations) == (Ending.SPANNED, 0)
     assert np.isfinite(run.w).all() and np.isfinite(run.effective) and np.isfinite(run.normal.loss)
 
 
@@ -130,14 +131,14 @@ def test_start_at_the_minimum(seed):
     given = regression()
     w = minimise(given, w=given.bound.init(jax.random.key(seed))).w
     again = minimise(given, w=w)
-    assert again.code == lm.CONVERGED
+    assert again.ending is Ending.CONVERGED
     np.testing.assert_allclose(again.w, w, atol=1e-10)
 
 
 def test_start_at_a_perfect_fit():
     given = regression()
     given = problem(MLP(hidden=()), given.z, 0.0 * given.e, given.q)
-    assert minimise(given, w=jnp.zeros(given.bound.size)).code == lm.CONVERGED
+    assert minimise(given, w=jnp.zeros(given.bound.size)).ending is Ending.CONVERGED
 
 
 def uphill(w, overlap):
@@ -147,7 +148,7 @@ def uphill(w, overlap):
 
 def test_no_step_descends():
     run = LevenbergMarquardt().minimise(uphill, jnp.ones(2), (), Overlap(jnp.zeros((0, 2)), jnp.zeros(0)), samples=1)
-    assert run.code == lm.NO_DESCENT
+    assert run.ending is Ending.NO_DESCENT
     np.testing.assert_array_equal(run.w, 1.0)
 
 
@@ -164,7 +165,7 @@ def test_trial_without_a_value_is_taken_back():
 
 def test_iteration_limit():
     run = minimise(regression(MLP(hidden=(5,))), solver=LevenbergMarquardt(iterations=4))
-    assert (run.code, run.iterations) == (lm.RUNNING, 4)
+    assert (run.ending, run.iterations) == (Ending.RUNNING, 4)
 
 
 def test_loss_and_overlap_belong_to_the_weights():
@@ -187,13 +188,17 @@ def test_pauses_change_nothing(monkeypatch, seconds):
     given, told = regression(MLP(hidden=(5,))), []
     solver = LevenbergMarquardt(iterations=40)
     w = given.bound.init(jax.random.key(3))
-    options = lm.Options(jnp.asarray(solver.tolerance), jnp.asarray(True), jnp.asarray(float(SAMPLES)))
-    start = lm._start(given.criterion, w, given.arguments, given.nothing, jnp.asarray(0.1), options)
-    whole = lm._advance(given.criterion, start, given.arguments, options, jnp.asarray(solver.iterations))
+    options = compiled.Options(jnp.asarray(solver.tolerance), jnp.asarray(True), jnp.asarray(float(SAMPLES)))
+    start = compiled._start(given.criterion, w, given.arguments, given.nothing, jnp.asarray(0.1), options)
+    whole = compiled._advance(given.criterion, start, given.arguments, options, jnp.asarray(solver.iterations))
 
-    monkeypatch.setattr(lm, "_SECONDS_PER_BURST", seconds)
+    monkeypatch.setattr(compiled, "_SECONDS_PER_BURST", seconds)
     run = minimise(given, w, solver, ridge=0.1, evidence=True, progress=lambda i, loss: told.append((i, loss)))
     np.testing.assert_array_equal(run.w, whole.w)
-    assert (run.ridge, run.iterations, run.code) == (float(whole.ridge), int(whole.iteration), int(whole.code))
+    assert (run.ridge, run.iterations, run.ending) == (
+        float(whole.ridge),
+        int(whole.iteration),
+        Ending(int(whole.code)),
+    )
     assert told[-1] == (run.iterations, float(run.normal.loss))
     assert len(told) == (run.iterations if seconds == 0 else 4)

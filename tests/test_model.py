@@ -98,12 +98,12 @@ def test_predict_is_a_loop(case, horizon):
     response = model.predict(record, horizon=horizon)
     assert response.horizon == horizon
     close(response.model, naive.predicted(model, record, horizon))
-    assert np.isfinite(response.model).all(axis=1).sum() == 40 - model.form.start - horizon + 1
+    assert np.isfinite(response.model).all(axis=1).sum() == 40 - model.form.first_row - horizon + 1
 
 
 def test_simulate_is_a_loop(case):
     model, record = case
-    start, measured = model.form.start, record.experiments[0].outputs
+    start, measured = model.form.first_row, record.experiments[0].outputs
     zero = np.zeros((start, measured.shape[1]))
     given = np.random.default_rng(5).normal(size=zero.shape)
     close(model.simulate(record).model, naive.simulated(model, record, measured[:start]))
@@ -115,7 +115,7 @@ def test_simulate_is_a_loop(case):
 def test_parts_are_the_loop_s(case):
     model, record = case
     (trajectory,) = model.components(record).trajectories
-    start = model.form.start
+    start = model.form.first_row
     signals = naive.signals_of(record.experiments[0], record)
     rows = [naive.row(model, signals, k) for k in range(start, len(record))]
     for i, found in enumerate((trajectory.baseline, trajectory.learner, trajectory.learner_before)):
@@ -129,7 +129,7 @@ def test_simulated_parts_add_up(case):
     model, record = case
     (trajectory,) = model.simulate(record).trajectories
     close(trajectory.baseline + trajectory.learner, trajectory.model)
-    assert trajectory.start == model.form.start and trajectory.diverged is None
+    assert trajectory.start == model.form.first_row and trajectory.diverged is None
 
 
 @pytest.mark.parametrize("usable", [1, 255, 256, 257, 4096, 4097])
@@ -256,7 +256,7 @@ def test_to_frame(pair):
     np.testing.assert_allclose(frame["time"], 0.5 * np.arange(30))
     np.testing.assert_array_equal(frame["y1"], record.experiments[0].outputs[:, 0])
     np.testing.assert_allclose(frame["y2_baseline"] + frame["y2_learner"], frame["y2_model"])
-    assert frame["y1_model"].isna().sum() == model.form.start == 4
+    assert frame["y1_model"].isna().sum() == model.form.first_row == 4
 
 
 def test_repr(pair):

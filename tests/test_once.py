@@ -47,7 +47,9 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
     for name, home in (("pose", problem), ("stack_rows", regressors)):
         original = getattr(home, name)
-        users = [m for key, m in sys.modules.items() if key.startswith("orthaug") and getattr(m, name, None) is original]
+        users = [
+            m for key, m in sys.modules.items() if key.startswith("orthaug") and getattr(m, name, None) is original
+        ]
         count(home, name)
         for module in users:
             monkeypatch.setattr(module, name, getattr(home, name))

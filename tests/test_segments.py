@@ -18,8 +18,9 @@ from orthaug.data.regressors import Lags
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.segments import Segments, lay_segments, respond, sensitivity
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.models.dynamics import Numbers
+from orthaug.models.lagged import Lagged
 from orthaug.models.learners import MLP, Bound
-from orthaug.models.predictor import Form, Numbers
 from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.problem import pose
 
@@ -60,13 +61,13 @@ def record_of(ny, lengths=LENGTHS):
 
 
 class Case(NamedTuple):
-    """A model with arbitrary numbers, its record in two chunks of segments, and pasts that are not the measured."""
+    """A model with arbitrary numbers, its record in two chunks of segments, and states to start from that are not the measured."""
 
     record: Record
-    form: Form
+    form: Lagged
     numbers: Numbers
     segments: Segments
-    past: np.ndarray
+    states: np.ndarray
     weight: np.ndarray
 
 
@@ -78,17 +79,17 @@ def case(name):
     posed = pose(record_of(ny), Baseline.from_terms(terms), lags, None if learner is None else learner.inputs)
     nz = posed.feature_rows().shape[1]
     bound = None if learner is None else Bound(learner, nz, ny)
-    form = Form(posed.baseline, posed.features, posed.layout, posed.outputs, bound)
+    form = Lagged(posed.baseline, posed.features, posed.layout, posed.outputs, bound)
     w = np.zeros(0) if bound is None else np.asarray(bound.init(jax.random.key(1))) + 0.1
     c = 0.4 * rng.normal(size=len(posed.baseline.names))
     scaling = (np.zeros(0), np.zeros(0), np.zeros(ny))
     if bound is not None:
         scaling = (rng.normal(size=nz), 1 + rng.random(nz), 0.5 * (1 + rng.random(ny)))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(orthaug.segments, "_CHUNK", 9)
+        patch.setattr(orthaug.fitting.segments, "_CHUNK", 9)
         segments = lay_segments(posed.record, form, SEGMENT, WASHOUT)
-    past = np.asarray(segments.past) + 0.3 * rng.normal(size=segments.past.shape)
-    return Case(posed.record, form, Numbers(c, 0 * c, w, *scaling), segments, past, rng.normal(size=(ny, ny)))
+    states = np.asarray(segments.start) + 0.3 * rng.normal(size=segments.start.shape)
+    return Case(posed.record, form, Numbers(c, 0 * c, w, *scaling), segments, states, rng.normal(size=(ny, ny)))
 
 
 def spread_out(part):
@@ -121,10 +122,11 @@ SIZES = [(0, 0), (1, 0), (5, 0), (7, 0), (500, 0), (0, 3), (5, 3), (7, 3), (7, 6
 def test_layout_by_a_double_loop(name, segment, washout):
     record, form = case(name).record, case(name).form
     found = lay_segments(record, form, segment, washout)
-    expected, steps, _ = laid_out(record, form.start, form.memory, segment, washout)
-    past, inputs, target, scored = map(spread_out, found)
+    expected, steps, _ = laid_out(record, form.first_row, form.memory, segment, washout)
+    start, inputs, target, scored = map(spread_out, found)
     assert inputs.shape[1] == target.shape[1] == scored.shape[1] == steps
-    assert past.shape[1:] == (form.memory, OUTPUTS[name])
+    assert start.shape[1:] == (form.states,) == (form.memory * OUTPUTS[name],)
+    past = start.reshape(len(start), form.memory, OUTPUTS[name])
     for s, (i, first, rows) in enumerate(expected):
         experiment = record.experiments[i]
         for lag in range(1, form.memory + 1):
@@ -140,22 +142,22 @@ def test_layout_by_a_double_loop(name, segment, washout):
 @pytest.mark.parametrize(("segment", "washout"), [(0, 0), (0, 4), (7, 3), (7, 0), (9, 8)])
 def test_every_usable_row_is_scored_once_but_the_first_washout(segment, washout):
     record, form = case("one output").record, case("one output").form
-    layout, _, washout = laid_out(record, form.start, form.memory, segment, washout)
+    layout, _, washout = laid_out(record, form.first_row, form.memory, segment, washout)
     rows = [(i, k) for i, _, scored in layout for k in scored]
-    usable = [(i, k) for i, e in enumerate(record.experiments) for k in range(form.start + washout, len(e))]
+    usable = [(i, k) for i, e in enumerate(record.experiments) for k in range(form.first_row + washout, len(e))]
     assert sorted(rows) == usable
     assert lay_segments(record, form, segment, washout).count == len(usable)
 
 
 def test_segments_stand_in_chunks_of_one_width(monkeypatch):
     record, form = case("one output").record, case("one output").form
-    monkeypatch.setattr(orthaug.segments, "_CHUNK", 4)
+    monkeypatch.setattr(orthaug.fitting.segments, "_CHUNK", 4)
     chunked = lay_segments(record, form, SEGMENT, WASHOUT)
     monkeypatch.undo()
     one = lay_segments(record, form, SEGMENT, WASHOUT)
-    assert one.past.shape[0] == 1 and chunked.past.shape[0] == 4 and chunked.past.shape[-1] <= 4
-    assert {part.shape[0] for part in chunked} == {4} and {part.shape[-1] for part in one} == {one.past.shape[-1]}
-    count = len(laid_out(record, form.start, form.memory, SEGMENT, WASHOUT)[0])
+    assert one.start.shape[0] == 1 and chunked.start.shape[0] == 4 and chunked.start.shape[-1] <= 4
+    assert {part.shape[0] for part in chunked} == {4} and {part.shape[-1] for part in one} == {one.start.shape[-1]}
+    count = len(laid_out(record, form.first_row, form.memory, SEGMENT, WASHOUT)[0])
     for found, expected in zip(chunked, one, strict=True):
         np.testing.assert_array_equal(spread_out(found)[:count], spread_out(expected)[:count])
 
@@ -164,7 +166,7 @@ def test_an_experiment_shorter_than_the_washout_is_not_scored():
     form = case("one output").form
     record = record_of(1, (30, 5))
     found = lay_segments(record, form, 7, 4)
-    assert found.count == 30 - form.start - 4
+    assert found.count == 30 - form.first_row - 4
 
 
 # --- free run
@@ -173,10 +175,11 @@ def test_an_experiment_shorter_than_the_washout_is_not_scored():
 @pytest.mark.parametrize("name", CASES)
 def test_respond_is_a_loop_over_time(name):
     given = case(name)
-    found = spread_out(respond(given.form, given.numbers, given.segments, given.past))
-    model, start = SimpleNamespace(form=given.form, numbers=given.numbers), given.form.start
+    found = spread_out(respond(given.form, given.numbers, given.segments, given.states))
+    model, start = SimpleNamespace(form=given.form, numbers=given.numbers), given.form.first_row
     layout, steps, _ = laid_out(given.record, start, given.form.memory, SEGMENT, WASHOUT)
-    past = spread_out(given.past)
+    past = spread_out(given.states)
+    past = past.reshape(len(past), given.form.memory, OUTPUTS[name])
     for s, (i, first, _) in enumerate(layout):
         experiment = given.record.experiments[i]
         signals = naive.signals_of(experiment, given.record)
@@ -199,9 +202,9 @@ def test_respond_over_whole_experiments_is_simulate(ny):
     model = estimate(record, Baseline.from_terms(terms), **options).model
     assert np.abs(model.theta_aux).max() > 1e-3
     whole = lay_segments(record, model.form, 0, 0)
-    found = spread_out(respond(model.form, model.numbers, whole, whole.past))
+    found = spread_out(respond(model.form, model.numbers, whole, whole.start))
     for s, trajectory in enumerate(model.simulate(record).trajectories):
-        expected = trajectory.model[model.form.start :]
+        expected = trajectory.model[model.form.first_row :]
         np.testing.assert_allclose(found[s, : len(expected)], expected, rtol=1e-10, atol=1e-12)
 
 
@@ -209,17 +212,17 @@ def test_respond_over_whole_experiments_is_simulate(ny):
 
 
 class Dense(NamedTuple):
-    """The scored rows' errors and Jacobian, weighted: columns are the pasts of all segments, then (c, w)."""
+    """The scored rows' errors and Jacobian, weighted: columns are the states of all segments, then (c, w)."""
 
     error: np.ndarray
-    past: np.ndarray
+    start: np.ndarray
     shared: np.ndarray
 
 
-def errors(given, p, past):
+def errors(given, p, states):
     nt = len(given.form.baseline.names)
     numbers = given.numbers._replace(theta=p[:nt], weights=p[nt:])
-    miss = jnp.where(given.segments.scored[:, :, None], respond(given.form, numbers, given.segments, past), 0.0)
+    miss = jnp.where(given.segments.scored[:, :, None], respond(given.form, numbers, given.segments, states), 0.0)
     return jnp.einsum("oi,ktim->ktom", given.weight, miss)
 
 
@@ -228,10 +231,10 @@ def dense(name):
     """Everything by `jax.jacfwd` through the scan."""
     given = case(name)
     p = jnp.concatenate([jnp.asarray(given.numbers.theta), jnp.asarray(given.numbers.weights)])
-    past = jnp.asarray(given.past)
-    jacobian = jax.jit(jax.jacfwd(partial(errors, given), argnums=(0, 1)))(p, past)
+    states = jnp.asarray(given.states)
+    jacobian = jax.jit(jax.jacfwd(partial(errors, given), argnums=(0, 1)))(p, states)
     target = jnp.where(given.segments.scored[:, :, None], given.segments.target, 0.0)
-    error = jnp.einsum("oi,ktim->ktom", given.weight, target) - errors(given, p, past)
+    error = jnp.einsum("oi,ktim->ktom", given.weight, target) - errors(given, p, states)
     return Dense(np.asarray(error), np.asarray(jacobian[1]), np.asarray(jacobian[0]))
 
 
@@ -243,7 +246,7 @@ def assert_close(found, expected, relative):
 @cache
 def found_of(name):
     given = case(name)
-    return sensitivity(given.form, given.numbers, given.segments, jnp.asarray(given.past), jnp.asarray(given.weight))
+    return sensitivity(given.form, given.numbers, given.segments, jnp.asarray(given.states), jnp.asarray(given.weight))
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -255,20 +258,20 @@ def test_gram_matrix_of_the_sensitivities_is_that_of_autodiff(name):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_gram_matrices_of_the_pasts_are_those_of_autodiff(name):
+def test_gram_matrices_of_the_states_are_those_of_autodiff(name):
     exact = dense(name)
-    chunks, _, _, width, na, ny = (*exact.error.shape, *case(name).segments.past.shape[1:3])
-    own = np.zeros((chunks, na * ny, na * ny + exact.shared.shape[-1] + 1, width))
+    (chunks, _, ny, width), n0 = exact.error.shape, case(name).segments.start.shape[1]
+    own = np.zeros((chunks, n0, n0 + exact.shared.shape[-1] + 1, width))
     for k in range(chunks):
         for m in range(width):
-            others = exact.past[k, :, :, m].copy()  # (T, ny, k, na, ny, m)
-            past = others[:, :, k, :, :, m].copy().reshape(others.shape[0] * ny, na * ny)
-            others[:, :, k, :, :, m] = 0
-            assert not others.any()  # a past touches its own segment only
+            others = exact.start[k, :, :, m].copy()  # (T, ny, k, n0, m)
+            start = others[:, :, k, :, m].copy().reshape(others.shape[0] * ny, n0)
+            others[:, :, k, :, m] = 0
+            assert not others.any()  # a state touches its own segment only
             rows = np.column_stack(
-                [past, exact.shared[k, :, :, m].reshape(len(past), -1), exact.error[k, :, :, m].ravel()]
+                [start, exact.shared[k, :, :, m].reshape(len(start), -1), exact.error[k, :, :, m].ravel()]
             )
-            own[k, :, :, m] = past.T @ rows
+            own[k, :, :, m] = start.T @ rows
     assert_close(np.asarray(found_of(name).own), own, 1e-8)
 
 
@@ -280,7 +283,7 @@ def test_gram_matrix_of_the_sensitivities_is_that_of_differences(name):
 
     def run(p):
         numbers = given.numbers._replace(theta=p[:nt], weights=p[nt:])
-        response = np.where(scored, respond(given.form, numbers, given.segments, given.past), 0.0)
+        response = np.where(scored, respond(given.form, numbers, given.segments, given.states), 0.0)
         return np.einsum("oi,ktim->ktom", given.weight, response).ravel()
 
     steps = 1e-5 * np.eye(len(p))
@@ -294,5 +297,5 @@ def test_a_kink_without_a_derivative_counts_as_flat():
                    layout=case("gaps between lags").form.layout[:1])  # fmt: skip
     segments = lay_segments(record, form, 0, 0)
     numbers = case("no learner").numbers._replace(theta=np.ones(1), theta_aux=np.zeros(1))
-    found = sensitivity(form, numbers, segments, segments.past, jnp.eye(1))
+    found = sensitivity(form, numbers, segments, segments.start, jnp.eye(1))
     assert np.isfinite(found.shared).all() and np.isfinite(found.own).all()

@@ -11,10 +11,10 @@ from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
 from orthaug.fitting.estimation import estimate
-from orthaug.fitting.one_step import Task
+from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.status import MESSAGES
+from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
 from orthaug.models.learners import MLP
 from orthaug.physics.baseline import Baseline, Term
@@ -68,7 +68,7 @@ def raw_physics(ny, shared):
 
 @lru_cache
 def posed(ny, shared):
-    task = Task.of(pose(*declared(ny, shared), LAGS), LEARNER)
+    task = OneStepTask.of(pose(*declared(ny, shared), LAGS), LEARNER)
     phi, y = raw_physics(ny, shared), signals(ny)[1][1:]
     spread = y.std(axis=0)
     z = jnp.asarray(task.scaling(task.problem.feature_rows()))
@@ -155,7 +155,7 @@ def fit(structure, ny, shared, solver):
 @pytest.mark.parametrize(("structure", "ny", "shared"), CASES, ids=IDS)
 def test_every_solver_fits_every_structure(structure, ny, shared, solver):
     found, again = fit(structure, ny, shared, solver), fit(structure, ny, shared, solver)
-    assert found.status.code in MESSAGES and found.status.ok
+    assert found.status.code in {ending.code for ending in Ending} and found.status.ok
     assert np.isfinite(found.theta).all() and np.isfinite(found.status.loss)
     np.testing.assert_array_equal(again.theta, found.theta)
     np.testing.assert_array_equal(again.model.numbers.weights, found.model.numbers.weights)

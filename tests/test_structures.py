@@ -11,17 +11,16 @@ import scipy.optimize
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jnp
 from orthaug.data.record import Record
+from orthaug.fitting.elimination import Elimination, eliminate
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import (
     Additive,
     BaselinePenalty,
-    Elimination,
     Orthogonal,
     OrthogonalPenalty,
-    Rows,
+    PenaltyRows,
     Structure,
-    eliminate,
 )
 from orthaug.models.learners import Function
 from orthaug.physics.baseline import Baseline, Term
@@ -80,7 +79,7 @@ FIXED = ({}, {1: 0.7}, {2: -0.3, 0: 1.2}, {0: 0.1, 1: 0.2, 2: 0.3})
 def elimination(rows=0, bounds=NO_BOUNDS, seed=0):
     """Random coordinates, outputs and rows for three entries of θ."""
     rng = np.random.default_rng(seed)
-    penalty = Rows(rng.normal(size=(rows, 3)), rng.normal(size=(rows, 3)), rng.normal(size=rows))
+    penalty = PenaltyRows(rng.normal(size=(rows, 3)), rng.normal(size=(rows, 3)), rng.normal(size=rows))
     return Elimination(rng.normal(size=(3, 3)), 3 * rng.normal(size=3), penalty, *bounds)
 
 
@@ -184,7 +183,7 @@ def test_columns_of_very_different_size():
     size = np.array([1e8, 1.0, 1e-8])
     box = np.array([-0.1, -1.0, -2.0]) / size, np.array([0.1, 1.0, 0.05]) / size
     square, outputs = rng.normal(size=(3, 3)), rng.normal(size=3)
-    rows = Rows(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    rows = PenaltyRows(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
     given = Elimination(square * size, outputs, rows, *box)
     plain = Elimination(square, outputs, rows, box[0] * size, box[1] * size)
     f = np.zeros(3)

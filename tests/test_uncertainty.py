@@ -56,7 +56,7 @@ def projected(fit, phi, jacobian):
 
 
 def residual_of(fit):
-    start = fit.model.form.start
+    start = fit.model.form.first_row
     record = fit.problem.record
     found = fit.model.predict(record).trajectories
     return np.concatenate([t.measured[start:] - t.model[start:] for t in found])
@@ -133,12 +133,12 @@ def test_another_measure_has_its_price(noisy):
 def spread_of(fit, rows):
     """√diag(R Cov(c, w) Rᵀ) of rows R (m, nθ + nw): σ²(SᵀS + α)⁻¹ by an SVD of S with its prior's rows below it."""
     design = np.concatenate(dense(fit), axis=2)[:, 0] * fit.model.weight[0]
-    prior = np.eye(design.shape[1])[len(fit.theta) :] * np.sqrt(fit.model.ridge)
+    prior = np.eye(design.shape[1])[len(fit.theta) :] * np.sqrt(fit.model.statistics.ridge)
     stacked = np.vstack([design, prior])
     unit = 1 / np.linalg.norm(stacked, axis=0)
     _, singular, vectors = np.linalg.svd(stacked * unit, full_matrices=False)
     half = (rows * unit) @ (vectors.T / singular)
-    return np.sqrt(np.sum(half**2, axis=1) * fit.model.noise[0, 0]) * fit.model.weight[0]
+    return np.sqrt(np.sum(half**2, axis=1) * fit.model.statistics.noise[0, 0]) * fit.model.weight[0]
 
 
 def test_the_covariance_under_a_measure_is_the_delta_method(noisy):
@@ -162,7 +162,7 @@ def test_variances_of_the_learner_are_not_negative(noisy, convention):
     psi, covariance = psi_of(noisy)[:, 0, 2:], noisy.joint_covariance(convention)[2:, 2:]
     variance = np.einsum("kn,np,kp->k", psi, covariance, psi)
     assert variance.min() >= 0
-    factor = 2 * np.mean(residual_of(noisy) ** 2) if convention == "paper" else noisy.model.noise[0, 0]
+    factor = 2 * np.mean(residual_of(noisy) ** 2) if convention == "paper" else noisy.model.statistics.noise[0, 0]
     rank = variance.sum() / factor / noisy.model.weight[0] ** 2
     assert 8 < rank <= psi.shape[1] + 1e-6
 
@@ -173,7 +173,7 @@ def test_the_whole_covariance_where_every_weight_is_estimable(convention):
     fit = estimate(example.train, example.baseline, learner=LINEAR, solver=QUICK)
     expected = paper(fit)
     if convention == "calibrated":
-        expected = expected * fit.model.noise[0, 0] / (2 * np.mean(residual_of(fit) ** 2))
+        expected = expected * fit.model.statistics.noise[0, 0] / (2 * np.mean(residual_of(fit) ** 2))
     size = np.sqrt(np.diag(expected))
     found = fit.joint_covariance(convention)
     np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), rtol=0, atol=1e-8)
@@ -225,9 +225,11 @@ def test_outputs_that_share_theta_need_equal_noise_for_zero_covariance():
 def test_outputs_without_a_common_theta_have_zero_covariance():
     """Diagonal noise: what is left of the correlation is that of the residuals themselves."""
     fit = two_outputs(False)
-    rho = fit.model.noise[0, 1] / np.sqrt(fit.model.noise[0, 0] * fit.model.noise[1, 1])
+    rho = fit.model.statistics.noise[0, 1] / np.sqrt(
+        fit.model.statistics.noise[0, 0] * fit.model.statistics.noise[1, 1]
+    )
     assert np.abs(correlations(fit)).max() <= max(abs(rho), 1e-10)
-    independent = fit.model.noise * np.eye(2)
+    independent = fit.model.statistics.noise * np.eye(2)
     psi = psi_of(fit)
     middle = np.einsum("koa,op,kpb->ab", psi, independent, psi)
     size = np.sqrt(np.diag(middle))
@@ -240,7 +242,7 @@ def test_the_joint_covariance_of_two_outputs_is_a_sum_over_rows(shared, conventi
     fit = two_outputs(shared)
     psi, weight = psi_of(fit), fit.model.weight
     residual = residual_of(fit)
-    noise = residual.T @ residual / len(residual) if convention == "paper" else fit.model.noise
+    noise = residual.T @ residual / len(residual) if convention == "paper" else fit.model.statistics.noise
     whitened = noise * np.outer(weight, weight)
     outer, middle = np.einsum("koa,kob->ab", psi, psi), np.einsum("koa,op,kpb->ab", psi, whitened, psi)
     expected = (2 if convention == "paper" else 1) * pinv(outer) @ middle @ pinv(outer)
@@ -256,8 +258,8 @@ def test_one_pass_over_chunks_is_a_sum_over_rows(count):
     phi, jacobian = (part * model.weight[:, None] for part in dense(fit))
     psi = np.concatenate([phi, jacobian], axis=2)
     size = np.sqrt(np.einsum("koa,koa->a", psi, psi))
-    whitened = model.noise * np.outer(model.weight, model.weight)
-    for found, mix in ((model.gram, np.eye(2)), (model.middle, whitened)):
+    whitened = model.statistics.noise * np.outer(model.weight, model.weight)
+    for found, mix in ((model.statistics.gram, np.eye(2)), (model.statistics.middle, whitened)):
         expected = np.einsum("koa,op,kpb->ab", psi, mix, psi, optimize=True)
         np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), rtol=0, atol=1e-10)
 
@@ -300,7 +302,7 @@ def test_prediction_std_of_the_default_fit_is_that_of_what_the_data_see():
     example = static(1, noise=True)
     fit = estimate(example.train, example.baseline)
     (found,) = prediction_std(fit.model, example.train)
-    rank = np.mean(found**2) * len(found) / fit.model.noise[0, 0]
+    rank = np.mean(found**2) * len(found) / fit.model.statistics.noise[0, 0]
     assert found.min() > 0
     assert 10 < rank < 2 + fit.model.form.bound.size
     assert rank == pytest.approx(round(rank), abs=0.1)

@@ -28,7 +28,7 @@ from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.inference.measures import Training
-from orthaug.models.learners import MLP, External, Learner, Scaling
+from orthaug.models.learners import MLP, Bound, External, Function, Learner, Scaling
 from orthaug.models.model import Model
 from orthaug.models.rows import Engine, InMemory
 from orthaug.physics.baseline import Baseline
@@ -91,7 +91,7 @@ def estimate(
         >>> f"{fit.theta[0]:.3f}"
         '2.000'
     """
-    _check_record(record, baseline, lags, initial)
+    _check_record(record, baseline, lags, learner, initial)
     model = initial.model if isinstance(initial, Estimate) else initial
     inputs = None if learner is None else learner.inputs
     if model is not None:
@@ -198,10 +198,19 @@ def orthogonalize(
     problem = pose(record, baseline, lags)
     ny, nz = len(problem.outputs), len(problem.features.entries)
     external = External(function, ny=ny)
-    external.values(problem.feature_rows()[:1])  # a wrong shape is told here, not from inside of compiled code
-    scaling = Scaling(np.zeros(nz), np.ones(nz))
-    task = OneStepTask.of(problem, external, scaling, np.ones(ny))
-    return conclude(task, Orthogonal(), Learned(task.bound, np.zeros(0), scaling, np.ones(ny), elsewhere=True))
+    values = external.values(problem.feature_rows())  # once; the sums below read what it gave
+    scaling, unit = Scaling(np.zeros(nz), np.ones(nz)), np.ones(ny)
+    task = OneStepTask.of(problem, None, scaling, unit)
+    gain = np.broadcast_to(problem.weight / task.rms, values.shape)
+    rows = task.engine.lay(values, problem.projection.q, problem.unexplained / task.rms, gain)
+    task = replace(task, rows=rows, unit=unit, bound=Bound(_GIVEN, ny, ny))
+    found = conclude(task, Orthogonal(), Learned(task.bound, np.zeros(0), scaling, unit, elsewhere=True))
+    form = replace(found.model.form, bound=Bound(external, nz, ny))
+    return replace(found, model=replace(found.model, form=form))
+
+
+_GIVEN = Function(lambda w, z: z, lambda key: ())
+"""The learner whose values are its features."""
 
 
 def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStepTask, Float[Array, "nw"], Vector]:
@@ -302,10 +311,11 @@ def _finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _check_record(record: Any, baseline: Any, lags: Any, initial: Any) -> None:
+def _check_record(record: Any, baseline: Any, lags: Any, learner: Any, initial: Any) -> None:
     check_type(record, Record, "record", "a Record")
     check_type(baseline, Baseline, "baseline", "a Baseline")
     check_type(lags, Lags | None, "lags", "Lags(…) or None")
+    check_type(learner, Learner | None, "learner", "a learner such as MLP(), or None")
     check_type(initial, Estimate | Model | None, "initial", "an Estimate, a Model or None")
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.progress import RunTell, quiet
@@ -56,6 +56,7 @@ class Learned:
     """Whether it is a function from another toolbox."""
 
 
+@runtime_checkable
 class Task(Protocol):
     """A problem laid out for training on one criterion; `OneStepTask` and `FreeRunTask`."""
 

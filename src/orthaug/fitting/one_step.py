@@ -154,10 +154,12 @@ class OneStepTask:
             criterion, arguments = OneStep(self.bound), (self.rows, hold)
             return solver.minimise(criterion, w, arguments, self._nothing, samples=samples, **options)
         objective = Streamed(self.engine, self.bound, self.rows, hold, samples)
-        first = objective.fly(np.asarray(w), self._nothing)  # its overlap makes the next pass exact
-        if compiled.spanned(first.normal):
+        first = objective.fly(np.asarray(w), self._nothing)
+        first = objective.fly(np.asarray(w), first.normal.overlap)  # less what rounding left of J in the physics
+        if np.isfinite(first.normal.hessian).all() and compiled.spanned(first.normal):
             return compiled.Run(w, first.normal, ridge, 0.0, 0, Ending.SPANNED, 0.0)
-        end = solver.descend(objective, np.asarray(w), first.normal.overlap, damping=IDENTITY, **options)
+        late: dict[str, Any] = {"evidence_at_start": False}  # as the compiled loop has it
+        end = solver.descend(objective, np.asarray(w), first.normal.overlap, damping=IDENTITY, **late, **options)
         normal: Normal = end.flown.normal
         weights = jnp.asarray(end.flown.p)
         return compiled.Run(weights, normal, end.ridge, end.effective, end.iterations, end.ending, end.seconds)

@@ -30,7 +30,7 @@ class Factor:
         """From rows that come in blocks, one at a time: R of each stacked upon that of all before (tree QR)."""
         r = scale = None
         for block in blocks:
-            rows = block.reshape(-1, block.shape[-1])
+            rows = block.reshape(block.shape[0] * block.shape[1], block.shape[2])  # −1 has no meaning without columns
             if scale is None or r is None:
                 scale, r = _scale(rows), np.zeros((0, rows.shape[1]))
             r = np.asarray(np.linalg.qr(np.concatenate([r, rows * scale]), mode="r"))

@@ -126,6 +126,7 @@ def descend(
     damping: Damping,
     ridge: float = 0.0,
     evidence: bool = False,
+    evidence_at_start: bool = True,
     bounds: tuple[Vector, Vector] | None = None,
     progress: RunTell = quiet,
 ) -> Descent:
@@ -134,6 +135,7 @@ def descend(
     Args:
         start: handed to the first trial.
         ridge: α; with `evidence` where it starts.
+        evidence_at_start: whether α is re-estimated at p already, or first after an accepted step.
         bounds: of θ, each (physics,); the start is moved inside.
     """
     began = time.perf_counter()
@@ -147,7 +149,7 @@ def descend(
         return Descent(flown, None, ridge, 0.0, 0, Ending.NON_FINITE, time.perf_counter() - began)
     largest = 1.0 if damping.diagonal else float(np.diag(linear.hessian).max(initial=1e-300))
     place = _Place(flown, linear, ridge, damping.first * largest)
-    place = place._replace(ridge=_next_ridge(objective, place, evidence))
+    place = place._replace(ridge=_next_ridge(objective, place, evidence and evidence_at_start))
     ending, done = Ending.RUNNING, 0
     while ending is Ending.RUNNING and done < iterations:
         place, ending = _trial(objective, place, limits, tolerance, damping, evidence)

@@ -14,8 +14,8 @@ from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Record
 from orthaug.fitting.criteria import Prediction, Simulation
 from orthaug.fitting.estimation import estimate
-from orthaug.fitting.free_run import FreeRun
-from orthaug.fitting.one_step import Task
+from orthaug.fitting.free_run import FreeRunTask
+from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.segments import respond
 from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
@@ -56,7 +56,7 @@ def free_run_loss(found, given, washout):
     """Mean square of `Model.simulate` over whole experiments, each output in its training deviation."""
     squares = []
     for trajectory in found.model.simulate(given).trajectories:
-        first = found.model.form.start + washout
+        first = found.model.form.first_row + washout
         squares.append(((trajectory.measured - trajectory.model)[first:] * found.problem.weight) ** 2)
     return np.mean(np.concatenate(squares))
 
@@ -87,7 +87,7 @@ def test_loss_is_the_mean_square_of_simulate(lengths):
 def test_theta_is_the_share_of_the_model_in_the_physics(lengths):
     """θ = Φ⁺G with G the model's one-step values at the measured regressors."""
     found, given = fit(lengths=lengths), record(1, lengths)
-    start = found.model.form.start
+    start = found.model.form.first_row
     values = np.concatenate([t.model[start:] for t in found.model.predict(given).trajectories])
     rows = found.problem.rows
     phi = found.problem.baseline.phi(rows.x, rows.layout, ("y",), np)[:, 0]
@@ -163,7 +163,7 @@ def test_a_fixed_term_stays_beside_a_learner():
     terms = [*TERMS, Term("d", "y[k-2]", 0.15, fixed=True)]
     shifted = estimate(record(), Baseline.from_terms(terms), learner=NETWORK, solver=LM, criterion=FREE)
     rows = shifted.problem.rows
-    start = shifted.model.form.start
+    start = shifted.model.form.first_row
     known = 0.15 * record().experiments[0].outputs[start - 2 : -2, 0]
     values = shifted.model.predict(record()).model[start:, 0] - known
     phi = shifted.problem.baseline.phi(rows.x, rows.layout, ("y",), np)[:, 0]
@@ -195,15 +195,15 @@ def bounded(structure):
 def reparametrised(found, orthogonal):
     """(residual, Jacobian) of the segments' errors over (θ, w), with `c = θ − Φ⁺F(w)` where θ is orthogonal."""
     problem = found.problem
-    flown = FreeRun.of(problem, Task.of(problem, MLP((2,))), SMALL)
+    flown = FreeRunTask.of(OneStepTask.of(problem, MLP((2,))), SMALL)
     phi = problem.baseline.phi(problem.rows.x, problem.layout, ("y",), np)[:, 0]
-    pseudo, z = np.linalg.pinv(phi), jnp.asarray(flown.scaling(problem.feature_rows()))
+    pseudo, z = np.linalg.pinv(phi), jnp.asarray(flown.task.scaling(problem.feature_rows()))
 
     def residual(p):
         theta, w = p[:3], p[3:]
-        share = pseudo @ (flown.unit * jax.vmap(lambda row: flown.form.bound.values(w, row))(z))[:, 0]
+        share = pseudo @ (flown.task.unit * jax.vmap(lambda row: flown.bound.values(w, row))(z))[:, 0]
         numbers = flown.numbers(0.0 * phi[0], 0.0)._replace(theta=theta - orthogonal * share, weights=w)
-        run = respond(flown.form, numbers, flown.segments, flown.segments.past)
+        run = respond(flown.dynamics, numbers, flown.segments, flown.segments.start)
         return jnp.where(flown.segments.scored[:, :, None], flown.segments.target - run, 0.0).ravel()
 
     jacobian = jax.jit(jax.jacfwd(residual))
@@ -496,7 +496,7 @@ def test_a_free_run_that_diverges_over_whole_experiments_is_no_error():
     found = estimate(first_order(0), unstable, learner=None, criterion=Simulation(8, 0))
     assert found.status.ok and np.isnan(found.status.loss) and found.restarts[0].loss is None
     assert np.isfinite(found.parameters["value"]).all()
-    assert "diverge" in " ".join((found.status.message, *found.warnings))  # a silent NaN has no remedy
+    assert "diverge" in " ".join((found.status.message, *map(str, found.warnings)))  # a silent NaN has no remedy
 
 
 def test_a_slowly_growing_free_run_has_a_loss():
@@ -526,13 +526,13 @@ def runaway(seed):
 
 
 def test_a_start_that_runs_away_trains_through_shorter_segments(monkeypatch):
-    steps, shorter = [], FreeRun._shorter
+    steps, shorter = [], FreeRunTask._shorter
 
     def counted(self):
         steps.append(self.segments.scored.shape[1])
         return shorter(self)
 
-    monkeypatch.setattr(FreeRun, "_shorter", counted)
+    monkeypatch.setattr(FreeRunTask, "_shorter", counted)
     found = runaway(0)
     assert steps == [256, 64, 16]
     assert found.status.code == "converged" and found.status.loss < 1e-3 and found.defect <= 1e-12

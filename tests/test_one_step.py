@@ -8,7 +8,7 @@ import pytest
 from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
-from orthaug.fitting.one_step import OUTPUT_UNIT, Task
+from orthaug.fitting.one_step import OUTPUT_UNIT, OneStepTask
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Orthogonal, OrthogonalPenalty
 from orthaug.models.learners import MLP, Scaling
@@ -32,7 +32,7 @@ def task(request):
     else:
         terms, record = TERMS, Record.from_arrays(100 * u, y)
     problem = pose(record, Baseline.from_terms(terms), Lags(na=1, nb=2, nk=0))
-    return Task.of(problem, MLP(hidden=(3,)))
+    return OneStepTask.of(problem, MLP(hidden=(3,)))
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def run(task):
 
 
 def test_features_fill_the_unit_box(task):
-    z = from_chunks(task.chunks.z, len(task.problem.rows))
+    z = from_chunks(task.rows.z, len(task.problem.rows))
     np.testing.assert_allclose(z.min(axis=0), -1.0, atol=1e-12)
     np.testing.assert_allclose(z.max(axis=0), 1.0, atol=1e-12)
     np.testing.assert_allclose(z, task.scaling(task.problem.feature_rows()), atol=1e-12)
@@ -54,24 +54,24 @@ def test_output_unit_is_a_multiple_of_the_baseline_s_residual(task):
     e = (y - phi @ np.linalg.lstsq(phi, y, rcond=None)[0]).reshape(problem.target.shape)
     np.testing.assert_allclose(task.unit, OUTPUT_UNIT * e.std(axis=0) / problem.weight, rtol=1e-9)
     assert task.rms == pytest.approx(np.sqrt(np.mean(e.var(axis=0))), rel=1e-9)
-    rows = from_chunks(task.chunks.e, len(problem.rows))
+    rows = from_chunks(task.rows.e, len(problem.rows))
     np.testing.assert_allclose(rows, e / task.rms, atol=1e-10)
     assert np.mean(rows.var(axis=0)) == pytest.approx(1.0)
 
 
 def test_padding_has_no_weight(task):
-    count, _, size = task.chunks.z.shape
+    count, _, size = task.rows.z.shape
     rows = len(task.problem.rows)
     assert count * size >= rows
     for name in ("q", "e", "gain"):
-        assert not from_chunks(getattr(task.chunks, name), count * size)[rows:].any()
+        assert not from_chunks(getattr(task.rows, name), count * size)[rows:].any()
 
 
 def test_a_given_scaling_is_kept(task):
     scaling, unit = Scaling(np.zeros(task.bound.nz), np.full(task.bound.nz, 2.0)), np.full(task.bound.ny, 3.0)
-    again = Task.of(task.problem, task.bound.learner, scaling, unit)
+    again = OneStepTask.of(task.problem, task.bound.learner, scaling, unit)
     np.testing.assert_array_equal(again.unit, unit)
-    np.testing.assert_allclose(from_chunks(again.chunks.z, len(task.problem.rows)), task.problem.feature_rows() / 2)
+    np.testing.assert_allclose(from_chunks(again.rows.z, len(task.problem.rows)), task.problem.feature_rows() / 2)
 
 
 def whitened(task, w):
@@ -105,7 +105,7 @@ def test_mean_square_is_that_of_the_projected_residual(task, run):
 
 def test_gram_has_no_rows_of_a_penalty():
     example = mass_spring_damper()
-    task = Task.of(pose(example.train.rows(0, 400), example.baseline), MLP(hidden=(3,)))
+    task = OneStepTask.of(pose(example.train.rows(0, 400), example.baseline), MLP(hidden=(3,)))
     w = task.bound.init(jax.random.key(0))
     free, held = (task.run(LevenbergMarquardt(0), w, s) for s in (Orthogonal(), OrthogonalPenalty(100.0)))
     assert held.held and not free.held

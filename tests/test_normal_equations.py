@@ -9,8 +9,9 @@ from helpers import problem
 from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Record
 from orthaug.fitting.normal_equations import Hold
-from orthaug.fitting.one_step import Task
-from orthaug.fitting.solvers.levenberg_marquardt import CONVERGED, LevenbergMarquardt
+from orthaug.fitting.one_step import OneStepTask
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.status import Ending
 from orthaug.models.learners import MLP, Function
 from orthaug.models.rows import Overlap
 from orthaug.physics.baseline import Baseline, Term
@@ -102,8 +103,8 @@ def test_learner_almost_in_the_span_of_the_physics():
 
 def test_padding_adds_nothing():
     given, w = case(2, 3)
-    padded = [jax.tree.map(lambda a: jnp.concatenate([a, jnp.zeros_like(a[:2])]), given.chunks)]
-    padded += [jax.tree.map(lambda a: jnp.concatenate([a, jnp.zeros((*a.shape[:-1], 8))], axis=-1), given.chunks)]
+    padded = [jax.tree.map(lambda a: jnp.concatenate([a, jnp.zeros_like(a[:2])]), given.rows)]
+    padded += [jax.tree.map(lambda a: jnp.concatenate([a, jnp.zeros((*a.shape[:-1], 8))], axis=-1), given.rows)]
     expected = jax.jit(given.criterion)(w, *given.arguments, given.nothing)
     for chunks in padded:
         found = jax.jit(given.criterion)(w, chunks, given.hold, given.nothing)
@@ -113,7 +114,7 @@ def test_padding_adds_nothing():
 def test_padding_adds_nothing_of_a_learner_without_a_value_at_zero():
     logarithm = Function(lambda w, z: w * jnp.log(jnp.abs(z)), lambda key: jnp.ones(1))
     u, y = np.random.default_rng(0).normal(size=(2, 37))
-    task = Task.of(pose(Record.from_arrays(u, y), Baseline.from_terms([Term("a", "u[k]")])), logarithm)
-    assert task.chunks.z.size > 37
+    task = OneStepTask.of(pose(Record.from_arrays(u, y), Baseline.from_terms([Term("a", "u[k]")])), logarithm)
+    assert task.rows.z.size > 37
     run = task.run(LevenbergMarquardt(), jnp.ones(1))
-    assert run.code == CONVERGED and np.isfinite(run.normal.hessian).all()
+    assert run.ending is Ending.CONVERGED and np.isfinite(run.normal.hessian).all()

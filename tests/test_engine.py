@@ -1,0 +1,266 @@
+"""An engine that keeps rows on the host, one chunk at a time: training and conclusions are those of rows in memory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cache
+
+import numpy as np
+import pytest
+
+from orthaug._base.errors import InputError
+from orthaug._base.jax import jax, jnp
+from orthaug.data.record import Record
+from orthaug.data.regressors import Lags
+from orthaug.fitting.estimation import estimate, fit
+from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.status import Ending
+from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
+from orthaug.models.learners import MLP, Bound, Function
+from orthaug.models.rows import Chunk, Engine, InMemory, MixedGram, Overlaps
+from orthaug.physics.baseline import Baseline, Term
+from orthaug.physics.problem import pose
+
+SIZE, ROWS = 37, 160
+
+
+@dataclass(frozen=True)
+class Streaming:
+    """Rows as a list of host chunks of uneven size, summed one at a time."""
+
+    resident: bool = False
+    passes: list = field(default_factory=list, compare=False)
+
+    def lay(self, z, q, e, gain):
+        pieces = []
+        for begin in range(0, len(z), SIZE):
+            rows = slice(begin, begin + SIZE)
+            pieces.append(Chunk(*(np.moveaxis(np.asarray(part)[rows], 0, -1) for part in (z, q, e, gain))))
+        return pieces
+
+    def sum(self, function, rows, *arguments):
+        assert isinstance(rows, list) and all(isinstance(chunk.z, np.ndarray) for chunk in rows)
+        self.passes.append(function)
+        total = None
+        for chunk in rows:
+            found = jax.jit(function)(chunk, *arguments)
+            total = found if total is None else jax.tree.map(lambda a, b: a + b, total, found)
+        return total
+
+
+@cache
+def posed(ny, lower=None):
+    """A nonlinear system whose physics is linear; of two outputs that share a parameter."""
+    rng = np.random.default_rng(ny)
+    u, y = rng.uniform(-1, 1, ROWS), np.zeros((ROWS, ny))
+    for k in range(1, ROWS):
+        y[k, 0] = 0.5 * y[k - 1, 0] + u[k - 1] + 0.3 * np.tanh(2 * u[k - 1] * y[k - 1, 0]) + 0.4 * u[k] ** 2
+        if ny == 2:
+            y[k, 1] = 3 * y[k - 1, 0] + 0.5 * y[k - 1, 1] - 2 * u[k - 1] ** 2
+    y = y + rng.normal(size=y.shape) * ([0.05, 0.2][:ny])
+    terms = [Term("a", "y1[k-1]", 0.4, output="y1", min=lower), Term("g", "u[k-1]", 0.8, output="y1")]
+    terms += [Term("h", "y1[k-1]", 2.0, output="y2"), Term("a", "y2[k-1]", output="y2")] if ny == 2 else []
+    record = Record.from_arrays(u, y, outputs=["y1", "y2"][:ny])
+    return pose(record, Baseline.from_terms(terms), Lags(na=1, nb=2, nk=0))
+
+
+EXACT = LevenbergMarquardt(iterations=400, tolerance=1e-13)
+EARLY = LevenbergMarquardt(iterations=20, tolerance=1e-13)  # without a ridge, before rounding has grown
+STRUCTURES = (Orthogonal(), Additive(), OrthogonalPenalty(1.0), BaselinePenalty(1.0))
+REGULARIZATIONS = ("none", 0.1, "evidence")
+CASES = [(s, r, ny) for s in STRUCTURES for r in REGULARIZATIONS for ny in (1, 2)]
+
+
+@cache
+def both(structure, regularization, ny, lower=None):
+    """The same fit with rows in memory, and streamed."""
+    solver = EARLY if regularization == "none" else EXACT
+    options = {"learner": MLP(hidden=(3,)), "solver": solver, "structure": structure, "regularization": regularization}
+    return fit(posed(ny, lower), **options), fit(posed(ny, lower), engine=Streaming(), **options)
+
+
+def apart(found, expected):
+    """Largest difference against the largest entry."""
+    return np.max(np.abs(np.asarray(found) - expected)) / np.max(np.abs(expected))
+
+
+def prediction(found):
+    return np.concatenate([t.model[t.start :] for t in found.model.predict(found.problem.record).trajectories])
+
+
+def test_it_is_an_engine():
+    assert isinstance(Streaming(), Engine) and isinstance(InMemory(), Engine)
+    assert InMemory().resident and not Streaming().resident
+
+
+@pytest.mark.parametrize(("structure", "regularization", "ny"), CASES, ids=lambda v: getattr(v, "name", str(v)))
+def test_streamed_rows_train_to_the_same_model(structure, regularization, ny):
+    memory, streamed = both(structure, regularization, ny)
+    assert memory.status.ok and streamed.status.ok
+    assert apart(streamed.theta, memory.theta) <= (1e-10 if structure.projects else 1e-6)
+    assert apart(prediction(streamed), prediction(memory)) <= 1e-6
+    assert streamed.status.loss == pytest.approx(memory.status.loss, rel=1e-6)
+
+
+@pytest.mark.parametrize(("structure", "regularization", "ny"), CASES, ids=lambda v: getattr(v, "name", str(v)))
+def test_streamed_rows_end_in_the_same_conclusions(structure, regularization, ny):
+    memory, streamed = both(structure, regularization, ny)
+    assert streamed.warnings == memory.warnings
+    assert streamed.effective_weights == pytest.approx(memory.effective_weights, rel=1e-4)
+    assert streamed.freedom == pytest.approx(memory.freedom, rel=1e-5)
+    assert apart(streamed.model.statistics.noise, memory.model.statistics.noise) <= 1e-5
+    assert streamed.model.statistics.ridge == pytest.approx(memory.model.statistics.ridge, rel=1e-4)
+    if structure.projects:
+        assert max(streamed.defect, memory.defect) <= 1e-12
+        np.testing.assert_allclose(streamed.std, memory.std, rtol=1e-5)
+    else:
+        assert streamed.defect == pytest.approx(memory.defect, rel=1e-4) and streamed.std is memory.std is None
+
+
+@pytest.mark.parametrize("structure", STRUCTURES, ids=lambda s: s.name)
+@pytest.mark.parametrize("ny", [1, 2])
+def test_conclusions_of_the_same_weights_are_the_same(structure, ny):
+    """Nothing trained: what differs is the order of sums alone."""
+    options = {"learner": MLP(hidden=(3,)), "solver": LevenbergMarquardt(0), "structure": structure,
+               "regularization": 0.1}  # fmt: skip
+    memory, streamed = (fit(posed(ny), engine=engine, **options) for engine in (InMemory(), Streaming()))
+    np.testing.assert_array_equal(streamed.model.numbers.weights, memory.model.numbers.weights)
+    assert apart(streamed.theta, memory.theta) <= 1e-11
+    for name in ("gram", "middle", "noise"):
+        assert apart(getattr(streamed.model.statistics, name), getattr(memory.model.statistics, name)) <= 1e-11
+    assert streamed.status.loss == pytest.approx(memory.status.loss, rel=1e-12)
+    assert streamed.effective_weights == pytest.approx(memory.effective_weights, rel=1e-9)
+    assert streamed.model.statistics.ridge == memory.model.statistics.ridge
+    if structure.projects:
+        np.testing.assert_allclose(streamed.covariance, memory.covariance, rtol=1e-10)
+
+
+@pytest.mark.parametrize("structure", STRUCTURES, ids=lambda s: s.name)
+def test_the_path_of_the_host_s_loop_is_that_of_the_compiled_one(structure):
+    """Few steps from the same start, so that rounding has not grown: the same trials accepted, the same weights."""
+    options = {"learner": MLP(hidden=(3,)), "structure": structure, "regularization": 0.1}
+    for steps in (1, 4, 9):
+        solver = LevenbergMarquardt(steps, tolerance=1e-13)
+        memory, streamed = (fit(posed(1), solver=solver, engine=e, **options) for e in (InMemory(), Streaming()))
+        assert memory.status.iterations == streamed.status.iterations == steps
+        assert apart(streamed.model.numbers.weights, memory.model.numbers.weights) <= 1e-7
+
+
+@pytest.mark.parametrize("structure", STRUCTURES, ids=lambda s: s.name)
+@pytest.mark.parametrize("ny", [1, 2])
+def test_a_learner_that_is_linear_in_its_weights_ends_at_the_same_place(structure, ny):
+    """Without a ridge: the minimum is one point, whatever the way there."""
+    learner = Function(lambda w, z: w @ (z**2 - z**3), lambda key: 0.1 * jax.random.normal(key, (ny, 2 + ny)))
+    options = {"learner": learner, "solver": EXACT, "structure": structure}
+    memory, streamed = (fit(posed(ny), engine=engine, **options) for engine in (InMemory(), Streaming()))
+    assert memory.status.code == streamed.status.code == "converged"
+    assert apart(streamed.theta, memory.theta) <= 1e-10
+    assert apart(prediction(streamed), prediction(memory)) <= 1e-10
+    assert streamed.status.loss == pytest.approx(memory.status.loss, rel=1e-12)
+    assert apart(streamed.model.statistics.gram, memory.model.statistics.gram) <= 1e-11
+    if structure.projects:
+        np.testing.assert_allclose(streamed.std, memory.std, rtol=1e-10)
+
+
+def test_physics_alone():
+    memory, streamed = (fit(posed(2), learner=None, engine=engine) for engine in (InMemory(), Streaming()))
+    np.testing.assert_array_equal(streamed.theta, memory.theta)
+    np.testing.assert_allclose(streamed.covariance, memory.covariance, rtol=1e-12)
+    np.testing.assert_allclose(streamed.model.statistics.noise, memory.model.statistics.noise, rtol=1e-12)
+
+
+def test_bounds_that_reach_into_training():
+    memory, streamed = both(Additive(), 0.1, 1, 0.9)
+    assert dict(streamed.at_bound) == dict(memory.at_bound) == {"a": 0.9}
+    assert apart(streamed.theta, memory.theta) <= 1e-6
+    assert streamed.status.loss == pytest.approx(memory.status.loss, rel=1e-6)
+
+
+def test_an_ensemble_and_a_validation():
+    options = {"learner": MLP(hidden=(2,)), "solver": LevenbergMarquardt(15), "restarts": 3,
+               "regularization": [0.1, 1.0], "validation": posed(1).record, "ensemble": True}  # fmt: skip
+    memory, streamed = (fit(posed(1), engine=engine, **options) for engine in (InMemory(), Streaming()))
+    assert [r.chosen for r in streamed.restarts] == [r.chosen for r in memory.restarts]
+    np.testing.assert_allclose(streamed.theta, memory.theta, rtol=1e-10)
+    assert apart(prediction(streamed), prediction(memory)) <= 1e-6
+    assert streamed.defect <= 1e-12
+
+
+IN_THE_SPAN = Function(lambda w, z: (w @ z[:2])[None], lambda key: jax.random.normal(key, (2,)))
+
+
+@pytest.mark.parametrize("regularization", REGULARIZATIONS)
+def test_a_learner_in_the_span_of_the_physics_has_converged(regularization):
+    """P⊥J = 0, the paper's Example 1."""
+    rng = np.random.default_rng(0)
+    u = rng.uniform(-1, 1, (90, 2))
+    u = np.concatenate([u, -u])  # scaling to [-1, 1] then adds no constant
+    record = Record.from_arrays(u, u @ [1.0, -2.0] + 0.1 * rng.normal(size=180))
+    problem = pose(record, Baseline.from_terms([Term("a", "u1[k]"), Term("b", "u2[k]")]))
+    options = {"learner": IN_THE_SPAN, "regularization": regularization}
+    memory, streamed = (fit(problem, engine=engine, **options) for engine in (InMemory(), Streaming()))
+    for found in (memory, streamed):
+        assert found.status.ending is Ending.SPANNED and found.status.code == "converged"
+        assert found.status.iterations == 0
+        assert sum(w.code == "learner_spanned" for w in found.warnings) == 1
+    np.testing.assert_allclose(streamed.theta, memory.theta, rtol=1e-12)
+    assert streamed.effective_weights == pytest.approx(memory.effective_weights, abs=1e-6)
+
+
+def test_a_start_that_is_not_finite():
+    learner = Function(lambda w, z: w * jnp.log(z[:1] - 5), lambda key: jnp.ones(1))
+    found = fit(posed(1), learner=learner, engine=Streaming())
+    assert (found.status.code, found.status.iterations) == ("non_finite", 0)
+    assert np.isfinite(found.theta).all() and found.std is None
+
+
+def test_adam_needs_rows_in_memory():
+    options = {"learner": MLP(hidden=(2,)), "solver": AdamLBFGS(2, 2)}
+    assert fit(posed(1), **options).status.ok
+    with pytest.raises(InputError, match="training on rows that are not in memory needs .*levenberg-marquardt"):
+        fit(posed(1), engine=Streaming(), **options)
+
+
+def test_progress_is_told_as_a_mean_square():
+    told = []
+    found = fit(posed(1), learner=MLP(hidden=(2,)), solver=LevenbergMarquardt(6), engine=Streaming(),
+                progress=lambda *at: told.append(at))  # fmt: skip
+    assert [(run, n) for run, n, _ in told] == [(0, n + 1) for n in range(found.status.iterations)]
+    assert told[-1][2] == pytest.approx(found.status.loss, rel=1e-9)
+
+
+def test_a_trial_is_one_pass_over_the_rows():
+    """Beside those of the start; nothing but sums is asked of the rows."""
+    engines = [Streaming(), Streaming()]
+    fits = [
+        fit(posed(1), learner=MLP(hidden=(2,)), solver=LevenbergMarquardt(n, tolerance=0.0), engine=engine)
+        for n, engine in zip((3, 10), engines, strict=True)
+    ]
+    assert [found.status.iterations for found in fits] == [3, 10]
+    assert len(engines[1].passes) - len(engines[0].passes) == 7
+
+
+def test_estimate_is_fit_of_the_problem_it_poses():
+    problem = posed(1)
+    options = {"learner": MLP(hidden=(2,)), "solver": LevenbergMarquardt(5)}
+    direct = estimate(problem.record, problem.baseline, lags=Lags(na=1, nb=2, nk=0), **options)
+    again = fit(problem, **options)
+    np.testing.assert_array_equal(direct.theta, again.theta)
+    np.testing.assert_array_equal(direct.model.numbers.weights, again.model.numbers.weights)
+
+
+@pytest.mark.parametrize("ny", [1, 2])
+def test_sums_over_lists_are_sums_over_chunks(ny):
+    rng = np.random.default_rng(0)
+    rows = (rng.normal(size=(100, 3)), rng.normal(size=(100, ny, 2)), rng.normal(size=(100, ny)))
+    rows = (*rows, rng.uniform(0.5, 2, (100, ny)))
+    bound = Bound(MLP(hidden=(2,)), 3, ny)
+    w, mix = jnp.asarray(bound.init(jax.random.key(0))), jnp.asarray(rng.normal(size=(ny, ny)))
+    found = []
+    for engine in (InMemory(limit=16), InMemory(), Streaming()):
+        laid = engine.lay(*rows)
+        found.append((engine.sum(Overlaps(bound), laid, w), engine.sum(MixedGram(bound), laid, w, mix)))
+    for other in found[1:]:
+        for one, two in zip(jax.tree.leaves(found[0]), jax.tree.leaves(other), strict=True):
+            assert apart(two, one) <= 1e-13
