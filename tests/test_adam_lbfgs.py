@@ -10,7 +10,6 @@ from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Record
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.solvers import adam_lbfgs as gradient
 from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
 from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
 from orthaug.models.learners import MLP, Function
@@ -67,13 +66,13 @@ def test_linear_learner_ends_at_least_squares(structure):
 @pytest.fixture
 def seen(monkeypatch):
     """What the solver is called with."""
-    calls, original = [], gradient.minimise
+    calls, original = [], AdamLBFGS.minimise
 
     def minimise(solver, criterion, w, rows, physics, *, progress=None):
         calls.append((criterion, w, rows, physics))
         return original(solver, criterion, w, rows, physics, progress=progress)
 
-    monkeypatch.setattr(gradient, "minimise", minimise)
+    monkeypatch.setattr(AdamLBFGS, "minimise", minimise)
     return calls
 
 

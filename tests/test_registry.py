@@ -22,7 +22,7 @@ from orthaug.fitting.criteria import Prediction, Simulation
 from orthaug.fitting.kinds import CRITERIA, SOLVERS, STRUCTURES
 from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import Rows
+from orthaug.fitting.structures import PenaltyRows
 from orthaug.inference.kinds import MEASURES
 from orthaug.inference.measures import Measure, Points, Training
 from orthaug.models.kinds import LEARNERS
@@ -56,9 +56,9 @@ class Nearness:
     stiffness: Annotated[float, Ge(0)] = 1.0
     name: str = field(default="nearness", metadata=LIBRARY_ONLY)
 
-    def penalty(self, names: Any, initial: Any, unit: float) -> Rows:
+    def penalty(self, names: Any, initial: Any, unit: float) -> PenaltyRows:
         nt, root = len(names), np.sqrt(self.stiffness) * unit
-        return Rows(root * np.eye(nt), np.zeros((nt, nt)), root * initial)
+        return PenaltyRows(root * np.eye(nt), np.zeros((nt, nt)), root * initial)
 
 
 @dataclass(frozen=True)
