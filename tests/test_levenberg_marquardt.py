@@ -147,7 +147,9 @@ def uphill(w, overlap):
 
 
 def test_no_step_descends():
-    run = compiled.minimise(LevenbergMarquardt(), uphill, jnp.ones(2), (), Overlap(jnp.zeros((0, 2)), jnp.zeros(0)), samples=1)
+    run = compiled.minimise(
+        LevenbergMarquardt(), uphill, jnp.ones(2), (), Overlap(jnp.zeros((0, 2)), jnp.zeros(0)), samples=1
+    )
     assert run.ending is Ending.NO_DESCENT
     np.testing.assert_array_equal(run.w, 1.0)
 
@@ -159,7 +161,9 @@ def wall(w, overlap):
 
 
 def test_trial_without_a_value_is_taken_back():
-    run = compiled.minimise(LevenbergMarquardt(), wall, jnp.zeros(1), (), Overlap(jnp.zeros((0, 1)), jnp.zeros(0)), samples=1)
+    run = compiled.minimise(
+        LevenbergMarquardt(), wall, jnp.zeros(1), (), Overlap(jnp.zeros((0, 1)), jnp.zeros(0)), samples=1
+    )
     assert 0.0 < run.w[0] <= 1.0 and np.isfinite(run.normal.loss)
 
 
@@ -195,6 +199,10 @@ def test_pauses_change_nothing(monkeypatch, seconds):
     monkeypatch.setattr(compiled, "_SECONDS_PER_BURST", seconds)
     run = minimise(given, w, solver, ridge=0.1, evidence=True, progress=lambda i, loss: told.append((i, loss)))
     np.testing.assert_array_equal(run.w, whole.w)
-    assert (run.ridge, run.iterations, run.ending) == (float(whole.ridge), int(whole.iteration), Ending(int(whole.code)))
+    assert (run.ridge, run.iterations, run.ending) == (
+        float(whole.ridge),
+        int(whole.iteration),
+        Ending(int(whole.code)),
+    )
     assert told[-1] == (run.iterations, float(run.normal.loss))
     assert len(told) == (run.iterations if seconds == 0 else 4)

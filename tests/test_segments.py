@@ -18,9 +18,9 @@ from orthaug.data.regressors import Lags
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.segments import Segments, lay_segments, respond, sensitivity
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.models.learners import MLP, Bound
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
+from orthaug.models.learners import MLP, Bound
 from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.problem import pose
 
@@ -61,7 +61,7 @@ def record_of(ny, lengths=LENGTHS):
 
 
 class Case(NamedTuple):
-    """A model with arbitrary numbers, its record in two chunks of segments, and states to start from that are not the measured."""
+    """A model with arbitrary numbers, its record in two chunks of segments, and states that are not the measured."""
 
     record: Record
     form: Lagged

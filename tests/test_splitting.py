@@ -193,7 +193,9 @@ def test_a_split_says_what_it_is(curve):
 def test_a_measure_beyond_the_data_is_warned_of(curve):
     found = curve.split(Uniform({"u[k]": (-3, 3)}))
     assert found.measure.support == pytest.approx(0.29, abs=0.02)
-    assert any("only 29 % of the uniform measure lies within reach of the training data" in str(w) for w in found.warnings)
+    assert any(
+        "only 29 % of the uniform measure lies within reach of the training data" in str(w) for w in found.warnings
+    )
 
 
 # --- the paper's data sets

@@ -225,7 +225,9 @@ def test_outputs_that_share_theta_need_equal_noise_for_zero_covariance():
 def test_outputs_without_a_common_theta_have_zero_covariance():
     """Diagonal noise: what is left of the correlation is that of the residuals themselves."""
     fit = two_outputs(False)
-    rho = fit.model.statistics.noise[0, 1] / np.sqrt(fit.model.statistics.noise[0, 0] * fit.model.statistics.noise[1, 1])
+    rho = fit.model.statistics.noise[0, 1] / np.sqrt(
+        fit.model.statistics.noise[0, 0] * fit.model.statistics.noise[1, 1]
+    )
     assert np.abs(correlations(fit)).max() <= max(abs(rho), 1e-10)
     independent = fit.model.statistics.noise * np.eye(2)
     psi = psi_of(fit)
