@@ -21,11 +21,6 @@ from orthaug.data.record import Record
 from orthaug.models.model import Model
 from orthaug.models.response import Response
 
-<<<<<<< HEAD
-=======
-_PER_STEP = ("points", "transition", "radius", "unit")  # too long for JSON
-
->>>>>>> e
 
 @dataclass(frozen=True, eq=False)
 class Stability:

@@ -161,6 +161,8 @@ class Differentiated:
         unknowns = jnp.concatenate([jnp.asarray(numbers.theta), jnp.asarray(numbers.weights)])
         value = jax.vmap(both, (-1, None, -1), -1)(state, unknowns, inputs)
         to_state, to_unknowns = jax.vmap(jax.jacrev(both, (0, 1)), (-1, None, -1), -1)(state, unknowns, inputs)
+        # a kink without a derivative, such as sqrt(max(y, 0)) at 0, counts as flat
+        to_state, to_unknowns = (jnp.where(jnp.isfinite(d), d, 0.0) for d in (to_state, to_unknowns))
         n0 = self.states
         slope = jnp.einsum("ijm,jnm->inm", to_state, slopes)
         slope = slope + jnp.pad(to_unknowns, ((0, 0), (n0, 0), (0, 0)))
