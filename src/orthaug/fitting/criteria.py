@@ -77,7 +77,7 @@ class Simulation:
     """Declaration: the error of a free run over segments that start from measured lags.
 
     With a washout, or over whole experiments, the outputs before a segment are taken for as noisy as all others: they
-    are unknowns too (`Pasts`). Segments without a washout start exactly from what was measured.
+    are unknowns too (`InitialStates`). Segments without a washout start exactly from what was measured.
 
     Args:
         segment: steps of a segment; 0 for whole experiments.

@@ -84,7 +84,7 @@ def estimate(
 
     Examples:
         >>> import numpy as np
-        >>> from orthaug.baseline import Term
+        >>> from orthaug.physics.baseline import Term
         >>> u = np.linspace(-1, 1, 200)
         >>> record = Record.from_arrays(u=u, y=2 * u + u**2)
         >>> fit = estimate(record, Baseline.from_terms([Term("gain", "u[k]")]), learner=MLP(hidden=(4,)))
