@@ -286,7 +286,7 @@ class OneStepTask:
         )
 
     def gram(self, run: compiled.TrainingRun) -> Matrix:
-        """Gram matrix of `[Φ J]` in whitened outputs, from the run's last pass; where a run was held, without the hold."""
+        """Gram matrix of `[Φ J]` in whitened outputs, from the run's last pass; of a held run without the hold."""
         normal = run.normal
         if run.held:
             nt = len(normal.overlap.values)
