@@ -271,7 +271,7 @@ def test_repr(pair):
 
 @pytest.mark.parametrize("horizon", [0, -1, 1.5, True, "1", None])
 def test_horizon_refused(first_order, horizon):
-    with pytest.raises(InputError, match=rf"`horizon` must be a whole number of steps, 1 or more; got {horizon}"):
+    with pytest.raises(InputError, match=rf"`horizon` must be a whole number of steps, 1 or more; got {horizon!r}"):
         first_order.predict(Record.from_arrays(np.ones(9), np.ones(9)), horizon=horizon)
 
 

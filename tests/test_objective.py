@@ -15,7 +15,7 @@ from orthaug.fitting.free_run import FreeRunTask
 from orthaug.fitting.initial_states import Start
 from orthaug.fitting.objective import FreeRunObjective
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.solvers.descent import MARQUARDT, Objective, descend
+from orthaug.fitting.solvers.descent import MARQUARDT, SquaredResiduals, descend
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
 from orthaug.models.learners import MLP
@@ -73,7 +73,7 @@ def copied(found):
 
 
 def test_the_objective_is_what_the_solver_takes():
-    assert isinstance(objective(), Objective)
+    assert isinstance(objective(), SquaredResiduals)
 
 
 @pytest.mark.parametrize("kind", KINDS)

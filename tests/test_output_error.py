@@ -12,7 +12,7 @@ import scipy.optimize
 import scipy.signal
 
 from orthaug.fitting.colour import independent_share
-from orthaug.fitting.solvers.descent import MARQUARDT, Objective, descend
+from orthaug.fitting.solvers.descent import MARQUARDT, SquaredResiduals, descend
 from orthaug.fitting.status import Ending
 
 
@@ -102,7 +102,7 @@ def decay(seed=1):
 
 
 def test_the_tests_have_an_objective():
-    assert isinstance(rosenbrock(), Objective)
+    assert isinstance(rosenbrock(), SquaredResiduals)
 
 
 def test_linear_least_squares():

@@ -67,10 +67,11 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f", did you mean '{close[0]}'?" if close else ""
 
 
-def check_count(value: Any, name: str, least: int = 1) -> int:
-    """Return `value` if it is a whole number of at least `least`, otherwise raise InputError."""
+def check_count(value: Any, name: str, least: int = 1, *, of: str = "") -> int:
+    """Return `value` if it is a whole number (`of` something) of at least `least`, otherwise raise InputError."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise InputError(f"`{name}` must be a whole number, {least} or more; got {value!r}.")
+        counted = f" of {of}" if of else ""
+        raise InputError(f"`{name}` must be a whole number{counted}, {least} or more; got {value!r}.")
     return int(value)
 
 

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 
 class InputError(ValueError):
-    """Bad input: names what was found and what was expected. The command line exits with 2."""
+    """Bad input. The text says what is there and what was expected. The command line exits with 2."""
 
 
 class KeyedError(InputError):
     """Bad input in one key of a declaration.
 
     Args:
-        text: the whole sentence, as Python's user reads it.
+        text: the whole sentence, for users of Python.
         key: the key at fault.
-        words: what follows the key where a spec or an option gave it, such as `: found 3; expected less than 2`.
+        words: what a spec's or an option's message says after the key, such as `: found 3; expected less than 2`.
     """
 
     def __init__(self, text: str, key: str, words: str) -> None:

@@ -12,7 +12,7 @@ from orthaug._base.errors import InputError
 
 
 def check_replaceable(folder: Path, is_ours: Callable[[Path], bool]) -> None:
-    """Raise InputError unless `folder` can be written: it is absent, empty or ours, in a place that can be written."""
+    """Raise InputError unless `folder` is absent, empty or ours, and stands where one may write."""
     try:
         there = folder.exists() or folder.is_symlink()
     except OSError as error:
@@ -54,7 +54,7 @@ def whole_folder(folder: Path, is_ours: Callable[[Path], bool]) -> Iterator[Path
 
 
 def _put_in_place(partial: Path, folder: Path) -> None:
-    """Rename, with the folder that was there kept until the new one stands."""
+    """Rename. The folder that was there is kept until the new one stands."""
     if not folder.exists():
         partial.rename(folder)
         return

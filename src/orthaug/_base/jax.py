@@ -1,4 +1,4 @@
-"""JAX in double precision, imported when it is first used: a declaration of a learner or solver costs no import.
+"""JAX in double precision, imported when it is first used. A declaration of a learner or solver costs no import.
 
 `jax` and `jnp` stand for the modules. `jax.jit` compiles at the first call, so that a module with compiled functions
 can be imported without JAX.

@@ -17,10 +17,11 @@ Result = TypeVar("Result")
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """BLAS on one thread: its others would wait actively after every call, for longer than a pass over 10⁵ rows takes.
+    """BLAS on one thread.
 
-    The Cholesky factors of a step are LAPACK's, everything else is XLA's own threads; sharing the cores
-    with waiting ones cost 45 % (benchmarks/lm_iteration.py).
+    Its other threads would wait actively after every call, for longer than a pass over 10⁵ rows takes. LAPACK makes the
+    Cholesky factors of a step; XLA's own threads do everything else. Where they shared the cores with waiting threads,
+    an iteration took 45 % longer (benchmarks/lm_iteration.py).
     """
     with threadpool_limits(limits=1, user_api="blas"):
         yield

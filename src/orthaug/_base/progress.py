@@ -1,4 +1,4 @@
-"""What training tells while it runs, on its way from a run's iteration to whoever shows it."""
+"""Progress of training: from the iteration of a run to whoever shows it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _nothing(run: int, iteration: int, loss: float) -> None:
 
 @dataclass(frozen=True)
 class Progress:
-    """Tells `(run, iteration, loss)`, runs and iterations counted on from those that were told before.
+    """Tells `(run, iteration, loss)`. Runs and iterations are counted on from those that were told before.
 
     Examples:
         >>> told = Progress(lambda run, iteration, loss: print(run, iteration, loss))
@@ -41,7 +41,7 @@ class Progress:
         self.tell(self.runs + run, self.iterations + iteration, loss)
 
     def after(self, *, runs: int = 0, iterations: int = 0) -> Progress:
-        """The same for what follows so many runs or iterations."""
+        """The progress of what follows so many runs or iterations."""
         return replace(self, runs=self.runs + runs, iterations=self.iterations + iterations)
 
     def of(self, run: int) -> RunTell:

@@ -62,7 +62,7 @@ class Key:
     @property
     def meaning(self) -> tuple[Any, ...]:
         """Type and limits, which must agree wherever a section has the key."""
-        return self.type, *(one for one in self.metadata if not isinstance(one, Option))
+        return self.type, *(mark for mark in self.metadata if not isinstance(mark, Option))
 
     @property
     def metadata(self) -> tuple[Any, ...]:
@@ -72,7 +72,7 @@ class Key:
     @property
     def option(self) -> str | None:
         """The command-line option that gives it."""
-        return next((one.name for one in self.metadata if isinstance(one, Option)), None)
+        return next((mark.name for mark in self.metadata if isinstance(mark, Option)), None)
 
 
 class Registry(Mapping[str, Any]):
@@ -150,10 +150,10 @@ class Registry(Mapping[str, Any]):
 
     def section_keys(self) -> dict[str, Key]:
         """The keys of all kinds."""
-        found: dict[str, Key] = {}
+        keys: dict[str, Key] = {}
         for declaration in self._entries.values():
-            found = keys_of(declaration) | found
-        return found
+            keys = keys_of(declaration) | keys
+        return keys
 
     def kind_of(self, declared: object) -> str | None:
         """The name under which a declaration's class is registered; None for a foreign one."""
@@ -202,9 +202,9 @@ def check_fields(declared: Any) -> None:
     """Raise InputError for a field outside of the limits of its type; for the `__post_init__` of declarations."""
     for name, key in keys_of(type(declared)).items():
         value, metadata = getattr(declared, name), key.metadata
-        low = next((one.ge for one in metadata if isinstance(one, Ge)), None)
-        positive = any(isinstance(one, Gt) for one in metadata)
-        choices = next((one.choices for one in metadata if isinstance(one, OneOf)), None)
+        low = next((mark.ge for mark in metadata if isinstance(mark, Ge)), None)
+        positive = any(isinstance(mark, Gt) for mark in metadata)
+        choices = next((mark.choices for mark in metadata if isinstance(mark, OneOf)), None)
         if choices is not None:
             check_choice(value, choices, f"`{name}`")
         elif key.type is int and low is not None:
@@ -222,7 +222,7 @@ def _default(field: dataclasses.Field[Any]) -> Any:
 def frozen(value: Any) -> Any:
     """Lists, as files hold them, as tuples."""
     if isinstance(value, list | tuple):
-        return tuple(frozen(one) for one in value)
+        return tuple(frozen(item) for item in value)
     if isinstance(value, Mapping):
-        return {name: frozen(one) for name, one in value.items()}
+        return {name: frozen(item) for name, item in value.items()}
     return value.item() if isinstance(value, np.generic) else value

@@ -13,7 +13,7 @@ from orthaug._base.progress import SILENT, Progress
 
 @contextmanager
 def training_bar(runs: int, iterations: int, wanted: bool = True) -> Iterator[Progress]:
-    """A progress bar on standard error where that is a terminal; Ctrl-C is told what it stopped."""
+    """A progress bar on standard error where that is a terminal; Ctrl-C says what it stopped."""
     if not wanted:
         yield SILENT
         return
@@ -51,13 +51,14 @@ def training_bar(runs: int, iterations: int, wanted: bool = True) -> Iterator[Pr
 def study_bars() -> Iterator[Callable[[str, int, int], None]]:
     """A bar per study on standard error where that is a terminal; Ctrl-C stops after the run at hand."""
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
 
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with (
         _deferred_interrupt() as interrupted,
-        Progress(*columns, console=console, disable=not console.is_terminal) as bar,
+        Bar(*columns, console=console, disable=not console.is_terminal) as bar,
     ):
         tasks: dict[str, Any] = {}
 

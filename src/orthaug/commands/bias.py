@@ -1,4 +1,4 @@
-"""What suspected terms would do to the parameters of a job, before a fit and after it."""
+"""The bias of a job's parameters by suspected terms, before a fit and after it."""
 
 from __future__ import annotations
 

@@ -249,7 +249,7 @@ def split(
     given = {"box": box or [], "samples": [samples] if samples else [], "weights": [weights] if weights else []}
     chosen = read_measure(measure, given, split_place(opened.model, opened.record))
     _prepare_jax()
-    result = splitting.split(opened, chosen)
+    result = splitting.split_model(opened, chosen)
     typer.echo(result.to_json() if as_json else split_text(result))
 
 

@@ -59,7 +59,7 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -
             continue
         fitted[kind] = fit_variant(job, variant, progress.after(runs=number * job.run_count))
     verdicts = _verdicts(job, fitted)
-    rows = [_row(kind, one, verdicts.get(kind)) for kind, one in fitted.items()]
+    rows = [_row(kind, fit, verdicts.get(kind)) for kind, fit in fitted.items()]
     rows += [_saved_row(name, model, job) for name, model in models.items()]
     content = {
         "spec": job.declaration,
@@ -75,7 +75,7 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -
 def _verdicts(job: Job, fitted: dict[str, Fitted]) -> dict[str, Verdict]:
     """Whether the learner earns its place in each structure, by blocked cross-validation and the held-out parts."""
     alone = fitted[ALONE].fit
-    kinds = [kind for kind, one in fitted.items() if kind != ALONE and one.fit.status.ok]
+    kinds = [kind for kind, tried in fitted.items() if kind != ALONE and tried.fit.status.ok]
     if not kinds or not alone.status.ok:
         return {}
     blocks = DEFAULT_BLOCKS if job.spec.validation.blocks is None else job.spec.validation.blocks
@@ -88,11 +88,11 @@ def write(comparison: Comparison, folder: Path) -> None:
     """result.json, models/ and figures/, whole or not at all."""
     with whole_folder(folder, is_result) as partial:
         (partial / "result.json").write_text(comparison.result.to_json() + "\n", encoding="utf-8")
-        for kind, one in comparison.fitted.items():
-            if one.fit.status.ok:
+        for kind, fitted in comparison.fitted.items():
+            if fitted.fit.status.ok:
                 place = partial / "models" / kind.replace(" ", "-")
                 place.mkdir(parents=True)
-                storage.write(one.fit.model, place)
+                storage.write(fitted.fit.model, place)
         (partial / "figures").mkdir()
         figure = plots.comparison_figure(comparison.result.comparison)
         plots.save(figure, partial / "figures" / "comparison.png")
@@ -118,8 +118,8 @@ def _matching(path: Path, job: Job) -> Model:
     return model
 
 
-def _row(kind: str, one: Fitted, verdict: Verdict | None) -> RowResult:
-    result, bound = one.result, one.fit.model.form.bound
+def _row(kind: str, fitted: Fitted, verdict: Verdict | None) -> RowResult:
+    result, bound = fitted.result, fitted.fit.model.form.bound
     return RowResult.model_validate(
         {
             "name": kind,
@@ -131,7 +131,7 @@ def _row(kind: str, one: Fitted, verdict: Verdict | None) -> RowResult:
             "scores": result.scores,
             "residuals": result.residuals,
             "warnings": result.warnings,
-            "learner_to_physics": dominance(one.fit) if one.fit.status.ok else None,
+            "learner_to_physics": dominance(fitted.fit) if fitted.fit.status.ok else None,
             "validation": verdict,
         }
     )
@@ -158,7 +158,7 @@ def _saved_row(name: str, model: Model, job: Job) -> RowResult:
 
 
 def _chosen(rows: Sequence[RowResult]) -> str | None:
-    """The row of the lowest one-step error on the validation part."""
+    """The name of the row with the lowest one-step error on the validation part."""
     errors = {}
     for row in rows:
         nrmse = row.scores["validation"].prediction.nrmse if "validation" in row.scores else None

@@ -40,7 +40,7 @@ DEFAULT_BLOCKS = 4
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A fit with the content of result.json: parameters, scores on every part, what was found."""
+    """A fit with the content of result.json: parameters, scores on every part, findings."""
 
     job: Job
     fit: Estimate
@@ -69,7 +69,7 @@ def fit_job(job: Job, progress: Progress = SILENT) -> Fitted:
 
 
 def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitted:
-    """Train a variant of a job and score every part; whether the learner helps is not asked."""
+    """Train a variant of a job and score every part; `judge_fit` asks whether the learner helps."""
     fit = run_fit(job, variant, progress)
     warnings: list[Any] = [*job.warnings, *fit.warnings]
     unknown = ("physical_parameters", "physical_consistency", "sensitivities", "bias", "residuals", "stability")
@@ -202,7 +202,7 @@ def cross_validated(job: Job, blocks: int, variants: Sequence[Variant]) -> list[
 
 
 def score_part(model: Model, part: Part, warnings: list[Any]) -> tuple[PartScores, tuple[Response, Response]]:
-    """Scores of a part and the responses they come from; what does not exist is None, with one of the `warnings`."""
+    """Scores of a part, and the responses they come from. For a score that does not exist a warning is added."""
     responses = model.predict(part.record), model.simulate(part.record)
     scores = {}
     for kind, response in zip(("prediction", "simulation"), responses, strict=True):

@@ -1,4 +1,4 @@
-"""Where commands write: whether a place may be written, before anything is computed for it."""
+"""Checks of the places where commands write, made before anything is computed."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, KeyedError
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.warning import Warning
 from orthaug.commands.parts import Part, load_parts
@@ -15,6 +15,7 @@ from orthaug.commands.suspects import check_suspects
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Record, check_channels
 from orthaug.data.regressors import largest_lag
+from orthaug.fitting.rules import check_scored
 from orthaug.fitting.structures import Structure
 from orthaug.inference.measure_files import MeasurePlace
 from orthaug.inference.measures import Measure
@@ -32,9 +33,9 @@ ALONE = "physics alone"
 
 @dataclass(frozen=True, eq=False)
 class Variant:
-    """A variant of a job: another structure or physics alone, and a fold of the training data instead of all.
+    """A variant of a job: another structure or physics alone, perhaps on a fold of the training data.
 
-    On a fold of cross-validation there is one start, few iterations, and nothing to choose from.
+    A fit on a fold has one start, few iterations, and nothing to choose from.
     """
 
     kind: str | None = None
@@ -48,7 +49,7 @@ class Variant:
 
     @property
     def structure_kind(self) -> str | None:
-        """Of the structure; physics alone is orthogonal to nothing."""
+        """Of the structure; "orthogonal" for physics alone."""
         return "orthogonal" if self.alone else self.kind
 
     def on(self, fold: Record) -> Variant:
@@ -101,7 +102,7 @@ class Job:
         return self.weighed.measure
 
     def posed(self, variant: Variant) -> Problem:
-        """The problem that a variant of the job solves; the job's own one, unless data or lags are others."""
+        """The problem that a variant of the job solves: the job's own, unless its data or lags are others."""
         if variant.fold is None:
             return self.problem.physics_alone() if variant.alone else self.problem
         spec, baseline = self.spec, self.problem.baseline
@@ -154,7 +155,7 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
         validation = validation.without_short(first) if validation else None
         problem = pose(train.record, baseline, lags, learner_inputs, require_full_rank=require_full_rank)
         problem.feature_rows()
-        _check_segments(spec, problem)
+        _check_scored(spec, problem)
         weighed = weigh_problem(measure_of(spec, problem, path.parent), problem)
         _check_measure(weighed, problem)
         job = Job(path, spec, train, validation, tests, problem, weighed, physics, ())
@@ -168,19 +169,13 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
     return replace(job, warnings=tuple(warning for part in job.parts for warning in part.warnings))
 
 
-def _check_segments(spec: Spec, problem: Problem) -> None:
-    """Raise InputError where a free run would score nothing."""
-    training = spec.training
+def _check_scored(spec: Spec, problem: Problem) -> None:
+    """`check_scored` in the words of the spec."""
     longest = max(len(e) for e in problem.record.experiments) - problem.rows.start
-    if training.focus == "simulation" and training.washout >= min(training.segment or longest, longest):
-        raise InputError(
-            f"'training.washout': found {training.washout}; expected less than the {longest} usable rows of the "
-            "longest experiment, or nothing is scored."
-        )
-    if training.focus == "prediction" and training.horizon > longest:
-        raise InputError(
-            f"'training.horizon': found {training.horizon}; the longest experiment has {longest} usable rows."
-        )
+    try:
+        check_scored(spec.declared_criterion(), longest)
+    except KeyedError as error:
+        raise InputError(f"'training.{error.key}'{error.words}.") from None
 
 
 def structure_of(spec: Spec, kind: str | None = None, measure: Measure | None = None) -> Structure:

@@ -1,4 +1,4 @@
-"""The measure that the options of `orthaug split` declare, as the registry says which option belongs to which kind."""
+"""The measure that the options of `orthaug split` declare. The registry says which option belongs to which kind."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ def read_measure(kind: str, given: Mapping[str, Sequence[str]], place: MeasurePl
     check_choice(kind, MEASURES, "--measure")
     values = {}
     for option, texts in given.items():
-        found = MEASURES.kind_with(option)
-        if not texts or found is None:
+        owned = MEASURES.kind_with(option)
+        if not texts or owned is None:
             continue
-        owner, key = found
+        owner, key = owned
         if owner != kind:
             raise InputError(f"--{option}: belongs to --measure {owner}; found --measure {kind}.")
         values[key.name] = _read(key, option, texts)
@@ -37,7 +37,7 @@ def read_measure(kind: str, given: Mapping[str, Sequence[str]], place: MeasurePl
 
 
 def split_place(model: Any, record: Any) -> MeasurePlace:
-    """Where a saved model's measure is declared: files relative to here, on the data that it was trained on."""
+    """The place of a saved model's measure: files relative to the working folder, and the training data."""
     return MeasurePlace(Path(), [str(lag) for lag in model.form.used], record, model.form.first_row)
 
 

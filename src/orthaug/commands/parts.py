@@ -55,7 +55,7 @@ class Part:
         return tuple(max(0, self.skip - experiment.offset) for experiment in self.record.experiments)
 
     def scored(self, start: int) -> Record:
-        """The record without rows that are neither scored nor lags of what is, for a first usable row `start`."""
+        """The record of the scored rows and their lags, where the first usable row is `start`."""
         kept = tuple(
             e.rows(max(0, skip - start), None) for e, skip in zip(self.record.experiments, self.skips, strict=True)
         )
@@ -85,8 +85,8 @@ def load_parts(path: Path, spec: declared.Spec) -> tuple[Part, Part | None, tupl
     return train, validation, tests
 
 
-def _load(path: Path, spec: declared.Spec, part: declared.Part, name: str) -> Part:
-    """Read a part's files; messages begin with the file that is at fault, as the spec names it once it is read."""
+def _load(path: Path, spec: declared.Spec, part: declared.PartSection, name: str) -> Part:
+    """Read a part's files. Messages begin with the file at fault; once it is read, with its name in the spec."""
     unknown = [channel for channel in part.columns if channel not in (*spec.data.inputs, *spec.data.outputs)]
     if unknown:
         raise InputError(f"{path}: 'data.{name}.columns': '{unknown[0]}' is neither an input nor an output.")
@@ -107,7 +107,7 @@ def _load(path: Path, spec: declared.Spec, part: declared.Part, name: str) -> Pa
         files.append(FileResult(file=file, sha256=digest, rows=len(record)))
         records.append(record)
     record = Record.join(records)
-    sources = (file for one, file in zip(records, part.files, strict=True) for _ in one.experiments)
+    sources = (file for read, file in zip(records, part.files, strict=True) for _ in read.experiments)
     told = tuple(replace(e, source=file) for e, file in zip(record.experiments, sources, strict=True))
     record = replace(record, experiments=told)
     warnings = (_thinned(name, part.every),) if part.every > 1 else ()
@@ -119,5 +119,5 @@ def _thinned(name: str, every: int) -> Warning:
     return Warning("thinned", f"{name}: {kept}; content above the new Nyquist frequency folds back.")
 
 
-def _count(number: int, one: str, more: str = "") -> str:
-    return f"{number} {one if number == 1 else more or one + 's'}"
+def _count(number: int, thing: str, things: str = "") -> str:
+    return f"{number} {thing if number == 1 else things or thing + 's'}"

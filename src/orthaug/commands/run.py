@@ -22,15 +22,15 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
-    """A model with the record it is to run on."""
+class ModelOnData:
+    """A saved model with the record of a data file."""
 
     model: Model
     record: Record
     source: Path
 
 
-def open_run(model: Path, data: Path, *, need_outputs: bool = False) -> Run:
+def open_run(model: Path, data: Path, *, need_outputs: bool = False) -> ModelOnData:
     """Load a model and read its channels from a file; outputs only where the file has them, unless needed.
 
     Raises:
@@ -48,40 +48,40 @@ def open_run(model: Path, data: Path, *, need_outputs: bool = False) -> Run:
         raise InputError(f"{data}: has some of the model's outputs but not {', '.join(missing)}; give all or none.")
     step = None if loaded.time_column else loaded.sampling_time
     record = read_record(data, inputs=loaded.inputs, outputs=held, sampling_time=step, time=loaded.time_column)
-    return Run(loaded, record, data)
+    return ModelOnData(loaded, record, data)
 
 
-def read_initial(initial: str | None, run: Run) -> str | Any:
+def read_initial(initial: str | None, opened: ModelOnData) -> str | Any:
     """The `initial` of `Model.simulate`: measured where the data have outputs, zero otherwise, or a CSV's rows."""
     if initial is None:
-        return "measured" if run.record.outputs else "zero"
+        return "measured" if opened.record.outputs else "zero"
     if initial in ("measured", "zero"):
-        if initial == "measured" and not run.record.outputs:
-            raise InputError(f"{run.source}: has no measured outputs to start from; use --initial zero or a CSV.")
+        if initial == "measured" and not opened.record.outputs:
+            raise InputError(f"{opened.source}: has no measured outputs to start from; use --initial zero or a CSV.")
         return initial
     if not Path(initial).suffix and "/" not in initial:
         raise InputError(f"--initial: found '{initial}'; expected measured, zero, or a CSV file of the first outputs.")
-    record = read_record(initial, outputs=run.model.outputs, sampling_time=run.model.sampling_time)
+    record = read_record(initial, outputs=opened.model.outputs, sampling_time=opened.model.sampling_time)
     try:
-        run.model.check_initial(record.experiments[0].outputs)
+        opened.model.check_initial(record.experiments[0].outputs)
     except InputError as error:
         raise InputError(f"{initial}: {error}") from None
     return record.experiments[0].outputs
 
 
-def with_initial(run: Run, initial: str | Any) -> Record:
+def with_initial(opened: ModelOnData, initial: str | Any) -> Record:
     """The record with the outputs of its first rows replaced, for predictions that start from others."""
     if isinstance(initial, str) and initial == "measured":
-        return run.record
-    start, experiment = run.model.form.first_row, run.record.experiments[0]
+        return opened.record
+    start, experiment = opened.model.form.first_row, opened.record.experiments[0]
     outputs = experiment.outputs.copy()
     rows = np.zeros((start, outputs.shape[1])) if isinstance(initial, str) else initial[:start]
     outputs[start - len(rows) : start] = rows
-    return replace(run.record, experiments=(replace(experiment, outputs=outputs),))
+    return replace(opened.record, experiments=(replace(experiment, outputs=outputs),))
 
 
 def warnings(response: Response) -> list[Warning]:
-    """What the reader of a response must know."""
+    """Warnings about a response."""
     told = "the free run diverged in output '{}' at step {}; it has no values from there on."
     ends = (trajectory.diverged for trajectory in response.trajectories if trajectory.diverged)
     return [Warning("free_run_diverged", told.format(output, step)) for step, output in ends]

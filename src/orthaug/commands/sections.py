@@ -1,4 +1,4 @@
-"""Tables of the spec as pydantic models: what all have in common, and the keys that a registry's kinds declare."""
+"""Tables of the spec as pydantic models: their common base, and the keys that a registry's kinds declare."""
 
 from __future__ import annotations
 
@@ -74,12 +74,12 @@ def _in_file(annotation: Any) -> Any:
     if origin is Mapping:
         return dict[inner[0], _in_file(inner[1])]
     if origin in (Union, types.UnionType):
-        return Union[tuple(_in_file(one) for one in inner)]  # noqa: UP007
+        return Union[tuple(_in_file(branch) for branch in inner)]  # noqa: UP007
     return Annotated[float, Field(allow_inf_nan=False)] if annotation is float else annotation
 
 
 def _thawed(value: Any) -> Any:
     """Tuples as lists, as files hold them."""
     if isinstance(value, tuple | list):
-        return [_thawed(one) for one in value]
-    return {name: _thawed(one) for name, one in value.items()} if isinstance(value, Mapping) else value
+        return [_thawed(item) for item in value]
+    return {name: _thawed(item) for name, item in value.items()} if isinstance(value, Mapping) else value

@@ -47,7 +47,7 @@ def _as_list(value: Any) -> list[Any]:
     return value if isinstance(value, list) else [value]
 
 
-class Part(Section):
+class PartSection(Section):
     """Files of training or test data; each file, and each row range, is an experiment."""
 
     files: Annotated[list[str], Field(min_length=1)]
@@ -58,7 +58,7 @@ class Part(Section):
 
 
 class ChannelSection(Section):
-    """How files hold a channel: value = scale * cell + offset of column."""
+    """A channel in files: value = scale * cell + offset of column."""
 
     column: str = ""
     unit: str = ""
@@ -74,9 +74,9 @@ class Data(Section):
     inputs: list[str] = []
     outputs: Annotated[list[str], Field(min_length=1)]
     missing: Literal["error", "skip"] = "error"
-    train: Part
-    validation: Part | None = None
-    tests: dict[str, Part] = {}
+    train: PartSection
+    validation: PartSection | None = None
+    tests: dict[str, PartSection] = {}
     channels: dict[str, ChannelSection] = {}
 
     @model_validator(mode="after")
@@ -91,7 +91,7 @@ class Data(Section):
 
 
 class LagsSection(Section):
-    """The learner's regressor, as MATLAB means the orders."""
+    """The learner's regressor, by orders as in MATLAB."""
 
     na: Orders = 0
     nb: Orders = 0
@@ -210,7 +210,7 @@ class TrainingSection(KindSection):
         return self
 
     def regularizations(self, validated: bool) -> str | float | tuple[str | float, ...]:
-        """What to try: by default none, or with a validation part to choose by, none and evidence."""
+        """The regularizations to try: by default none; none and evidence where a validation part can choose."""
         if self.regularization is None:
             return ("none", "evidence") if validated and SOLVERS[self.solver].gauss_newton else "none"
         return tuple(self.regularization) if isinstance(self.regularization, list) else self.regularization
@@ -322,7 +322,7 @@ def _spec_model(registered: object) -> type[Spec]:
     structure = with_kinds(StructureSection, {"measure": (measure, measure())}, kind=STRUCTURES)
     training = with_kinds(TrainingSection, solver=SOLVERS, focus=CRITERIA)
     sections = {"learner": learner, "structure": structure, "training": training}
-    return create_model("Spec", __base__=Spec, **{name: (one, one()) for name, one in sections.items()})  # type: ignore[call-overload]
+    return create_model("Spec", __base__=Spec, **{name: (section, section()) for name, section in sections.items()})  # type: ignore[call-overload]
 
 
 def load_spec(path: Path) -> Spec:

@@ -14,11 +14,11 @@ from orthaug._base.errors import KeyedError
 def first_message(error: ValidationError, content: dict[str, Any], model: type[BaseModel]) -> str:
     """The first error as `key: found …; expected …`."""
     errors = error.errors()
-    # of a union every branch complains: what was meant is the branch whose type fits, there the deepest complaint
+    # every branch of a union complains: the branch was meant whose type fits, and there the deepest complaint counts
     fitting = [e for e in errors if not e["type"].endswith("_type")]
     first = max(fitting or errors[:1], key=lambda e: len(e["loc"]))
     key = _key(first["loc"], content)
-    kind, found = first["type"], first["input"]
+    kind, given = first["type"], first["input"]
     if kind == "extra_forbidden":
         *parents, name = [part for part in first["loc"] if isinstance(part, str | int)]
         known = _known_keys(parents, model)
@@ -33,7 +33,7 @@ def first_message(error: ValidationError, content: dict[str, Any], model: type[B
         return f"'{key}': {text}" if key else text
     same_key = [e["msg"] for e in errors if _key(e["loc"], content) == key]
     expected = " or ".join(dict.fromkeys(_plain(m) for m in same_key))
-    return f"'{key}': found {_shown(found)}; expected {expected}"
+    return f"'{key}': found {_shown(given)}; expected {expected}"
 
 
 def _shown(value: Any) -> str:
@@ -76,11 +76,11 @@ def _known_keys(parents: list[Any], model: Any) -> list[str]:
 
 
 def _section_of(annotation: Any) -> Any:
-    """The section inside an annotation such as `dict[str, Part] | None`."""
+    """The section inside an annotation such as `dict[str, PartSection] | None`."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     for inner in getattr(annotation, "__args__", ()):
-        found = _section_of(inner)
-        if found is not None:
-            return found
+        section = _section_of(inner)
+        if section is not None:
+            return section
     return None

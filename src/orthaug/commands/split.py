@@ -9,7 +9,7 @@ import numpy as np
 
 from orthaug._base.errors import InputError
 from orthaug._base.warning import Warning
-from orthaug.commands.run import Run
+from orthaug.commands.run import ModelOnData
 from orthaug.data.readers import read_record
 from orthaug.data.record import Record
 from orthaug.data.tables import check_readable
@@ -17,7 +17,7 @@ from orthaug.inference.measures import Measure, Support
 from orthaug.reports.result import SplitResult, parameter_rows
 
 
-def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | None) -> Run:
+def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | None) -> ModelOnData:
     """A model with the files that it was trained on, `rows` of each."""
     from orthaug.models.storage import load
 
@@ -29,7 +29,7 @@ def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | Non
     records = [
         read_record(path, inputs=inputs, outputs=outputs, sampling_time=step, time=time, rows=rows) for path in data
     ]
-    return Run(loaded, Record.join(records), data[0])
+    return ModelOnData(loaded, Record.join(records), data[0])
 
 
 def read_rows(text: str | None) -> tuple[int, int] | None:
@@ -42,7 +42,7 @@ def read_rows(text: str | None) -> tuple[int, int] | None:
     return int(start), int(stop)
 
 
-def split(run: Run, measure: Measure) -> SplitResult:
+def split_model(opened: ModelOnData, measure: Measure) -> SplitResult:
     """θ of a saved model under a measure.
 
     Raises:
@@ -51,12 +51,12 @@ def split(run: Run, measure: Measure) -> SplitResult:
     from orthaug.inference.covariance import interval
     from orthaug.inference.splitting import split_under
 
-    model = run.model
+    model = opened.model
     parameters = model.form.baseline.parameters
     stands = [p.name for p, value in zip(parameters, model.theta, strict=True) if value in (p.min, p.max)]
     if stands:
         raise InputError(f"{', '.join(stands)} stands at a bound, which a split would leave; fit without the bound.")
-    support = Support(run.model.fitting(run.record, need_outputs=True), model.form.layout, model.form.used)
+    support = Support(opened.model.fitting(opened.record, need_outputs=True), model.form.layout, model.form.used)
     under = split_under(measure, model, support, model.statistics.joint(len(model.theta)))
     std = None if under.covariance is None else np.sqrt(np.diag(under.covariance))
     ci = None if std is None else interval(under.theta, std, model.statistics.freedom)

@@ -1,8 +1,8 @@
 """Expressions of lagged signals, such as `"sign(v[k-1])*v[k-1]**2"`: a whitelisted parser, no `eval`.
 
-Python's own grammar reads the text into a syntax tree; every node that is not on the list below is
-refused by name, so an expression can only do arithmetic. The same tree is evaluated with NumPy on
-whole records and with JAX inside a compiled free run.
+Python's own grammar reads the text into a syntax tree. A node that is not on the list below is refused by
+name, so an expression can only do arithmetic. NumPy evaluates the tree on whole records, JAX inside a
+compiled free run.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def is_name(name: str) -> bool:
 
 
 def parse(text: str, constants: Mapping[str, float] | None = None) -> Expression:
-    """Read `text`; `constants` are the names it may use besides channels and functions.
+    """Read `text`. Besides channels and functions it may use the names in `constants`.
 
     Raises:
         InputError: anything that is not arithmetic on lagged channels, with the offending piece named.

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.checks import Vector, check_choice
+from orthaug._base.checks import Vector, check_choice, check_count
 from orthaug._base.errors import InputError
 from orthaug.data.record import Channel, Experiment, Record, same_step
 from orthaug.data.tables import Table, check_readable, has_column, read_table
@@ -42,8 +42,8 @@ def read_record(
         rows: half-open range `(start, stop)` of data rows, or several; None for all.
         every: keep each n-th row (no filter); the sampling time is multiplied.
         columns: this file's column for a channel, `{"position": "yVal"}`.
-        missing: "error", or "skip" to leave out rows with empty or NaN cells: what lies between them is an experiment
-            of its own, so that no lag reaches across a gap.
+        missing: "error", or "skip" to leave out rows with empty or NaN cells. Each stretch between them is then an
+            experiment of its own, so that no lag reaches across a gap.
 
     Raises:
         InputError: no such file, wrong type, missing columns, cells that are empty or no finite numbers.
@@ -53,8 +53,7 @@ def read_record(
     column_of = {c.name: (columns or {}).get(c.name, c.file_column) for group in channels for c in group}
     if sampling_time is not None and time is not None:
         raise InputError("give `sampling_time` or `time`, not both.")
-    if isinstance(every, bool) or not isinstance(every, int | np.integer) or every < 1:
-        raise InputError(f"`every` must be a whole number, 1 or more; got {every}.")
+    check_count(every, "every")
     wanted: list[str] = list(dict.fromkeys([*column_of.values(), *([time] if time else [])]))
     if not wanted:
         raise InputError("no channels are asked for; name inputs, outputs or both.")
@@ -115,7 +114,7 @@ def read_samples(
 
 
 def _trim(table: Table, *, uneven: bool = False) -> Table:
-    """Without the rows at the end in which every used column is empty (blank lines, longer unused columns)."""
+    """The table without its last rows where every used column is empty (blank lines, longer unused columns)."""
     longest = max(table.filled.values())
     if longest == 0:
         raise InputError(f"{table.path}: there are no data rows in {', '.join(table.columns)}.")
@@ -171,8 +170,8 @@ def _check_cells(table: Table, columns: Sequence[str], start: int, stop: int) ->
         bad = np.flatnonzero(~np.isfinite(table.columns[name][start:stop]))
         if bad.size:
             row = start + int(bad[0])
-            found = table.cell(name, row)
-            what = f"found '{found}'" if found else "the cell is empty"
+            text = table.cell(name, row)
+            what = f"found '{text}'" if text else "the cell is empty"
             raise InputError(f"{table.path}: {table.where(row)}, column '{name}': {what}; expected a finite number.")
 
 

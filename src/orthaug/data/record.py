@@ -15,9 +15,9 @@ from orthaug.data.expressions import RESERVED, is_name
 _LONGEST_STEP = 1e12  # s; a longer one overflows somewhere in a time axis
 
 
-def same_step(one: float, other: float) -> bool:
+def same_step(step: float, other: float) -> bool:
     """Whether two sampling times are the same to 0.1 %, as logged time columns are."""
-    return bool(np.isclose(one, other, rtol=1e-3, atol=0.0))
+    return bool(np.isclose(step, other, rtol=1e-3, atol=0.0))
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Channel:
 
 
 def check_channels(inputs: Sequence[Channel], outputs: Sequence[Channel]) -> None:
-    """Raise InputError for a name that stands twice, or an output whose name tables of results need."""
+    """Raise InputError for a name that stands twice, or an output named like a column of result tables."""
     check_unique((channel.name for channel in (*inputs, *outputs)), "channel")
     derived = [f"{c.name}_{part}" for c in outputs for part in ("model", "baseline", "learner")]
     for channel in outputs:
@@ -67,9 +67,9 @@ def check_channels(inputs: Sequence[Channel], outputs: Sequence[Channel]) -> Non
 class Experiment:
     """One uninterrupted run: `inputs` (N, nu) and `outputs` (N, ny), row k taken at the same instant.
 
-    `source`, `first_row`, `stride` and `first_line` (the file's line of its row 0) say where a row came from, for
-    messages; `start_time` [s] is the instant of the first row. A stretch between missing samples begins `offset` rows
-    into the recording it is a part of.
+    Messages say where a row came from: `source`, `first_row`, `stride` and `first_line`, the file's line of its row 0.
+    `start_time` [s] is the instant of the first row. A stretch between missing samples is a part of a recording, and
+    begins `offset` rows into it.
     """
 
     inputs: Matrix
@@ -174,7 +174,7 @@ class Record:
 
     @classmethod
     def join(cls, records: Iterable[Record]) -> Record:
-        """One record of the experiments of several, kept apart."""
+        """One record with the experiments of several, each kept as it is."""
         records = tuple(records)
         if not records:
             raise InputError("a record needs at least one experiment; got none.")
@@ -217,11 +217,6 @@ class Record:
             raise InputError(f"`fraction` must lie between 0 and 1; got {fraction}.")
         cut = round(fraction * len(self._only("split")))
         return self.rows(None, cut), self.rows(cut, None)
-
-    def without_short(self, first: int) -> Record:
-        """Without stretches between missing samples that end before row `first`, as long as one is left."""
-        long = tuple(e for e in self.experiments if len(e) > first)
-        return replace(self, experiments=long) if self.missing and long else self
 
     def _only(self, verb: str) -> Experiment:
         if len(self.experiments) != 1:

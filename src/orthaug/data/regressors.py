@@ -21,7 +21,7 @@ Layout = tuple[Lag, ...]
 
 @dataclass(frozen=True)
 class Lags:
-    """Orders as MATLAB means them: `y[k-1..k-na]` and `u[k-nk..k-nk-nb+1]`; one number, or one per channel.
+    """Orders as in MATLAB: `y[k-1..k-na]` and `u[k-nk..k-nk-nb+1]`; one number, or one per channel.
 
     The paper's `u_k … u_{k-n_b}` is `nk = 0, nb = n_b + 1`.
 
@@ -38,7 +38,7 @@ class Lags:
         """The raw lags in regressor order.
 
         Raises:
-            InputError: negative orders, or as many numbers as there are no channels.
+            InputError: negative orders, or a list whose length is not the number of channels.
         """
         na = _per_channel(self.na, outputs, "na", "output")
         nb = _per_channel(self.nb, inputs, "nb", "input")
@@ -100,7 +100,7 @@ def lag_rows(record: Record, layout: Layout) -> Matrix:
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class UsableRows:
     """The usable rows of a record, stacked over experiments: regressors `x` (N, nx), outputs `y` (N, ny)."""
 
     x: Matrix
@@ -112,7 +112,7 @@ class Rows:
         return len(self.x)
 
 
-def stack_rows(record: Record, layout: Layout) -> Rows:
+def stack_rows(record: Record, layout: Layout) -> UsableRows:
     """All rows from the largest lag on, experiment after experiment.
 
     Raises:
@@ -128,12 +128,12 @@ def stack_rows(record: Record, layout: Layout) -> Rows:
             )
     x = lag_rows(record, layout)
     y = [experiment.outputs[start:] for experiment in record.experiments]
-    return Rows(x, np.concatenate(y), layout, start)
+    return UsableRows(x, np.concatenate(y), layout, start)
 
 
 @dataclass(frozen=True)
 class Features:
-    """What the learner sees of the regressor: expressions, most often single raw lags."""
+    """What the learner sees: expressions of the regressor, most often single raw lags."""
 
     entries: tuple[Expression, ...]
 

@@ -1,4 +1,4 @@
-"""Files to named columns of floats, by the file's ending; what is no number is kept to be named later."""
+"""Named columns of floats from files, by the file's ending. What is no number is kept, so that messages can name it."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from orthaug.data.variables import ENDINGS, read_variables
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Columns of a file as floats; NaN where the cell is empty or no number, `where` and `cell` to say so.
+    """Columns of a file as floats, NaN where the cell is empty or no number. `where` and `cell` are for messages.
 
-    `filled` counts the rows of each column up to its last cell that holds anything; `first_line` is the
-    file's line of row 0, for text files.
+    `filled` counts the rows of each column up to its last cell that holds anything. In a text file `first_line` is
+    the line of row 0.
     """
 
     path: Path
@@ -78,7 +78,7 @@ def check_readable(path: Path) -> None:
 
 
 def _read_text(path: Path, columns: Sequence[str]) -> Table:
-    """CSV and TSV as they are found: byte-order mark, trailing separators, units in headers, decimal commas."""
+    """CSV and TSV as they occur: byte-order mark, trailing separators, units in headers, decimal commas."""
     import pandas as pd
 
     try:

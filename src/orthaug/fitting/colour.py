@@ -1,4 +1,4 @@
-"""How many of a free run's errors are independent: coloured ones say less than their number."""
+"""The share of a free run's errors that is independent: coloured errors say less than their number."""
 
 from __future__ import annotations
 

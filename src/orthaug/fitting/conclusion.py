@@ -1,6 +1,6 @@
-"""From what training left to an estimate: θ split from the learner, statistics, warnings.
+"""From a trained learner to an estimate: θ split from the learner, statistics, warnings.
 
-Everything is a sum over rows that the task's engine makes; no array of N rows is kept.
+The task's engine makes every sum over rows; no array of N rows is kept.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.warning import Warning
-from orthaug.fitting.elimination import Fixed, Split, split
+from orthaug.fitting.elimination import Fixed, ThetaSplit, split_theta
 from orthaug.fitting.estimates import NOT_UNIQUE, Estimate
 from orthaug.fitting.learned import ErrorStatistics, Learned
 from orthaug.fitting.one_step import OneStepTask, Share
@@ -37,17 +37,17 @@ def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estim
     ending = learned.ending if finite else Ending.NON_FINITE
     if learned.elsewhere:  # c = 0: all of the function is the learner's
         aux = problem.projection.from_coordinates(share.coordinates)
-        theta, theta_aux, fixed = Split(aux, aux, {})
+        theta, theta_aux, fixed = ThetaSplit(aux, aux, {})
     else:
         there = share.coordinates if ending.usable else 0.0 * problem.target_coordinates
         held = learned.errors.fixed if learned.errors else None
-        theta, theta_aux, fixed = split(structure, problem, there, learned.coefficients, held)
+        theta, theta_aux, fixed = split_theta(structure, problem, there, learned.coefficients, held)
     errors = learned.errors or _one_step_errors(task, learned, theta - theta_aux, fixed)
     noise = errors.noise if ending.usable else None
     identified = structure.projects or (learned.bound is None and structure.identifies)
     known = noise is not None and identified and not learned.elsewhere
     return Estimate(
-        model=_model(problem, structure, learned, Split(theta, theta_aux, fixed), errors, noise),
+        model=_model(problem, structure, learned, ThetaSplit(theta, theta_aux, fixed), errors, noise),
         status=Status(ending, learned.iterations, learned.seconds, errors.mean_square),
         restarts=(),
         excitation=problem.excitation,
@@ -66,12 +66,12 @@ def _model(
     problem: Problem,
     structure: Structure,
     learned: Learned,
-    found: Split,
+    parameters: ThetaSplit,
     errors: ErrorStatistics,
     noise: Matrix | None,
 ) -> Model:
     record, scaling = problem.record, learned.scaling
-    numbers = (found.theta, found.theta_aux, learned.weights, scaling.centre, scaling.halfwidth, learned.unit)
+    numbers = (parameters.theta, parameters.theta_aux, learned.weights, scaling.centre, scaling.halfwidth, learned.unit)
     middle = _middle(learned, noise, problem.weight)
     return Model(
         form=Lagged(problem.baseline, problem.features, problem.layout, problem.outputs, learned.bound),

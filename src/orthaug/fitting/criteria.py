@@ -1,4 +1,4 @@
-"""Criteria: what is minimised, as declarations. One step ahead, several, or over a free run."""
+"""Criteria: declarations of what is minimised, the error one step ahead, several steps ahead, or of a free run."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Criterion(Protocol):
         ...
 
     def response(self, model: Model, record: Record) -> Response:
-        """What a validation part judges a model by."""
+        """The response whose error judges a model on a validation part."""
         ...
 
 
@@ -76,8 +76,8 @@ class Prediction:
 class Simulation:
     """Declaration: the error of a free run over segments that start from measured lags.
 
-    With a washout, or over whole experiments, the outputs before a segment are taken for as noisy as all others: they
-    are unknowns too (`InitialStates`). Segments without a washout start exactly from what was measured.
+    With a washout, or over whole experiments, the outputs before a segment count as noisy like all others: they are
+    unknowns too (`InitialStates`). Segments without a washout start exactly from what was measured.
 
     Args:
         segment: steps of a segment; 0 for whole experiments.

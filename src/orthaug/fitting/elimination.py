@@ -1,4 +1,4 @@
-"""θ taken out of the criterion, whatever the structure: penalties and bounds are one small quadratic in QᵀF (F1)."""
+"""θ is eliminated from the criterion, whatever the structure: what remains is one small quadratic in QᵀF (F1)."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ Fixed = dict[int, float]
 
 @dataclass(frozen=True, eq=False)
 class Elimination:
-    """θ taken out of `‖p − f − Tθ‖² + ‖e − A θ − B f‖²`, with f = QᵀF, p = QᵀY, `T` = coordinates of θ.
+    """θ eliminated from `‖p − f − Tθ‖² + ‖e − A θ − B f‖²`, with f = QᵀF, p = QᵀY, `T` = coordinates of θ.
 
-    `(A, B, e)` are the structure's rows. Bounds are met by an active set: some entries of θ stand at a
-    bound, the others are free and minimise the rest.
+    `(A, B, e)` are the structure's rows. An active set meets the bounds: some entries of θ stand at a bound, and the
+    others minimise the rest.
     """
 
     to_coordinates: Matrix
@@ -48,7 +48,7 @@ class Elimination:
         return np.concatenate([self.outputs, self.rows.target])
 
     def hold(self, fixed: Fixed) -> tuple[Matrix, Vector]:
-        """`(S, t)` with `min_θ (…) = ‖t − S f‖² + constant`: what remains for the learner to see, (nθ, nθ) and (nθ,).
+        """`(S, t)` with `min_θ (…) = ‖t − S f‖² + constant`, (nθ, nθ) and (nθ,): all that the learner sees of θ.
 
         S is zero where θ can follow any f: without penalty rows and with no entry at a bound.
         """
@@ -82,11 +82,13 @@ class Elimination:
             return {}
         matrix, right = self._theta, self._target - self._learner @ f
         scale = np.linalg.norm(matrix, axis=0)
-        found = scipy.optimize.lsq_linear(
+        solution = scipy.optimize.lsq_linear(
             matrix / scale, right, bounds=(self.lower * scale, self.upper * scale), method="bvls", tol=1e-14
         )
         return {
-            i: float(self.lower[i] if side < 0 else self.upper[i]) for i, side in enumerate(found.active_mask) if side
+            i: float(self.lower[i] if side < 0 else self.upper[i])
+            for i, side in enumerate(solution.active_mask)
+            if side
         }
 
     def _split(self, fixed: Fixed) -> tuple[Matrix, Vector]:
@@ -109,7 +111,7 @@ def eliminate(structure: Structure, problem: Problem) -> Elimination:
     )
 
 
-class Split(NamedTuple):
+class ThetaSplit(NamedTuple):
     """θ and θ_aux, and which entries of θ stand at a bound."""
 
     theta: Vector
@@ -117,18 +119,18 @@ class Split(NamedTuple):
     fixed: Fixed
 
 
-def split(
+def split_theta(
     structure: Structure,
     problem: Problem,
     share: Vector,
     coefficients: Vector | None = None,
     fixed: Fixed | None = None,
-) -> Split:
+) -> ThetaSplit:
     """θ for the learner's share QᵀF (nθ,) in the physics, and its part θ_aux = Φ⁺F that the structure moves to θ.
 
     Args:
-        coefficients: c = θ − θ_aux (nθ,) where training found it; None to solve for θ.
-        fixed: what stands at a bound, where training found that.
+        coefficients: c = θ − θ_aux (nθ,) where it was an unknown of training; None to solve for θ.
+        fixed: what stands at a bound, where training knows that.
     """
     baseline = problem.baseline
     aux = problem.projection.from_coordinates(share)
@@ -144,4 +146,4 @@ def split(
         theta = elimination.theta(f, fixed)
     else:  # refined least squares, as exact as double precision allows
         theta = problem.least_squares - (0.0 if structure.projects else aux)
-    return Split(theta, aux if structure.projects else 0.0 * aux, fixed)
+    return ThetaSplit(theta, aux if structure.projects else 0.0 * aux, fixed)

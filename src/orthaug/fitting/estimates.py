@@ -126,24 +126,24 @@ class Estimate:
             )
         support = Support(self.problem.record, self.problem.layout, self.model.form.used, self.problem.rows.x)
         joint = self.model.statistics.joint(len(self.theta))
-        found = split_under(measure, self.model, support, joint)
-        if found.covariance is not None:
+        under = split_under(measure, self.model, support, joint)
+        if under.covariance is not None:
             training = self.covariance if self.measure is None else None
             training = split_under(Training(), self.model, support, joint).covariance if training is None else training
             with np.errstate(all="ignore"):
-                price = np.sqrt(np.diag(found.covariance) / np.diag(np.asarray(training)))
-            found = replace(found, price=price)
-        ensemble = found.covariance is None and self.model.numbers.tilt is not None
+                price = np.sqrt(np.diag(under.covariance) / np.diag(np.asarray(training)))
+            under = replace(under, price=price)
+        ensemble = under.covariance is None and self.model.numbers.tilt is not None
         text = "no standard errors after a split: an ensemble has no gradient in its weights."
         unknown = (Warning("no_standard_errors", text),) if ensemble else ()
-        numbers = self.model.numbers._replace(theta=found.theta, theta_aux=found.theta_aux)
+        numbers = self.model.numbers._replace(theta=under.theta, theta_aux=under.theta_aux)
         return replace(
             self,
             model=replace(self.model, numbers=numbers, structure="orthogonal", measure=measure.name),
-            covariance=found.covariance,
-            defect=found.defect,
-            measure=found,
-            warnings=(*(w for w in self.warnings if w.code != NOT_UNIQUE), *found.warnings, *unknown),
+            covariance=under.covariance,
+            defect=under.defect,
+            measure=under,
+            warnings=(*(w for w in self.warnings if w.code != NOT_UNIQUE), *under.warnings, *unknown),
         )
 
     def joint_covariance(self, convention: str = "calibrated") -> Matrix:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Vector, check_choice, check_count, check_type
+from orthaug._base.checks import Vector, check_choice, check_count, check_type, finite_or_none
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, jnp
 from orthaug._base.parallel import spread
@@ -68,14 +68,14 @@ def estimate(
             trained with the weights and split off at the end (F2).
         solver: `LevenbergMarquardt(…)`, or `AdamLBFGS(…)`, the paper's pipeline from θ⁰.
         regularization: "none", "evidence" (MacKay; the weights' prior is estimated too), or a number: the
-            ridge α on the weights, against squared errors in units of the baseline's RMS residual. Several, if
-            `validation` is there to choose.
-        restarts: runs from initial weights of seeds `seed … seed + restarts - 1`, spread over the cores; the lowest
-            training loss is kept, or with `validation` the lowest error there, one-step or of the free run as trained.
+            ridge α on the weights, against squared errors in units of the baseline's RMS residual. Several may be
+            given with `validation`, which then chooses.
+        restarts: runs from initial weights of seeds `seed … seed + restarts - 1`, spread over the cores. The run of the
+            lowest training loss is kept. With `validation` it is the lowest error of the criterion there.
         seed: of the initial weights.
         ensemble: the median of all restarts as one model, instead of the best one.
-        initial: warm start from an earlier estimate or model: its learner, features, scaling and weights take
-            the place of `learner`, `restarts` and `seed`.
+        initial: warm start from an earlier estimate or model. Its learner, features, scaling and weights replace
+            `learner`, `restarts` and `seed`.
         validation: a record that chooses between restarts and regularizations; it is never fitted.
         progress: called about twice a second with (restart, iteration, loss).
 
@@ -128,10 +128,10 @@ def fit(
     progress: Tell = SILENT,
     engine: Engine = InMemory(),  # noqa: B008  (frozen)
 ) -> Estimate:
-    """`estimate` for a problem that is posed already, for what the learner is to see.
+    """`estimate` for a problem that is posed already.
 
     Args:
-        problem: record and physics; the other arguments as of `estimate`.
+        problem: record, physics and learner inputs; the other arguments as of `estimate`.
         learner: None for physics alone, on the rows of the problem.
         engine: where the rows of a one-step criterion are, and who sums over them.
 
@@ -148,17 +148,17 @@ def fit(
     warm = None
     if initial is not None:
         task, weights, warm = _warm_start(problem, initial, engine)
-        starts = [_Start(0, weights, choice) for choice in choices]
+        starts = [_PlannedRun(0, weights, choice) for choice in choices]
     else:
         task = OneStepTask.of(problem, learner, engine=engine)
         seeds = range(seed, seed + restarts) if learner is not None else (seed,)
         keyed = {s: np.zeros(0) if task.bound is None else task.bound.init(jax.random.key(s)) for s in seeds}
-        starts = [_Start(s, w, choice) for choice in choices for s, w in keyed.items()]
+        starts = [_PlannedRun(s, w, choice) for choice in choices for s, w in keyed.items()]
     solved = criterion.one_step and problem.baseline.linear
     if task.bound is None and solved:
         return conclude(task, structure, task.physics_learned())
     if task.bound is None:
-        starts = [_Start(seed, np.zeros(0), "none")]
+        starts = [_PlannedRun(seed, np.zeros(0), "none")]
     trained = task if solved else FreeRunTask.of(task, criterion, warm)
     return _train(trained, task, starts, structure, solver, validation, progress, ensemble and task.bound is not None)
 
@@ -204,9 +204,9 @@ def orthogonalize(
     gain = np.broadcast_to(problem.weight / task.rms, values.shape)
     rows = task.engine.lay(values, problem.projection.q, problem.unexplained / task.rms, gain)
     task = replace(task, rows=rows, unit=unit, bound=Bound(_GIVEN, ny, ny))
-    found = conclude(task, Orthogonal(), Learned(task.bound, np.zeros(0), scaling, unit, elsewhere=True))
-    form = replace(found.model.form, bound=Bound(external, nz, ny))
-    return replace(found, model=replace(found.model, form=form))
+    concluded = conclude(task, Orthogonal(), Learned(task.bound, np.zeros(0), scaling, unit, elsewhere=True))
+    form = replace(concluded.model.form, bound=Bound(external, nz, ny))
+    return replace(concluded, model=replace(concluded.model, form=form))
 
 
 _GIVEN = Function(lambda w, z: z, lambda key: ())
@@ -228,7 +228,7 @@ def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStep
 
 
 @dataclass(frozen=True, eq=False)
-class _Start:
+class _PlannedRun:
     """One run to be made: its seed, initial weights and regularization."""
 
     seed: int
@@ -239,7 +239,7 @@ class _Start:
 def _train(
     task: Task,
     rows: OneStepTask,
-    starts: Sequence[_Start],
+    starts: Sequence[_PlannedRun],
     structure: Structure,
     solver: Solver,
     validation: Record | None,
@@ -248,7 +248,7 @@ def _train(
 ) -> Estimate:
     """Run from every start and conclude with the best, by training loss or by the criterion's validation error."""
 
-    def one(numbered: tuple[int, _Start], check: Callable[[], None]) -> Any:
+    def train(numbered: tuple[int, _PlannedRun], check: Callable[[], None]) -> Any:
         i, start = numbered
 
         def tell(iteration: int, loss: float) -> None:
@@ -260,12 +260,12 @@ def _train(
     def concluded(learned: Learned) -> Estimate:
         return replace(conclude(rows, structure, learned), criterion=task.criterion)
 
-    runs = spread(one, list(enumerate(starts)))
+    runs = spread(train, list(enumerate(starts)))
     losses, errors = [task.loss(run) for run in runs], [math.nan] * len(runs)
     tried: dict[int, Estimate] = {}
     if validation is not None:
         tried = {i: concluded(task.learned(run)) for i, run in enumerate(runs)}
-        errors = [_validation_error(one, validation) for one in tried.values()]
+        errors = [_validation_error(trained, validation) for trained in tried.values()]
     ranking = np.array(losses if validation is None else errors)
     best = int(np.nanargmin(ranking)) if np.isfinite(ranking).any() else 0
     members = [best]
@@ -277,12 +277,12 @@ def _train(
     restarts = tuple(
         Restart(
             seed=start.seed,
-            loss=_finite(losses[i]),
+            loss=finite_or_none(losses[i]),
             iterations=run.iterations,
             code=run.ending.code,
             chosen=i in members,
             regularization=start.regularization,
-            validation=_finite(errors[i]),
+            validation=finite_or_none(errors[i]),
         )
         for i, (start, run) in enumerate(zip(starts, runs, strict=True))
     )
@@ -294,9 +294,9 @@ def _train(
 
 def _median(task: Task, rows: OneStepTask, runs: Sequence[Any], members: Sequence[int], best: int) -> Learned:
     """The median of the members that have a value everywhere; the best one alone if it has none."""
-    found = {i: task.learned(runs[i]) for i in members}
-    sound = [i for i, one in found.items() if np.isfinite(rows.share(one).square)]
-    return task.median([found[i] for i in sound], sound.index(best)) if best in sound else found[best]
+    learned = {i: task.learned(runs[i]) for i in members}
+    sound = [i for i, member in learned.items() if np.isfinite(rows.share(member).square)]
+    return task.median([learned[i] for i in sound], sound.index(best)) if best in sound else learned[best]
 
 
 def _validation_error(fit: Estimate, validation: Record) -> float:
@@ -305,10 +305,6 @@ def _validation_error(fit: Estimate, validation: Record) -> float:
         return math.nan
     rmse = fit.criterion.response(fit.model, validation).scores().rmse
     return float(np.mean((rmse * fit.problem.weight) ** 2))
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
 
 
 def _check_record(record: Any, baseline: Any, lags: Any, learner: Any, initial: Any) -> None:

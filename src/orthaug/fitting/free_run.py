@@ -1,7 +1,7 @@
 """Training on the free run: θ and the weights together, from a one-step solution (the criterion `Simulation`).
 
-Here θ is an unknown beside the weights (F1 does not hold); it is split off at the end over the *measured* regressors
-(F2), which keeps the orthogonal structure exact.
+Here θ is an unknown beside the weights (F1 does not hold). The split at the end is over the *measured* regressors (F2),
+which keeps the orthogonal structure exact.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from orthaug.fitting.initial_states import InitialStates, Start
 from orthaug.fitting.learned import ErrorStatistics, Learned
 from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, errors_of
 from orthaug.fitting.one_step import OneStepTask
+from orthaug.fitting.rules import check_scored
 from orthaug.fitting.segments import Segments, lay_segments
 from orthaug.fitting.solvers.descent import MARQUARDT, Descent
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
@@ -32,7 +33,7 @@ from orthaug.models.learners import Bound
 from orthaug.physics.problem import Problem
 
 _COLOURED_STEPS = 256  # shorter segments do not show how long the errors remember
-_COLOUR_ROWS = 4096  # of each experiment, which show it instead
+_COLOUR_ROWS = 4096  # of each experiment: they show it instead
 _SHORTEST = 4  # steps of a segment
 
 
@@ -58,9 +59,9 @@ class FreeRunTask:
     dynamics: Lagged
     segments: Segments
     whole: Segments
-    """What runs are compared over: whole experiments; for a prediction h steps ahead its own segments."""
+    """Segments over which runs are compared: whole experiments; for a prediction h steps ahead its own segments."""
     colour: Segments | None
-    """What the colour of the errors is taken from, where segments are too short to show it."""
+    """Segments that show the colour of the errors, where the others are too short for that."""
     criterion: Criterion
     flown: Simulation
     warm: Vector | None = None
@@ -78,11 +79,7 @@ class FreeRunTask:
         problem, flown = task.problem, criterion.flown
         assert flown is not None, "one step ahead is `OneStepTask`'s"
         longest = max(len(e) for e in problem.record.experiments) - problem.rows.start
-        if flown.washout >= longest:
-            raise InputError(
-                f"nothing is scored: the longest experiment has {longest} usable rows, and the first "
-                f"{flown.washout} of a segment are washout; shorten it, or the horizon."
-            )
+        check_scored(criterion, longest)
         record = problem.record
         dynamics = Lagged(problem.baseline, problem.features, problem.layout, problem.outputs, task.bound)
         segments = lay_segments(record, dynamics, flown.segment, flown.washout)
@@ -195,7 +192,7 @@ class FreeRunTask:
         return objective, again._replace(iterations=done + again.iterations, seconds=end.seconds + again.seconds)
 
     def _shorter(self) -> FreeRunTask:
-        """The same over segments of a quarter of the length, from which training reaches where longer ones run away."""
+        """The same over segments of a quarter of the length: they train where longer ones run away."""
         segment = max(_SHORTEST, self.segments.steps // 4)
         shorter = replace(self.flown, segment=segment, washout=min(self.flown.washout, segment // 2))
         return FreeRunTask.of(self.task, shorter)
@@ -218,13 +215,13 @@ class FreeRunTask:
         return mean if mean < RUNAWAY else np.nan
 
     def learned(self, run: Flight) -> Learned:
-        """What a run left, with the statistics of its errors."""
+        """The learner as a run left it, with the statistics of its errors."""
         end, objective = run.end, run.objective
         linear = end.linear
         gram = None if linear is None else linear.information * self.task.rms**2
 
         def middle(noise: Matrix) -> Matrix:
-            """ΣψᵀΣ_eψ of the rows of `gram`, which are white where `weight` made them so."""
+            """ΣψᵀΣ_eψ of the rows of `gram`. They are white where `weight` made them so."""
             assert gram is not None
             change = objective.weight / self.problem.weight  # of errors in whitened outputs
             white = change @ noise @ change.T * self.task.rms**2

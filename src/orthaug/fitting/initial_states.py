@@ -1,8 +1,8 @@
-"""The states that segments start from, as unknowns of their own, eliminated from the normal equations.
+"""The states that segments start from: unknowns of their own, eliminated from the normal equations.
 
-A state is scored against the measured one, `‖L (x − measured)‖²`: past outputs have the errors of all others. It
-touches its own segment only, so a Schur complement per segment removes it. Without this, noise in a segment's measured
-lags would be a disturbance that the model has to explain.
+A state is scored against the measured one, `‖L (x − measured)‖²`, because past outputs have errors like all others. A
+state acts on its own segment only, so a Schur complement per segment removes it. If the states were not unknowns, noise
+in a segment's measured lags would be a disturbance that the model has to explain.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class Start(NamedTuple):
 
     values: Float[np.ndarray, "k n0 m"]
     misfit: float = np.inf
-    """`‖r‖²` where they are the best, which a trial is compared with."""
+    """`‖r‖²` with the best states. A trial is compared with it."""
     unknowns: Vector | None = None
     """(c, w) there; None before anything was linearised."""
     offset: Float[np.ndarray, "k m n0"] | None = None
@@ -38,7 +38,7 @@ class Start(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class InitialStates:
-    """What is known of the states before training: `measured` (k, n0, m), and whether they are `free` unknowns."""
+    """The states before training: `measured` (k, n0, m), and whether they are `free` unknowns."""
 
     measured: Float[np.ndarray, "k n0 m"]
     free: bool
@@ -49,16 +49,16 @@ class InitialStates:
             return float(np.sum(np.einsum("oi,kim->kom", rows, self.measured - values) ** 2))
 
     def eliminate(
-        self, found: Sensitivity, values: Float[np.ndarray, "k n0 m"], rows: Matrix
+        self, sensitivity: Sensitivity, values: Float[np.ndarray, "k n0 m"], rows: Matrix
     ) -> tuple[Matrix, Vector, Float[np.ndarray, "k m n0"] | None, Float[np.ndarray, "k m n0 n"] | None]:
         """Normal matrix and right-hand side of (c, w) with the states at their best, and how these follow (c, w).
 
         The best states are `values + offset − slope · step` for a small step of (c, w).
         """
-        shared = np.asarray(found.shared)
+        shared = np.asarray(sensitivity.shared)
         if not self.free:
             return shared[:-1, :-1], shared[:-1, -1], None, None
-        own = np.moveaxis(np.asarray(found.own), -1, 1)  # (k, m, n0, n0+n+1)
+        own = np.moveaxis(np.asarray(sensitivity.own), -1, 1)  # (k, m, n0, n0+n+1)
         n0 = own.shape[2]
         prior = rows.T @ rows
         missed = np.moveaxis(self.measured - values, -1, 1)

@@ -1,4 +1,4 @@
-"""What training left, whatever the criterion, for the estimate to be concluded from."""
+"""What training leaves, under any criterion: the estimate is concluded from it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from orthaug.physics.problem import Problem
 
 
 class ErrorStatistics(NamedTuple):
-    """What is known about the errors of a fit, and through them about θ."""
+    """Statistics of the errors of a fit, and of θ as they follow from them."""
 
     noise: Matrix | None
     """Covariance (ny, ny) of the errors, in the outputs' units."""
@@ -31,7 +31,7 @@ class ErrorStatistics(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Learned:
-    """The learner's weights, and what the run that found them knows."""
+    """A trained learner: its weights, and what the run knows of them."""
 
     bound: Bound | None
     weights: Vector
@@ -47,7 +47,7 @@ class Learned:
     middle: Callable[[Matrix], Matrix] | None = None
     """ΣψᵀΣ_eψ in the units of `gram`, for the noise covariance (ny, ny) of whitened outputs."""
     coefficients: Vector | None = None
-    """c = θ − θ_aux (nθ,) where it was an unknown of training; None where θ is solved."""
+    """c = θ − θ_aux (nθ,), if it was an unknown of training; None where θ is solved."""
     errors: ErrorStatistics | None = None
     """Of a free run; None where they are those of the one-step residual."""
     tilt: Matrix | None = None

@@ -1,7 +1,7 @@
 """The prediction criterion over the learner's weights, as normal equations from one pass over rows (F1, F4).
 
-Rows are whitened: each output is divided by its standard deviation, and all rows by the RMS of what the
-physics leaves unexplained, so a residual of 1 is as large as the baseline's own.
+Rows are whitened: each output is divided by its standard deviation, and all rows by the RMS of the baseline's
+residual. So a residual of 1 is as large as the baseline's own.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from orthaug.models.rows import Chunk, Engine, Overlap, gram, row_sum
 
 
 class Hold(NamedTuple):
-    """`‖target − matrix QᵀF‖²`: how a structure holds the learner's share in the span of the physics."""
+    """`‖target − matrix QᵀF‖²`: the structure's hold on the learner's share in the span of the physics."""
 
     matrix: Float[Array, "nt nt"]
     target: Float[Array, "nt"]
@@ -38,9 +38,9 @@ class Normal(NamedTuple):
 
 @dataclass(frozen=True)
 class Blocks:
-    """Gram matrix of the columns `[Q r J]` of one chunk: what one chunk gives to the sum.
+    """Gram matrix of the columns `[Q r J]` of one chunk: its share of the sum.
 
-    Where J lies almost in the span of Q, `JᵀJ − (QᵀJ)ᵀ(QᵀJ)` cancels: the share that the previous pass found is
+    Where J lies almost in the span of Q, `JᵀJ − (QᵀJ)ᵀ(QᵀJ)` cancels. So the overlap of the previous pass is
     subtracted first.
     """
 
@@ -91,7 +91,7 @@ class OneStep:
 def linearise(
     criterion: Callable[..., Normal], w: Float[Array, "nw"], arguments: tuple[Any, ...], overlap: Overlap
 ) -> Normal:
-    """The criterion at w, in two passes: the second subtracts the overlap that the first one found."""
+    """The criterion at w, in two passes: the second subtracts the overlap of the first."""
     first = criterion(w, *arguments, overlap)
     return criterion(w, *arguments, first.overlap)
 
@@ -104,8 +104,8 @@ class Passed(NamedTuple):
     normal: Normal
 
 
-class Linear(NamedTuple):
-    """What a solver's step needs of a pass, and what the next pass subtracts."""
+class LinearisedPass(NamedTuple):
+    """A pass as a solver's step needs it, with the overlap that the next pass subtracts."""
 
     hessian: Matrix
     gradient: Vector
@@ -125,14 +125,14 @@ class Streamed:
     physics: int = 0
 
     def fly(self, p: Vector, start: Overlap) -> Passed:
-        """The normal equations at w = p; `start` is the overlap that the previous pass found."""
+        """The normal equations at w = p; `start` is the overlap from the previous pass."""
         total = self.engine.sum(Blocks(self.bound), self.rows, jnp.asarray(p), start)
         normal = _collect(total, self.hold, start)
         return Passed(np.asarray(p), float(normal.loss), normal)
 
-    def linearise(self, flown: Passed) -> Linear:
+    def linearise(self, flown: Passed) -> LinearisedPass:
         normal = flown.normal
-        return Linear(np.asarray(normal.hessian), np.asarray(normal.gradient), normal.overlap)
+        return LinearisedPass(np.asarray(normal.hessian), np.asarray(normal.gradient), normal.overlap)
 
     def samples(self, flown: Passed) -> tuple[float, float]:
         """Residuals, all of them independent."""

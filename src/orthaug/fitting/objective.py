@@ -41,7 +41,7 @@ class Flown(NamedTuple):
     """The same with the structure's rows."""
 
 
-class Linear(NamedTuple):
+class LinearisedFreeRun(NamedTuple):
     """A trial linearised: normal equations of p, and what the next trial starts from."""
 
     hessian: Matrix
@@ -55,9 +55,8 @@ class Linear(NamedTuple):
 class FreeRunObjective:
     """`‖r‖²` of the free run and of the structure's rows.
 
-    `numbers` makes a model's numbers of (c, w). `weight` (ny, ny) multiplies the errors of a step. `rms` is the unit of
-    all rows. `colour` holds segments that are long enough to show how long the errors remember, where the others are
-    too short.
+    `numbers` makes a model's numbers of (c, w). `weight` (ny, ny) multiplies the errors of a step. `colour` holds
+    longer segments, where the others are too short to show how long the errors remember.
     """
 
     dynamics: Dynamics
@@ -104,7 +103,7 @@ class FreeRunObjective:
         return theta, c, w
 
     def fly(self, p: Vector, start: Start) -> Flown:
-        """A trial at p. The states follow p to first order; where that does not lower the misfit, they stay."""
+        """A trial at p. The states follow p to first order. Where that does not lower the misfit, they stay."""
         theta, c, w = self.place(p)
         following = start.at(np.concatenate([c, w])) if self.initial.free else None
         trials = []
@@ -124,12 +123,12 @@ class FreeRunObjective:
             loss += float(miss @ miss) / self.task.rms**2
         return Flown(p, theta, c, w, states, errors, misfit, loss)
 
-    def linearise(self, flown: Flown) -> Linear:
+    def linearise(self, flown: Flown) -> LinearisedFreeRun:
         """Normal equations about a trial, with its states at their best."""
         numbers, states = self.numbers(flown.c, flown.w), jnp.asarray(flown.states)
-        found = sensitivity(self.dynamics, numbers, self.segments, states, jnp.asarray(self.weight))
+        slopes = sensitivity(self.dynamics, numbers, self.segments, states, jnp.asarray(self.weight))
         start_rows = self.dynamics.start_rows(self.weight)
-        information, gradient, offset, slope = self.initial.eliminate(found, flown.states, start_rows)
+        information, gradient, offset, slope = self.initial.eliminate(slopes, flown.states, start_rows)
         start = Start(flown.states, flown.misfit, np.concatenate([flown.c, flown.w]), offset, slope)
         hessian = information
         rows, rms = self.elimination.rows, self.task.rms
@@ -140,7 +139,7 @@ class FreeRunObjective:
             by_rows = np.column_stack([rows.theta, rows.learner @ self.task.share_slope(flown.w)]) / rms
             miss = (rows.target - rows.theta @ flown.theta - rows.learner @ self.task.share_of(flown.w)) / rms
             hessian, gradient = hessian + by_rows.T @ by_rows, gradient + by_rows.T @ miss
-        return Linear(hessian, gradient, information, start)
+        return LinearisedFreeRun(hessian, gradient, information, start)
 
     def errors(self, c: Vector, w: Vector, states: Any, segments: Segments) -> Float[np.ndarray, "k T ny m"]:
         """Errors of every segment from its state, in the outputs' units; 0 where they are not scored."""

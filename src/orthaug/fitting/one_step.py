@@ -15,9 +15,9 @@ from orthaug._base.jax import Array, jax, jnp
 from orthaug._base.progress import RunTell, quiet
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.elimination import Elimination, Fixed, eliminate
-from orthaug.fitting.joint import JointCriterion, Physics
 from orthaug.fitting.learned import Learned
 from orthaug.fitting.normal_equations import Blocks, Hold, Normal, OneStep, Streamed, linearise
+from orthaug.fitting.paper_criterion import PaperCriterion, Physics
 from orthaug.fitting.solvers import compiled
 from orthaug.fitting.solvers.descent import IDENTITY
 from orthaug.fitting.status import Ending
@@ -44,8 +44,8 @@ class Share(NamedTuple):
 class OneStepTask:
     """A problem with its learner (None for physics alone), scaled for training.
 
-    `unit` (ny,) is the learner's output unit in the outputs' units; `rms` is the RMS of the baseline's whitened
-    residual, the unit of the criterion's rows, which are the engine's.
+    `unit` (ny,) is the learner's output unit in the outputs' units. `rms` is the RMS of the baseline's whitened
+    residual, the unit of the criterion's rows. The engine keeps these rows.
     """
 
     problem: Problem
@@ -86,11 +86,11 @@ class OneStepTask:
         structure: Structure | None = None,
         regularization: str | float = "none",
         progress: RunTell = quiet,
-    ) -> compiled.Run:
+    ) -> compiled.TrainingRun:
         """One run from the weights `w`; the arguments as in `estimate`, `structure` None for no penalty.
 
-        Bounds that reach into training (every structure but the orthogonal, F1) are met by an active set: what
-        stands at a bound is held there, and training goes on until the same entries stand there.
+        An active set meets bounds that reach into training (every structure but the orthogonal, F1). Entries at a
+        bound are held there, and training goes on until the same entries stand there.
         """
         structure = Orthogonal() if structure is None else structure
 
@@ -110,7 +110,7 @@ class OneStepTask:
         held = bool(elimination.hold(fixed)[0].any())
         return run._replace(seconds=seconds, iterations=iterations, held=held)
 
-    def coordinates(self, run: compiled.Run) -> Vector:
+    def coordinates(self, run: compiled.TrainingRun) -> Vector:
         """QᵀF (nθ,) in whitened outputs, at the end of a run."""
         return np.asarray(run.normal.overlap.values) * self.rms
 
@@ -123,7 +123,7 @@ class OneStepTask:
         fixed: Fixed,
         regularization: str | float,
         progress: RunTell,
-    ) -> compiled.Run:
+    ) -> compiled.TrainingRun:
         assert self.bound is not None, "physics alone is not trained one step ahead"
         matrix, target = elimination.hold(fixed)
         hold = Hold(jnp.asarray(matrix), jnp.asarray(target / self.rms))
@@ -135,18 +135,20 @@ class OneStepTask:
             what = "evidence regularization" if evidence else "training on rows that are not in memory"
             raise InputError(f"{what} needs the Gauss-Newton matrix of the levenberg-marquardt solver.")
         physics = Physics.of(self.problem, elimination, fixed, ridge, self.rms, solved=structure.projects)
-        joint = JointCriterion(self.bound, structure.projects)
+        joint = PaperCriterion(self.bound, structure.projects)
         end = solver.minimise(joint, w, self.rows, physics, progress=progress)
         normal = linearise(OneStep(self.bound), end.w, (self.rows, hold), self._nothing)
         coordinates = np.asarray(physics.start + physics.basis @ end.v) * self.rms
         coefficients = None if structure.projects else self.problem.projection.from_coordinates(coordinates)
         effective = float(compiled.effective_weights(normal, jnp.asarray(ridge)))
-        return compiled.Run(end.w, normal, ridge, effective, end.iterations, end.ending, end.seconds, coefficients)
+        return compiled.TrainingRun(
+            end.w, normal, ridge, effective, end.iterations, end.ending, end.seconds, coefficients
+        )
 
     def _least_squares(
         self, solver: Any, w: Any, hold: Hold, ridge: float, evidence: bool, progress: RunTell
-    ) -> compiled.Run:
-        """Levenberg-Marquardt: compiled whole where the rows are in memory, otherwise driven from here."""
+    ) -> compiled.TrainingRun:
+        """Levenberg-Marquardt: compiled whole where the rows are in memory, otherwise driven by the host."""
         assert self.bound is not None
         samples = self.problem.target.size - len(self.problem.baseline.names)
         options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "progress": progress}
@@ -157,12 +159,12 @@ class OneStepTask:
         first = objective.fly(np.asarray(w), self._nothing)
         first = objective.fly(np.asarray(w), first.normal.overlap)  # less what rounding left of J in the physics
         if np.isfinite(first.normal.hessian).all() and compiled.spanned(first.normal):
-            return compiled.Run(w, first.normal, ridge, 0.0, 0, Ending.SPANNED, 0.0)
+            return compiled.TrainingRun(w, first.normal, ridge, 0.0, 0, Ending.SPANNED, 0.0)
         late: dict[str, Any] = {"evidence_at_start": False}  # as the compiled loop has it
         end = solver.descend(objective, np.asarray(w), first.normal.overlap, damping=IDENTITY, **late, **options)
         normal: Normal = end.flown.normal
         weights = jnp.asarray(end.flown.p)
-        return compiled.Run(weights, normal, end.ridge, end.effective, end.iterations, end.ending, end.seconds)
+        return compiled.TrainingRun(weights, normal, end.ridge, end.effective, end.iterations, end.ending, end.seconds)
 
     @property
     def _nothing(self) -> Overlap:
@@ -170,7 +172,7 @@ class OneStepTask:
         nt, size = len(self.problem.baseline.names), self.bound.size if self.bound else 0
         return Overlap(jnp.zeros((nt, size)), jnp.zeros(nt))
 
-    def loss(self, run: compiled.Run) -> float:
+    def loss(self, run: compiled.TrainingRun) -> float:
         """Mean of squared errors of a run, with each output in its standard deviation."""
         return self.mean_square(run.normal.loss)
 
@@ -178,7 +180,7 @@ class OneStepTask:
         """The criterion's `‖r‖²` as the mean of squared errors with each output in its standard deviation."""
         return float(loss) * self.rms**2 / self.problem.target.size
 
-    def learned(self, run: compiled.Run) -> Learned:
+    def learned(self, run: compiled.TrainingRun) -> Learned:
         """What a run left."""
         return Learned(
             bound=self.bound,
@@ -211,8 +213,8 @@ class OneStepTask:
     def median(self, members: list[Learned], best: int) -> Learned:
         """The median of several: `g = φ c̄ + median_i(f_i + φ (c_i − c̄))`, each with its own c_i (F2).
 
-        It is again one function of the regressor, split like any other. Statistics that a median has none of its own
-        of are those of the `best` member.
+        The median is one function of the regressor again, and split like any other. It lacks some statistics: those
+        are taken from the `best` member.
         """
         factor, least_squares = self.problem.projection, self.problem.least_squares
         coefficients = []
@@ -283,8 +285,8 @@ class OneStepTask:
             learned.tilt @ self.problem.projection.to_coordinates.T / self.rms
         )
 
-    def gram(self, run: compiled.Run) -> Matrix:
-        """Gram matrix of `[Φ J]` in whitened outputs, from the run's last pass; a held run's has rows of its own."""
+    def gram(self, run: compiled.TrainingRun) -> Matrix:
+        """Gram matrix of `[Φ J]` in whitened outputs, from the run's last pass; of a held run without the hold."""
         normal = run.normal
         if run.held:
             nt = len(normal.overlap.values)
@@ -324,12 +326,12 @@ def _values(bound: Bound | None, chunk: Chunk, w: Any, tilt: Any) -> Float[Array
     if bound is None:
         return jnp.zeros_like(chunk.e)
 
-    def one(w: Any) -> Any:
+    def member_values(w: Any) -> Any:
         return chunk.gain * jax.vmap(lambda z: bound.values(w, z), in_axes=-1, out_axes=-1)(chunk.z)
 
     if tilt is None:
-        return one(w)
-    return jnp.median(jax.vmap(one)(w) + jnp.einsum("otm,it->iom", chunk.q, tilt), axis=0)
+        return member_values(w)
+    return jnp.median(jax.vmap(member_values)(w) + jnp.einsum("otm,it->iom", chunk.q, tilt), axis=0)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What restarts, solver, criterion and regularization demand of each other, for `estimate` and for the spec."""
+"""Rules between restarts, solver, criterion, regularization and data, for `estimate` and for the spec."""
 
 from __future__ import annotations
 
@@ -18,6 +18,26 @@ def check_starts(restarts: int, seed: int, *, ensemble: bool) -> None:
     if ensemble and restarts < 2:
         words = f": found {restarts}; expected 2 or more for an ensemble"
         raise KeyedError("an ensemble needs `restarts` of 2 or more to be the median of.", "restarts", words)
+
+
+def check_scored(criterion: Criterion, longest: int) -> None:
+    """Raise InputError where nothing is scored: the longest experiment ends within the washout.
+
+    Args:
+        longest: usable rows of the longest experiment.
+    """
+    flown = criterion.flown
+    if flown is None or flown.washout < longest:
+        return
+    text = (
+        f"nothing is scored: the longest experiment has {longest} usable rows, and the first "
+        f"{flown.washout} of a segment are washout; shorten it, or the horizon."
+    )
+    if criterion.simulates:
+        rows = f"the {longest} usable rows of the longest experiment, or nothing is scored"
+        raise KeyedError(text, "washout", f": found {flown.washout}; expected less than {rows}")
+    rows = f"the longest experiment has {longest} usable rows"
+    raise KeyedError(text, "horizon", f": found {flown.segment}; {rows}")
 
 
 def check_solver(solver: Solver, criterion: Criterion, regularizations: Sequence[object]) -> None:

@@ -1,7 +1,7 @@
 """Free runs over segments, with their sensitivities.
 
-A segment starts from a state and then lives on its own outputs; its first steps, the washout, are not scored. One scan
-carries states, sensitivities and the Gram matrix of `[S r]` together, so that nothing of size N × nw ever exists.
+A segment starts from a state and then lives on its own outputs. Its first steps, the washout, are not scored. One scan
+carries states, sensitivities and the Gram matrix of `[S r]`, so that nothing of size N × nw ever exists.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _CHUNK = 256  # segments that run side by side
 
 
 class Segments(NamedTuple):
-    """Segments of T steps in chunks of m, the segment as the last axis; steps that are not scored may be padding."""
+    """Segments of T steps in chunks of m; the last axis counts segments. Steps that are not scored may be padding."""
 
     start: Float[Any, "k n0 m"]
     """The state before the first step, as it was measured."""
@@ -41,9 +41,10 @@ class Segments(NamedTuple):
 
 
 def lay_segments(record: Record, dynamics: Dynamics, segment: int, washout: int) -> Segments:
-    """Segments of `segment` steps, 0 for whole experiments; each begins where the washout of the one before it ends.
+    """Segments of `segment` steps; 0 for whole experiments.
 
-    So every usable row is scored once, except the first `washout` of each experiment.
+    The scored steps of a segment begin where those of the segment before it end. So every usable row is scored once,
+    except the first `washout` of each experiment.
     """
     usable = [len(experiment) - dynamics.first_row for experiment in record.experiments]
     steps = min(segment, max(usable)) if segment else max(usable)
@@ -65,7 +66,7 @@ def lay_segments(record: Record, dynamics: Dynamics, segment: int, washout: int)
 
 
 def _segment(experiment: Experiment, inputs: Any, begin: int, steps: int, washout: int, dynamics: Dynamics) -> Segments:
-    """One segment, its end repeated where the experiment is shorter."""
+    """One segment. Where the experiment is shorter, its end is repeated."""
     rows = np.arange(begin, begin + steps)
     there = np.minimum(rows, len(inputs) - 1)
     first = dynamics.first_row + begin
@@ -79,22 +80,22 @@ def respond(
     dynamics: Dynamics, numbers: Numbers, segments: Segments, states: Float[Array, "k n0 m"]
 ) -> Float[Array, "k T ny m"]:
     """Outputs of every segment from its state."""
-    one = jax.vmap(partial(dynamics.step, numbers), in_axes=-1, out_axes=-1)
+    side_by_side = jax.vmap(partial(dynamics.step, numbers), in_axes=-1, out_axes=-1)
 
     def step(state: Any, inputs: Any) -> tuple[Any, Any]:
-        state, parts = one(state, inputs)
+        state, parts = side_by_side(state, inputs)
         return state, parts.total
 
     return jax.lax.map(lambda chunk: jax.lax.scan(step, *chunk)[1], (states, segments.inputs))
 
 
 class Sensitivity(NamedTuple):
-    """Gram matrices over the scored steps; columns are the start's entries (n0), then c and w (n), then the error."""
+    """Gram matrices over the scored steps. Columns: the entries of the start (n0), then c and w (n), then the error."""
 
     shared: Float[Array, "n+1 n+1"]
     """Of `[S_c S_w r]`, over all segments."""
     own: Float[Array, "k n0 n0+n+1 m"]
-    """Of the start's sensitivities with all columns, of every segment by itself."""
+    """Of the columns of the start with all columns, for every segment by itself."""
 
 
 @partial(jax.jit, static_argnames="dynamics")
@@ -115,8 +116,8 @@ def sensitivity(
         state, slopes, value, slope = dynamics.tangents(numbers, state, slopes, inputs)
         columns = jnp.where(scored, jnp.concatenate([slope, (target - value)[:, None]], axis=1), 0.0)
         columns = jnp.einsum("oi,inm->onm", weight, columns) if ny > 1 else weight[0, 0] * columns
-        shared = shared + sum(gram(one[n0:]) for one in columns)
-        own = own + sum(one[:n0, None] * one[None] for one in columns)
+        shared = shared + sum(gram(output[n0:]) for output in columns)
+        own = own + sum(output[:n0, None] * output[None] for output in columns)
         return (state, slopes, shared, own), None
 
     def one_chunk(total: Any, chunk: tuple[Any, ...]) -> tuple[Any, Any]:

@@ -2,8 +2,8 @@
 
 Every structure spans the same functions. It decides two things only: which rows join the criterion, and
 which part of `c = θ − θ_aux` is called θ afterwards. The rows are linear in θ and in the learner's
-coordinates `QᵀF`, so θ can always be eliminated, and what training sees of a structure, its penalty or
-its bounds is one small quadratic in `QᵀF` (`fitting.elimination`).
+coordinates `QᵀF`, so θ can always be eliminated. Training sees a structure, its penalty and its bounds as
+one small quadratic in `QᵀF` (`fitting.elimination`).
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Structure(Protocol):
         ...
 
     def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> PenaltyRows:
-        """The rows that join the criterion, given θ⁰ (nθ,) and the output's unit in whitened outputs."""
+        """The rows that join the criterion, from θ⁰ (nθ,) and the output's unit in whitened outputs."""
         ...
 
 
@@ -65,8 +65,8 @@ def _no_rows(nt: int) -> PenaltyRows:
 class Orthogonal:
     """ŷ = φ(θ − θ_aux) + f with θ_aux = Φ_μ⁺F_μ (eq:orth_param).
 
-    Under the training measure θ̂ = Φ⁺Y for every learner (F1); under another `measure` training is the same, and the
-    fitted function is split over the measure's points at the end (F2).
+    Under the training measure θ̂ = Φ⁺Y for every learner (F1). Under another `measure` training is the same; at the end
+    the fitted function is split over the measure's points (F2).
     """
 
     projects = True

@@ -18,7 +18,7 @@ from orthaug.physics.projection import Factor
 
 
 def degrees_of_freedom(rows: int, physics: Vector, effective: float) -> Vector:
-    """Rows of each output less what the fit has used up of them, (ny,).
+    """Degrees of freedom of each output (ny,): its rows less what the fit has used up.
 
     The physics uses `Σ_k ‖Q_ki‖²` of output i (its share of nθ), the learner its effective weights.
     """
@@ -63,7 +63,7 @@ def theta_block(information: Matrix, ridge: float, nt: int, fixed: Collection[in
     """Cov θ̂ (nθ, nθ) per unit of noise variance, from the information `[S_θ S_w]ᵀ[S_θ S_w]` of θ and weights.
 
     The weights are eliminated: `(H_θθ − H_θw (H_ww + αI)⁺ H_wθ)⁻¹`. Directions of the weights that the data do not see
-    count as absent. NaN for entries at a bound (`fixed`), and for all where θ is not determined beside the weights.
+    count as absent. Entries at a bound (`fixed`) are NaN. All are NaN where θ is not determined beside the weights.
     """
     free = [i for i in range(nt) if i not in fixed]
     covariance = np.full((nt, nt), np.nan)
@@ -78,8 +78,8 @@ def theta_block(information: Matrix, ridge: float, nt: int, fixed: Collection[in
     remaining = scaled[np.ix_(free, free)] - (across / values[kept]) @ across.T
     values, vectors = np.linalg.eigh(remaining)
     if free and values.min() > len(information) * np.finfo(float).eps:
-        found = (vectors / values) @ vectors.T
-        covariance[np.ix_(free, free)] = found * np.outer(unit[free], unit[free])
+        inverse = (vectors / values) @ vectors.T
+        covariance[np.ix_(free, free)] = inverse * np.outer(unit[free], unit[free])
     return covariance
 
 

@@ -1,7 +1,7 @@
 """Covariances beyond θ: of θ and weights together, of predictions, and robust to coloured or uneven noise.
 
-`Cov p̂ = M⁻¹ (ΣψᵀΣ_eψ) M⁻¹`, `M = Σψᵀψ` (Ljung 1999, ch. 9). The paper's eq:cov_approx has a factor 2 in the middle; for
-plain least squares it gives twice `σ²(ΦᵀΦ)⁻¹`. Learner weights are over-parametrised: their block is singular, and only
+`Cov p̂ = M⁻¹ (ΣψᵀΣ_eψ) M⁻¹`, `M = Σψᵀψ` (Ljung 1999, ch. 9). The paper's eq:cov_approx has a factor 2 in the middle: for
+plain least squares it gives twice `σ²(ΦᵀΦ)⁻¹`. Learner weights are over-parametrised, so their block is singular. Only
 functions of the model have intervals.
 """
 
@@ -32,8 +32,8 @@ CONVENTIONS = ("calibrated", "paper")
 def joint_covariance(problem: Problem, model: Model, convention: str = "calibrated") -> Matrix:
     """Cov of θ̂ and the learner's weights in the orthogonal structure, from the raw `[Φ J̃]`, J̃ = P⊥J; (nθ + nw)².
 
-    Under the training measure its blocks between θ and weights are zero (`thm:zero_cov`) where the noise is the same in
-    all outputs, or the outputs share no θ. One pass over the rows.
+    Under the training measure the blocks between θ and weights are zero (`thm:zero_cov`), if all outputs have the same
+    noise or share no θ. One pass over the rows.
 
     Args:
         convention: "paper" for eq:cov_approx divided by N, factor 2 and `Σ̂ = (1/N) Σ e eᵀ` included.
@@ -56,7 +56,7 @@ def joint_covariance(problem: Problem, model: Model, convention: str = "calibrat
     outer, middle = (projected_gram(engine, bound, w, rows, jnp.asarray(m)) for m in (np.eye(ny), mixing(whitened)))
     change = np.eye(len(outer))
     change[:nt, :nt] = projection.r / projection.scale
-    outer, middle = (change.T @ found @ change for found in (outer, middle))
+    outer, middle = (change.T @ gram @ change for gram in (outer, middle))
     half = half_inverse(outer, nt)
     return (2.0 if convention == "paper" else 1.0) * half @ (half.T @ middle @ half) @ half.T
 
@@ -76,7 +76,7 @@ def prediction_std(model: Model, record: Record) -> list[Matrix]:
         )
     root = jnp.asarray(joint.root())
     record = model.fitting(record, need_outputs=True)
-    found = []
+    deviations = []
     for experiment in record.experiments:
         x = model.form.regressors(experiment, record)
         shape = chunk_shape(len(x))
@@ -84,8 +84,8 @@ def prediction_std(model: Model, record: Record) -> list[Matrix]:
         variance = np.asarray(_variances(model.form, model.numbers, chunks, root))
         values = np.full((len(experiment), len(model.outputs)), np.nan)
         values[model.form.first_row :] = np.sqrt(np.maximum(from_chunks(variance, len(x)), 0.0))
-        found.append(values)
-    return found
+        deviations.append(values)
+    return deviations
 
 
 @partial(jax.jit, static_argnames="form")
@@ -114,13 +114,13 @@ def newey_west(scores: Sequence[Float[np.ndarray, "N nt"]], lags: int | None = N
     """
     if lags is not None:
         check_count(lags, "lags", least=0)
-    total = sum(len(s) for s in scores)
-    reach = int(4 * (total / 100) ** (2 / 9)) if lags is None else lags
-    found = sum(s.T @ s for s in scores)
+    rows = sum(len(s) for s in scores)
+    reach = int(4 * (rows / 100) ** (2 / 9)) if lags is None else lags
+    total = sum(s.T @ s for s in scores)
     for lag in range(1, reach + 1):
         share = sum(s[lag:].T @ s[:-lag] for s in scores if len(s) > lag)
-        found = found + (1 - lag / (reach + 1)) * (share + np.transpose(share))
-    return np.asarray(found)
+        total = total + (1 - lag / (reach + 1)) * (share + np.transpose(share))
+    return np.asarray(total)
 
 
 def robust_covariance(problem: Problem, residual: Matrix, used: float, lags: int | None = None) -> Matrix:

@@ -1,4 +1,4 @@
-"""Measures that stand in files: what a spec or the command line declares, made into `Samples` and `Weighted`."""
+"""Measures from files: declarations of a spec or the command line that become `Samples` and `Weighted`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Range = tuple[Row, Row]
 
 @dataclass(frozen=True, eq=False)
 class MeasurePlace:
-    """Where a measure is declared: the folder of its files, the model's raw lags, and the training data.
+    """What a declared measure is resolved with: the folder of its files, the model's raw lags, the training data.
 
     `start` is the first usable row of each experiment.
     """
@@ -57,7 +57,7 @@ class SampleFiles:
 
 @dataclass(frozen=True)
 class WeightFiles:
-    """Declares `Weighted`: files with a column `weight`, together a row for each row of the training data, in order.
+    """Declares `Weighted`: files with a column `weight`. Together they have a row for each row of the training data.
 
     Rows before the first usable one have weights too, which are not used.
     """

@@ -1,7 +1,8 @@
 """Measures: the points, with weights, on which physics and learner are made orthogonal (F3).
 
 θ under a measure is `Φ_μ⁺ G_μ`, the least-squares share of the fitted function g in the physics over those points. The
-paper takes the training set; what is orthogonal to the physics under one measure need not be so under another.
+paper takes the training set. A function that is orthogonal to the physics under one measure need not be so under
+another.
 """
 
 from __future__ import annotations
@@ -53,8 +54,8 @@ class Support:
     def share(self, points: Points) -> float:
         """The measure's weight within reach of the training data.
 
-        A point is within reach if a training point lies no farther from it than twice the distance that 99 % of the
-        training points keep from their nearest neighbour; each used lag is divided by the range of its data.
+        A point is within reach if its nearest training point is closer than a limit: twice the distance from a training
+        point to its nearest neighbour, at the 99 % quantile. Each used lag counts in units of the range of its data.
         """
         columns = [j for j, lag in enumerate(self.layout) if lag in self.used]
         x = self.x[:, columns]
@@ -91,7 +92,7 @@ def _even(x: Matrix) -> Points:
 
 @dataclass(frozen=True)
 class Training:
-    """The training rows, each with the same weight: the paper's measure. `rows` (start, stop) takes a part of each."""
+    """The training rows with equal weights: the paper's measure. `rows` (start, stop) of each experiment."""
 
     rows: tuple[int, int] | None = field(default=None, metadata=LIBRARY_ONLY)
     name: str = field(default="training", metadata=LIBRARY_ONLY)
@@ -113,7 +114,7 @@ class Training:
 
 @dataclass(frozen=True)
 class Symmetrized:
-    """The training rows and their mirror images −x: the paper's sign trick, done to the measure, not the experiment."""
+    """The training rows and their mirror images −x: the paper's sign trick without a new experiment."""
 
     name: str = field(default="symmetrized", metadata=LIBRARY_ONLY)
 

@@ -1,7 +1,7 @@
 """Physical parameters p̂ from θ̂, with their statistics: the inverse of θ = h(p).
 
-p̂ minimises ‖θ̂ − h(p)‖² under W = Cov(θ̂)⁻¹; with as many θ as p that solves θ̂ = h(p), with more θ the leftover
-tests the physics. Cov p̂ = (HᵀWH)⁻¹, H = dh/dp (delta method).
+p̂ minimises ‖θ̂ − h(p)‖² under W = Cov(θ̂)⁻¹. With as many θ as p it solves θ̂ = h(p); with more θ the rest tests the
+physics. Cov p̂ = (HᵀWH)⁻¹, H = dh/dp (delta method).
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class _Fit:
     def descend(self, p: Vector) -> tuple[float, Vector]:
         """Cost and p of the minimum that Levenberg-Marquardt finds from p; cost inf where θ has no value at p.
 
-        Every step solves its linear problem within the bounds exactly, so that p ends on a bound or off it, not near.
+        Every step solves its linear problem within the bounds exactly: p ends on a bound or away from it.
         """
         free = list(self.free)
         low, high = (bound[free] for bound in self.physics.bounds)
@@ -122,12 +122,12 @@ class _Fit:
         return cost, p
 
     def solutions(self, starts: int) -> list[Vector]:
-        """The best p, first, and others that explain θ̂ as well, from p⁰ and `starts` points about it."""
+        """The best p first, then others that explain θ̂ as well; from p⁰ and `starts` points about it."""
         points = (self.physics.initial, *self.physics.around(starts, 4.0))
-        found = [self.descend(p) for p in points]
-        least = min(cost for cost, _ in found)
+        minima = [self.descend(p) for p in points]
+        least = min(cost for cost, _ in minima)
         distinct: list[Vector] = []
-        for cost, p in found:
+        for cost, p in minima:
             near = [np.all(np.abs(p - q) <= 1e-3 * np.maximum(np.abs(q), 1e-3 * self.physics.size)) for q in distinct]
             if cost <= least * (1 + 1e-9) + _SOLVED[self.known] and not any(near):
                 distinct.append(p)
@@ -181,16 +181,18 @@ def solve(
     held = _held(physics, value, jacobian.T @ residual)
     chi2, df = float(residual @ residual), len(residual) - int(np.sum(~held))
     outside = df == 0 and chi2 > _SOLVED[fit.known]
-    found = excitation(
+    sensitivity = excitation(
         jacobian[:, ~held], [name for name, at_bound in zip(physics.names, held, strict=True) if not at_bound]
     )
-    spread, sensitivities = _linear(fit, value, jacobian, held) if found.full_rank and not outside else (None, None)
+    spread, sensitivities = (
+        _linear(fit, value, jacobian, held) if sensitivity.full_rank and not outside else (None, None)
+    )
     consistency = _consistency(chi2, df, freedom, bool(held.any())) if fit.known and df > 0 else None
     warnings = [*_at_bounds(physics, value, held), *_elsewhere(physics, others)]
     if outside:
         warnings.append(_outside(fit, value))
-    elif not found.full_rank:
-        told = f"At the solution {tied(found)}; the physical parameters have no standard errors."
+    elif not sensitivity.full_rank:
+        told = f"At the solution {tied(sensitivity)}; the physical parameters have no standard errors."
         warnings.append(Warning("physical_parameters_tied", told))
     if not fit.known:
         told = "theta has no finite covariance, so the physical parameters have no standard errors."
@@ -240,7 +242,7 @@ def _check_freedom(freedom: float) -> None:
 
 
 def _consistency(chi2: float, df: int, freedom: float, held: bool) -> Consistency:
-    """The noise variance is estimated itself, so χ²/df is compared with F(df, freedom), for inf with χ²."""
+    """χ²/df is compared with F(df, freedom), as the noise variance is estimated itself; χ² itself where it is known."""
     p = scipy.special.chdtrc(df, chi2) if math.isinf(freedom) else scipy.special.fdtrc(df, freedom, chi2 / df)
     verb = "contradict" if p < CONTRADICTION else "agree with"
     what = ("constraint" if df == 1 else f"{df} constraints") + (", bounds included" if held else "")
@@ -287,8 +289,8 @@ def profile(
 ) -> tuple[float, float]:
     """Profile-likelihood interval of one physical parameter: {pᵢ : min over the others χ² ≤ least χ² + F(1, freedom)}.
 
-    Unlike p̂ ± reach·std it is asymmetric where h bends, and ends at the parameter's bounds; a side on which the
-    data set no limit is ±inf.
+    Unlike p̂ ± reach·std it is asymmetric where h bends, and it ends at the parameter's bounds. A side without a limit
+    from the data is ±inf.
 
     Raises:
         InputError: as for `solve`, an unknown name, a level outside (0, 1), or no covariance.
@@ -308,7 +310,7 @@ def profile(
     least, limit = float(residual @ residual), scipy.special.stdtrit(freedom, 0.5 + level / 2) ** 2
     path = [best]  # the others' last minimum is the next start
 
-    @cache  # a bracket's end keeps its sign whatever the path has found since
+    @cache  # a bracket's end keeps its sign, however far the path has come since
     def excess(value: float) -> float:
         p = path[-1].copy()
         p[i] = value

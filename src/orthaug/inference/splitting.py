@@ -1,7 +1,7 @@
 """θ of a fitted function under any measure, with its uncertainty: `θ_μ = c + Φ_μ⁺F_μ`, without training again (F2).
 
-With `Cov(c, w)` from training, `Cov θ_μ = K Cov(c, w) Kᵀ`, `K = [I, Φ_μ⁺J_μ]`: under another measure θ depends on the
-learner, and shares its variance.
+With `Cov(c, w)` from training, `Cov θ_μ = K Cov(c, w) Kᵀ` with `K = [I, Φ_μ⁺J_μ]`. Under another measure θ depends on
+the learner, and shares its variance.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def split_under(measure: Measure, model: Model, support: Support, joint: JointCo
     """Split a model under a measure.
 
     Args:
-        model: any, however it was trained: with c = θ − θ_aux its prediction stays what it is.
+        model: any, however it was trained. Its c = θ − θ_aux and its prediction stay what they are.
         support: the training data.
         joint: Cov(c, w) from training; None for no intervals.
 

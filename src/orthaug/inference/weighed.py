@@ -1,4 +1,4 @@
-"""The physics over a measure's points, weighted and factorised: what splits, suspects and checks of a measure share."""
+"""The physics over a measure's points, weighted and factorised. Splits, suspects and checks of a measure share it."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def weigh_model(measure: Measure, support: Support, form: Lagged, weight: Vector
 
 
 def weigh_problem(measure: Measure, problem: Problem) -> Weighed:
-    """The same for a posed problem; under the training measure its own factor, not another one."""
+    """The same for a posed problem. Under the training measure it takes the factor that the problem has."""
     if measure != Training():
         return weigh(measure, support_of(problem), problem.baseline, problem.outputs, problem.weight)
     rows, own = len(problem.rows), problem.projection

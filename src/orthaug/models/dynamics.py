@@ -1,6 +1,7 @@
-"""A model as a state and a step: what a free run, its training and its stability need to know, and no more.
+"""A model as a state and a step: `x_{k+1}, ŷ_k = step(numbers, x_k, u_k)`.
 
-`x_{k+1}, ŷ_k = step(numbers, x_k, u_k)`. The lagged form (`models.lagged`) is the case whose state is the past outputs.
+A free run, its training and its stability need no more. The lagged form (`models.lagged`) is the case whose state is
+the past outputs.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ class Numbers(NamedTuple):
     gain: Float[AnyArray, "ny"]
     """Unit of the learner's output, in the outputs' units."""
     tilt: Any = None
-    """(members, nθ) where the learner is the median of several, one row of weights each: the physics each one adds."""
+    """(members, nθ) of an ensemble: the physics that each member adds. `weights` has a row for each; None otherwise."""
 
 
 class Parts(NamedTuple):
@@ -87,11 +88,11 @@ class Dynamics(Protocol):
         ...
 
     def start(self, outputs: Matrix, rows: Any) -> Float[np.ndarray, "r n0"]:
-        """The states at some rows, as the outputs (N, ny) measured before each of them give it."""
+        """The states at some rows, made of the outputs (N, ny) that were measured before each of them."""
         ...
 
     def start_rows(self, weight: Matrix) -> Matrix:
-        """L (n0, n0): `‖L (x − start)‖²` is what a state x costs that differs from the measured one.
+        """L (n0, n0): a state x that differs from the measured one costs `‖L (x − start)‖²`.
 
         `weight` (ny, ny) multiplies the errors of an output. Zero rows leave an entry free.
         """
@@ -122,9 +123,9 @@ class Dynamics(Protocol):
         ...
 
     def tangents(self, numbers: Numbers, state: Any, slopes: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
-        """A step of m runs side by side with its derivatives: (state, slopes, ŷ (ny, m), ∂ŷ/∂(start, c, w)).
+        """A step of m runs side by side with its derivatives: (state, slopes, ŷ, ∂ŷ/∂(start, c, w)).
 
-        The last one is (ny, n0 + n, m), `state` (n0, m), `inputs` (nu, m), `slopes` as `first_slopes` lays them out.
+        Shapes: `state` (n0, m), `inputs` (nu, m), ŷ (ny, m), ∂ŷ (ny, n0 + n, m); `slopes` as in `first_slopes`.
         """
         ...
 

@@ -79,7 +79,7 @@ class Lagged:
         return outputs[before].reshape(len(before), self.states)
 
     def start_rows(self, weight: Matrix) -> Matrix:
-        """Every past output was measured with the errors of all others."""
+        """A past output has the same errors as all others."""
         return np.kron(np.eye(self.memory), weight)
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
@@ -118,8 +118,8 @@ class Lagged:
         return Parts(known + phi @ numbers.theta, raw - phi @ numbers.theta_aux, raw)
 
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
-        found = self.at(numbers, self.regressor(state, inputs))
-        return self._push(state, found.total), found
+        parts = self.at(numbers, self.regressor(state, inputs))
+        return self._push(state, parts.total), parts
 
     def _push(self, state: Any, y: Any) -> Any:
         """The state (n0, …) one step later, when y (ny, …) is the newest output."""

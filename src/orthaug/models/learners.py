@@ -1,8 +1,8 @@
 """Learners: the trainable correction f(z; w) of scaled features z (nz,), giving (ny,) values.
 
 A learner is a frozen declaration with `init` and `apply` on a pytree of weights. `Bound` fixes the
-numbers of features and outputs; from there on the weights are one flat vector w, and its methods are
-the only place that knows the tree.
+numbers of features and outputs. From there on the weights are one flat vector w; only the methods of
+`Bound` know the tree.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ ACTIVATIONS: dict[str, Callable[[Any], Any]] = {
     "softplus": lambda a: jax.nn.softplus(a),
     "identity": lambda a: a,
 }
-"""By name; functions of an array that call JAX when they are called, so that a spec is read without it."""
+"""By name. They call JAX only when they are called, so that a spec is read without it."""
 _GAIN = {"tanh": 5 / 3, "relu": math.sqrt(2.0)}  # Xavier gains; 1 for the others
 
 
@@ -63,7 +63,7 @@ class Learner(Protocol):
 class MLP:
     """Fully connected feedforward network with a linear output layer.
 
-    Initialised with the Xavier method as in the paper's Sect. 5.1: weights uniform on (-a, a) with
+    Initialised as in Sect. 5.1 of the paper (Xavier): weights uniform on (-a, a) with
     `a = gain √(6 / (fan_in + fan_out))`, biases zero.
 
     Args:
@@ -205,7 +205,7 @@ class External:
 
 @dataclass(frozen=True, eq=False)
 class Scaling:
-    """Affine map of each feature onto [-1, 1] over the training data: `(z - centre) / halfwidth`."""
+    """Affine map of each feature: `(z - centre) / halfwidth` lies in [-1, 1] over the training data."""
 
     centre: Float[np.ndarray, "nz"]
     halfwidth: Float[np.ndarray, "nz"]
@@ -288,8 +288,8 @@ class Bound:
     ) -> tuple[Float[Array, "ny m"], Float[Array, "nw ny m"]]:
         """`gain·f` and `gain·∂f/∂w` for a batch of rows.
 
-        Reverse mode per row, one pass per output, with the batch as the *last* axis: every entry of the
-        Jacobian is then a contiguous run over rows, which is 2.5 times faster here than rows first.
+        Reverse mode per row, one pass per output. The batch is the *last* axis: every entry of the Jacobian is
+        then contiguous over rows, which is 2.5 times faster here than rows first.
         """
 
         def one_row(leaves: list[Any], z_row: Any, gain_row: Any) -> tuple[Any, list[Any]]:

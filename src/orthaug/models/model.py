@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Matrix, Vector, as_signal
+from orthaug._base.checks import Matrix, Vector, as_signal, check_count
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, jnp, padded_length
 from orthaug.data.record import Channel, Experiment, Record, same_step
@@ -18,9 +18,6 @@ from orthaug.models.dynamics import Dynamics, Numbers, Parts
 from orthaug.models.lagged import Lagged
 from orthaug.models.response import Response, Trajectory
 from orthaug.models.statistics import Statistics
-
-if TYPE_CHECKING:
-    pass
 
 RUNAWAY = 1e6  # times the largest training output: a free run beyond this has diverged
 _BATCH = 4096  # rows per compiled call; records of any length share the program
@@ -43,10 +40,10 @@ def _ahead(
     form: Dynamics, numbers: Numbers, states: Float[Array, "m n0"], inputs: Float[Array, "m T nu"], horizon: Any
 ) -> Parts:
     """The last of `horizon` free-run steps from each of m starts."""
-    one = jax.vmap(lambda state, row: form.step(numbers, state, row))
+    side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row))
 
     def step(i: Any, carry: tuple[Any, Parts]) -> tuple[Any, Parts]:
-        return one(carry[0], inputs[:, i])
+        return side_by_side(carry[0], inputs[:, i])
 
     nothing = jnp.zeros((states.shape[0], len(form.outputs)))
     return jax.lax.fori_loop(0, horizon, step, (states, Parts(nothing, nothing, nothing)))[1]
@@ -56,8 +53,8 @@ def _ahead(
 class Model:
     """A fitted model; `estimate` makes it, `orthaug.save` and `orthaug.load` keep it.
 
-    `weight` (ny,) is one over each output's deviation; outputs times it are whitened. With its `statistics` every
-    function of the model has an interval.
+    `weight` (ny,) is one over each output's deviation: it whitens outputs. From the `statistics` every function of the
+    model has an interval.
     """
 
     form: Lagged
@@ -100,19 +97,18 @@ class Model:
         Raises:
             InputError: a record without outputs, other channels, a horizon below 1, too few rows.
         """
-        if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1:
-            raise InputError(f"`horizon` must be a whole number of steps, 1 or more; got {horizon}.")
+        horizon = check_count(horizon, "horizon", of="steps")
         record = self.fitting(record, need_outputs=True)
         trajectories = []
         for experiment in record.experiments:
             first = self.form.first_row + horizon - 1
             self.check_rows(experiment, first)
             if horizon == 1 or not self.form.states:
-                found = self._predict_rows(self.form.regressors(experiment, record, first))
+                parts = self._predict_rows(self.form.regressors(experiment, record, first))
             else:
-                found = self._predict_ahead(experiment, record, int(horizon))
-            trajectories.append(_trajectory(found, experiment, experiment.outputs, first))
-        return Response(tuple(trajectories), int(horizon), self.outputs, record.sampling_time)
+                parts = self._predict_ahead(experiment, record, horizon)
+            trajectories.append(_trajectory(parts, experiment, experiment.outputs, first))
+        return Response(tuple(trajectories), horizon, self.outputs, record.sampling_time)
 
     def simulate(self, record: Record, initial: str | Any = "measured") -> Response:
         """Free run: the outputs' past is the model's own, from the first usable row on.
@@ -130,8 +126,8 @@ class Model:
         for experiment in record.experiments:
             self.check_rows(experiment, self.form.first_row)
             measured = experiment.outputs if record.outputs else None
-            found = self._run(self._start(initial, measured), experiment, record)
-            trajectories.append(self._bounded(found, experiment, measured))
+            parts = self._run(self._start(initial, measured), experiment, record)
+            trajectories.append(self._bounded(parts, experiment, measured))
         return Response(tuple(trajectories), None, self.outputs, record.sampling_time)
 
     def check_initial(self, initial: Any) -> Matrix:
@@ -186,16 +182,16 @@ class Model:
             rows = self.check_initial(initial)[: self.form.first_row]
         return self.form.start(rows, [len(rows)])[0]
 
-    def _bounded(self, found: Parts, experiment: Experiment, measured: Matrix | None) -> Trajectory:
+    def _bounded(self, parts: Parts, experiment: Experiment, measured: Matrix | None) -> Trajectory:
         """A free run cut where it left all bounds."""
-        trajectory = _trajectory(found, experiment, measured, self.form.first_row)
+        trajectory = _trajectory(parts, experiment, measured, self.form.first_row)
         with np.errstate(all="ignore"):
             wild = ~(np.abs(trajectory.model[self.form.first_row :]) <= RUNAWAY * self.largest_output)
         if not wild.any():
             return trajectory
         step = int(np.argmax(wild.any(axis=1)))
         output = self.outputs[int(np.argmax(wild[step]))].name
-        cut = Parts(*(np.where(np.arange(len(part))[:, None] < step, part, np.nan) for part in found))
+        cut = Parts(*(np.where(np.arange(len(part))[:, None] < step, part, np.nan) for part in parts))
         bounded = _trajectory(cut, experiment, measured, self.form.first_row)
         return replace(bounded, diverged=(step + self.form.first_row, output))
 
@@ -222,8 +218,8 @@ class Model:
         for kind, channels in wanted.items():
             missing = [c.name for c in channels if c.name not in names[kind]]
             if missing:
-                found = ", ".join(names[kind]) or "none"
-                raise InputError(f"the record lacks the {kind[:-1]} {', '.join(missing)} of the model; it has {found}.")
+                there = ", ".join(names[kind]) or "none"
+                raise InputError(f"the record lacks the {kind[:-1]} {', '.join(missing)} of the model; it has {there}.")
         order = {kind: [names[kind].index(c.name) for c in channels] for kind, channels in wanted.items()}
         experiments = tuple(
             replace(e, inputs=e.inputs[:, order["inputs"]], outputs=e.outputs[:, order["outputs"]])
@@ -241,17 +237,17 @@ def _in_batches(function: Callable[..., Parts], rows: tuple[np.ndarray, ...], la
         batch = [array[begin : begin + size] for array in rows]
         padding = size - len(batch[0])
         padded = [np.concatenate([b, np.repeat(b[-1:], padding, axis=0)]) if padding else b for b in batch]
-        found = function(*(jnp.asarray(b) for b in padded))
-        pieces.append([np.asarray(part)[: size - padding] for part in found])
+        parts = function(*(jnp.asarray(b) for b in padded))
+        pieces.append([np.asarray(part)[: size - padding] for part in parts])
     return Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True)))
 
 
-def _trajectory(found: Parts, experiment: Experiment, measured: Matrix | None, first: int) -> Trajectory:
+def _trajectory(parts: Parts, experiment: Experiment, measured: Matrix | None, first: int) -> Trajectory:
     def whole(values: Any) -> Matrix:
         padded = np.full((len(experiment), values.shape[1]), np.nan)
         padded[first:] = values
         return padded
 
     return Trajectory(
-        whole(found.baseline), whole(found.learner), whole(found.raw), measured, first, experiment.start_time
+        whole(parts.baseline), whole(parts.learner), whole(parts.raw), measured, first, experiment.start_time
     )

@@ -1,6 +1,6 @@
-"""What a model answers along a record, and how well that follows the measured outputs.
+"""A model's response along a record, and scores of how it follows the measured outputs.
 
-The horizon always stands beside the number.
+Every response carries its horizon.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ def scores(measured: Matrix, model: Matrix) -> Scores:
 class Trajectory:
     """A model along one experiment; arrays (N, ny) are NaN on rows without a value (the first lags).
 
-    `baseline + learner` is the model's output; `learner_before` is f, before θ_aux moved its share of
-    the physics to θ. `diverged` is the row and output at which a free run left all bounds, if it did.
+    `baseline + learner` is the model's output. `learner_before` is f, before θ_aux moved its share in the physics to θ.
+    `diverged` is the row and output at which a free run left all bounds; None where it did not.
     """
 
     baseline: Matrix
@@ -87,7 +87,7 @@ class Response:
         return f"Response({kind}, {len(self.trajectories)} experiment(s), {len(self.model)} samples)"
 
     def scores(self, skip: int | tuple[int, ...] = 0) -> Scores:
-        """Scores over all experiments; the first `skip` samples of each (or of each its own) are not counted.
+        """Scores over all experiments, without the first `skip` samples of each; a tuple has one number per experiment.
 
         Raises:
             InputError: no measured outputs, or no sample left to score.

@@ -1,8 +1,8 @@
-"""Sums over rows, which are all that training and its statistics need of the data (F4), and the engine that makes them.
+"""Sums over rows, and the engine that makes them. Training and its statistics need no more of the data (F4).
 
-Rows are laid out in chunks with the row index last, padded with zero weights to one shape, so that one compiled program
-serves any number of rows and nothing of size N × nw ever exists. What is summed is a function of one chunk; it knows
-blocks, not where the rows are.
+Chunks hold the rows, with the row index last, padded with zero weights to one shape. So one compiled program serves any
+number of rows, and nothing of size N × nw ever exists. What is summed is a function of one chunk. The function does not
+know where the rows are.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Chunk(NamedTuple):
 
 
 class Overlap(NamedTuple):
-    """What an earlier pass found of the learner in the span of the physics."""
+    """The learner's share in the span of the physics, as an earlier pass gave it."""
 
     jacobian: Float[Array, "nt nw"]
     """QᵀJ."""
@@ -148,7 +148,7 @@ class Overlaps:
 class MixedGram:
     """Gram matrix of `[Q J]` with the outputs of every row multiplied by `mix`: `ΣψᵀΣ_eψ` for `Σ_e = mixᵀ mix`.
 
-    J less its `overlaps` with Q, if any are given; without a learner of Q alone.
+    J is taken without its `overlaps` with Q, if any are given. Without a learner the matrix is that of Q.
     """
 
     bound: Bound | None
@@ -160,7 +160,7 @@ class MixedGram:
 
 @dataclass(frozen=True)
 class _LeftOver:
-    """QᵀJ of what is left of J without its `overlaps`."""
+    """QᵀJ, with J less its `overlaps`."""
 
     bound: Bound | None
 

@@ -13,7 +13,7 @@ _ROUNDING = 1e-13  # of the largest eigenvalue of a Gram matrix with unit column
 
 
 def column_units(gram: Matrix, nt: int) -> Vector:
-    """One over the norm of each column, θ first; learner columns that are rounding beside the largest stay small."""
+    """One over the norm of each column, θ first. Learner columns that are rounding beside the largest stay small."""
     size = np.sqrt(np.maximum(np.diag(gram), 0.0))
     size[nt:] = np.maximum(size[nt:], np.sqrt(np.finfo(float).eps) * size[nt:].max(initial=0.0))
     return 1 / np.where(size > 1e-150, size, 1.0)
@@ -34,8 +34,8 @@ def half_inverse(gram: Matrix, nt: int) -> Float[np.ndarray, "n r"]:
 class JointCovariance:
     """Cov of all that training estimated, p = (c, w): `σ² M⁻¹` with `M = G + ridge` on the weights.
 
-    G is the Gram matrix of ∂ŷ/∂p in whitened outputs. Only functions of the fitted model have a variance: directions of
-    p that change no prediction on the training rows count as absent.
+    G is the Gram matrix of ∂ŷ/∂p in whitened outputs. Only functions of the fitted model have a variance. A direction
+    of p that changes no prediction on the training rows counts as absent.
     """
 
     gram: Matrix

@@ -1,6 +1,6 @@
 """Models on disk: `model.json` for what a model is, `arrays.safetensors` for its numbers; nothing executable.
 
-The JSON carries a checksum of itself and of the arrays, so that a file that was cut or altered is refused.
+The JSON carries checksums of itself and of the arrays. A file that was cut or altered is refused.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def is_model(folder: Path) -> bool:
 def save(model: Model, folder: str | Path) -> None:
     """Write a model to a folder of its own, whole or not at all.
 
-    A baseline or learner that is a Python callable cannot be written; its numbers are, and `load` asks for it again.
+    A baseline or learner that is a Python callable cannot be written. Its numbers can; `load` asks for the callable.
 
     Raises:
         InputError: the folder cannot be written, or holds something else.
@@ -148,7 +148,7 @@ def _declare(model: Model) -> dict[str, Any]:
 
 
 def _declare_learner(learner: Learner) -> dict[str, Any]:
-    """Kind and fields of a learner that is registered; a Python callable has none that a file could hold."""
+    """Kind and fields of a registered learner; of a Python callable a file can hold neither."""
     kind = LEARNERS.kind_of(learner)
     if kind is None:
         return {"kind": "callable"}
@@ -160,7 +160,7 @@ def _field_names(learner: type) -> list[str]:
 
 
 def _rebuilt_learner(kept: dict[str, Any], given: Learner | None, path: Path) -> Learner:
-    """The learner that a file declares, or for a callable the one that is given."""
+    """The learner that a file declares. For a callable it is the given one."""
     kind = kept["kind"]
     if kind in LEARNERS:
         learner = LEARNERS[kind]
@@ -192,9 +192,9 @@ def _rebuild(
     bound, kept = None, declared["learner"]
     if kept is not None:
         bound = Bound(_rebuilt_learner(kept, learner, path), kept["nz"], kept["ny"])
-        found = arrays["numbers.weights"].shape[-1]
-        if bound.size != found:
-            raise InputError(f"{path}: the learner has {bound.size} weights, the saved one {found}; give the same one.")
+        saved = arrays["numbers.weights"].shape[-1]
+        if bound.size != saved:
+            raise InputError(f"{path}: the learner has {bound.size} weights, the saved one {saved}; give the same one.")
     features = Features(tuple(Expression(e["text"], tuple(e["constants"].items())) for e in declared["features"]))
     outputs, inputs_ = (tuple(Channel(**c) for c in declared[kind]) for kind in ("outputs", "inputs"))
     form = Lagged(

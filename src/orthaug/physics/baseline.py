@@ -31,10 +31,9 @@ class Parameter:
 class Term:
     """`parameter * regressor`, a summand of one output; the same parameter in several terms shares θ.
 
-    `initial`, `unit` and the bounds `min` and `max` on the parameter may be left out where another of its
-    terms gives them, or none does (0, no unit, no bounds). `fixed` keeps `initial` as a known coefficient:
-    the term is subtracted from the output first and the learner is not made orthogonal to it. `output` may
-    be left out where there is only one.
+    `initial`, `unit` and the bounds `min` and `max` belong to the parameter: one of its terms gives them, or none
+    (0, no unit, no bounds). `fixed` keeps `initial` as a known coefficient: the term is subtracted from the output
+    first, and the learner is not made orthogonal to it. `output` may be left out where there is only one.
     """
 
     parameter: str
@@ -197,7 +196,7 @@ _SHARED = ("initial", "unit", "fixed", "min", "max")  # what the terms of one pa
 
 
 def _agreed(terms: Sequence[Term]) -> list[Term]:
-    """The terms with what one of them says about a parameter said by all of them."""
+    """The terms; what one of them says about a parameter, all of its terms say."""
     said: dict[tuple[str, str], Any] = {}
     for term in terms:
         if not term.parameter.strip() or not term.parameter.isprintable():
@@ -217,7 +216,7 @@ def _agreed(terms: Sequence[Term]) -> list[Term]:
 
 
 def _parameter(term: Term) -> Parameter:
-    """The parameter of a term that says all that any of its terms says."""
+    """The parameter of a term from `_agreed`."""
     low = -math.inf if term.min is None else float(term.min)
     high = math.inf if term.max is None else float(term.max)
     if not low < high:

@@ -23,7 +23,7 @@ ILL_CONDITIONED = 1e8  # condition number above which half of the digits of θ a
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """How well rows of φ determine θ: rank, condition number and which columns depend on each other."""
+    """How well rows of φ determine θ: rank, condition number, and which columns depend on each other."""
 
     rank: int
     columns: int
@@ -38,8 +38,8 @@ class Excitation:
 def excitation(r: Matrix, names: Sequence[str]) -> Excitation:
     """Rank and condition of a matrix from its R factor (or itself), columns scaled to unit norm.
 
-    The condition number is σmax/σmin of the scaled columns, None where it is infinite. Columns that a
-    null direction involves are grouped: nothing in the data can tell their parameters apart.
+    The condition number is σmax/σmin of the scaled columns, None where it is infinite. A group holds the columns that
+    a null direction ties: nothing in the data can tell their parameters apart.
     """
     columns = len(names)
     if columns == 0:
@@ -70,20 +70,22 @@ def _groups(null_space: Matrix, names: Sequence[str]) -> tuple[tuple[str, ...], 
     return tuple(groups)
 
 
-def require_rank(found: Excitation, rows: int) -> None:
+def require_rank(excited: Excitation, rows: int) -> None:
     """Raise RankError where θ is not determined, naming the parameters that cannot be told apart."""
-    if rows < found.columns:
-        raise RankError(f"{rows} usable rows for {found.columns} parameters; give at least as many rows as parameters.")
-    if found.full_rank:
+    if rows < excited.columns:
+        raise RankError(
+            f"{rows} usable rows for {excited.columns} parameters; give at least as many rows as parameters."
+        )
+    if excited.full_rank:
         return
     groups = "; ".join(
         f"the column of {group[0]} is zero"
         if len(group) == 1
         else f"the columns of {', '.join(group)} are linearly dependent"
-        for group in found.collinear
+        for group in excited.collinear
     )
     raise RankError(
-        f"the physics is rank-deficient on the data (rank {found.rank} of {found.columns}): {groups}. "
+        f"the physics is rank-deficient on the data (rank {excited.rank} of {excited.columns}): {groups}. "
         "Remove or fix one of them, or use data that excite them separately."
     )
 

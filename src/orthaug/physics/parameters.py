@@ -24,8 +24,8 @@ AGREEMENT = 1e-6  # relative difference up to which a term's `initial` is what t
 
 
 # What `Expression.evaluate` asks of numpy, on p + ih: Im θ / h is dθ/dp by the complex step (Squire & Trapp 1998),
-# exact up to rounding whatever the scales of p are. numpy's own functions are analytic; these five are not and take
-# the branch of the real part, which gives the slope of one side at a kink.
+# exact up to rounding whatever the scales of p are. The functions of numpy are analytic, these five are not. They take
+# the branch of the real part: at a kink that is the slope of one side.
 _COMPLEX = SimpleNamespace(
     asarray=lambda x, dtype=None: np.asarray(x, dtype=complex),
     abs=lambda x: np.where(np.real(x) < 0, -1.0, 1.0) * x,
@@ -133,7 +133,7 @@ class PhysicsMap:
         reals = {**dict(self.constants), **dict(zip(self.names, p, strict=True))}
         lifted: dict[str, Any] = reals | dict(zip(self.names, p[:, None] + 1j * np.diag(step), strict=True))
         theta, jacobian = np.empty(len(self.expressions)), np.empty((len(self.expressions), len(p)))
-        with np.errstate(all="ignore"):  # what has no value is told by the caller
+        with np.errstate(all="ignore"):  # the caller says what has no value
             for i, expression in enumerate(self.expressions):
                 theta[i] = _at(expression, reals).evaluate({}, np)
                 jacobian[i] = np.imag(_at(expression, lifted).evaluate({}, _COMPLEX))
@@ -143,7 +143,7 @@ class PhysicsMap:
 
     @cached_property
     def size(self) -> Vector:
-        """The magnitude of each p, (np,), for scaling: |p⁰|, and where p⁰ = 0 its bounds' or what changes θ."""
+        """The magnitude of each p, (np,), for scaling: |p⁰|. Where p⁰ = 0, that of its bounds, or what moves θ."""
         theta, jacobian = self.linearised(self.initial)
         change = np.max(np.abs(jacobian) / magnitude(theta)[:, None], axis=0)
         reach = np.max(np.abs(self.bounds), axis=0)
@@ -151,7 +151,7 @@ class PhysicsMap:
         return np.where(self.initial != 0, np.abs(self.initial), np.where(np.isfinite(reach), reach, moving))
 
     def around(self, count: int, factor: float) -> Matrix:
-        """`count` points within the bounds, (count, np), p⁰ times 1/`factor` to `factor`; always the same."""
+        """`count` points within the bounds, (count, np): p⁰ times 1/`factor` to `factor`, the same at every call."""
         exponent = np.random.default_rng(0).uniform(-1, 1, (count, len(self.parameters)))
         points = np.where(self.initial != 0, self.initial * factor**exponent, self.size * exponent)
         return np.clip(points, *self.bounds)
@@ -169,7 +169,7 @@ class PhysicsMap:
 
 
 def magnitude(values: Vector) -> Vector:
-    """|values|, where zero the largest of them, where all are zero 1."""
+    """|values|. A zero takes the largest of them; where all are zero, each is 1."""
     size = np.abs(values)
     return np.where(size > 0, size, size.max(initial=0.0) or 1.0)
 
@@ -208,7 +208,7 @@ def _check_parameters(parameters: Sequence[PhysicalParameter], constants: Mappin
 
 
 def _parsed(name: str, text: str, known: Mapping[str, float], parameters: Sequence[str]) -> Expression:
-    """The expression of one θ, its names checked before `parse` takes an unknown one for a channel."""
+    """The expression of one θ. Its names are checked first: `parse` would take an unknown name for a channel."""
     where = f"physics.theta '{name}'"
     if not isinstance(text, str):
         raise InputError(f"{where} must be an expression in text such as 'Ts**2 / m'; got {text!r}.")
@@ -238,9 +238,9 @@ def _check_identifiable(physics: PhysicsMap) -> None:
         if not np.isfinite(jacobian).all():
             continue
         row = np.abs(jacobian).max(axis=1, keepdims=True)
-        found = excitation(jacobian / np.where(row > 0, row, 1.0), physics.names)
-        if best is None or found.rank > best.rank:
-            best = found
+        sensitivity = excitation(jacobian / np.where(row > 0, row, 1.0), physics.names)
+        if best is None or sensitivity.rank > best.rank:
+            best = sensitivity
     if best is not None and not best.full_rank:
         raise InputError(
             f"theta does not determine the physical parameters: {tied(best)} ({len(physics.theta_names)} theta, "
@@ -248,11 +248,11 @@ def _check_identifiable(physics: PhysicsMap) -> None:
         )
 
 
-def tied(found: Excitation) -> str:
+def tied(sensitivity: Excitation) -> str:
     """Which parameters θ does not tell apart, in words."""
     return "; ".join(
         f"{group[0]} has no effect" if len(group) == 1 else f"{', '.join(group)} cannot be told apart"
-        for group in found.collinear
+        for group in sensitivity.collinear
     )
 
 

@@ -15,7 +15,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug.data.expressions import Lag, parse
 from orthaug.data.record import Record
-from orthaug.data.regressors import Features, Lags, Layout, Rows, in_order, lag_matrix, stack_rows
+from orthaug.data.regressors import Features, Lags, Layout, UsableRows, in_order, lag_matrix, stack_rows
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.excitation import Excitation, excitation, require_rank
 from orthaug.physics.projection import Projection
@@ -27,15 +27,15 @@ _LARGEST = 1e120  # size of outputs and regressors whose squares still add up; 1
 class Problem:
     """Usable rows of a record with everything that does not depend on the learner's weights.
 
-    Outputs are whitened by `weight` = 1 / standard deviation, for criterion and measure alike, so that
-    fact F1 holds for several outputs too. `target` has the fixed terms subtracted.
+    `weight` = 1 / standard deviation whitens the outputs, for criterion and measure alike: so F1 holds for
+    several outputs too. `target` is the outputs without the fixed terms.
     """
 
     record: Record
     baseline: Baseline
     features: Features
     layout: Layout
-    rows: Rows
+    rows: UsableRows
     target: Float[np.ndarray, "N ny"]
     weight: Vector
     projection: Projection
@@ -72,11 +72,11 @@ class Problem:
 
     @cached_property
     def freedom_used(self) -> Vector:
-        """Degrees of freedom that the physics uses up in each output, its share `Σ_k ‖Q_ki‖²` of nθ, (ny,)."""
+        """Degrees of freedom that the physics uses up in each output (ny,): the output's share `Σ_k ‖Q_ki‖²` of nθ."""
         return np.sum(self.projection.q**2, axis=(0, 2))
 
     def physics_alone(self) -> Problem:
-        """The same without a learner; posed anew where the learner's lags took rows from the physics."""
+        """The problem without a learner. It is posed anew where the learner's lags took rows from the physics."""
         if self.baseline.function is not None:
             return replace(self, features=Features(()))
         outputs, inputs = self.outputs, tuple(channel.name for channel in self.record.inputs)
@@ -134,10 +134,10 @@ def pose(
         )
     weight = 1.0 / np.where(deviation > 0, deviation, 1.0)
     projection = Projection.factor(phi * weight[:, None])
-    found = excitation(projection.r, baseline.names)
+    excited = excitation(projection.r, baseline.names)
     if require_full_rank:
-        require_rank(found, rows.y.size)
-    return Problem(record, baseline, features, layout, rows, target, weight, projection, found)
+        require_rank(excited, rows.y.size)
+    return Problem(record, baseline, features, layout, rows, target, weight, projection, excited)
 
 
 def check_defined(problem: Problem, record: Record) -> None:
@@ -145,7 +145,7 @@ def check_defined(problem: Problem, record: Record) -> None:
     layout, outputs, start = problem.layout, problem.outputs, problem.rows.start
     for experiment in record.experiments:
         alone = replace(record, experiments=(experiment,))
-        rows = Rows(lag_matrix(experiment, layout, record, start), experiment.outputs[start:], layout, start)
+        rows = UsableRows(lag_matrix(experiment, layout, record, start), experiment.outputs[start:], layout, start)
         with np.errstate(all="ignore"):
             phi = np.asarray(problem.baseline.phi(rows.x, layout, outputs, np))
             known = np.asarray(problem.baseline.known(rows.x, layout, outputs, np))
@@ -153,7 +153,7 @@ def check_defined(problem: Problem, record: Record) -> None:
         _feature_rows(problem.features, rows, layout, alone)
 
 
-def _feature_rows(features: Features, rows: Rows, layout: Layout, record: Record) -> Matrix:
+def _feature_rows(features: Features, rows: UsableRows, layout: Layout, record: Record) -> Matrix:
     with np.errstate(all="ignore"):
         z = np.asarray(features.evaluate(rows.x, layout, np))
     for j, entry in enumerate(features.entries):
@@ -207,7 +207,7 @@ def _check_moving(record: Record, layout: Layout) -> None:
                 )
 
 
-def _check_physics(phi: np.ndarray, known: np.ndarray, baseline: Baseline, rows: Rows, record: Record) -> None:
+def _check_physics(phi: np.ndarray, known: np.ndarray, baseline: Baseline, rows: UsableRows, record: Record) -> None:
     for j, name in enumerate(baseline.names):
         texts = ", ".join(t.regressor for t in baseline.terms if t.parameter == name) or "the baseline function"
         _check_finite(phi[:, :, j], f"the regressor of {name} ({texts})", rows, record)
@@ -220,7 +220,7 @@ def _check_physics(phi: np.ndarray, known: np.ndarray, baseline: Baseline, rows:
     _check_finite(known, "the sum of the fixed terms", rows, record)
 
 
-def _check_finite(values: np.ndarray, what: str, rows: Rows, record: Record) -> None:
+def _check_finite(values: np.ndarray, what: str, rows: UsableRows, record: Record) -> None:
     bad = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
     if not bad.size:
         return

@@ -1,6 +1,6 @@
 """The projection onto the physics: a scaled QR of Φ, made once and used for θ̂, θ_aux and P⊥.
 
-Everything here is orthogonal factorisation; `ΦᵀΦ` is never formed, let alone inverted.
+Everything here is orthogonal factorisation. `ΦᵀΦ` is never formed, let alone inverted.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from orthaug._base.checks import Matrix, Vector
 
 @dataclass(frozen=True, eq=False)
 class Factor:
-    """What stays of Φ where its rows do not: `r` (nθ, nθ), upper triangular, of the columns times `scale` (nθ,).
+    """R of Φ, for where the rows of Φ are not kept: `Φ scale = q r` with orthonormal q.
 
-    The scale is of powers of two, which is exact: `Φ scale = q r` with orthonormal q.
+    `r` (nθ, nθ) is upper triangular. `scale` (nθ,) multiplies the columns; its entries are powers of two, which is
+    exact.
     """
 
     r: Float[np.ndarray, "nt nt"]
@@ -27,7 +28,7 @@ class Factor:
 
     @classmethod
     def of_blocks(cls, blocks: Iterable[Float[np.ndarray, "n ny nt"]]) -> Factor:
-        """From rows that come in blocks, one at a time: R of each stacked upon that of all before (tree QR)."""
+        """From blocks of rows, one at a time: R of the blocks before is stacked upon the next block (tree QR)."""
         r = scale = None
         for block in blocks:
             rows = block.reshape(block.shape[0] * block.shape[1], block.shape[2])  # −1 has no meaning without columns

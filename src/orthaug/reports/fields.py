@@ -1,9 +1,8 @@
-"""What results are made of: plain numbers and lists that JSON can hold, read from the library's objects."""
+"""The fields of results: plain numbers and lists that JSON can hold, read from the library's objects."""
 
 from __future__ import annotations
 
 import json
-import math
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -15,11 +14,13 @@ from pydantic import (
     model_serializer,
 )
 
+from orthaug._base.checks import finite_or_none
+
 
 def _number(value: Any) -> Any:
     """A float, or None for what is not finite: JSON has no NaN."""
     if isinstance(value, float | int | np.number):
-        return float(value) if math.isfinite(value) else None
+        return finite_or_none(float(value))
     return value
 
 
@@ -37,7 +38,7 @@ ByName = dict[str, Number]
 
 
 class Content(BaseModel):
-    """A table of a result. It reads an object's attributes, or the JSON that it wrote."""
+    """A table of a result, read from an object's attributes or from JSON."""
 
     model_config = ConfigDict(from_attributes=True, populate_by_name=True, frozen=True)
 
@@ -58,7 +59,7 @@ class Content(BaseModel):
 
 
 class WarningResult(Content):
-    """What the reader must know: a `code` for programs and a sentence. It reads a `Warning`."""
+    """A `Warning`: a `code` for programs and a sentence for the reader."""
 
     code: str
     text: str

@@ -1,4 +1,4 @@
-"""The parts of a result that analyse it: suspects, residuals, stability, and whether the learner helps."""
+"""The analyses in a result: suspects, residuals, stability, and whether the learner helps."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ class SuspectResult(Content):
     def percent(self) -> dict[str, float | None]:
         """The bias of every θ and physical parameter, in per cent of its value.
 
-        It is what the guessed coefficient gives; without a guess, what the term gives where it makes up 1 % of the
-        outputs' deviation over the measure.
+        With a guess it is the bias by the guessed coefficient. Without one the term counts as 1 % of the outputs'
+        deviation over the measure.
         """
         coefficient = self.coefficient
         if coefficient is None:

@@ -1,4 +1,4 @@
-"""Figures of results; results in, figures out, nothing is computed here that a result does not hold."""
+"""Figures of results. They show what a result holds, and compute nothing else."""
 
 from __future__ import annotations
 
@@ -208,7 +208,7 @@ def _panels(response: Response, title: str, heights: tuple[int, ...] = (1,)) -> 
 
 
 def _extent(response: Response, rows: slice) -> str:
-    """What of the record is drawn."""
+    """Which samples of the record are drawn, in words."""
     whole = len(response.trajectories[0].model)
     text = f"samples {rows.start} to {rows.stop - 1} of {whole}"
     return text + (f", first of {len(response.trajectories)} experiments" if len(response.trajectories) > 1 else "")

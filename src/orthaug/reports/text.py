@@ -69,7 +69,7 @@ def check_text(result: CheckResult) -> str:
 
 
 def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
-    """Two tables, parameters with standard errors and scores on every part; then what is told of each row."""
+    """Two tables, parameters with standard errors and scores on every part; then the verdicts on each row."""
     lines = [*_table(_parameter_cells(result)), "", *_table(_score_cells(result.comparison))]
     if result.chosen:
         lines += ["", "* lowest one-step error on the validation part"]
@@ -101,9 +101,9 @@ def split_text(result: SplitResult) -> str:
 def design_text(result: DesignResult) -> str:
     """The design and what else was tried."""
     rows = [["signal", "error", "bias", "std", "condition"]]
-    for one in result.candidates[:SHOWN]:
-        error = None if one.cost is None else float(np.sqrt(one.cost))
-        rows.append([one.name, *map(_or_infinite, (error, one.bias, one.std, one.condition))])
+    for signal in result.candidates[:SHOWN]:
+        error = None if signal.cost is None else float(np.sqrt(signal.cost))
+        rows.append([signal.name, *map(_or_infinite, (error, signal.bias, signal.std, signal.condition))])
     lines = [
         f"input       {result.kind}",
         f"predicted   relative error of θ {_or_infinite(result.relative_error)}, "

@@ -20,7 +20,7 @@ def catalogue() -> dict[str, Reproduction]:
         static_noise,
     )
 
-    found: list[Any] = [
+    modules: list[Any] = [
         static_errors,
         data_length,
         static_noise,
@@ -30,4 +30,4 @@ def catalogue() -> dict[str, Reproduction]:
         coverage,
         solver_times,
     ]
-    return {module.REPRODUCTION.name: module.REPRODUCTION for module in found}
+    return {module.REPRODUCTION.name: module.REPRODUCTION for module in modules}

@@ -1,4 +1,4 @@
-"""What the studies of the paper share: its pipeline, its structures and records, colours and axes."""
+"""Shared by the studies of the paper: its pipeline, its structures and records, colours and axes."""
 
 from __future__ import annotations
 

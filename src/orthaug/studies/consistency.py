@@ -69,10 +69,10 @@ def figures(table: pd.DataFrame) -> Mapping[str, Figure]:
     figure, axes = panels(2, sharey=True, height=3.2)
     for axis, data_set in zip(axes, (1, 3), strict=True):
         for curve in ("additive", "orthogonal", "uniform"):
-            found = _means(table, data_set, curve)
-            if len(found):
+            means = _means(table, data_set, curve)
+            if len(means):
                 label = "orthogonal, training measure" if curve == "orthogonal" else ""
-                bars(axis, found.samples, found["mean"], 2 * found["std"], curve, label=label)
+                bars(axis, means.samples, means["mean"], 2 * means["std"], curve, label=label)
         if data_set == 3:
             axis.axhline(limit(3), linestyle="--", linewidth=0.9, color="black", label="limit of set 3, N → ∞")
         axis.set_xscale("log")
@@ -86,7 +86,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Figure]:
 
 def findings(table: pd.DataFrame) -> list[Finding]:
     """Consistent or not, and the uniform measure's price."""
-    found = []
+    compared = []
     for data_set, curve, published, low, high, why in (
         (1, "orthogonal", "converges to 0", -0.65, -0.35, "consistent at the rate 1/√N (thm:consistency)"),
         (1, "additive", "does not converge", -0.25, 9.0, "no consistency: more data do not tell θ from the learner"),
@@ -97,24 +97,24 @@ def findings(table: pd.DataFrame) -> list[Finding]:
         rate = slope(means.samples, means["mean"])
         quantity = f"set {data_set}, 30 dB, {curve}: exponent of ‖θ* − θ̂‖ in N"
         text = f"{rate:.2f}; {means['mean'].iloc[-1]:.2g} at N = {int(means.samples.iloc[-1])}"
-        found.append(Finding(quantity, published, "–", text, bool(low < rate < high), why))
+        compared.append(Finding(quantity, published, "–", text, bool(low < rate < high), why))
     last = _means(table, 3, "orthogonal").iloc[-1]
     quantity = f"set 3, 30 dB, orthogonal: ‖θ* − θ̂‖ at N = {int(last.samples)}"
     text, met = f"{last['mean']:.4g}; limit {limit(3):.4g}", bool(abs(last["mean"] / limit(3) - 1) < 0.25)
-    found.append(Finding(quantity, "–", "–", text, met, "tends to the bias of set 3, not to 0"))
+    compared.append(Finding(quantity, "–", "–", text, met, "tends to the bias of set 3, not to 0"))
     own = table[(table.data_set == 1) & (table.curve == "orthogonal") & (table.run == 0) & (table.samples == 1024)]
     error = float(own.theta_error.iloc[0])
     quantity = "set 1, 30 dB, the paper's record of 1024: ‖θ* − θ̂‖"
     met = bool(abs(error - 0.0089013) < 5e-8)
-    found.append(Finding(quantity, "0.0089", "0.0089019", f"{error:.5g}", met, "least squares"))
+    compared.append(Finding(quantity, "0.0089", "0.0089019", f"{error:.5g}", met, "least squares"))
     rows = table[(table.data_set == 1) & (table.curve == "uniform") & (table.samples == 1024)]
     prices = np.array([price for price in rows.price if price is not None], dtype=float)
     text = f"θ₁ {span(prices[:, 0])}, θ₃ {span(prices[:, 1])}"
     quantity = "set 1, N = 1024, uniform measure: standard error over the training measure's"
     met = bool((prices > 1).all())
     why = "the price: θ shares the learner's variance, and the box reaches where data are few"
-    found.append(Finding(quantity, "–", "–", text, met, why))
-    return found
+    compared.append(Finding(quantity, "–", "–", text, met, why))
+    return compared
 
 
 REPRODUCTION = Reproduction(

@@ -44,7 +44,7 @@ def one(data_set: int, draw: int) -> dict[str, Any]:
     fit = estimate(record, example.baseline, **options)
     uniform = fit.split(UNIFORM)
     deviation = np.sqrt(np.diag(fit.joint_covariance("paper"))[: len(fit.theta)])
-    found: dict[str, Any] = {"theta": fit.theta, "theta_uniform": uniform.theta}
+    result: dict[str, Any] = {"theta": fit.theta, "theta_uniform": uniform.theta}
     intervals = {
         "training": fit.interval,
         "paper": interval(fit.theta, deviation, fit.freedom),
@@ -52,9 +52,9 @@ def one(data_set: int, draw: int) -> dict[str, Any]:
     }
     for kind, limits in intervals.items():
         assert limits is not None
-        found[f"{kind}_holds"] = ((limits[:, 0] <= example.theta) & (example.theta <= limits[:, 1])).tolist()
-        found[f"{kind}_width"] = limits[:, 1] - limits[:, 0]
-    return found
+        result[f"{kind}_holds"] = ((limits[:, 0] <= example.theta) & (example.theta <= limits[:, 1])).tolist()
+        result[f"{kind}_width"] = limits[:, 1] - limits[:, 0]
+    return result
 
 
 def study(pipeline: str, small: bool) -> Study:
@@ -99,13 +99,13 @@ def findings(table: pd.DataFrame) -> list[Finding]:
         (3, "paper", lambda share: share.min() < 0.5, "no wider interval mends a bias"),
         (3, "uniform", lambda share: abs(share - 0.95) < band, "as promised, where the training measure fails"),
     )
-    found = []
+    compared = []
     for data_set, kind, check, why in expected:
         shares = _shares(table, data_set, kind)
         text = ", ".join(f"{100 * s:.1f} %" for s in shares)
         quantity = f"set {data_set}, {KINDS[kind]}: coverage of 95 % intervals, θ₁ and θ₃"
-        found.append(Finding(quantity, "–", "–", text, bool(np.all(check(shares))), f"{why} ({draws} draws)"))
-    return found
+        compared.append(Finding(quantity, "–", "–", text, bool(np.all(check(shares))), f"{why} ({draws} draws)"))
+    return compared
 
 
 REPRODUCTION = Reproduction(

@@ -66,9 +66,9 @@ def figures(table: pd.DataFrame) -> Mapping[str, Figure]:
     figure, axes = panels(2, sharey=True, height=3.1)
     for axis, data_set in zip(axes, (2, 3), strict=True):
         for measure, name in (("training", "orthogonal"), ("uniform", "uniform")):
-            found = _means(table, data_set, measure)
+            means = _means(table, data_set, measure)
             label = "orthogonal, training measure" if measure == "training" else ""
-            bars(axis, found.samples, found["mean"], 2 * found["std"], name, label=label)
+            bars(axis, means.samples, means["mean"], 2 * means["std"], name, label=label)
         own = table[(table.data_set == data_set) & (table.measure == "training") & (table.draw == 0)]
         own = own.iloc[own.samples.argsort()]
         axis.plot(
@@ -87,31 +87,31 @@ def figures(table: pd.DataFrame) -> Mapping[str, Figure]:
 
 def findings(table: pd.DataFrame) -> list[Finding]:
     """The two trends, and what the uniform measure makes of them."""
-    found = []
+    compared = []
     two, three = (_means(table, data_set, "training") for data_set in (2, 3))
     rate = slope(two.samples, two["mean"])
     quantity = "set 2, no noise: exponent of ‖θ* − θ̂‖ in N"
     why = "falls as 1/√N: the sample's asymmetry averages out"
-    found.append(Finding(quantity, "converges towards 0", "–", f"{rate:.2f}", bool(-0.7 < rate < -0.3), why))
+    compared.append(Finding(quantity, "converges towards 0", "–", f"{rate:.2f}", bool(-0.7 < rate < -0.3), why))
     last = float(three["mean"].iloc[-1])
     met = bool(abs(last / limit(3) - 1) < 0.25)
     quantity = f"set 3, no noise: ‖θ* − θ̂‖ at N = {int(three.samples.iloc[-1])}"
     text = f"{last:.4g}; limit by quadrature {limit(3):.4g}"
     why = "tends to the bias that the inputs' mean of −0.01 leaves"
-    found.append(Finding(quantity, "converges to a fixed number", "–", text, met, why))
+    compared.append(Finding(quantity, "converges to a fixed number", "–", text, met, why))
     own = table[(table.measure == "training") & (table.draw == 0) & (table.samples == 1024)].set_index("data_set")
     for data_set, scripts in ((2, 0.07956), (3, 0.14333)):
         error = float(own.theta_error[data_set])
         met = bool(abs(error / scripts - 1) < 1e-3)
         quantity = f"set {data_set}, the paper's record of 1024: ‖θ* − θ̂‖"
-        found.append(Finding(quantity, "–", f"{scripts:.5g}", f"{error:.5g}", met, "the same"))
+        compared.append(Finding(quantity, "–", f"{scripts:.5g}", f"{error:.5g}", met, "the same"))
     for data_set in (2, 3):
         worst = float(table[(table.data_set == data_set) & (table.measure == "uniform")].theta_error.max())
         quantity = f"set {data_set}, uniform measure: largest ‖θ* − θ̂‖ over all N"
         met = bool(worst < 5e-3)
         why = "no bias at any N: under the uniform measure physics and unmodelled term are orthogonal"
-        found.append(Finding(quantity, "–", "–", f"{worst:.2g}", met, why))
-    return found
+        compared.append(Finding(quantity, "–", "–", f"{worst:.2g}", met, why))
+    return compared
 
 
 REPRODUCTION = Reproduction(

@@ -1,4 +1,4 @@
-"""What an entry of `orthaug reproduce` consists of: its runs, its figures, its numbers beside the published ones."""
+"""An entry of `orthaug reproduce`: its runs, its figures, its numbers beside the published ones."""
 
 from __future__ import annotations
 

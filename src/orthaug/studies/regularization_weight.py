@@ -108,9 +108,9 @@ def _panel(axis: Axes, table: pd.DataFrame, quantity: str) -> None:
     axis.axhspan(middle - reach, middle + reach, color=COLOURS["orthogonal"], alpha=0.2, linewidth=0)
     axis.axhline(middle, color=COLOURS["orthogonal"], linewidth=1.2, label=LABELS["orthogonal"])
     for k, structure in enumerate(PENALTIES):
-        found = _of(table, structure).groupby("weight")[quantity].agg(["mean", "std"]).reset_index()
-        place = found.weight.where(found.weight > 0, zero) * 1.25 ** (k - 0.5)
-        bars(axis, place, found["mean"], found["std"], structure)
+        errors = _of(table, structure).groupby("weight")[quantity].agg(["mean", "std"]).reset_index()
+        place = errors.weight.where(errors.weight > 0, zero) * 1.25 ** (k - 0.5)
+        bars(axis, place, errors["mean"], errors["std"], structure)
     axis.set_xscale("log")
     ticks = [zero, *sorted(positive.unique())[::2]]
     axis.set_xticks(ticks, ["0", *(f"$10^{{{np.log10(t):.0f}}}$" for t in ticks[1:])])
@@ -122,7 +122,7 @@ def findings(table: pd.DataFrame) -> list[Finding]:
     """Limits, and the scripts' numbers at every weight that they ran."""
     largest = table.weight.max()
     own = _of(table, "orthogonal")
-    found = [
+    compared = [
         Finding(
             "orthogonal: relative error of θ",
             "–",
@@ -147,24 +147,24 @@ def findings(table: pd.DataFrame) -> list[Finding]:
         rows = _of(table, structure, largest)
         met = bool(abs(rows.theta_error.mean() / limit - 1) < 0.05)
         quantity = f"{structure}, λ = {largest:g}: relative error of θ"
-        found.append(Finding(quantity, f"tends to {what}", "–", span(rows.theta_error), met, f"limit {limit:.4g}"))
+        compared.append(Finding(quantity, f"tends to {what}", "–", span(rows.theta_error), met, f"limit {limit:.4g}"))
     rows = _of(table, "orthogonal-penalty", 0.0)
     met = bool(rows.theta_error.max() > 2 * LEAST_SQUARES)
     quantity = "λ = 0, the additive structure: relative error of θ"
-    found.append(Finding(quantity, "not unique", "–", span(rows.theta_error), met, "a lottery over starts"))
-    found += _prices(table)
+    compared.append(Finding(quantity, "not unique", "–", span(rows.theta_error), met, "a lottery over starts"))
+    compared += _prices(table)
     for structure, values in SCRIPTS.items():
         for weight, scripts in values.items():
             rows = _of(table, structure, weight)
             if len(rows):
                 quantity = f"{structure}, λ = {weight:g}: relative error of θ"
                 met, why = _beside_scripts(structure, rows.theta_error, scripts)
-                found.append(
+                compared.append(
                     Finding(
                         quantity, "figure only", f"{scripts[0]:g} ± {scripts[1]:g}", span(rows.theta_error), met, why
                     )
                 )
-    return found
+    return compared
 
 
 def _prices(table: pd.DataFrame) -> list[Finding]:

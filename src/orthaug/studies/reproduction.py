@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 PIPELINES = ("ours", "paper")
 MARK = "reproduction.json"
-Progress = Callable[[str, int, int], None]
+StudiesTell = Callable[[str, int, int], None]
 """Called with the study's title, the runs done and all of them."""
 
 
@@ -67,7 +67,7 @@ def reproduce(
     pipeline: str = "ours",
     small: bool = False,
     store: Path | None = None,
-    progress: Progress | None = None,
+    progress: StudiesTell | None = None,
 ) -> list[Reproduced]:
     """Run the studies; what a store holds already is not run again.
 
@@ -78,14 +78,14 @@ def reproduce(
     """
     check_choice(pipeline, PIPELINES, "--pipeline")
     store = Path(platformdirs.user_cache_dir("orthaug")) / "studies" if store is None else store
-    found = []
+    reproduced = []
     for entry in entries:
         began = time.perf_counter()
         tell = None if progress is None else lambda done, total, e=entry: progress(e.title, done, total)
         table = run(entry.study(pipeline, small), store=store, progress=tell)
         drawn, compared = dict(entry.figures(table)), entry.findings(table)
-        found.append(Reproduced(entry, table, drawn, compared, time.perf_counter() - began, small))
-    return found
+        reproduced.append(Reproduced(entry, table, drawn, compared, time.perf_counter() - began, small))
+    return reproduced
 
 
 def is_reproduction(folder: Path) -> bool:
@@ -98,59 +98,59 @@ def check_output(folder: Path) -> None:
     check_replaceable(folder, is_reproduction)
 
 
-def write(found: Sequence[Reproduced], folder: Path, pipeline: str) -> None:
+def write(reproduced: Sequence[Reproduced], folder: Path, pipeline: str) -> None:
     """index.html, and for each study its figures as PNG and its runs as CSV; whole or not at all."""
     with whole_folder(folder, is_reproduction) as partial:
-        for one in found:
-            place = partial / one.entry.name
+        for study in reproduced:
+            place = partial / study.entry.name
             place.mkdir()
-            one.table.to_csv(place / "runs.csv", index=False)
-            for name, figure in one.figures.items():
+            study.table.to_csv(place / "runs.csv", index=False)
+            for name, figure in study.figures.items():
                 plots.save(figure, place / f"{name}.png")
-        content = {"orthaug": __version__, "pipeline": pipeline, "findings": as_rows(found)}
+        content = {"orthaug": __version__, "pipeline": pipeline, "findings": as_rows(reproduced)}
         (partial / MARK).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-        (partial / "index.html").write_text(_page(found, pipeline), encoding="utf-8")
+        (partial / "index.html").write_text(_page(reproduced, pipeline), encoding="utf-8")
 
 
-def as_rows(found: Sequence[Reproduced]) -> list[dict[str, Any]]:
+def as_rows(reproduced: Sequence[Reproduced]) -> list[dict[str, Any]]:
     """The findings as plain rows, each with its study."""
-    return [{"study": one.entry.name, **finding._asdict()} for one in found for finding in one.findings]
+    return [{"study": study.entry.name, **finding._asdict()} for study in reproduced for finding in study.findings]
 
 
-def text(found: Sequence[Reproduced]) -> str:
+def text(reproduced: Sequence[Reproduced]) -> str:
     """The table: quantity, published, the published scripts as measured, ours, verdict."""
     head = ("quantity", "published", "scripts", "ours", "", "verdict")
     rows: list[tuple[str, ...]] = [head]
-    for finding in (finding for one in found for finding in one.findings):
+    for finding in (finding for study in reproduced for finding in study.findings):
         mark = "met" if finding.met else "differs"
         rows.append((finding.quantity, finding.published, finding.scripts, finding.ours, mark, finding.verdict))
     widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
     return "\n".join("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows)
 
 
-def _page(found: Sequence[Reproduced], pipeline: str) -> str:
+def _page(reproduced: Sequence[Reproduced], pipeline: str) -> str:
     """One HTML file with its figures inside."""
     source = files("orthaug.studies").joinpath("templates/reproduction.html").read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     studies = [
         {
-            "name": one.entry.name,
-            "title": one.entry.title,
-            "text": one.entry.text,
-            "findings": one.findings,
-            "figures": {name: _inline(figure) for name, figure in one.figures.items()},
-            "runs": len(one.table),
-            "seconds": f"{one.seconds:.0f}",
+            "name": study.entry.name,
+            "title": study.entry.title,
+            "text": study.entry.text,
+            "findings": study.findings,
+            "figures": {name: _inline(figure) for name, figure in study.figures.items()},
+            "runs": len(study.table),
+            "seconds": f"{study.seconds:.0f}",
         }
-        for one in found
+        for study in reproduced
     ]
-    findings = [finding for one in found for finding in one.findings]
+    findings = [finding for study in reproduced for finding in study.findings]
     return environment.from_string(source).render(
         studies=studies,
         theory=THEORY,
         pipeline=pipeline,
         version=__version__,
-        small=any(one.small for one in found),
+        small=any(study.small for study in reproduced),
         compared=len(findings),
         met=sum(finding.met for finding in findings),
     )

@@ -88,7 +88,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Figure]:
 
 def findings(table: pd.DataFrame) -> list[Finding]:
     """Each solver at its full length, medians over starts."""
-    found = []
+    compared = []
     full = pick(table, table.share == table.share.max())
     for example in table.example.unique():
         rows = pick(full, full.example == example).groupby("solver")[["seconds", "loss"]].median()
@@ -102,8 +102,8 @@ def findings(table: pd.DataFrame) -> list[Finding]:
             elif error < 1.02 * best:
                 why = "ends as low, within 2 %" if error >= best / 1.02 else "ends lower"
             text = f"{seconds:.3g} s, relative training error {error:.3g}"
-            found.append(Finding(f"{EXAMPLES[example]}, {SOLVERS[solver][0]}", "–", scripts, text, bool(met), why))
-    return found
+            compared.append(Finding(f"{EXAMPLES[example]}, {SOLVERS[solver][0]}", "–", scripts, text, bool(met), why))
+    return compared
 
 
 REPRODUCTION = Reproduction(

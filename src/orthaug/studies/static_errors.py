@@ -129,16 +129,16 @@ def _learner(table: pd.DataFrame) -> Figure:
 
 def findings(table: pd.DataFrame) -> list[Finding]:
     """Every mean of the reference beside ours."""
-    found = []
+    compared = []
     for (data_set, structure), (rmse, error) in SCRIPTS.items():
         rows = pick(table, (table.data_set == data_set) & (table.structure == structure))
         where = f"set {data_set}, no noise, {structure}"
         better = bool(rows.test_rmse.mean() <= rmse)
         why = "better: trained to the end" if better else "not reached"
-        found.append(Finding(f"{where}: test RMSE", "–", f"{rmse:.3g}", span(rows.test_rmse), better, why))
+        compared.append(Finding(f"{where}: test RMSE", "–", f"{rmse:.3g}", span(rows.test_rmse), better, why))
         met = _same_error(structure, data_set, rows, error)
         why = _why(structure, data_set) if met else "a number of other starts or another record"
-        found.append(
+        compared.append(
             Finding(
                 f"{where}: ‖θ* − θ̂‖", _published(structure, data_set), f"{error:.4g}", span(rows.theta_error), met, why
             )
@@ -147,7 +147,7 @@ def findings(table: pd.DataFrame) -> list[Finding]:
         rows = table[(table.data_set == data_set) & (table.structure == "orthogonal")]
         met = bool(rows.uniform_error.max() <= 0.01 * rows.theta_error.min())
         text = span(rows.uniform_error)
-        found.append(
+        compared.append(
             Finding(
                 f"set {data_set}, uniform measure: ‖θ* − θ̂‖",
                 "–",
@@ -157,7 +157,7 @@ def findings(table: pd.DataFrame) -> list[Finding]:
                 "the measure, not the fit, is what biases θ",
             )
         )
-    return found
+    return compared
 
 
 def _same_error(structure: str, data_set: int, rows: pd.DataFrame, scripts: float) -> bool:

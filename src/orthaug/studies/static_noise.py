@@ -74,7 +74,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Figure]:
 
 def findings(table: pd.DataFrame) -> list[Finding]:
     """The table's four numbers, with and without regularization."""
-    found = []
+    compared = []
     for kind in dict.fromkeys(table.regularization):
         for structure in ("additive", "orthogonal"):
             rows = table[(table.structure == structure) & (table.regularization == kind)]
@@ -83,7 +83,7 @@ def findings(table: pd.DataFrame) -> list[Finding]:
             met = bool(rows.test_rmse.mean() < 1.1 * scripts_rmse)
             texts = (f"{rmse:.3g}", f"{scripts_rmse:.3g}", span(rows.test_rmse))
             paper = bool((rows.pipeline == "paper").any())
-            found.append(Finding(f"{where}: test RMSE", *texts, met, _why_rmse(kind, structure, paper)))
+            compared.append(Finding(f"{where}: test RMSE", *texts, met, _why_rmse(kind, structure, paper)))
             if structure == "orthogonal":
                 met = bool(np.allclose(rows.theta_error, LEAST_SQUARES, rtol=0, atol=5e-8))
                 why = "exact least squares for every start; the scripts end within 1e-6 of it"
@@ -92,8 +92,8 @@ def findings(table: pd.DataFrame) -> list[Finding]:
                 met = bool(rows.theta_error.min() <= error <= rows.theta_error.max())
                 why = "a lottery over starts; where it is trained farther than published, θ wanders farther"
                 texts = (f"{error:.4g}", f"{scripts_error:.5g}", span(rows.theta_error))
-            found.append(Finding(f"{where}: ‖θ* − θ̂‖", *texts, met, why))
-    return found
+            compared.append(Finding(f"{where}: ‖θ* − θ̂‖", *texts, met, why))
+    return compared
 
 
 def _why_rmse(kind: str, structure: str, paper: bool) -> str:

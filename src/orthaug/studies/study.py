@@ -1,4 +1,4 @@
-"""Studies: one function over a grid of arguments and seeds, its results in a table; interrupted ones go on.
+"""Studies: one function over a grid of arguments and seeds, its results in a table. An interrupted study goes on.
 
 A study is a declaration, so anyone's Monte Carlo is a function and a grid:
 
@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import inspect
 import json
-import math
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,6 +20,7 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from orthaug._base.checks import finite_or_none
 from orthaug._base.errors import InputError
 from orthaug._base.parallel import spread
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Case = dict[str, Any]
-Progress = Callable[[int, int], None]
+CasesTell = Callable[[int, int], None]
 """Called after each run with the runs done and all of them."""
 
 
@@ -55,11 +55,11 @@ class Study:
     def cases(self) -> list[Case]:
         """Every combination that runs, as keyword arguments of plain values."""
         axes = [[_value(self, axis, value) for value in values] for axis, values in self.grid.items()]
-        found = (dict(zip(self.grid, values, strict=True)) for values in product(*axes))
-        return [case for case in found if self.where is None or self.where(**case)]
+        combinations = (dict(zip(self.grid, values, strict=True)) for values in product(*axes))
+        return [case for case in combinations if self.where is None or self.where(**case)]
 
     def key(self, case: Case) -> str:
-        """What a stored result is found by: a hash of study, version, arguments, function and this package's code."""
+        """The key of a stored result: a hash of study, version, arguments, function and this package's code."""
         declared = {"study": self.name, "version": self.version, "case": case, "code": _text(self.one)}
         declared["orthaug"] = _sources()
         return hashlib.sha256(json.dumps(declared, sort_keys=True).encode()).hexdigest()[:24]
@@ -67,11 +67,11 @@ class Study:
 
 @cache
 def _sources() -> str:
-    """A digest of this package's own code: results of an older one do not count."""
-    found = hashlib.sha256()
+    """A digest of this package's code: results of older code do not count."""
+    digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.rglob("*.py")):
-        found.update(path.read_bytes())
-    return found.hexdigest()
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def _text(function: Callable[..., Any]) -> str:
@@ -86,7 +86,7 @@ def run(
     *,
     store: Path | None = None,
     workers: int | None = None,
-    progress: Progress | None = None,
+    progress: CasesTell | None = None,
 ) -> pd.DataFrame:
     """Run what the store does not hold yet, several cases at a time; a row per case, axes first.
 
@@ -100,24 +100,24 @@ def run(
     import pandas as pd
 
     cases = study.cases()
-    found = [_read(store, study, case) for case in cases]
-    todo = [i for i, result in enumerate(found) if result is None]
+    results = [_read(store, study, case) for case in cases]
+    todo = [i for i, result in enumerate(results) if result is None]
     done = len(cases) - len(todo)
     if progress is not None:
         progress(done, len(cases))
 
-    def one(i: int, check: Callable[[], None]) -> None:
+    def run_case(i: int, check: Callable[[], None]) -> None:
         nonlocal done
         check()
         result = _plain(study, study.one(**cases[i]))
         _write(store, study, cases[i], result)
-        found[i] = result
+        results[i] = result
         done += 1
         if progress is not None:
             progress(done, len(cases))
 
-    spread(one, todo, study.workers if workers is None else workers)
-    return pd.DataFrame([{**case, **(result or {})} for case, result in zip(cases, found, strict=True)])
+    spread(run_case, todo, study.workers if workers is None else workers)
+    return pd.DataFrame([{**case, **(result or {})} for case, result in zip(cases, results, strict=True)])
 
 
 def _path(store: Path, study: Study, case: Case) -> Path:
@@ -125,7 +125,7 @@ def _path(store: Path, study: Study, case: Case) -> Path:
 
 
 def _read(store: Path | None, study: Study, case: Case) -> dict[str, Any] | None:
-    """A stored result; one that was cut is as good as none."""
+    """A stored result; None where there is none, or where it was cut."""
     if store is None:
         return None
     try:
@@ -160,7 +160,7 @@ def _value(study: Study, key: str, value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_value(study, key, item) for item in value]
     if isinstance(value, float):
-        return value if math.isfinite(value) else None
+        return finite_or_none(value)
     if value is None or isinstance(value, bool | int | str):
         return value
     raise InputError(f"study '{study.name}': '{key}' is a {type(value).__name__}; expected numbers, texts or lists.")

@@ -1,7 +1,7 @@
 """The paper's pipeline: Adam, then L-BFGS, over θ and the learner's weights together, compiled whole.
 
-θ starts at θ⁰ in units of its columns, the weights where the caller says. Here it is optax's L-BFGS in one
-compiled loop; SciPy's L-BFGS-B, called back from Python, took 3 to 6 times longer on both of the paper's examples.
+θ starts at θ⁰ in units of its columns, the weights where the caller says. L-BFGS is optax's, in one compiled
+loop. SciPy's L-BFGS-B, called back from Python, took 3 to 6 times longer on both of the paper's examples.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from jaxtyping import Float
 from orthaug._base.jax import Array, jax, jnp
 from orthaug._base.progress import RunTell, quiet
 from orthaug._base.registry import check_fields
-from orthaug.fitting.joint import JointCriterion, Physics
+from orthaug.fitting.paper_criterion import PaperCriterion, Physics
 from orthaug.fitting.solvers.compiled import burst_length
 from orthaug.fitting.status import Ending
 from orthaug.models.rows import Chunk
@@ -36,7 +36,7 @@ class GradientRun(NamedTuple):
     seconds: float
 
 
-class _State(NamedTuple):
+class _GradientState(NamedTuple):
     unknowns: tuple[Float[Array, "nt"], Float[Array, "nw"]]
     optimizer: Any
     loss: Float[Array, ""]
@@ -74,7 +74,7 @@ class AdamLBFGS:
 
     def minimise(
         self,
-        criterion: JointCriterion,
+        criterion: PaperCriterion,
         w: Float[Array, "nw"],
         chunks: Chunk,
         physics: Physics,
@@ -87,13 +87,15 @@ class AdamLBFGS:
         began = time.perf_counter()
         unknowns = (jnp.zeros_like(physics.start), w)
         loss = _value(criterion, unknowns, chunks, physics)
-        done, state = 0, _State(unknowns, None, loss, jnp.asarray(0), jnp.asarray(0))
+        done, state = 0, _GradientState(unknowns, None, loss, jnp.asarray(0), jnp.asarray(0))
         phases = (
             (self.adam_iterations, optax.adam(self.learning_rate)),
             (self.lbfgs_iterations, optax.lbfgs(memory_size=_MEMORY)),
         )
         for limit, optimizer in phases:
-            state = _State(state.unknowns, optimizer.init(state.unknowns), state.loss, jnp.asarray(0), jnp.asarray(0))
+            state = _GradientState(
+                state.unknowns, optimizer.init(state.unknowns), state.loss, jnp.asarray(0), jnp.asarray(0)
+            )
             burst, second = 1, optimizer is phases[1][1]
             while int(state.iteration) < limit and bool(_going(state)):
                 tick = time.perf_counter()
@@ -109,33 +111,37 @@ class AdamLBFGS:
         return GradientRun(v, w, done, ending, time.perf_counter() - began)
 
 
-def _going(state: _State) -> Any:
+def _going(state: _GradientState) -> Any:
     """Whether another step makes sense: the loss is finite and still falls."""
     return jnp.isfinite(state.loss) & (state.small < 5)
 
 
 @partial(jax.jit, static_argnames="criterion")
-def _value(criterion: JointCriterion, unknowns: Any, chunks: Chunk, physics: Physics) -> Any:
+def _value(criterion: PaperCriterion, unknowns: Any, chunks: Chunk, physics: Physics) -> Any:
     return criterion(unknowns, chunks, physics)
 
 
 @partial(jax.jit, static_argnames="criterion")
-def _adam(criterion: JointCriterion, state: _State, chunks: Chunk, physics: Physics, rate: Any, stop: Any) -> _State:
+def _adam(
+    criterion: PaperCriterion, state: _GradientState, chunks: Chunk, physics: Physics, rate: Any, stop: Any
+) -> _GradientState:
     import optax
 
     optimizer = optax.adam(rate)
 
-    def step(s: _State) -> _State:
+    def step(s: _GradientState) -> _GradientState:
         loss, gradient = jax.value_and_grad(criterion)(s.unknowns, chunks, physics)
         update, inner = optimizer.update(gradient, s.optimizer)
         unknowns: Any = optax.apply_updates(s.unknowns, update)
-        return _State(unknowns, inner, loss, s.iteration + 1, s.small)
+        return _GradientState(unknowns, inner, loss, s.iteration + 1, s.small)
 
     return jax.lax.while_loop(lambda s: (s.iteration < stop) & _going(s), step, state)
 
 
 @partial(jax.jit, static_argnames="criterion")
-def _lbfgs(criterion: JointCriterion, state: _State, chunks: Chunk, physics: Physics, rate: Any, stop: Any) -> _State:
+def _lbfgs(
+    criterion: PaperCriterion, state: _GradientState, chunks: Chunk, physics: Physics, rate: Any, stop: Any
+) -> _GradientState:
     import optax
 
     optimizer = optax.lbfgs(memory_size=_MEMORY)
@@ -145,12 +151,12 @@ def _lbfgs(criterion: JointCriterion, state: _State, chunks: Chunk, physics: Phy
 
     value_and_grad = optax.value_and_grad_from_state(value)
 
-    def step(s: _State) -> _State:
+    def step(s: _GradientState) -> _GradientState:
         loss, gradient = value_and_grad(s.unknowns, state=s.optimizer)
         update, inner = optimizer.update(gradient, s.optimizer, s.unknowns, value=loss, grad=gradient, value_fn=value)
         unknowns: Any = optax.apply_updates(s.unknowns, update)
-        found = optax.tree.get(inner, "value")
-        small = jnp.where(loss - found <= _SMALL * loss, s.small + 1, 0)
-        return _State(unknowns, inner, found, s.iteration + 1, small)
+        reached = optax.tree.get(inner, "value")
+        small = jnp.where(loss - reached <= _SMALL * loss, s.small + 1, 0)
+        return _GradientState(unknowns, inner, reached, s.iteration + 1, small)
 
     return jax.lax.while_loop(lambda s: (s.iteration < stop) & _going(s), step, state)

@@ -1,8 +1,8 @@
 """The Levenberg-Marquardt loop compiled whole, for a criterion whose rows are in memory: the fast path of the solver.
 
 The step solves `(H + (α + μ) I) d = g − α w`. Damping with the identity and Nielsen's update (Madsen, Nielsen and
-Tingleff 2004, algorithm 3.16) converges from Xavier starts on normalised data. One trial costs one pass over the rows,
-which is at once the next step's linearisation.
+Tingleff 2004, algorithm 3.16) converges from Xavier starts on normalised data. A trial costs one pass over the rows,
+and this pass is also the linearisation for the next step.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _SECONDS_PER_BURST = 0.5  # how often progress is told and Ctrl-C is heard
 
 
 class State(NamedTuple):
-    """The iterate with its linearisation; plain arrays, so a run can pause and go on."""
+    """The iterate with its linearisation. These are plain arrays, so a run can pause and go on."""
 
     w: Float[Array, "nw"]
     normal: Normal
@@ -48,8 +48,8 @@ class Options(NamedTuple):
     samples: Float[Array, ""]
 
 
-class Run(NamedTuple):
-    """What one run from one start found."""
+class TrainingRun(NamedTuple):
+    """The end of one run from one start."""
 
     w: Float[Array, "nw"]
     normal: Normal
@@ -77,12 +77,12 @@ def minimise(
     iterations: int,
     tolerance: float,
     progress: RunTell = quiet,
-) -> Run:
+) -> TrainingRun:
     """Minimise `‖r(w)‖² + α‖w‖²` from `w`.
 
     Args:
         criterion: hashable; `(w, *arguments, overlap) -> Normal`.
-        overlap: a first guess of the learner's share in the physics, zeros will do.
+        overlap: a first guess of the learner's share in the physics; zeros do.
         ridge: α in normalised units; with `evidence` where it starts.
         evidence: choose α by MacKay's re-estimation after every accepted step.
         samples: residuals less the physics' own parameters, for the noise variance.
@@ -99,7 +99,7 @@ def minimise(
         spent = time.perf_counter() - tick
         burst = burst_length(burst, spent)
         progress(int(state.iteration), float(state.normal.loss))
-    return Run(
+    return TrainingRun(
         state.w,
         state.normal,
         float(state.ridge),
@@ -194,7 +194,7 @@ def _evidence(w: Any, normal: Normal, alpha: Any, samples: Any) -> Any:
 
 @jax.jit
 def effective_weights(normal: Normal, alpha: Any) -> Any:
-    """tr(H (H + αI)⁻¹), with directions that are rounding beside the columns of J counted as absent."""
+    """tr(H (H + αI)⁻¹). Directions that are rounding beside the columns of J count as absent."""
     n = normal.hessian.shape[0]
     if n == 0:
         return jnp.asarray(0.0)

@@ -1,9 +1,9 @@
 """The Levenberg-Marquardt loop that the host drives, for any objective that can be tried and linearised.
 
 The step solves `(H + αE + μ D) d = g − αE p` with Nielsen's update of μ (Madsen, Nielsen and Tingleff 2004, algorithm
-3.16); the ridge α acts on the weights alone (E). D is the identity one step ahead, which converges from Xavier starts
-on normalised data, and diag H (Marquardt's scaling) on the free run. A trial costs one evaluation; derivatives follow
-only where it is accepted. A trial that is not finite is rejected like one that does not descend.
+3.16). The ridge α acts on the weights alone (E). One step ahead D is the identity, which converges from Xavier starts
+on normalised data; on the free run D is diag H (Marquardt's scaling). A trial costs one evaluation. Only an accepted
+trial is linearised. A trial that is not finite is rejected like one that does not descend.
 
 Where the rows of a one-step criterion are in memory, the loop is compiled whole instead (`compiled`).
 """
@@ -22,11 +22,11 @@ from orthaug._base.progress import RunTell, quiet
 from orthaug.fitting.status import Ending
 
 _SETTLED = 0.1  # of the objective: a step that lowers it by less belongs to the end of a run
-_SMALLEST_CURVATURE = 1e-14  # of the largest: what a direction that does nothing is damped with
+_SMALLEST_CURVATURE = 1e-14  # of the largest: it damps a direction that does nothing
 
 
 class Damping(NamedTuple):
-    """The first μ and the largest, of the largest curvature with the identity, of 1 with Marquardt's scaling."""
+    """The first μ and the largest, in units of the largest curvature; with Marquardt's scaling in units of 1."""
 
     first: float
     largest: float
@@ -37,7 +37,7 @@ IDENTITY = Damping(1e-5, 1e12, diagonal=False)  # docs/design.md has the compari
 MARQUARDT = Damping(1e-3, 1e16, diagonal=True)
 
 
-class Flown(Protocol):
+class Tried(Protocol):
     """A trial: an objective at p."""
 
     @property
@@ -69,8 +69,8 @@ class Linearised(Protocol):
 
 
 @runtime_checkable
-class Objective(Protocol):
-    """`‖r(p)‖²` of p = (θ, w), θ in front. Its functions are pure: a rejected trial leaves nothing behind."""
+class SquaredResiduals(Protocol):
+    """The objective `‖r(p)‖²` of p = (θ, w), θ in front. Its functions are pure: a rejected trial leaves no trace."""
 
     @property
     def physics(self) -> int:
@@ -78,7 +78,7 @@ class Objective(Protocol):
         ...
 
     def fly(self, p: Vector, start: Any) -> Any:
-        """A trial (`Flown`) at p, from the `start` that the last accepted one left."""
+        """A trial (`Tried`) at p, from the `start` that the last accepted one left."""
         ...
 
     def linearise(self, flown: Any) -> Any:
@@ -91,7 +91,7 @@ class Objective(Protocol):
 
 
 class Descent(NamedTuple):
-    """Where a run ended: the last accepted trial with its derivative, None where the start has none."""
+    """Where a run ended: the last accepted trial and its derivative, which is None where the start has none."""
 
     flown: Any
     linear: Any | None
@@ -102,7 +102,7 @@ class Descent(NamedTuple):
     seconds: float
 
 
-class _Place(NamedTuple):
+class _Iterate(NamedTuple):
     """An accepted trial, and what the rest of the run knows of the way there."""
 
     flown: Any
@@ -113,11 +113,11 @@ class _Place(NamedTuple):
     small: int = 0
     accepted: int = 0
     coloured: bool = False
-    """Whether the colour of the errors counts: once they no longer fall fast. Before, it is that of the misfit."""
+    """Whether the colour of the errors counts. It does once they no longer fall fast; before, misfit colours them."""
 
 
 def descend(
-    objective: Objective,
+    objective: SquaredResiduals,
     p: Vector,
     start: Any,
     *,
@@ -148,26 +148,26 @@ def descend(
     if linear is None or not np.isfinite(linear.hessian).all():
         return Descent(flown, None, ridge, 0.0, 0, Ending.NON_FINITE, time.perf_counter() - began)
     largest = 1.0 if damping.diagonal else float(np.diag(linear.hessian).max(initial=1e-300))
-    place = _Place(flown, linear, ridge, damping.first * largest)
-    place = place._replace(ridge=_next_ridge(objective, place, evidence and evidence_at_start))
+    iterate = _Iterate(flown, linear, ridge, damping.first * largest)
+    iterate = iterate._replace(ridge=_next_ridge(objective, iterate, evidence and evidence_at_start))
     ending, done = Ending.RUNNING, 0
     while ending is Ending.RUNNING and done < iterations:
-        place, ending = _trial(objective, place, limits, tolerance, damping, evidence)
+        iterate, ending = _trial(objective, iterate, limits, tolerance, damping, evidence)
         done += 1
-        progress(done, place.flown.loss)
-    effective = effective_weights(place.linear.hessian, place.ridge, objective.physics)
-    return Descent(place.flown, place.linear, place.ridge, effective, done, ending, time.perf_counter() - began)
+        progress(done, iterate.flown.loss)
+    effective = effective_weights(iterate.linear.hessian, iterate.ridge, objective.physics)
+    return Descent(iterate.flown, iterate.linear, iterate.ridge, effective, done, ending, time.perf_counter() - began)
 
 
 def _trial(
-    objective: Objective, place: _Place, limits: Any, tolerance: float, damping: Damping, evidence: bool
-) -> tuple[_Place, Ending]:
+    objective: SquaredResiduals, iterate: _Iterate, limits: Any, tolerance: float, damping: Damping, evidence: bool
+) -> tuple[_Iterate, Ending]:
     """One damped step: accept it, or damp more."""
-    flown, linear, ridge = place.flown, place.linear, place.ridge
+    flown, linear, ridge = iterate.flown, iterate.linear, iterate.ridge
     p = flown.p
     penalty = np.concatenate([np.zeros(objective.physics), np.ones(len(p) - objective.physics)])
     downhill = linear.gradient - ridge * penalty * p
-    step, expected = _step(linear.hessian + ridge * np.diag(penalty), downhill, place.damping, p, limits, damping)
+    step, expected = _step(linear.hessian + ridge * np.diag(penalty), downhill, iterate.damping, p, limits, damping)
     moves = bool(np.isfinite(step).all() and step.any())
     tried = objective.fly(p + step, linear.start) if moves else None
     before = flown.loss + ridge * float(penalty @ p**2)
@@ -175,31 +175,31 @@ def _trial(
     followed = objective.linearise(tried) if np.isfinite(after) and after < before else None
     if tried is not None and followed is not None and np.isfinite(followed.hessian).all():
         gain = (before - after) / expected if expected > 0 else 1.0
-        place = _Place(
+        iterate = _Iterate(
             flown=tried,
             linear=followed,
             ridge=ridge,
-            damping=place.damping * max(1 / 3, 1 - (2 * gain - 1) ** 3),
-            small=place.small + 1 if before - after < tolerance * before else 0,
-            accepted=place.accepted + 1,
-            coloured=place.coloured or before - after < _SETTLED * before,
+            damping=iterate.damping * max(1 / 3, 1 - (2 * gain - 1) ** 3),
+            small=iterate.small + 1 if before - after < tolerance * before else 0,
+            accepted=iterate.accepted + 1,
+            coloured=iterate.coloured or before - after < _SETTLED * before,
         )
-        place = place._replace(ridge=_next_ridge(objective, place, evidence))
-        return place, Ending.CONVERGED if place.small >= 2 else Ending.RUNNING
-    place = place._replace(damping=place.damping * place.growth, growth=2 * place.growth)
+        iterate = iterate._replace(ridge=_next_ridge(objective, iterate, evidence))
+        return iterate, Ending.CONVERGED if iterate.small >= 2 else Ending.RUNNING
+    iterate = iterate._replace(damping=iterate.damping * iterate.growth, growth=2 * iterate.growth)
     largest = 1.0 if damping.diagonal else float(np.diag(linear.hessian).max(initial=1e-300))
-    if place.damping > damping.largest * largest or not step.any():
+    if iterate.damping > damping.largest * largest or not step.any():
         level = _level(linear.hessian, downhill, before, _held(p, downhill, *limits))
-        return place, Ending.CONVERGED if place.accepted or level else Ending.NO_DESCENT
-    return place, Ending.RUNNING
+        return iterate, Ending.CONVERGED if iterate.accepted or level else Ending.NO_DESCENT
+    return iterate, Ending.RUNNING
 
 
-def _next_ridge(objective: Objective, place: _Place, evidence: bool) -> float:
+def _next_ridge(objective: SquaredResiduals, iterate: _Iterate, evidence: bool) -> float:
     if not evidence:
-        return place.ridge
-    flown, samples = place.flown, objective.samples(place.flown)
-    physics, hessian = objective.physics, place.linear.hessian
-    return _evidence(samples, flown.p, hessian, flown.loss, place.ridge, physics, place.coloured)
+        return iterate.ridge
+    flown, samples = iterate.flown, objective.samples(iterate.flown)
+    physics, hessian = objective.physics, iterate.linear.hessian
+    return _evidence(samples, flown.p, hessian, flown.loss, iterate.ridge, physics, iterate.coloured)
 
 
 def _step(
@@ -240,12 +240,12 @@ def weights_hessian(hessian: Matrix, physics: int) -> Matrix:
     h_tt, h_tw, h_ww = hessian[:physics, :physics], hessian[:physics, physics:], hessian[physics:, physics:]
     unit = np.sqrt(np.maximum(np.diag(h_tt), np.finfo(float).tiny))
     inner = np.linalg.lstsq(h_tt / np.outer(unit, unit), h_tw / unit[:, None], rcond=1e-14)[0]
-    found = h_ww - (h_tw / unit[:, None]).T @ inner
-    return (found + found.T) / 2
+    eliminated = h_ww - (h_tw / unit[:, None]).T @ inner
+    return (eliminated + eliminated.T) / 2
 
 
 def effective_weights(hessian: Matrix, ridge: float, physics: int) -> float:
-    """tr(H (H + αI)⁻¹) of the weights, with directions that are rounding counted as absent."""
+    """tr(H (H + αI)⁻¹) of the weights. Directions that are rounding count as absent."""
     if len(hessian) == physics:
         return 0.0
     values = np.linalg.eigvalsh(weights_hessian(hessian, physics))
@@ -258,8 +258,8 @@ def _evidence(
 ) -> float:
     """MacKay's fixed point `α = γσ²/(κ‖w‖²)`, κ the share of the residuals that is independent.
 
-    Residuals of a free run are coloured: N of them say as much as κN independent ones, which divides the weight
-    of the data against the prior.
+    Residuals of a free run are coloured: N of them say as much as κN independent ones. So the data weigh less against
+    the prior.
     """
     count, share = samples
     share = share if coloured else 1.0

@@ -14,8 +14,8 @@ from orthaug._base.jax import Array
 from orthaug._base.registry import LIBRARY_ONLY, InSpec, check_fields
 from orthaug.fitting.normal_equations import Normal
 from orthaug.fitting.solvers import compiled
-from orthaug.fitting.solvers.compiled import Run
-from orthaug.fitting.solvers.descent import Descent, Objective, descend
+from orthaug.fitting.solvers.compiled import TrainingRun
+from orthaug.fitting.solvers.descent import Descent, SquaredResiduals, descend
 from orthaug.models.rows import Overlap
 
 
@@ -47,11 +47,11 @@ class LevenbergMarquardt:
         arguments: tuple[Any, ...],
         overlap: Overlap,
         **options: Any,
-    ) -> Run:
+    ) -> TrainingRun:
         """`‖r(w)‖² + α‖w‖²` from `w`, compiled whole: the rows are in memory; see `compiled.minimise`."""
         limits: dict[str, Any] = {"iterations": self.iterations, "tolerance": self.tolerance}
         return compiled.minimise(criterion, w, arguments, overlap, **limits, **options)
 
-    def descend(self, objective: Objective, p: Vector, start: Any, **options: Any) -> Descent:
+    def descend(self, objective: SquaredResiduals, p: Vector, start: Any, **options: Any) -> Descent:
         """`‖r(p)‖² + α‖w‖²` from p, driven by the host; see `descent.descend`."""
         return descend(objective, p, start, iterations=self.iterations, tolerance=self.tolerance, **options)

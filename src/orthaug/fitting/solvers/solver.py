@@ -14,7 +14,8 @@ class Solver(Protocol):
     def gauss_newton(self) -> bool:
         """Whether it works on normal equations over the weights, with θ eliminated.
 
-        Evidence and the free run need them. Other solvers get the criterion over θ and the weights together (`Joint`).
+        Evidence and the free run need them. Other solvers get the criterion of θ and the weights together
+        (`PaperCriterion`).
         """
         ...
 

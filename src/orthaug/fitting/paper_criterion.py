@@ -1,4 +1,4 @@
-"""The paper's own problem, over θ and the learner's weights together, for gradient solvers."""
+"""The paper's own criterion: of θ and the learner's weights together, for gradient solvers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from orthaug.physics.problem import Problem
 
 
 class Physics(NamedTuple):
-    """θ as an unknown beside w: coordinates `q = start + basis v` in whitened rows, and the structure's rows."""
+    """θ as an unknown beside w: its coordinates `q = start + basis v` in whitened rows, and the structure's rows."""
 
     start: Float[Array, "nt"]
     basis: Float[Array, "nt nt"]
@@ -32,7 +32,7 @@ class Physics(NamedTuple):
     def of(
         cls, problem: Problem, elimination: Elimination, fixed: Fixed, ridge: float, rms: float, *, solved: bool
     ) -> Physics:
-        """θ from θ⁰ on: every free column scaled to the size of a row, fixed entries without a column.
+        """θ that starts at θ⁰. A free entry has a column, scaled to the size of a row; a fixed one has none.
 
         Where θ is `solved` (F1), it stands at its end and has no columns: the learner's path does not depend on it.
         """
@@ -61,10 +61,10 @@ class Physics(NamedTuple):
 
 
 @dataclass(frozen=True)
-class JointCriterion:
-    """The paper's own problem, for gradient solvers: mean square of `Y − Φθ − F` over θ and w together.
+class PaperCriterion:
+    """Mean square of `Y − Φθ − F`, and the structure's rows, as a function of θ and w.
 
-    In the orthogonal structure the learner enters as P⊥F, which decouples the two (F1).
+    In the orthogonal structure the learner enters as P⊥F, which decouples θ and w (F1).
     """
 
     bound: Bound
@@ -86,6 +86,6 @@ class JointCriterion:
 
     def _sums(self, w: Float[Array, "nw"], chunk: Chunk) -> tuple[Float[Array, ""], Float[Array, "nt"]]:
         """‖P⊥Y − F‖² and QᵀF of one chunk."""
-        one = jax.vmap(self.bound.values, in_axes=(None, -1), out_axes=-1)
-        values = chunk.gain * one(w, chunk.z)
+        row_values = jax.vmap(self.bound.values, in_axes=(None, -1), out_axes=-1)
+        values = chunk.gain * row_values(w, chunk.z)
         return jnp.sum((chunk.e - values) ** 2), jnp.einsum("ytm,ym->t", chunk.q, values)
