@@ -10,6 +10,7 @@ from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Record
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.one_step import OneStepTask
+from orthaug.fitting.solvers import adam_lbfgs
 from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
 from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
 from orthaug.models.learners import MLP, Function
@@ -128,7 +129,7 @@ def test_lbfgs_goes_on_from_adam(structure):
 
 
 def test_the_loss_never_rises_under_lbfgs(monkeypatch):
-    monkeypatch.setattr(gradient, "burst_length", lambda burst, spent: 1)
+    monkeypatch.setattr(adam_lbfgs, "burst_length", lambda burst, spent: 1)
     told = []
     fit(Additive(), AdamLBFGS(0, 40), progress=lambda run, iteration, loss: told.append((iteration, loss)))
     iterations, losses = zip(*told, strict=True)
@@ -141,7 +142,7 @@ def test_the_loss_never_rises_under_lbfgs(monkeypatch):
 def test_bursts_change_nothing(monkeypatch, structure, burst):
     found = []
     for length in (burst, 10**6):
-        monkeypatch.setattr(gradient, "burst_length", lambda b, spent, length=length: length)
+        monkeypatch.setattr(adam_lbfgs, "burst_length", lambda b, spent, length=length: length)
         found.append(fit(structure, AdamLBFGS(20, 20)))
     np.testing.assert_array_equal(found[0].model.numbers.weights, found[1].model.numbers.weights)
     np.testing.assert_array_equal(found[0].theta, found[1].theta)

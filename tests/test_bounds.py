@@ -315,7 +315,7 @@ def test_a_fit_from_a_spec(tmp_path, kind):
     for entry in (a, c):
         assert entry["std"] is None and entry["ci95"] is None
     assert b["std"] > 0 and b["ci95"][0] < b["value"] < b["ci95"][1]
-    assert any("a = 0.8" in text and "c = 0.1" in text for text in result["warnings"])
+    assert any("a = 0.8" in w["text"] and "c = 0.1" in w["text"] for w in result["warnings"])
 
 
 @pytest.mark.parametrize(

@@ -137,6 +137,9 @@ class StateSpace(Differentiated):
     def inputs(self, experiment, record):
         return experiment.inputs[self.first_row :]
 
+    def describe(self, state, inputs):
+        return {f"x{i}": float(value) for i, value in enumerate(state)}
+
     def matrices(self, theta):
         n, m = self.order, self.inputs_count
         a, b, c = theta[: n * n], theta[n * n : n * (n + m)], theta[n * (n + m) :]

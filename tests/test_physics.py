@@ -29,6 +29,11 @@ TRUTH = np.array([1.0, 100.0, 1000.0])
 P = PhysicalParameter
 
 
+def texts(found):
+    """What the warnings say."""
+    return tuple(warning.text for warning in found.warnings)
+
+
 def spring(theta=EULER, start=(1.1, 90.0, 1100.0), ts=0.01):
     """The mass-spring-damper of Sect. 5.2, p = (m, cd, ks)."""
     units, names = ("kg", "Ns/m", "N/m"), ("m", "cd", "ks")
@@ -144,9 +149,7 @@ def test_a_round_trip_to_the_last_digits():
         np.testing.assert_allclose(found.value, TRUTH, rtol=1e-13)
         assert found.std == (None, None, None) and found.ci95 == (None, None, None)
         assert found.covariance is None and found.consistency is None
-        assert found.warnings == (
-            "theta has no finite covariance, so the physical parameters have no standard errors.",
-        )
+        assert texts(found) == ("theta has no finite covariance, so the physical parameters have no standard errors.",)
 
 
 factors = st.floats(-1.5, 1.5).map(math.exp)
@@ -159,7 +162,7 @@ def test_round_trips_from_a_distant_start(a, b, c, ts, theta):
     found = solve(physics, target, relative(target), freedom=50)
     condition = np.abs(found.sensitivities).max()  # how much the last digit of θ moves p
     np.testing.assert_allclose(found.value, p, rtol=1e-14 * max(condition, 10.0))
-    assert found.warnings == ()
+    assert texts(found) == ()
 
 
 @given(st.integers(0, 10**6))
@@ -206,11 +209,11 @@ def test_sensitivity_of_a_parameter_that_is_zero_does_not_exist():
 def test_two_solutions_are_told():
     found = solve(one("(m - 2)**2", initial=3.5), np.array([1.0]), None, freedom=10)
     np.testing.assert_allclose(found.value, [3.0], rtol=1e-12)
-    assert found.warnings[0] == (
+    assert texts(found)[0] == (
         "theta is explained as well by m = 1; bounds or better initial values choose between the solutions."
     )
     alone = solve(one("(m - 2)**2", initial=3.5, min=2.0), np.array([1.0]), None, freedom=10)
-    assert not any("as well" in text for text in alone.warnings)
+    assert not any("as well" in text for text in texts(alone))
 
 
 def test_theta_that_no_parameters_give():
@@ -218,7 +221,7 @@ def test_theta_that_no_parameters_give():
     found = solve(physics, np.array([0.5, 4.0]), relative(np.array([0.5, 4.0]), correlation=0.0), freedom=10)
     np.testing.assert_allclose(found.value, [2.0, 2.0], rtol=1e-5)
     assert found.std == (None, None) and found.sensitivities is None and found.consistency is None
-    assert found.warnings == (
+    assert texts(found) == (
         "No physical parameters give the estimated theta: nearest is a = 1 instead of 0.5. They have no standard "
         "errors; check the expressions of theta, and whether theta is biased.",
     )
@@ -228,9 +231,7 @@ def test_a_singular_solution_has_no_standard_errors():
     physics = two("m + q", "(m - q)**2", "(m - q)**2 + m + q", initial=(1.0, 1.0))
     found = solve(physics, np.array([2.0, 0.0, 2.0]), np.eye(3), freedom=10)
     assert found.std == (None, None) and found.sensitivities is None
-    assert (
-        "At the solution m, q cannot be told apart; the physical parameters have no standard errors." in found.warnings
-    )
+    assert "At the solution m, q cannot be told apart; the physical parameters have no standard errors." in texts(found)
 
 
 def test_rows_are_json():
@@ -310,7 +311,7 @@ def test_a_constraint_of_the_physics_is_tested(shift, verb):
     assert found.consistency.text == (
         f"The data {verb} the physics' own constraint (chi2 = {shift**2:.3g}, p = {p:.2g})."
     )
-    assert found.warnings == ((found.consistency.text,) if verb == "contradict" else ())
+    assert texts(found) == ((found.consistency.text,) if verb == "contradict" else ())
 
 
 def test_several_constraints_are_counted():
@@ -358,7 +359,7 @@ def test_a_singular_covariance_is_a_constraint():
 def test_theta_at_a_bound_gives_no_standard_errors():
     found = solve(two("m", "q"), np.array([3.0, 4.0]), np.array([[1.0, np.nan], [np.nan, np.nan]]), freedom=10)
     np.testing.assert_allclose(found.value, [3.0, 4.0])
-    assert found.std == (None, None) and "no finite covariance" in found.warnings[0]
+    assert found.std == (None, None) and "no finite covariance" in texts(found)[0]
 
 
 # bounds
@@ -375,7 +376,7 @@ def test_a_parameter_at_its_bound():
     assert found.ci95[0] is None and np.isnan(found.covariance[0]).all()
     np.testing.assert_array_equal(np.isnan(found.sensitivities), [[True, True], [False, False]])
     assert found.consistency.df == 1 and found.consistency.chi2 == pytest.approx(0.25 / 0.05)
-    assert found.warnings[0] == (
+    assert texts(found)[0] == (
         "m stands at its bound 0 and has no standard error; those of the others hold with it there."
     )
     assert "own constraint, bounds included (chi2" in found.consistency.text

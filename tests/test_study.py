@@ -231,7 +231,7 @@ def test_a_store_that_cannot_be_written(tmp_path):
 PROGRAM = """
 import sys, time
 from pathlib import Path
-from orthaug.study import Study, run
+from orthaug.studies import Study, run
 
 def one(seed):
     time.sleep(0.05)

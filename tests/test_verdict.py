@@ -25,6 +25,7 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import Lags, stack_rows
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.status import Ending
 from orthaug.models.learners import MLP
 from orthaug.models.model import Model
 from orthaug.physics.baseline import Baseline, Term
@@ -301,7 +302,7 @@ def test_a_fit_that_fails_counts_as_a_free_run_that_diverges():
 
     def non_finite(fold):
         fit = fitted(fold)
-        return replace(fit, status=replace(fit.status, code="non_finite"))
+        return replace(fit, status=replace(fit.status, ending=Ending.NON_FINITE))
 
     errors = cross_validate(system(0, 120), [fitted, refused, non_finite], blocks=2, start=2)
     assert all(0 < alone < 1 and (first, second) == (INF, INF) for alone, first, second in errors)

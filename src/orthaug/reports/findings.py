@@ -184,7 +184,7 @@ class StabilityResult(Content):
     contraction: ContractionResult | None
     diverges_at: Number
     searched: Number
-    lipschitz: LipschitzResult
+    lipschitz: LipschitzResult | None
     warnings: list[WarningResult]
     text: str
 

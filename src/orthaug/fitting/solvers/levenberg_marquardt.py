@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from annotated_types import Ge
 from jaxtyping import Float
 
-from orthaug._base.checks import Vector
+from orthaug._base.checks import Vector, check_number
 from orthaug._base.jax import Array
 from orthaug._base.registry import LIBRARY_ONLY, InSpec, check_fields
 from orthaug.fitting.normal_equations import Normal
@@ -35,6 +35,7 @@ class LevenbergMarquardt:
 
     def __post_init__(self) -> None:
         check_fields(self)
+        check_number(self.tolerance, "tolerance")
 
     def at_most(self, iterations: int) -> LevenbergMarquardt:
         """The same with fewer iterations."""
