@@ -45,7 +45,7 @@ def per_row(fit: oa.Estimate, timed: int) -> tuple[np.ndarray, float]:
     psi = np.asarray(jax.lax.map(lambda k: gradient(parameters, k), jnp.arange(len(phi))))
     scale = 1 / np.linalg.norm(psi, axis=0)
     inverse = np.linalg.pinv((psi * scale).T @ (psi * scale), rcond=psi.shape[1] * np.finfo(float).eps, hermitian=True)
-    return model.noise[0, 0] * inverse * np.outer(scale, scale), seconds
+    return model.statistics.noise[0, 0] * inverse * np.outer(scale, scale), seconds
 
 
 def main(timed: int) -> None:

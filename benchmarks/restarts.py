@@ -14,7 +14,7 @@ from orthaug import MLP, LevenbergMarquardt
 from orthaug._base.jax import jax, jnp
 from orthaug.fitting.normal_equations import Hold, OneStep
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.solvers.levenberg_marquardt import Options, _advance, _start
+from orthaug.fitting.solvers.compiled import Options, _advance, _start
 from orthaug.models.rows import Overlap
 from orthaug.physics.problem import pose
 from orthaug.studies import synthetic

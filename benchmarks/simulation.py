@@ -11,7 +11,7 @@ from machine import describe, median_seconds
 from orthaug import MLP, Baseline, LevenbergMarquardt, Orthogonal, Record, Simulation, Term
 from orthaug._base.jax import jax, jnp
 from orthaug._base.parallel import one_blas_thread
-from orthaug.fitting.free_run import FreeRun
+from orthaug.fitting.free_run import FreeRunTask
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.segments import respond
 from orthaug.physics.problem import pose
@@ -35,17 +35,17 @@ def main() -> None:
     problem = pose(record(), baseline, None, ("y[k-1]", "y[k-2]"))
     task = OneStepTask.of(problem, MLP((10,)))
     start = task.bound.init(jax.random.key(0))
-    flight = FreeRun.of(problem, task, Simulation(segment=512, washout=40))
+    flight = FreeRunTask.of(task, Simulation(segment=512, washout=40))
     c = problem.projection.solve(problem.whitened_target - task.values(start) * problem.weight)
-    numbers, past = flight.numbers(c, start), jnp.asarray(flight.segments.past)
+    numbers, states = flight.numbers(c, start), jnp.asarray(flight.segments.start)
 
     def train(iterations: int) -> None:
         with one_blas_thread():  # as `estimate` trains
             run = flight.run(LevenbergMarquardt(iterations, tolerance=0.0), start, Orthogonal(), "evidence")
-        assert run.found.iterations == iterations, "training ended early"
+        assert run.end.iterations == iterations, "training ended early"
 
     plain = median_seconds(
-        lambda: jax.block_until_ready(respond(flight.form, numbers, flight.segments, past)), 5 * REPEATS
+        lambda: jax.block_until_ready(respond(flight.dynamics, numbers, flight.segments, states)), 5 * REPEATS
     )
     # a run's beginning (one-step training, the first linearisation) is paid once: take the difference of two lengths
     short, long = median_seconds(lambda: train(SHORT), REPEATS), median_seconds(lambda: train(LONG), REPEATS)

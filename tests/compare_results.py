@@ -1,7 +1,9 @@
 """Compares two results: `python tests/compare_results.py BEFORE AFTER`, folders with a result.json.
 
 Numbers are equal to 1e-9 relative. Aside stay times, the number of the schema, whether a warning is text or has a code,
-and paths. The orthogonality defect, rounding of about 1e-16, may differ by 1e-12.
+and paths. Rounding may differ: the orthogonality defect, of about 1e-16, by 1e-12, and a number beside larger ones (in
+a list, or by name) by 1e-12 of the largest. The contraction metric is the end of a search that rounding of the model
+turns elsewhere; it may differ by 1e-3.
 """
 
 from __future__ import annotations
@@ -14,13 +16,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-RELATIVE, ROUNDING = 1e-9, 1e-12
+RELATIVE, ROUNDING, SEARCH = 1e-9, 1e-12, 1e-3
 ASIDE = {"seconds", "schema", "where"}
 FOLDERS = re.compile(r"(?:[^\s:,;()]*/)+")  # of a path within a text
 
 
-def differences(before: Any, after: Any, where: str = "") -> Iterator[str]:
-    """What differs, each with its place."""
+def differences(before: Any, after: Any, where: str = "", beside: float = 0.0) -> Iterator[str]:
+    """What differs, each with its place; `beside` is the largest number next to it."""
     key = where.rpartition(".")[2]
     if key in ASIDE:
         return
@@ -29,23 +31,38 @@ def differences(before: Any, after: Any, where: str = "") -> Iterator[str]:
     if isinstance(before, dict) and isinstance(after, dict):
         yield from (f"{where}.{name}: only in one of them" for name in before.keys() ^ after.keys())
         for name in (name for name in before if name in after):
-            yield from differences(before[name], after[name], f"{where}.{name}" if where else name)
+            yield from differences(before[name], after[name], f"{where}.{name}" if where else name, largest(before))
     elif isinstance(before, list) and isinstance(after, list):
         if len(before) != len(after):
             yield f"{where}: {len(before)} entries, then {len(after)}"
         for i, (one, other) in enumerate(zip(before, after, strict=False)):
-            yield from differences(one, other, f"{where}[{i}]")
-    elif not same(before, after, ROUNDING if key == "orthogonality_defect" else 0.0):
+            yield from differences(one, other, f"{where}[{i}]", largest(before))
+    elif not same(before, after, allowed(where, beside), SEARCH if "stability.contraction" in where else RELATIVE):
         yield f"{where}: {before!r}, then {after!r}"
 
 
-def same(before: Any, after: Any, absolute: float) -> bool:
-    """Whether two entries are equal, numbers to `RELATIVE` or `absolute`, texts without the folders of paths."""
+def is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def largest(values: Any) -> float:
+    """The largest number among the entries of a list or a mapping by parameter; fields of other meanings have none."""
+    if isinstance(values, dict):
+        values = [] if {"name", "value", "p", "rmse", "where", "kind", "code"} & values.keys() else values.values()
+    return max((abs(value) for value in values if is_number(value)), default=0.0)
+
+
+def allowed(where: str, beside: float) -> float:
+    """The absolute difference that is rounding."""
+    return ROUNDING if where.endswith("orthogonality_defect") else ROUNDING * beside
+
+
+def same(before: Any, after: Any, absolute: float, relative: float = RELATIVE) -> bool:
+    """Whether two entries are equal, numbers to `relative` or `absolute`, texts without the folders of paths."""
     if isinstance(before, str) and isinstance(after, str):
         return FOLDERS.sub("", before) == FOLDERS.sub("", after)
-    numbers = [isinstance(v, int | float) and not isinstance(v, bool) for v in (before, after)]
-    if all(numbers):
-        return math.isclose(before, after, rel_tol=RELATIVE, abs_tol=absolute)
+    if is_number(before) and is_number(after):
+        return math.isclose(before, after, rel_tol=relative, abs_tol=absolute)
     return type(before) is type(after) and before == after
 
 

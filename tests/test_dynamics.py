@@ -57,10 +57,10 @@ def runs(dynamics, numbers, inputs, steps=6):
     """(states, slopes as (n0, n0 + n, m), outputs, their slopes) after every step of m runs side by side."""
     rng = np.random.default_rng(3)
     state, slopes = jnp.asarray(rng.normal(size=(dynamics.states, WIDTH))), dynamics.first_slopes(WIDTH)
-    found = []
+    found, tangents = [], jax.jit(dynamics.tangents)
     for k in range(steps):
         row = jnp.stack([inputs[k + 7 * m] for m in range(WIDTH)], axis=-1)
-        state, slopes, value, slope = dynamics.tangents(numbers, state, slopes, row)
+        state, slopes, value, slope = tangents(numbers, state, slopes, row)
         found.append((state, flat(dynamics, slopes), value, slope))
     return found
 

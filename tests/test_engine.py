@@ -12,6 +12,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
+from orthaug.fitting.criteria import Simulation
 from orthaug.fitting.estimation import estimate, fit
 from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
@@ -264,3 +265,8 @@ def test_sums_over_lists_are_sums_over_chunks(ny):
     for other in found[1:]:
         for one, two in zip(jax.tree.leaves(found[0]), jax.tree.leaves(other), strict=True):
             assert apart(two, one) <= 1e-13
+
+
+def test_a_free_run_needs_rows_in_memory():
+    with pytest.raises(InputError, match="a free run needs its rows in memory"):
+        fit(posed(1), learner=MLP(hidden=(2,)), criterion=Simulation(20, 2), engine=Streaming())

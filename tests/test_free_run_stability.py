@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
 from orthaug._base.errors import InputError
+from orthaug._base.jax import jnp
 from orthaug.analysis import contraction as metrics
 from orthaug.analysis import feedback as radii
 from orthaug.analysis.boundedness import divergence_scaling
@@ -17,11 +18,11 @@ from orthaug.analysis.contraction import contraction
 from orthaug.analysis.feedback import feedback
 from orthaug.analysis.free_run_stability import stability
 from orthaug.analysis.lipschitz import lipschitz
-from orthaug.analysis.local_dynamics import companions
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags, stack_rows
 from orthaug.fitting.estimation import estimate, orthogonalize
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.models.dynamics import Differentiated, Dynamics, Parts
 from orthaug.models.learners import MLP
 from orthaug.models.model import Model
 from orthaug.models.storage import load, save
@@ -98,9 +99,10 @@ def network():
 
 
 def differences(model: Model, record: Record, row: int, along) -> np.ndarray:
-    """A_{k,i} (na, ny, ny) at a row of one experiment by differences of the prediction from past outputs `along`."""
+    """A_k (na ny, na ny) at a row of one experiment by differences of the prediction from past outputs `along`."""
     (e,), names = record.experiments, [c.name for c in record.outputs]
-    found, h = np.zeros((model.form.memory, len(names), len(names))), 1e-6
+    n, ny, h = model.form.memory * len(names), len(names), 1e-6
+    found = np.eye(n, k=-ny)  # the other past outputs move up
     for i in range(1, model.form.memory + 1):
         for j in range(len(names)):
             sides = []
@@ -109,30 +111,33 @@ def differences(model: Model, record: Record, row: int, along) -> np.ndarray:
                 y[row - i, j] += sign * h
                 moved = Record.from_arrays(e.inputs, y, outputs=names)
                 sides.append(model.predict(moved).model[row])
-            found[i - 1, :, j] = (sides[0] - sides[1]) / (2 * h)
+            found[:ny, (i - 1) * ny + j] = (sides[0] - sides[1]) / (2 * h)
     return found
 
 
 @pytest.mark.parametrize("along", ["simulation", "measured"])
-def test_jacobians_are_differences(network, along):
+def test_transitions_are_differences(network, along):
     model, record = network
     found = feedback(model, record, along=along)
     measured = record.experiments[0].outputs
     run = model.simulate(record).model if along == "simulation" else measured
     past = np.where(np.isfinite(run), run, measured)
-    assert found.jacobians.shape == (147, 3, 2, 2) and found.steps == 147 and found.skipped == 0
+    assert found.transition.shape == (147, 6, 6) and found.steps == 147 and found.skipped == 0
     for place in (0, 1, 60, 146):
-        expected = differences(model, record, int(found.points.row[place]), past)
-        np.testing.assert_allclose(found.jacobians[place], expected, atol=1e-7)
+        expected = differences(model, record, int(found.points.where.row[place]), past)
+        np.testing.assert_allclose(found.transition[place], expected, atol=1e-7)
 
 
 def test_companion_moves_the_state(network):
     model, record = network
-    a = feedback(model, record).jacobians
-    whole = companions(a)[10]
+    found = feedback(model, record)
+    whole, state, inputs = found.transition[10], found.points.states[10], found.points.inputs[10]
+    a = [whole[:2, 2 * i : 2 * i + 2] for i in range(3)]
     past = np.random.default_rng(0).normal(size=(3, 2))
-    expected = [sum(a[10, i] @ past[i] for i in range(3)), past[0], past[1]]
+    expected = [sum(a[i] @ past[i] for i in range(3)), past[0], past[1]]
     np.testing.assert_allclose(whole @ past.ravel(), np.ravel(expected), atol=1e-12)
+    ends = [model.form.step(model.numbers, state + h * past.ravel(), inputs)[0] for h in (1e-6, -1e-6)]
+    np.testing.assert_allclose(whole @ past.ravel(), (ends[0] - ends[1]) / 2e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -157,7 +162,7 @@ def test_poles_of_linear_models(poles):
     assert found.share_above_one == 0
     assert radius - 1e-6 <= contracts.rate <= radius**0.93 < 1
     assert contracts.share == 1 and contracts.bound == pytest.approx(radius, abs=1e-6)
-    a, t = companions(found.jacobians)[0], np.linalg.cholesky(contracts.metric).T
+    a, t = found.transition[0], np.linalg.cholesky(contracts.metric).T
     assert np.linalg.norm(t @ a @ np.linalg.inv(t), 2) == pytest.approx(contracts.rate, rel=1e-4)
     for steps in (1, 10, 50):
         power = np.linalg.norm(np.linalg.matrix_power(a, steps), 2)
@@ -299,7 +304,7 @@ def test_a_run_that_diverges(duffing):
     (trajectory,) = model.simulate(wild).trajectories
     row = trajectory.diverged[0]
     found = stability(model, wild)
-    assert found.feedback.steps == row - 2 + 1 and found.feedback.points.row[-1] == row
+    assert found.feedback.steps == row - 2 + 1 and found.feedback.points.where.row[-1] == row
     assert found.feedback.diverged == (f"y at experiment 0, row {row}",)
     assert 0 < found.diverges_at < 1
     assert found.text.count("diverges") == 1 and f"row {row}" in found.warnings[0].text
@@ -334,8 +339,8 @@ def test_two_experiments(duffing):
     both = Record.join([quiet, record])
     found, alone = feedback(model, both), feedback(model, record)
     assert found.steps == 98 + 2998
-    np.testing.assert_array_equal(found.jacobians[98:], alone.jacobians)
-    np.testing.assert_array_equal(found.points.experiment, np.repeat([0, 1], [98, 2998]))
+    np.testing.assert_array_equal(found.transition[98:], alone.transition)
+    np.testing.assert_array_equal(found.points.where.experiment, np.repeat([0, 1], [98, 2998]))
     worst = contraction(model, both).worst
     assert worst.experiment == 1 and worst.where == f"experiment 1, row {worst.row}"
     wild = Record.join([record, Record.from_arrays(20 * e.inputs, e.outputs)])
@@ -350,7 +355,7 @@ def test_samples_are_bounded_and_the_same(duffing, monkeypatch):
     monkeypatch.setattr(radii, "MOST_STEPS", 500)
     found = feedback(model, record)
     assert len(found.radius) == 500 and found.steps == 2998
-    assert found.points.row[0] == 2 and found.points.row[-1] == 2999
+    assert found.points.where.row[0] == 2 and found.points.where.row[-1] == 2999
 
 
 def test_a_long_past_is_not_looked_at():
@@ -423,7 +428,7 @@ def test_a_model_from_elsewhere_by_differences(duffing):
     split = orthogonalize(record, Baseline.from_terms([DUFFING[0]]), outside, lags=Lags(na=2, nb=1)).model
     short = record.rows(None, 300)
     found, expected = feedback(split, short), feedback(model, short)
-    np.testing.assert_allclose(found.jacobians, expected.jacobians, atol=1e-5)
+    np.testing.assert_allclose(found.transition, expected.transition, atol=1e-5)
 
 
 def test_saved_and_loaded(network, tmp_path):
@@ -438,7 +443,7 @@ def test_the_result_is_plain(network):
     found = stability(model, record)
     plain = json.loads(json.dumps(content(found), allow_nan=False))
     assert plain == content(found)
-    assert plain["feedback"]["largest"] == found.feedback.largest and "jacobians" not in plain["feedback"]
+    assert plain["feedback"]["largest"] == found.feedback.largest and "transition" not in plain["feedback"]
     assert np.shape(plain["contraction"]["metric"]) == (6, 6)
     assert set(plain["lipschitz"]["worst"]["regressor"]) == {str(lag) for lag in model.form.layout}
 
@@ -480,6 +485,114 @@ def test_channels_by_name(network):
     (e,) = record.experiments
     turned = Record.from_arrays(e.inputs, e.outputs[:, ::-1], outputs=["q", "p"])
     assert content(stability(model, turned)) == content(stability(model, record))
+
+
+@dataclass(frozen=True)
+class Oscillator(Differentiated):
+    """x⁺ = A x + (0, u), y = x₁ + x₂³ of a state that nobody measures: no past outputs anywhere."""
+
+    a: tuple[tuple[float, ...], ...]
+    outputs: tuple[str, ...] = ("y",)
+    linear: bool = False
+    first_row: int = 0
+    states: int = 2
+    unknowns: int = 0
+    memory: int = 0
+
+    def start(self, outputs, rows):
+        return np.ones((len(rows), 2))
+
+    def start_rows(self, weight):
+        return np.zeros((2, 2))
+
+    def inputs(self, experiment, record):
+        return experiment.inputs
+
+    def describe(self, state, inputs):
+        return {"x1": float(state[0]), "x2": float(state[1]), "u": float(inputs[0])}
+
+    def step(self, numbers, state, inputs):
+        y = state[:1] + state[1:] ** 3
+        return jnp.asarray(self.a) @ state + jnp.append(jnp.zeros(1), inputs), Parts(y, 0 * y, 0 * y)
+
+
+def oscillating(radius: float) -> tuple[Model, np.ndarray]:
+    """A slow oscillation of this spectral radius as a model, seen through a lens that spoils its normality; and A."""
+    turn = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
+    a = np.diag([1.0, 5.0]) @ (radius * turn) @ np.diag([1.0, 0.2])
+    model = model_of([Term("a", "y[k-1]"), Term("b", "u[k-1]")], [0.5, 1.0], largest=1.0)
+    return replace(model, form=Oscillator(tuple(map(tuple, a)))), a
+
+
+def visited_states(a, u) -> np.ndarray:
+    x = [np.ones(2)]
+    for value in u[:-1]:
+        x.append(a @ x[-1] + [0.0, value])
+    return np.array(x)
+
+
+def test_a_state_that_is_no_past_output():
+    """Radius, contraction and growth of a linear state space, whose states are those that its steps come to."""
+    model, a = oscillating(0.9)
+    u = 0.1 * noise(400)
+    record = Record.from_arrays(u, noise(400, 2))
+    assert isinstance(model.form, Dynamics)
+    found, contracts = feedback(model, record), contraction(model, record, box=50)
+    x = visited_states(a, u)
+    np.testing.assert_allclose(found.points.states, x, atol=1e-12)
+    np.testing.assert_array_equal(found.points.inputs, u[:, None])
+    np.testing.assert_allclose(found.transition, np.broadcast_to(a, (400, 2, 2)), atol=1e-12)
+    np.testing.assert_allclose(found.unit, x.std(axis=0), rtol=1e-9)
+    assert found.largest == pytest.approx(0.9) and found.steps == 400 and found.diverged == ()
+    row = found.worst.row
+    assert found.worst.regressor == pytest.approx({"x1": x[row, 0], "x2": x[row, 1], "u": u[row]})
+    assert np.linalg.norm(a, 2) > 1 and 0.9 - 1e-9 <= contracts.rate < 0.91
+    assert contracts.share == 1 and contracts.samples == 450
+    again = feedback(model, record, response=model.simulate(record))
+    np.testing.assert_array_equal(again.points.states, found.points.states)
+    assert np.all(feedback(model, record, along="measured").points.states == 1)
+    whole = stability(model, record)
+    assert whole.lipschitz is None and whole.warnings == () and "one-step" not in whole.text
+    assert plainly(whole) == whole.as_dict()
+
+
+def test_a_state_that_is_no_past_output_grows_as_its_inputs():
+    """y is of third degree in the inputs: it reaches 10⁶ times the largest at a factor known from a plain loop."""
+    model, a = oscillating(0.9)
+    u = 0.1 * noise(400)
+    factor = divergence_scaling(model, Record.from_arrays(u, noise(400, 2)))
+
+    def peak(s):
+        x = visited_states(a, u.mean() + s * (u - u.mean()))
+        return np.abs(x[:, 0] + x[:, 1] ** 3).max()
+
+    assert peak(factor) > 1e6 >= peak(factor / 1.05)
+
+
+def test_a_state_that_is_no_past_output_diverges():
+    model, _ = oscillating(1.3)
+    record = Record.from_arrays(0.1 * noise(400), noise(400, 2))
+    found = stability(model, record)
+    row = model.simulate(record).trajectories[0].diverged[0]
+    assert found.feedback.diverged == (f"y at experiment 0, row {row}",) and found.feedback.steps == row + 1 < 100
+    assert found.feedback.largest == pytest.approx(1.3) and found.contraction.rate >= 1.3 - 1e-9
+    assert found.diverges_at == 0.0
+
+
+def test_a_state_by_differences():
+    """The same step told to have no derivative."""
+    model, a = oscillating(0.9)
+    blunt = replace(model, form=Blunt(model.form.a))
+    found = feedback(blunt, Record.from_arrays(noise(300), noise(300, 2)))
+    np.testing.assert_allclose(found.transition, np.broadcast_to(a, (300, 2, 2)), atol=1e-9)
+
+
+class Blunt(Oscillator):
+    differentiable = False
+
+
+def plainly(found) -> dict:
+    return json.loads(json.dumps(content(found), allow_nan=False))
 
 
 @pytest.mark.parametrize(

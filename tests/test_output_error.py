@@ -1,4 +1,4 @@
-"""The solver's loop, as the free run drives it, on small explicit least squares, and the evidence of coloured residuals."""
+"""The solver's loop with the free run's damping on explicit least squares, and the evidence of coloured residuals."""
 
 from __future__ import annotations
 

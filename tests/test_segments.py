@@ -61,7 +61,7 @@ def record_of(ny, lengths=LENGTHS):
 
 
 class Case(NamedTuple):
-    """A model with arbitrary numbers, its record in two chunks of segments, and states to start from that are not the measured."""
+    """A model with arbitrary numbers, its record in two chunks of segments, and states that are not the measured."""
 
     record: Record
     form: Lagged

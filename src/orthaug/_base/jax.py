@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 else:
     Array = Any  # in annotations; at run time jaxtyping checks shape and type of whatever is an array
 
-__all__ = ["Array", "jax", "jnp", "use_compilation_cache"]
+__all__ = ["Array", "jax", "jnp", "padded_length", "use_compilation_cache"]
 
 
 def _real_jax() -> Any:
@@ -74,6 +74,11 @@ def _late_jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any
         return made[0](*args, **kwargs)
 
     return call
+
+
+def padded_length(rows: int) -> int:
+    """What to pad a number of rows to: lengths grow by powers of two, so that few programs are compiled."""
+    return max(256, 1 << (rows - 1).bit_length())
 
 
 if not TYPE_CHECKING:

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from orthaug._base.checks import check_number
 from orthaug._base.errors import InputError
-from orthaug.analysis.local_dynamics import diverging, first_row, state_size
-from orthaug.analysis.visited import MOST_STEPS
+from orthaug._base.jax import Array, jax, jnp, padded_length
+from orthaug.analysis.visited import MOST_STEPS, usable
 from orthaug.data.record import Record
-from orthaug.models.model import Model
+from orthaug.models.dynamics import Dynamics, Numbers
+from orthaug.models.model import RUNAWAY, Model
 
 _LARGEST_FACTOR = 1e4  # outputs of a stable linear model grow with its inputs, and 10⁶ times the largest is "diverged"
+_SIDE_BY_SIDE = 16  # runs of one compiled call
 _CLOSE = 1.05  # ratio of two factors at which the bisection ends
 
 Diverging = Callable[[list[float]], np.ndarray]
@@ -27,18 +31,18 @@ def divergence_scaling(model: Model, record: Record, largest: float = 1024.0) ->
     It scales each input's deviation from its mean over the record; the measured outputs that the run starts from stay.
     Doubled until a run diverges, then bisected to 5 %; what is returned did diverge, and others below it may. Of longer
     records 20000 rows are used, the first of each experiment. None where no run up to `largest` diverges, as without
-    past outputs; at most 1 where the record's own run does, and 0 where it does with its inputs at their means.
+    a state; at most 1 where the record's own run does, and 0 where it does with its inputs at their means.
 
     Raises:
         InputError: a record that does not fit the model, or a `largest` that is not above 1 and at most 10⁴.
     """
     if not 1 < check_number(largest, "largest", positive=True) <= _LARGEST_FACTOR:
         raise InputError(f"`largest` must be a factor above 1 and at most {_LARGEST_FACTOR:g}; got {largest!r}.")
-    if not state_size(model):
+    if not model.form.states:
         return None
-    rows = max(MOST_STEPS // len(record.experiments), first_row(model) + 1)
+    rows = max(MOST_STEPS // len(record.experiments), model.form.first_row + 1)
     first = replace(record, experiments=tuple(e.rows(None, rows) for e in record.experiments))
-    diverges = partial(diverging, model, first)
+    diverges = partial(_diverging, model, first)
     growing = _doubled(float(largest))
     wild = diverges(growing)
     if not wild.any():
@@ -89,3 +93,56 @@ def _middles(low: float, high: float) -> list[float]:
 
 def _middle(low: float, high: float) -> float:
     return float(np.sqrt(low * high))
+
+
+def _diverging(model: Model, record: Record, factors: Sequence[float]) -> Bool[np.ndarray, "f"]:
+    """Whether the free run diverges with the inputs' deviations from their means times each of up to 16 factors.
+
+    The runs start from the measured outputs of each experiment and go side by side.
+
+    Raises:
+        InputError: a record that does not fit the model, or has no outputs to start from.
+    """
+    if not record.outputs:
+        raise InputError("the record has no measured outputs to start from; give those of its first rows.")
+    form: Dynamics = model.form
+    record = usable(model, record)
+    mean = np.concatenate([e.inputs for e in record.experiments]).mean(axis=0)
+    scales = np.concatenate([factors, np.repeat(factors[:1], _SIDE_BY_SIDE - len(factors))])
+    wild = np.zeros(_SIDE_BY_SIDE, dtype=bool)
+    for experiment in record.experiments:
+        if wild.all():
+            break
+        inputs = form.inputs(experiment, record)
+        resting = form.inputs(replace(experiment, inputs=np.tile(mean, (len(experiment), 1))), record)
+        padded = np.zeros((2, padded_length(len(inputs)), inputs.shape[1]))
+        padded[:, : len(inputs)] = resting, inputs
+        state, bound = form.start(experiment.outputs, [form.first_row])[0], RUNAWAY * model.largest_output
+        wild |= np.asarray(_side_by_side(form, model.numbers, state, *padded, len(inputs), scales, bound))
+    return wild[: len(factors)]
+
+
+@partial(jax.jit, static_argnames="form")
+def _side_by_side(
+    form: Dynamics,
+    numbers: Numbers,
+    state: Float[Array, "n0"],
+    resting: Float[Array, "T nu"],
+    inputs: Float[Array, "T nu"],
+    steps: Any,
+    factors: Float[Array, "f"],
+    bound: Float[Array, "ny"],
+) -> Bool[Array, "f"]:
+    """Whether an output leaves `bound` within `steps` of free runs with `resting + factor (inputs − resting)`."""
+    one = jax.vmap(lambda state, row: form.step(numbers, state, row))
+
+    def going_on(carry: tuple[Any, Any, Any]) -> Any:
+        return (carry[0] < steps) & ~carry[2].all()
+
+    def step(carry: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
+        k, states, wild = carry
+        states, parts = one(states, resting[k] + factors[:, None] * (inputs[k] - resting[k]))
+        return k + 1, states, wild | ~(jnp.abs(parts.total) <= bound).all(axis=1)
+
+    states = jnp.broadcast_to(state, (len(factors), *state.shape))
+    return jax.lax.while_loop(going_on, step, (0, states, jnp.zeros(len(factors), dtype=bool)))[2]

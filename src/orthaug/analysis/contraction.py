@@ -12,7 +12,7 @@ from scipy import linalg, optimize
 from orthaug._base.checks import Matrix, Vector, check_count
 from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.feedback import MOST_WORK, Feedback, feedback
-from orthaug.analysis.local_dynamics import companions, in_state, linearised
+from orthaug.analysis.local_dynamics import linearised
 from orthaug.analysis.visited import Place, evenly
 from orthaug.data.record import Record
 from orthaug.models.model import Model
@@ -20,16 +20,16 @@ from orthaug.models.response import Response
 
 _SAMPLES = 2000  # points at most
 _STEEPEST, _ACTIVE = 50, 64  # points of largest radius always among them; worst points that a round of search adds
-_LARGEST_SEARCH = 12  # na ny with a metric better than Lyapunov's
+_LARGEST_SEARCH = 12  # n0 with a metric better than Lyapunov's
 
 
 @dataclass(frozen=True, eq=False)
 class Contraction:
-    """The best norm that was found, `|s|_P = √(sᵀ P s)`, P (na ny)² for s = (y_{k−1}, …, y_{k−na}), up to a factor.
+    """The best norm that was found, `|x|_P = √(xᵀ P x)` of the state, P (n0, n0) up to a factor.
 
     `rate` is the largest `‖A_k‖_P` over the samples; `bound`, the largest spectral radius, is the least that any norm
     has. `share`, 0 to 1, is that of the samples with `‖A_k‖_P < 1`. Were it so at all points between two runs under one
-    input: `|s_k − s̃_k| ≤ overshoot · rateᵏ |s_0 − s̃_0|`, outputs in their standard deviations.
+    input: `|x_k − x̃_k| ≤ overshoot · rateᵏ |x_0 − x̃_0|`, each entry of the state in its deviation.
     """
 
     rate: float
@@ -58,7 +58,7 @@ def contraction(
     all points contract, it starts again without the worst of them. None where no A_k is there.
 
     Args:
-        box: how many points to add, uniform in the box of the regressors that the run met.
+        box: how many points to add, uniform in the box of the states and inputs that the run met.
         along: a result of `feedback`, computed if it is not given.
         response: the model's free run of the record, if it is there already.
 
@@ -69,14 +69,13 @@ def contraction(
     run = feedback(model, record, response=response) if along is None else along
     if not run or not run.worst:
         return None
-    unit = in_state(model, run.unit)
-    most = min(_SAMPLES, int(MOST_WORK / len(unit) ** 3))
+    unit, most = run.unit, min(_SAMPLES, int(MOST_WORK / len(run.unit) ** 3))
     steepest = np.argsort(-run.radius, kind="stable")[: min(_STEEPEST, most // 2)]
     some = run.points.take(np.union1d(evenly(len(run.radius), most - len(steepest)), steepest))
-    points, jacobians, radius = linearised(model, some.with_box(run.points, box))
-    a = companions(jacobians) * unit / unit[:, None]
+    points, transition, radius = linearised(model, some.with_box(run.points, box))
+    a = transition * unit / unit[:, None]
     sizes, metric = _sizes(t := _best_metric(a), a), (t / unit).T @ (t / unit)
-    rate, worst = points.worst(record, sizes)
+    rate, worst = points.worst(record, sizes, model.form.describe)
     assert rate is not None and worst is not None  # there are points, and no norm is infinite
     bound, share, overshoot = float(radius.max()), float(np.mean(sizes < 1)), float(np.linalg.cond(t))
     return Contraction(rate, bound, share, len(a), overshoot, metric / np.trace(metric), worst)

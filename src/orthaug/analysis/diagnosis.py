@@ -71,10 +71,10 @@ def diagnose(fit: Estimate, *, one_step: Response | None = None, free_run: Respo
         return None
     white = all(_is_white(test, _PRACTICALLY_WHITE) for test in tests)
     complete = white and not any(_misfits(test) for test in tests)
-    if not model.form.memory:
+    if not model.form.states:
         return _static(fit, tests, white, complete)
     free_run = model.simulate(problem.record) if free_run is None else free_run
-    skip = fit.criterion.washout if isinstance(fit.criterion, Simulation) else 0
+    skip = fit.criterion.washout
     flown = [(free_run, skip)] if not any(t.diverged for t in free_run.trajectories) else []
     free_tests = _tests(problem, free_run, skip) if flown else None
     if not simulated and not white:

@@ -24,13 +24,16 @@ from orthaug.models.response import Response
 
 @dataclass(frozen=True, eq=False)
 class Stability:
-    """Evidence on the free run (None without past outputs); `diverges_at` is searched up to the factor `searched`."""
+    """Evidence on the free run (None without a state); `diverges_at` is searched up to the factor `searched`.
+
+    `lipschitz` is None for a model that does not predict from lagged signals.
+    """
 
     feedback: Feedback | None
     contraction: Contraction | None
     diverges_at: float | None
     searched: float
-    lipschitz: Lipschitz
+    lipschitz: Lipschitz | None
     warnings: tuple[Warning, ...]
     text: str
 
@@ -65,14 +68,11 @@ def stability(
 
 def _sentences(checks: Stability) -> Iterator[tuple[str, str]]:
     """What the checks say, sentence by sentence; with the code of a warning, or nothing."""
-    run, contracts, factor, steepest = (
-        checks.feedback,
-        checks.contraction,
-        checks.diverges_at,
-        checks.lipschitz.gradient,
-    )
-    gradient = "no finite gradient" if steepest is None else f"a gradient of at most {steepest:.4g}"
-    yield f"The one-step predictor has {gradient} on measured rows; that says nothing about the free run.", ""
+    run, contracts, factor = checks.feedback, checks.contraction, checks.diverges_at
+    if checks.lipschitz:
+        steepest = checks.lipschitz.gradient
+        gradient = "no finite gradient" if steepest is None else f"a gradient of at most {steepest:.4g}"
+        yield f"The one-step predictor has {gradient} on measured rows; that says nothing about the free run.", ""
     if run is None:
         yield "The model uses no past outputs: its free run cannot diverge, and keeps nothing of its start.", ""
         return

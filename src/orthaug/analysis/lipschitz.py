@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from orthaug._base.checks import Matrix
-from orthaug.analysis.local_dynamics import gradients, measured_by, physics_at
-from orthaug.analysis.visited import MOST_STEPS, Place, evenly, positive
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.errors import InputError
+from orthaug._base.jax import Array, jax, jnp
+from orthaug.analysis.local_dynamics import by_differences, difference_width
+from orthaug.analysis.visited import MOST_STEPS, Place, Where, evenly, positive, usable
 from orthaug.data.record import Record
+from orthaug.models.dynamics import Numbers
+from orthaug.models.lagged import Lagged
 from orthaug.models.model import Model
+
+_BATCH = 1024  # rows per compiled call
 
 
 @dataclass(frozen=True)
@@ -31,7 +40,7 @@ class Lipschitz:
     rows: int
 
 
-def lipschitz(model: Model, record: Record, *, x: Matrix | None = None) -> Lipschitz:
+def lipschitz(model: Model, record: Record, *, x: Matrix | None = None) -> Lipschitz | None:
     """Gradients of the one-step predictor g, and of ∂g/∂θ = φ, over measured regressors (`cond:pred_stab`).
 
     The predictor γ_k = g(x_k) reads the last n samples only. With ‖∂g/∂x‖ ≤ L on a convex set of all regressors,
@@ -39,6 +48,7 @@ def lipschitz(model: Model, record: Record, *, x: Matrix | None = None) -> Lipsc
     the condition holds with `C = max(L λ⁻ⁿ, |g(0)|)`, and likewise for ∂γ/∂θ. Bounded gradients are all that it asks
     of a finite memory. Here L is that of at most 20000 measured rows and of this θ; it may be larger elsewhere, and the
     learner's weights are not in φ. None of it tells about the free run: y_k = 2 y_{k−1} fulfils the condition.
+    A model whose state is not made of measured signals has no such predictor: None.
 
     Args:
         x: the record's usable regressors (N, nx) in the model's layout, if they are stacked already.
@@ -46,16 +56,57 @@ def lipschitz(model: Model, record: Record, *, x: Matrix | None = None) -> Lipsc
     Raises:
         InputError: a record that does not fit the model, or has no outputs.
     """
-    every, y_scale = measured_by(model, record, x)
-    points, x_scale = every.take(evenly(len(every), MOST_STEPS)), every.x.std(axis=0)
+    if not isinstance(form := model.form, Lagged):
+        return None
+    stacked, every, y_scale = _measured(model, record, x)
+    some = evenly(len(every), MOST_STEPS)
+    x, where, x_scale = stacked[some], every.take(some), stacked.std(axis=0)
+
+    def entries(i: int) -> dict[str, float]:
+        return {str(lag): float(value) for lag, value in zip(form.layout, x[i], strict=True)}
+
     size = partial(np.linalg.norm, axis=(1, 2))
     largest = []
     with np.errstate(all="ignore"):
-        phi = physics_at(model, points.x)
+        phi = np.asarray(form.baseline.phi(x, form.layout, form.outputs, np))
         rms = np.sqrt(np.mean(np.sum((phi / y_scale[:, None]) ** 2, axis=1), axis=0))
         for of_phi, scale in ((False, y_scale), (True, np.outer(y_scale, positive(rms)).ravel())):
-            batches = (g.reshape(len(g), len(scale), len(x_scale)) for g in gradients(model, points.x, of_phi))
+            batches = (g.reshape(len(g), len(scale), len(x_scale)) for g in _gradients(form, model.numbers, x, of_phi))
             norms = [(size(g), size(g * x_scale / scale[:, None])) for g in batches]
             plain, scaled = (np.concatenate(column) for column in zip(*norms, strict=True))
-            largest += [points.worst(record, plain)[0], *points.worst(record, scaled)]
-    return Lipschitz(*largest, rows=len(points))
+            largest += [where.worst(record, plain, entries)[0], *where.worst(record, scaled, entries)]
+    return Lipschitz(*largest, rows=len(x))
+
+
+def _measured(model: Model, record: Record, x: Matrix | None) -> tuple[Matrix, Where, Vector]:
+    """Regressors of measured outputs, where each stands, and deviations of these outputs (ny,)."""
+    form, record = model.form, usable(model, record)
+    lengths = [len(e) - form.first_row for e in record.experiments]
+    if x is None:
+        x = np.concatenate([form.regressors(e, record) for e in record.experiments])
+    elif np.shape(x) != (wanted := (sum(lengths), len(form.layout))):
+        raise InputError(f"`x` has shape {np.shape(x)}; the usable regressors of the record have {wanted}.")
+    outputs = np.concatenate([e.outputs for e in record.experiments])
+    return x, Where.of(lengths, form.first_row), positive(outputs.std(axis=0))
+
+
+def _gradients(form: Lagged, numbers: Numbers, x: Matrix, of_phi: bool) -> Iterator[Any]:
+    """∂g/∂x, or ∂φ/∂x, at regressors (m, nx), in batches that are computed at one shape."""
+    width = difference_width(x)
+    for begin in range(0, len(x), _BATCH):
+        rows = np.minimum(np.arange(begin, begin + _BATCH), len(x) - 1)  # the last one again
+        yield np.asarray(_gradient_rows(form, numbers, x[rows], width, of_phi))[: len(x) - begin]
+
+
+@partial(jax.jit, static_argnames=("form", "of_phi"))
+def _gradient_rows(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"], width: Any, of_phi: bool) -> Array:
+    """∂g/∂x (m, ny, nx), by differences of `width` (nx,) where a learner has no derivative; or ∂φ/∂x."""
+
+    def g(row: Any) -> Any:
+        return form.at(numbers, row).total
+
+    def phi(row: Any) -> Any:
+        return form.baseline.phi(row, form.layout, form.outputs, jnp)
+
+    slope = jax.jacrev(g) if form.differentiable else partial(by_differences, g, width=width)
+    return jax.vmap(jax.jacfwd(phi) if of_phi else slope)(x)

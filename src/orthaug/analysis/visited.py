@@ -1,7 +1,8 @@
-"""Regressors that a run visits, each with its row in the record, and the place where a quantity is largest."""
+"""States and inputs that a run visits, each with its row in the record, and the place where a quantity is largest."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,16 +10,21 @@ import numpy as np
 from jaxtyping import Int
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.data.record import Record
+from orthaug.data.record import Experiment, Record
+from orthaug.models.dynamics import Dynamics
+from orthaug.models.model import Model
+from orthaug.models.response import Response
+
+Describe = Callable[[Vector, Vector], dict[str, float]]
 
 MOST_STEPS = 20_000  # rows that a check looks at, spread evenly
 
 
 @dataclass(frozen=True)
 class Place:
-    """A regressor by its entries, and where it stands: experiment, row in it, and both in words.
+    """A point by its entries, and where it stands: experiment, row in it, and both in words.
 
-    `experiment` and `row` are None for a regressor that no run has visited.
+    `experiment` and `row` are None for a point that no run has visited.
     """
 
     experiment: int | None
@@ -31,45 +37,159 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False)
-class Visited:
-    """Regressors `x` (m, nx) with the experiment and the row of each; -1 for those that no run has visited.
+class Where:
+    """The experiment and the row (m,) of each of m points; -1 for those that no run has visited."""
 
-    `names` are those of the nx entries.
-    """
-
-    names: tuple[str, ...]
-    x: Matrix
     experiment: Int[np.ndarray, "m"]
     row: Int[np.ndarray, "m"]
 
+    @classmethod
+    def of(cls, lengths: Sequence[int], first: int) -> Where:
+        """So many rows of each experiment, from the row `first` on."""
+        experiment = [np.full(length, i) for i, length in enumerate(lengths)]
+        return cls(np.concatenate(experiment), np.concatenate([np.arange(length) + first for length in lengths]))
+
     def __len__(self) -> int:
-        return len(self.x)
+        return len(self.row)
 
-    def take(self, which: Any) -> Visited:
+    def take(self, which: Any) -> Where:
         """Those at the indices `which`, or where a mask is true."""
-        return replace(self, x=self.x[which], experiment=self.experiment[which], row=self.row[which])
+        return Where(self.experiment[which], self.row[which])
 
-    def with_box(self, of: Visited, count: int) -> Visited:
-        """With `count` regressors more, uniform in the box that others span; the same ones on every call."""
-        if not count:
-            return self
-        more = np.random.default_rng(0).uniform(of.x.min(axis=0), of.x.max(axis=0), (count, of.x.shape[1]))
-        nowhere = np.full(count, -1)
-        experiment, row = np.concatenate([self.experiment, nowhere]), np.concatenate([self.row, nowhere])
-        return Visited(self.names, np.concatenate([self.x, more]), experiment, row)
+    def and_nowhere(self, count: int) -> Where:
+        """With `count` points more that no run has visited."""
+        return Where(*(np.concatenate([known, np.full(count, -1)]) for known in (self.experiment, self.row)))
 
-    def worst(self, record: Record, values: Vector) -> tuple[float | None, Place | None]:
-        """The largest of the values (m,) and its place; None where no value is finite."""
+    def worst(
+        self, record: Record, values: Vector, entries: Callable[[int], dict[str, float]]
+    ) -> tuple[float | None, Place | None]:
+        """The largest of the values (m,) and its place, with the entries of that point; None where none is finite."""
         values = np.where(np.isfinite(values), values, -1.0)
         if values.max(initial=-1.0) < 0:
             return None, None
         i = int(np.argmax(values))
         experiment, row, size = int(self.experiment[i]), int(self.row[i]), float(values[i])
-        regressor = {name: float(v) for name, v in zip(self.names, self.x[i], strict=True)}
         if experiment < 0:
-            return size, Place(None, None, "a point off the trajectory", regressor)
+            return size, Place(None, None, "a point off the trajectory", entries(i))
         where = f"experiment {experiment}, {record.experiments[experiment].where(row)}"
-        return size, Place(experiment, row, where, regressor)
+        return size, Place(experiment, row, where, entries(i))
+
+
+@dataclass(frozen=True, eq=False)
+class Visited:
+    """Points of a run: states (m, n0) and the inputs (m, nu) of a step from there, and where they stand."""
+
+    states: Matrix
+    inputs: Matrix
+    where: Where
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+    def take(self, which: Any) -> Visited:
+        """Those at the indices `which`, or where a mask is true."""
+        return replace(self, states=self.states[which], inputs=self.inputs[which], where=self.where.take(which))
+
+    def with_box(self, of: Visited, count: int) -> Visited:
+        """With `count` points more, uniform in the box that others span; the same ones on every call."""
+        if not count:
+            return self
+        spanned = np.hstack([of.states, of.inputs])
+        more = np.random.default_rng(0).uniform(spanned.min(axis=0), spanned.max(axis=0), (count, spanned.shape[1]))
+        states, inputs = np.split(more, [self.states.shape[1]], axis=1)
+        where = self.where.and_nowhere(count)
+        return replace(
+            self,
+            states=np.concatenate([self.states, states]),
+            inputs=np.concatenate([self.inputs, inputs]),
+            where=where,
+        )
+
+    def worst(self, record: Record, values: Vector, describe: Describe) -> tuple[float | None, Place | None]:
+        """The largest of the values (m,) and its place in words of the dynamics; None where no value is finite."""
+        return self.where.worst(record, values, lambda i: describe(self.states[i], self.inputs[i]))
+
+
+@dataclass(frozen=True, eq=False)
+class Visits:
+    """At most so many `points` of a run of `steps` steps, and where it `diverged`.
+
+    `unit` (n0,) is what counts as one in each entry of the state: the deviation of the measured output it stands for,
+    or else its own over the points.
+    """
+
+    points: Visited
+    steps: int
+    unit: Vector
+    diverged: tuple[str, ...] = ()
+
+
+def usable(model: Model, record: Record) -> Record:
+    """The record's channels in the model's order.
+
+    Raises:
+        InputError: other channels, or too few rows in an experiment.
+    """
+    record = model.fitting(record, need_outputs=True)
+    for experiment in record.experiments:
+        model.check_rows(experiment, model.form.first_row)
+    return record
+
+
+def visited_by(model: Model, record: Record, free_run: Response, most: int) -> Visits:
+    """States of a free run from measured outputs, up to where it diverged."""
+    form: Dynamics = model.form
+    record, start, runs = usable(model, record), form.first_row, free_run.trajectories
+    ends = [t.diverged[0] + 1 if t.diverged else len(t.model) for t in runs]
+
+    def states(i: int, experiment: Experiment, inputs: Matrix, rows: Int[np.ndarray, "r"]) -> Matrix:
+        outputs = np.concatenate([experiment.outputs[:start], runs[i].model[start:]])
+        return form.states_at(model.numbers, outputs, inputs, rows)
+
+    found = _visits(form, record, ends, most, states)
+    diverged = [
+        f"{t.diverged[1]} at experiment {i}, {e.where(t.diverged[0])}"
+        for i, (e, t) in enumerate(zip(record.experiments, runs, strict=True))
+        if t.diverged
+    ]
+    return replace(found, diverged=tuple(diverged))
+
+
+def measured_by(model: Model, record: Record, most: int) -> Visits:
+    """States as the measured outputs give them."""
+    form: Dynamics = model.form
+    record = usable(model, record)
+    ends = [len(e) for e in record.experiments]
+    return _visits(form, record, ends, most, lambda i, e, inputs, rows: form.start(e.outputs, rows))
+
+
+def _visits(
+    form: Dynamics,
+    record: Record,
+    ends: Sequence[int],
+    most: int,
+    states: Callable[[int, Experiment, Any, Any], Matrix],
+) -> Visits:
+    """Points spread evenly over all experiments, up to the end of each."""
+    every = Where.of([end - form.first_row for end in ends], form.first_row)
+    some = every.take(evenly(len(every), most))
+    pieces = []
+    for i, experiment in enumerate(record.experiments):
+        rows = some.row[some.experiment == i]
+        inputs = form.inputs(experiment, record)
+        pieces.append((states(i, experiment, inputs, rows), inputs[rows - form.first_row]))
+    visited, inputs = (np.concatenate(piece) for piece in zip(*pieces, strict=True))
+    points = Visited(visited, inputs, some)
+    return Visits(points, len(every), _units(form, points, np.concatenate([e.outputs for e in record.experiments])))
+
+
+def _units(form: Dynamics, points: Visited, outputs: Matrix) -> Vector:
+    """One over what an entry costs in deviations of the outputs; its own deviation where it is free."""
+    if not len(points):
+        return np.ones(form.states)  # of what may be too long for a matrix
+    per_output = positive(outputs.std(axis=0))
+    cost = np.linalg.norm(form.start_rows(np.diag(1 / per_output)), axis=0)
+    return np.where(cost > 0, 1 / positive(cost), positive(points.states.std(axis=0)))
 
 
 def evenly(count: int, most: int) -> Int[np.ndarray, "m"]:

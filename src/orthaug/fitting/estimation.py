@@ -84,7 +84,7 @@ def estimate(
 
     Examples:
         >>> import numpy as np
-        >>> from orthaug.baseline import Term
+        >>> from orthaug.physics.baseline import Term
         >>> u = np.linspace(-1, 1, 200)
         >>> record = Record.from_arrays(u=u, y=2 * u + u**2)
         >>> fit = estimate(record, Baseline.from_terms([Term("gain", "u[k]")]), learner=MLP(hidden=(4,)))
@@ -200,7 +200,7 @@ def orthogonalize(
     external = External(function, ny=ny)
     values = external.values(problem.feature_rows())  # once; the sums below read what it gave
     scaling, unit = Scaling(np.zeros(nz), np.ones(nz)), np.ones(ny)
-    task = OneStepTask.of(problem, None, scaling, unit)
+    task = OneStepTask.of(problem, None)
     gain = np.broadcast_to(problem.weight / task.rms, values.shape)
     rows = task.engine.lay(values, problem.projection.q, problem.unexplained / task.rms, gain)
     task = replace(task, rows=rows, unit=unit, bound=Bound(_GIVEN, ny, ny))

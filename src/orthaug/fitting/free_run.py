@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.errors import InputError
 from orthaug._base.progress import RunTell, quiet
 from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.elimination import eliminate
@@ -71,8 +72,10 @@ class FreeRunTask:
         """Lay the problem's record out as a criterion of several steps declares.
 
         Raises:
-            InputError: nothing would be scored.
+            InputError: nothing would be scored, or the rows are not in memory.
         """
+        if not task.engine.resident:
+            raise InputError("a free run needs its rows in memory; train one step ahead, or take the default engine.")
         problem, flown = task.problem, criterion.flown
         assert flown is not None, "one step ahead is `OneStepTask`'s"
         longest = max(len(e) for e in problem.record.experiments) - problem.rows.start

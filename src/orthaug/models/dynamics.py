@@ -6,13 +6,14 @@ the past outputs.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from orthaug._base.checks import Matrix
-from orthaug._base.jax import jax, jnp
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.jax import Array, jax, jnp, padded_length
 from orthaug.data.record import Experiment, Record
 
 AnyArray = Any  # of NumPy or of JAX
@@ -62,13 +63,18 @@ class Dynamics(Protocol):
         ...
 
     @property
+    def differentiable(self) -> bool:
+        """Whether JAX can differentiate `step`; differences stand in where it cannot."""
+        ...
+
+    @property
     def first_row(self) -> int:
         """The first row of an experiment that has an output."""
         ...
 
     @property
     def states(self) -> int:
-        """n0, entries of the state."""
+        """n0, entries of the state; 0 without feedback: then no step depends on the one before."""
         ...
 
     @property
@@ -93,7 +99,19 @@ class Dynamics(Protocol):
         ...
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
-        """What the steps of an experiment read, (T, nu), from its first row with an output on."""
+        """What the steps of an experiment read, (T, nu), from its first row with an output on; affine in its inputs."""
+        ...
+
+    def states_at(self, numbers: Numbers, outputs: Matrix, inputs: Matrix, rows: Any) -> Float[np.ndarray, "r n0"]:
+        """The states of a free run at some rows of an experiment.
+
+        `outputs` (N, ny) are those of the run, before its first row the measured ones; `inputs` (T, nu) as its steps
+        read them, up to the last of the rows at least.
+        """
+        ...
+
+    def describe(self, state: Vector, inputs: Vector) -> dict[str, float]:
+        """A state and the inputs of a step as a user knows them, by names."""
         ...
 
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
@@ -113,7 +131,20 @@ class Dynamics(Protocol):
 
 
 class Differentiated:
-    """`first_slopes` and `tangents` by automatic differentiation of `step`, for dynamics that know no faster way."""
+    """What follows from `step`, for dynamics that know no faster way.
+
+    `first_slopes` and `tangents` by automatic differentiation, `states_at` by running it.
+    """
+
+    differentiable = True
+
+    def states_at(
+        self: Dynamics, numbers: Numbers, outputs: Matrix, inputs: Matrix, rows: Int[np.ndarray, "r"]
+    ) -> Float[np.ndarray, "r n0"]:
+        padded = np.zeros((padded_length(len(inputs)), inputs.shape[1]))
+        padded[: len(inputs)] = inputs
+        start = self.start(outputs, [self.first_row])[0]
+        return np.asarray(_states(self, numbers, start, padded))[np.asarray(rows, dtype=int) - self.first_row]
 
     def first_slopes(self: Dynamics, width: int) -> Any:
         n0 = self.states
@@ -131,7 +162,17 @@ class Differentiated:
         unknowns = jnp.concatenate([jnp.asarray(numbers.theta), jnp.asarray(numbers.weights)])
         value = jax.vmap(both, (-1, None, -1), -1)(state, unknowns, inputs)
         to_state, to_unknowns = jax.vmap(jax.jacrev(both, (0, 1)), (-1, None, -1), -1)(state, unknowns, inputs)
+        # a kink without a derivative, such as sqrt(max(y, 0)) at 0, counts as flat
+        to_state, to_unknowns = (jnp.where(jnp.isfinite(d), d, 0.0) for d in (to_state, to_unknowns))
         n0 = self.states
         slope = jnp.einsum("ijm,jnm->inm", to_state, slopes)
         slope = slope + jnp.pad(to_unknowns, ((0, 0), (n0, 0), (0, 0)))
         return value[:n0], slope[:n0], value[n0:], slope[n0:]
+
+
+@partial(jax.jit, static_argnames="form")
+def _states(
+    form: Dynamics, numbers: Numbers, state: Float[Array, "n0"], inputs: Float[Array, "T nu"]
+) -> Float[Array, "T n0"]:
+    """The state at every row of a free run."""
+    return jax.lax.scan(lambda state, row: (form.step(numbers, state, row)[0], state), state, inputs)[1]

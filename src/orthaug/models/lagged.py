@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from orthaug._base.checks import Matrix
+from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Experiment, Record
@@ -36,6 +36,10 @@ class Lagged:
     @property
     def linear(self) -> bool:
         return self.baseline.linear
+
+    @property
+    def differentiable(self) -> bool:
+        return self.bound is None or self.bound.differentiable
 
     @property
     def first_row(self) -> int:
@@ -80,6 +84,17 @@ class Lagged:
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
         return lag_matrix(experiment, self.input_layout, record, self.first_row)
+
+    def states_at(
+        self, numbers: Numbers, outputs: Matrix, inputs: Matrix, rows: Sequence[int] | Int[np.ndarray, "r"]
+    ) -> Float[np.ndarray, "r n0"]:
+        """The run's own past outputs: nothing needs to run again."""
+        return self.start(outputs, rows)
+
+    def describe(self, state: Vector, inputs: Vector) -> dict[str, float]:
+        """The entries of the regressor."""
+        x = self.regressor(state, inputs, np)
+        return {str(lag): float(value) for lag, value in zip(self.layout, x, strict=True)}
 
     def regressors(self, experiment: Experiment, record: Record, row: int | None = None) -> Matrix:
         """Measured regressors x (T, nx) of an experiment, from a row on, by default the first that has one."""

@@ -12,16 +12,16 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector, as_signal, check_count
 from orthaug._base.errors import InputError
-from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.jax import Array, jax, jnp, padded_length
 from orthaug.data.record import Channel, Experiment, Record, same_step
 from orthaug.models.dynamics import Dynamics, Numbers, Parts
 from orthaug.models.lagged import Lagged
 from orthaug.models.response import Response, Trajectory
 from orthaug.models.statistics import Statistics
 
+RUNAWAY = 1e6  # times the largest training output: a free run beyond this has diverged
 _BATCH = 4096  # rows per compiled call; records of any length share the program
 _WINDOW_CELLS = 8_000_000  # input cells of a batch of multi-step predictions
-_RUNAWAY = 1e6  # times the largest training output: a free run beyond this has diverged
 
 
 @partial(jax.jit, static_argnames="form")
@@ -102,7 +102,7 @@ class Model:
         trajectories = []
         for experiment in record.experiments:
             first = self.form.first_row + horizon - 1
-            self._check_rows(experiment, first)
+            self.check_rows(experiment, first)
             if horizon == 1 or not self.form.states:
                 parts = self._predict_rows(self.form.regressors(experiment, record, first))
             else:
@@ -124,7 +124,7 @@ class Model:
         record = self.fitting(record, need_outputs=False)
         trajectories = []
         for experiment in record.experiments:
-            self._check_rows(experiment, self.form.first_row)
+            self.check_rows(experiment, self.form.first_row)
             measured = experiment.outputs if record.outputs else None
             parts = self._run(self._start(initial, measured), experiment, record)
             trajectories.append(self._bounded(parts, experiment, measured))
@@ -152,7 +152,7 @@ class Model:
             return self._predict_rows(self.form.regressors(experiment, record))
         inputs = self.form.inputs(experiment, record)
         steps = len(inputs)
-        padded = np.zeros((_bucket(steps), inputs.shape[1]))
+        padded = np.zeros((padded_length(steps), inputs.shape[1]))
         padded[:steps] = inputs
         parts = _free_run(self.form, self.numbers, jnp.asarray(state), jnp.asarray(padded))
         return Parts(*(np.asarray(part)[:steps] for part in parts))
@@ -186,7 +186,7 @@ class Model:
         """A free run cut where it left all bounds."""
         trajectory = _trajectory(parts, experiment, measured, self.form.first_row)
         with np.errstate(all="ignore"):
-            wild = ~(np.abs(trajectory.model[self.form.first_row :]) <= _RUNAWAY * self.largest_output)
+            wild = ~(np.abs(trajectory.model[self.form.first_row :]) <= RUNAWAY * self.largest_output)
         if not wild.any():
             return trajectory
         step = int(np.argmax(wild.any(axis=1)))
@@ -195,7 +195,8 @@ class Model:
         bounded = _trajectory(cut, experiment, measured, self.form.first_row)
         return replace(bounded, diverged=(step + self.form.first_row, output))
 
-    def _check_rows(self, experiment: Experiment, first: int) -> None:
+    def check_rows(self, experiment: Experiment, first: int) -> None:
+        """Raises InputError where an experiment ends before the row `first`."""
         if len(experiment) <= first:
             name = experiment.source or "the record"
             raise InputError(f"{name} has {len(experiment)} rows, too few: the first value is at row {first}.")
@@ -227,15 +228,10 @@ class Model:
         return Record(self.inputs, wanted["outputs"], record.sampling_time, experiments)
 
 
-def _bucket(steps: int) -> int:
-    """Lengths grow by powers of two, so that few programs are compiled."""
-    return max(256, 1 << (steps - 1).bit_length())
-
-
 def _in_batches(function: Callable[..., Parts], rows: tuple[np.ndarray, ...], largest: int = _BATCH) -> Parts:
     """`function` over batches of rows, padded to one shape, its results concatenated."""
     count = len(rows[0])
-    size = min(_BATCH, largest, _bucket(count))
+    size = min(_BATCH, largest, padded_length(count))
     pieces = []
     for begin in range(0, count, size):
         batch = [array[begin : begin + size] for array in rows]

@@ -15,7 +15,7 @@ from orthaug._base.checks import Matrix
 from orthaug._base.errors import RankError
 from orthaug.data.regressors import Layout
 from orthaug.physics.baseline import Baseline
-from orthaug.physics.projection import Projection
+from orthaug.physics.projection import Factor
 
 RANK_TOLERANCE = 1e-13  # σmin/σmax of the unit-norm columns below which Φ counts as rank-deficient
 ILL_CONDITIONED = 1e8  # condition number above which half of the digits of θ are lost: a warning
@@ -107,4 +107,4 @@ def identifiability(baseline: Baseline, layout: Layout, outputs: Sequence[str], 
     finite = np.isfinite(phi).all(axis=(1, 2))  # a logarithm or a root has no value at some of them
     if finite.sum() < nt:
         return excitation(np.zeros((1, nt)), baseline.names)
-    return excitation(Projection.factor(phi[finite]).r, baseline.names)
+    return excitation(Factor.of_blocks([phi[finite]]).r, baseline.names)

@@ -203,7 +203,7 @@ class ExtrapolationResult(Content):
     part: str
     regressor: str = Field(validation_alias="lag")
     training: Numbers
-    found: Numbers
+    found: Numbers = Field(validation_alias="reach")
     share: Number
 
 

@@ -1,0 +1,5 @@
+from .result import CheckResult as CheckResult
+from .result import CompareResult as CompareResult
+from .result import DesignResult as DesignResult
+from .result import FitResult as FitResult
+from .result import SplitResult as SplitResult

@@ -1,0 +1,143 @@
+"""What the documents name is there: files, names in them, rooms; and what they tell a contributor to write works."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+from pathlib import Path
+
+import pytest
+from test_architecture import ROOMS
+from test_cli import make_project
+
+import orthaug
+from orthaug.commands.spec import load_spec
+from orthaug.models.kinds import LEARNERS
+from orthaug.models.learners import Bound
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCE = ROOT / "src" / "orthaug"
+PAGES = [
+    *sorted((ROOT / "docs").glob("*.md")),
+    *(ROOT / name for name in ("CONTRIBUTING.md", "README.md", "CHANGELOG.md", "examples/README.md")),
+]
+TEXTS = {str(page.relative_to(ROOT)): page.read_text(encoding="utf-8") for page in PAGES}
+DEVELOPERS = ("CONTRIBUTING.md", "docs/design.md", "docs/notation.md")  # their names are the code's, not a spec's
+
+
+def backticked(text: str) -> list[str]:
+    return re.findall(r"`([^`\n]+)`", re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE))
+
+
+def found(path: str, page: str) -> list[Path]:
+    """The files that a path in a document means, from its own folder, the root or the sources."""
+    places = (ROOT / page).parent, ROOT, SOURCE
+    return [file for place in places for file in ([place / path] if "*" not in path else place.glob(path))]
+
+
+def parsed(files: list[Path]) -> list[ast.stmt]:
+    return [node for file in files for node in ast.parse(file.read_text(encoding="utf-8")).body]
+
+
+def members(name: str, nodes: list[ast.stmt]) -> set[str]:
+    """The attributes of a class, as its body, its bases and `self.…` define them; none where there is no such class."""
+    names: set[str] = set()
+    for node in nodes:
+        if isinstance(node, ast.ClassDef) and node.name == name:
+            for child in ast.walk(node):
+                if isinstance(child, ast.FunctionDef):
+                    names.add(child.name)
+                elif isinstance(child, ast.AnnAssign | ast.Assign):
+                    targets = [child.target] if isinstance(child, ast.AnnAssign) else child.targets
+                    names |= {t.id if isinstance(t, ast.Name) else getattr(t, "attr", "") for t in targets}
+            names = names.union(*(members(base.id, nodes) for base in node.bases if isinstance(base, ast.Name)))
+    return names
+
+
+EVERYTHING = parsed(sorted(SOURCE.rglob("*.py")))
+WORDS = set(re.findall(r"\w+", "".join(f.read_text() for d in (SOURCE, ROOT / "tests") for f in d.rglob("*.py"))))
+
+
+@pytest.mark.parametrize("page", TEXTS)
+def test_every_file_that_is_named_exists(page):
+    named = re.findall(r"(?<![\w/.<])[\w./*-]+\.pyi?\b", TEXTS[page])
+    named += [link for link in re.findall(r"\]\(([^)#]+)\)", TEXTS[page]) if "://" not in link]
+    missing = {path for path in named if not any(file.exists() for file in found(path, page))}
+    assert missing == set()
+
+
+@pytest.mark.parametrize("page", TEXTS)
+def test_every_dotted_name_exists(page):
+    missing = set()
+    for name in re.findall(r"\b(?:orthaug|oa)(?:\.[A-Za-z_]\w*)+", "\n".join(backticked(TEXTS[page]))):
+        first, *rest = name.replace("oa.", "orthaug.", 1).split(".")[1:]
+        thing = importlib.import_module(f"orthaug.{first}") if first in ROOMS else getattr(orthaug, first, None)
+        for part in rest:
+            if hasattr(thing, "__path__") and not hasattr(thing, part):
+                thing = importlib.import_module(f"{thing.__name__}.{part}")
+            else:
+                thing = getattr(thing, part, None)
+        missing |= {name} if thing is None else set()
+    for owner, attribute in re.findall(r"\b([A-Z]\w+)\.(?!md|csv)([a-z_]\w*)", "\n".join(backticked(TEXTS[page]))):
+        missing |= {f"{owner}.{attribute}"} - {f"{owner}.{one}" for one in members(owner, EVERYTHING)}
+    assert missing == set()
+
+
+@pytest.mark.parametrize("page", DEVELOPERS)
+def test_every_name_of_the_code_is_a_word_of_the_code(page):
+    named = [text.partition("(")[0].removeprefix("@") for text in backticked(TEXTS[page])]
+    named = [text for text in named if re.fullmatch(r"[A-Za-z]\w*_\w*|[A-Z]\w*[a-z]\w*|[A-Z]{3,}", text)]
+    assert {name for name in named if name not in WORDS} == set()
+
+
+def rows() -> list[tuple[str, list[str], list[Path]]]:
+    """The rows of docs/notation.md that end with files: the row, its names, its files."""
+    rows = []
+    for line in TEXTS["docs/notation.md"].splitlines():
+        cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
+        files = re.findall(r"`([\w/]+\.py)`", cells[-1]) if cells else []
+        if files:
+            rows.append((cells[0] + " " + cells[1], backticked(cells[1]), [SOURCE / file for file in files]))
+    return rows
+
+
+@pytest.mark.parametrize(("row", "names", "files"), rows(), ids=[row for row, *_ in rows()])
+def test_a_symbol_s_names_are_in_the_files_of_its_row(row, names, files):
+    nodes, text = parsed(files), "".join(file.read_text(encoding="utf-8") for file in files)
+    for name in names:
+        for owner, attribute in re.findall(r"\b([A-Z]\w+)\.([a-z_]\w*)", name):
+            assert attribute in members(owner, nodes), f"{owner}.{attribute} is not in {files}"
+        words = set(re.findall(r"[A-Za-z_]\w*", name))
+        assert words <= set(re.findall(r"\w+", text)), f"{name} is not in {files}"
+    assert all(uses(file, names) for file in files), "a file of the row has none of its names"
+
+
+def uses(file: Path, names: list[str]) -> bool:
+    words = set(re.findall(r"\w+", file.read_text(encoding="utf-8")))
+    return not names or any(set(re.findall(r"[A-Za-z_]\w*", name)) <= words for name in names)
+
+
+def test_there_are_symbols():
+    assert len(rows()) > 70
+
+
+def test_the_rooms_are_told_in_their_order():
+    told = tuple(re.findall(r"^\| `(\w+)` \|", TEXTS["CONTRIBUTING.md"], re.MULTILINE))
+    assert told == ROOMS
+    assert " ← ".join(f"`{room}`" for room in ROOMS) in TEXTS["docs/design.md"]
+
+
+def test_the_learner_of_the_example_is_one_file_and_one_entry(tmp_path):
+    (text,) = re.findall(r"^```python\n(.*?)^```", TEXTS["CONTRIBUTING.md"], re.DOTALL | re.MULTILINE)
+    names: dict = {"__name__": __name__}
+    exec(compile(text, "CONTRIBUTING.md", "exec", dont_inherit=True), names)
+    polynomial = names["Polynomial"]
+    spec = make_project(tmp_path)
+    section = '[learner]\nkind = "polynomial"\ndegree = 2\n'
+    spec.write_text(re.sub(r"^\[learner\]\n(?:\w.*\n)*", section, spec.read_text(), flags=re.MULTILINE))
+    with LEARNERS.added("polynomial", polynomial):
+        assert load_spec(spec).declared_learner() == polynomial(degree=2)
+    assert Bound(polynomial(), nz=2, ny=1).size == 4
+    with pytest.raises(orthaug.InputError, match="`degree` must be a whole number, 2 or more; got 1"):
+        polynomial(degree=1)
