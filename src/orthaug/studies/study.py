@@ -13,7 +13,7 @@ import inspect
 import json
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
@@ -164,10 +164,3 @@ def _value(study: Study, key: str, value: Any) -> Any:
     if value is None or isinstance(value, bool | int | str):
         return value
     raise InputError(f"study '{study.name}': '{key}' is a {type(value).__name__}; expected numbers, texts or lists.")
-
-
-def columns(table: pd.DataFrame, name: str) -> Iterator[Any]:
-    """The entries of a column that holds lists, as one array (rows, entries)."""
-    import numpy as np
-
-    yield from np.array(table[name].tolist(), dtype=float).T
