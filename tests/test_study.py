@@ -9,13 +9,15 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
 from orthaug._base.errors import InputError
-from orthaug.studies.study import Study, columns, run
+from orthaug.studies import study as study_module
+from orthaug.studies.study import Study, run
 
 GRID = {"level": [0.1, 0.3], "seed": range(3)}
 
@@ -76,6 +78,15 @@ def test_the_key_does_not_change_with_what_it_does_not_depend_on():
     key = Study("s", one, GRID).key(case)
     assert key == Study("s", one, {"level": [0.1], "seed": [0]}, workers=1).key(case)
     assert key == Study("s", one, GRID).key(dict(reversed(case.items())))
+
+
+def test_the_key_counts_the_code_of_every_room(monkeypatch):
+    read, read_bytes = [], Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda path: read.append(path) or read_bytes(path))
+    study_module._sources.__wrapped__()
+    assert {"_base", "data", "physics", "models", "fitting", "solvers", "studies"} <= {
+        path.parent.name for path in read
+    }
 
 
 def test_a_function_without_a_text_has_a_key(tmp_path):
@@ -231,7 +242,7 @@ def test_a_store_that_cannot_be_written(tmp_path):
 PROGRAM = """
 import sys, time
 from pathlib import Path
-from orthaug.studies import Study, run
+from orthaug.studies.study import Study, run
 
 def one(seed):
     time.sleep(0.05)
@@ -263,8 +274,3 @@ def test_ended_at_any_point_the_next_run_goes_on(tmp_path, end):
     assert len(done.stdout.split()) == 30 - len(kept)
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
     assert len(list(store.rglob("*.json"))) == 30
-
-
-def test_columns_of_lists():
-    first, second = columns(pd.DataFrame({"theta": [[1, 2], [3, 4], [5, 6]]}), "theta")
-    assert first.tolist() == [1, 3, 5] and second.tolist() == [2, 4, 6]

@@ -13,7 +13,7 @@ import inspect
 import json
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
@@ -69,7 +69,7 @@ class Study:
 def _sources() -> str:
     """A digest of this package's code: results of older code do not count."""
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 
@@ -164,10 +164,3 @@ def _value(study: Study, key: str, value: Any) -> Any:
     if value is None or isinstance(value, bool | int | str):
         return value
     raise InputError(f"study '{study.name}': '{key}' is a {type(value).__name__}; expected numbers, texts or lists.")
-
-
-def columns(table: pd.DataFrame, name: str) -> Iterator[Any]:
-    """The entries of a column that holds lists, as one array (rows, entries)."""
-    import numpy as np
-
-    yield from np.array(table[name].tolist(), dtype=float).T

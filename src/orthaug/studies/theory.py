@@ -18,52 +18,56 @@ THEORY: tuple[Statement, ...] = (
     Statement(
         "assum:phi_full_rank",
         "The data determine θ: the stacked regressor matrix Φ has full column rank.",
-        "excitation.excitation, excitation.require_rank; whether any data could: excitation.identifiability",
+        "physics.excitation.excitation, physics.excitation.require_rank; whether any data could: "
+        "physics.excitation.identifiability",
         "tests/test_excitation.py; every fit reports rank and condition, and a deficient Φ is refused by name",
     ),
     Statement(
         "exmp:non-uniqueness",
         "With a linear learner on the physics' own regressors, any θ and W of the right sum is a minimum.",
-        "solvers.levenberg_marquardt (code SPANNED: P⊥J = 0), conclusion.conclude warns",
+        "fitting.status.Ending.SPANNED (P⊥J = 0), fitting.conclusion.conclude warns",
         "test_paper.test_example_1, test_example_1_without_orthogonality",
     ),
     Statement(
         "property:orthogonality",
         "Lemma: ΦᵀF̃ = 0, the projected learner has no share in the physics on the training rows (eq:theta_aux).",
-        "projection.Projection.solve (θ_aux), structures.split; the defect ‖QᵀF̃‖/‖F‖ is in every result",
+        "physics.projection.Projection.solve (θ_aux), fitting.elimination.split_theta; the defect ‖QᵀF̃‖/‖F‖ is in "
+        "every result",
         "test_paper.test_lemma_1; at most 1e-12",
     ),
     Statement(
         "cond:special_PE",
         "Physics and unmodelled term are orthogonal on the data: Σ φᵀ(x)δ(x) = 0. δ is unknown, so only suspected "
         "terms can be checked. Over a domain (eq:phi-delta-orthog-functions) it is the same under a uniform measure.",
-        "bias.bias_table, bias.find_certificate; for another measure measures.Uniform, splitting.split_under",
+        "analysis.bias.bias_table, analysis.bias.find_certificate; for another measure inference.measures.Uniform, "
+        "inference.splitting.split_under",
         "tests/test_bias.py; studies static_errors and data_length: set 1 meets it, 2 in the limit, 3 never, and "
         "3 does under the uniform measure",
     ),
     Statement(
         "Remark after cond:special_PE",
         "If δ can be suspected, the input can be designed so that the condition holds.",
-        "design.design_input, signals.sign_symmetric, suspects.Suspect",
+        "analysis.design.design_input, analysis.signals.sign_symmetric, analysis.suspects.Suspect",
         "tests/test_design.py, tests/test_signals.py",
     ),
     Statement(
         "assum:data_gen_sys_recovered",
         "Training reproduces the true function exactly on the training rows.",
-        "status and loss of result.Estimate; residual tests: residuals.analyse, verdict: diagnosis.diagnose. θ of the "
-        "orthogonal structure under the training measure needs it not: θ̂ = Φ⁺Y for every learner",
+        "status and loss of fitting.estimates.Estimate; residual tests: analysis.residuals.analyse, verdict: "
+        "analysis.diagnosis.diagnose. θ of the orthogonal structure under the training measure does "
+        "not need it: θ̂ = Φ⁺Y for every learner",
         "study static_errors (test RMSE 1e-6); test_paper.test_theta_is_the_same_for_every_learner",
     ),
     Statement(
         "thm:error_val",
         "‖θ* − θ̂‖ = ‖Φ⁺Δ‖ (eq:error_val), which is zero under cond:special_PE.",
-        "projection.Projection.solve; for suspected terms bias.bias_table",
+        "physics.projection.Projection.solve; for suspected terms analysis.bias.bias_table",
         "test_paper.test_theorem_1; study static_errors: 0, 0.07956, 0.14333 on the three sets",
     ),
     Statement(
         "assum:baseline_mdl_dominant",
         "The physics dominates: ‖Φθ*‖ > ‖Δ‖.",
-        "With θ̂ and the learner in place of what is unknown: model.Model.components",
+        "With θ̂ and the learner in place of what is unknown: models.model.Model.components",
         "The worst case of the additive error follows from it on paper; no program can take the supremum over all "
         "weights. Study static_errors shows errors of 0.1 to 1.5 against 0",
     ),
@@ -71,25 +75,26 @@ THEORY: tuple[Statement, ...] = (
         "eq:baseline_error_simple_augm and the remark after it",
         "Without orthogonality the error is ‖Φ⁺(F − Δ)‖: zero only if the learner finds the unmodelled term and "
         "nothing else.",
-        "structures.split (Additive)",
+        "fitting.elimination.split_theta (Additive)",
         "test_paper.test_error_of_the_additive_structure; study static_errors, figure learner",
     ),
     Statement(
         "cond:stable_sys",
         "The data-generating system forgets its initial state exponentially.",
-        "Of the fitted model: contraction.contraction, boundedness.divergence_scaling, feedback.feedback",
+        "Of the fitted model: analysis.contraction.contraction, analysis.boundedness.divergence_scaling, "
+        "analysis.feedback.feedback",
         "tests/test_free_run_stability.py. The true system is not at hand: out of a program's scope",
     ),
     Statement(
         "cond:pred_stab",
         "The one-step predictor and its gradient in the parameters forget and bound their data.",
-        "lipschitz.lipschitz: with finitely many lags a bounded slope is enough",
+        "analysis.lipschitz.lipschitz: with finitely many lags a bounded slope is enough",
         "test_free_run_stability.test_lipschitz_of_known_gradients",
     ),
     Statement(
         "Remark after thm:convergence",
         "The condition can be checked numerically after training; stable-by-design parametrisations are future work.",
-        "free_run_stability.stability, shown by `orthaug validate`",
+        "analysis.free_run_stability.stability, shown by `orthaug fit`",
         "tests/test_free_run_stability.py; a parametrisation that is stable by design is not part of orthaug either",
     ),
     Statement(
@@ -102,32 +107,34 @@ THEORY: tuple[Statement, ...] = (
     Statement(
         "cond:PE",
         "Models that differ have different criteria on the data.",
-        "For θ: excitation.excitation. For the learner: effective weights (solvers.levenberg_marquardt)",
+        "For θ: physics.excitation.excitation. For the learner: effective weights "
+        "(fitting.solvers.compiled.effective_weights)",
         "tests/test_excitation.py. For all weights of a network it fails by construction (neurons can be exchanged); "
         "what the data see is what counts",
     ),
     Statement(
         "lem:minimal_cost",
         "As N → ∞ the least criterion is the noise's variance, reached only by models equal to the true one.",
-        "covariance.noise_covariance: residual over its degrees of freedom",
+        "inference.covariance.noise_covariance: residual over its degrees of freedom",
         "test_covariance.test_a_learner_uses_up_freedom; the limit itself is proved in the paper",
     ),
     Statement(
         "thm:consistency",
         "Under the conditions above θ̂ → θ* with probability 1.",
-        "estimation.estimate; under other measures result.Estimate.split",
+        "fitting.estimation.estimate; under other measures fitting.estimates.Estimate.split",
         "study consistency: slope −1/2 on set 1, a constant on set 3, and −1/2 there under the uniform measure",
     ),
     Statement(
         "Remark after thm:consistency",
         "Without noise the error formula holds at every N, with noise only in the limit.",
-        "projection.Projection.solve",
+        "physics.projection.Projection.solve",
         "study data_length against study consistency; test_paper.test_theorem_1",
     ),
     Statement(
         "eq:cov_approx",
         "The covariance of θ and the weights from the Jacobian, with a factor 2 in the middle.",
-        "uncertainty.joint_covariance, convention “paper”; the default leaves the 2 out, which cancels (Ljung 1999)",
+        "inference.intervals.joint_covariance, convention “paper”; the default leaves the 2 out, which cancels "
+        "(Ljung 1999)",
         "test_uncertainty.test_the_papers_convention_is_eq_cov_approx; study coverage: 95 % intervals hold in 95 % "
         "without the factor, in 99 % with it",
     ),
@@ -135,7 +142,7 @@ THEORY: tuple[Statement, ...] = (
         "thm:zero_cov",
         "Cov of θ̂ and the learner's weights is zero. It holds for the sum over rows, not per row as the proof has it; "
         "outputs that share θ need Σ_e = σ²I, not only a diagonal one.",
-        "uncertainty.joint_covariance",
+        "inference.intervals.joint_covariance",
         "test_uncertainty.test_theta_and_the_learner_are_uncorrelated, "
         "test_outputs_that_share_theta_need_equal_noise_for_zero_covariance; study covariance",
     ),
