@@ -20,7 +20,7 @@ from orthaug.fitting.initial_states import InitialStates, Start
 from orthaug.fitting.learned import ErrorStatistics, Learned
 from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, errors_of
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.rules import check_scored
+from orthaug.fitting.rules import check_scored, ridge_of
 from orthaug.fitting.segments import Segments, lay_segments
 from orthaug.fitting.solvers.descent import MARQUARDT, Descent
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
@@ -120,8 +120,7 @@ class FreeRunTask:
         objective = self.objective(structure)
         nowhere = Start(objective.initial.measured)
         places, begun, seconds = [objective.begin(np.asarray(w))], 0, 0.0
-        evidence = regularization == "evidence"
-        ridge = 1.0 if evidence else 0.0 if regularization == "none" else float(regularization)
+        ridge, evidence = ridge_of(regularization)
         if self.bound is not None and self.flown.start_iterations:
             short = LevenbergMarquardt(self.flown.start_iterations, solver.tolerance)
             first = self.task.run(short, w, structure, regularization, progress)

@@ -18,6 +18,7 @@ from orthaug.fitting.elimination import Elimination, Fixed, eliminate
 from orthaug.fitting.learned import Learned
 from orthaug.fitting.normal_equations import Blocks, Hold, Normal, OneStep, Streamed, linearise
 from orthaug.fitting.paper_criterion import PaperCriterion, Physics
+from orthaug.fitting.rules import ridge_of
 from orthaug.fitting.solvers import compiled
 from orthaug.fitting.solvers.descent import IDENTITY
 from orthaug.fitting.status import Ending
@@ -127,8 +128,7 @@ class OneStepTask:
         assert self.bound is not None, "physics alone is not trained one step ahead"
         matrix, target = elimination.hold(fixed)
         hold = Hold(jnp.asarray(matrix), jnp.asarray(target / self.rms))
-        evidence = regularization == "evidence"
-        ridge = 1.0 if evidence else 0.0 if regularization == "none" else float(regularization)
+        ridge, evidence = ridge_of(regularization)
         if solver.gauss_newton:
             return self._least_squares(solver, w, hold, ridge, evidence, progress)
         if evidence or not self.engine.resident:

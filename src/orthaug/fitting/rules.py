@@ -58,3 +58,9 @@ def check_solver(solver: Solver, criterion: Criterion, regularizations: Sequence
             "regularization",
             f" = evidence; expected solver {able} with it",
         )
+
+
+def ridge_of(regularization: str | float) -> tuple[float, bool]:
+    """The ridge α that a run starts with, and whether evidence re-estimates it."""
+    evidence = regularization == "evidence"
+    return (1.0 if evidence else 0.0 if regularization == "none" else float(regularization)), evidence
