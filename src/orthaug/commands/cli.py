@@ -228,7 +228,7 @@ def split(
     model: ModelPath,
     data: Annotated[list[Path], typer.Argument(metavar="DATA…", help="The files that the model was trained on.")],
     measure: Annotated[
-        str, typer.Option("--measure", metavar="KIND", help="training, symmetrized, uniform, samples or weighted.")
+        str, typer.Option("--measure", metavar="KIND", help="As `kind` in the spec's [structure.measure].")
     ] = "training",
     rows: Annotated[str | None, typer.Option("--rows", metavar="A:B", help="Rows of each file, half-open.")] = None,
     box: Annotated[
