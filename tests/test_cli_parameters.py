@@ -52,6 +52,14 @@ MACHINE = TERMS + PHYSICS
 VELOCITY = "(position[k-1] - position[k-2])/Ts"
 
 
+@pytest.fixture(autouse=True, scope="module")
+def without_figures():
+    """Fits here are read as numbers; test_cli and test_cli_edges look at their figures."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("orthaug.commands.fit._draw", lambda *_: None)
+        yield
+
+
 def euler(m, cd, ks, sign=1, ts=0.01) -> np.ndarray:
     """Backward Euler; the paper prints it with sign −1."""
     return np.array([2 * m + sign * cd * ts, -m, ts**2]) / (m + cd * ts + ks * ts**2)

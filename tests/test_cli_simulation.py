@@ -113,10 +113,11 @@ def test_the_free_run_is_better_than_after_one_step_training(free, tmp_path):
 
 
 WAYS = {
-    "whole": FREE.replace("segment = 64", "segment = 0"),
-    "exact": FREE.replace("washout = 8", "washout = 0").replace("start_iterations = 5", "start_iterations = 0"),
+    "whole and exact": FREE.replace("segment = 64", "segment = 0")
+    .replace("washout = 8", "washout = 0")
+    .replace("start_iterations = 5", "start_iterations = 0"),
     "five steps": "[training]\nhorizon = 5\niterations = 20\n",
-    "ensemble": FREE + "ensemble = true\nrestarts = 2\n",
+    "ensemble": FREE + 'ensemble = true\nrestarts = 2\nregularization = "evidence"\n',
 }
 
 
@@ -249,9 +250,9 @@ def test_a_learner_that_finds_the_square_helps(tmp_path):
 @pytest.mark.parametrize("blocks", ["", "[validation]\nblocks = 40\n"], ids=["few rows", "many blocks"])
 def test_a_record_too_short_for_blocks_is_told(tmp_path, blocks):
     """No verdict, and a sentence that says why."""
-    rows = 300 if blocks else 60
+    rows, learner = (300, SMALL) if blocks else (60, GREEDY)
     result = fit(
-        project(tmp_path / "p", SMALL, "[training]\niterations = 5\n", blocks, **system(0, rows, equation=0.1))
+        project(tmp_path / "p", learner, "[training]\niterations = 5\n", blocks, **system(0, rows, equation=0.1))
     )
     assert result["validation"] is None
     assert any("too few" in w["text"] and "blocks" in w["text"] for w in result["warnings"])

@@ -218,6 +218,14 @@ def test_npz(tmp_path):
 # --- through the spec
 
 
+@pytest.fixture(autouse=True, scope="module")
+def without_figures():
+    """Fits here are read as numbers; test_cli and test_cli_edges look at their figures."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("orthaug.commands.fit._draw", lambda *_: None)
+        yield
+
+
 @pytest.fixture
 def project(tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)

@@ -172,6 +172,14 @@ kind = "none"
 """
 
 
+@pytest.fixture(autouse=True, scope="module")
+def without_figures():
+    """Fits here are read as numbers; test_cli and test_cli_edges look at their figures."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("orthaug.commands.fit._draw", lambda *_: None)
+        yield
+
+
 def fitted(folder: Path, spec: str) -> dict:
     """result.json of `orthaug fit`."""
     (folder / "plant.toml").write_text(spec)
@@ -223,7 +231,7 @@ def test_a_fit_of_matrix_columns(tmp_path, writer, from_csv):
 @each(EVERY)
 def test_a_fit_of_integers_and_logicals(tmp_path, writer):
     rng = np.random.default_rng(0)
-    u, y = rng.integers(0, 2, 40).astype(bool), rng.integers(-100, 100, 40).astype("i4")
+    u, y = rng.integers(0, 2, 80).astype(bool), rng.integers(-100, 100, 80).astype("i4")
     path = put(tmp_path, writer, u=u, y=y)
     found = theta(fitted(tmp_path, SPEC.format(file=path.name, u="u", y="y")))
     phi = np.stack([y[:-1], u[:-1]], axis=1).astype(float)
