@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -32,3 +33,11 @@ def data_folder() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no data sets in {folder}; set ORTHAUG_DATA to their folder")
     return folder
+
+
+@pytest.fixture(scope="module")
+def without_figures() -> Iterator[None]:
+    """Fits that are read as numbers draw nothing; test_cli and test_plots look at figures."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("orthaug.commands.fit._draw", lambda *_: None)
+        yield

@@ -20,6 +20,8 @@ from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, Or
 from orthaug.models.learners import MLP, Function
 from orthaug.physics.baseline import Baseline, Term
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 NAMES, INITIAL, ROWS = ("a", "b", "c"), np.array([0.9, -0.4, 0.2]), 90
 LM, GRADIENT = LevenbergMarquardt(60, tolerance=1e-14), AdamLBFGS(20, 400)
 JOINT = (Additive(), OrthogonalPenalty(0.5), BaselinePenalty(0.5))

@@ -52,12 +52,7 @@ MACHINE = TERMS + PHYSICS
 VELOCITY = "(position[k-1] - position[k-2])/Ts"
 
 
-@pytest.fixture(autouse=True, scope="module")
-def without_figures():
-    """Fits here are read as numbers; test_cli and test_cli_edges look at their figures."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthaug.commands.fit._draw", lambda *_: None)
-        yield
+pytestmark = pytest.mark.usefixtures("without_figures")
 
 
 def euler(m, cd, ks, sign=1, ts=0.01) -> np.ndarray:

@@ -308,9 +308,10 @@ def test_outputs_without_common_parameters_are_those_fitted_alone():
         np.testing.assert_allclose(both.std[places], alone.std, rtol=0.05)
 
 
-def test_two_outputs_with_a_learner():
+@pytest.mark.parametrize("baseline", [SHARED, SEPARATE], ids=["shared", "separate"])
+def test_two_outputs_with_a_learner(baseline):
     given = two_outputs(1, (0.05, 0.05), 0.2)
-    found = estimate(given, SHARED, learner=NETWORK, criterion=FREE, solver=LM)
+    found = estimate(given, baseline, learner=NETWORK, criterion=FREE, solver=LM)
     rows, weight = found.problem.rows, found.problem.weight[:, None]
     phi = (found.problem.baseline.phi(rows.x, rows.layout, found.problem.outputs, np) * weight).reshape(rows.y.size, -1)
     values = (found.model.predict(given).model[1:] * found.problem.weight).ravel()
@@ -446,9 +447,9 @@ SPRING_PHYSICS = Baseline.from_terms([Term("t1", "y[k-1]"), Term("t2", "y[k-2]")
 
 @cache
 def springs():
-    """10 draws of 10⁴ rows with 30 dB of output noise: (simulation, one-step) fits."""
+    """20 draws of 10⁴ rows with 30 dB of output noise: (simulation, one-step) fits."""
     found = []
-    for seed in range(10):
+    for seed in range(20):
         rng = np.random.default_rng(seed)
         u = 100 * rng.normal(size=10_000)
         y = scipy.signal.lfilter([SPRING[2]], [1, -SPRING[0], -SPRING[1]], u)
@@ -477,7 +478,7 @@ def test_output_error_recovers_the_mass_spring_damper_from_noisy_sensors():
         values, deviations = physical(simulated)
         inside.append(np.abs(values - [M, C, K]) < 3 * deviations)
         assert np.all(deviations < [0.01, 1.0, 10.0])
-    assert np.all(inside)
+    assert np.all(np.sum(inside, axis=0) >= 19)
 
 
 def test_one_step_is_far_off_where_the_sensor_is_noisy():
@@ -569,7 +570,7 @@ def test_standard_deviations_of_the_physics(criterion):
 
 def test_standard_deviations_beside_a_regularised_learner():
     theta, std = monte_carlo(
-        30, learner=MLP((2,)), criterion=Simulation(64, 8, 10), regularization="evidence", solver=LM
+        60, learner=MLP((2,)), criterion=Simulation(64, 8, 10), regularization="evidence", solver=LM
     )
     np.testing.assert_allclose(std.mean(axis=0), theta.std(axis=0, ddof=1), rtol=0.25)
 

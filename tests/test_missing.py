@@ -218,12 +218,7 @@ def test_npz(tmp_path):
 # --- through the spec
 
 
-@pytest.fixture(autouse=True, scope="module")
-def without_figures():
-    """Fits here are read as numbers; test_cli and test_cli_edges look at their figures."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthaug.commands.fit._draw", lambda *_: None)
-        yield
+pytestmark = pytest.mark.usefixtures("without_figures")
 
 
 @pytest.fixture

@@ -17,6 +17,8 @@ from orthaug.physics import problem
 from orthaug.physics.projection import Projection
 from orthaug.studies.synthetic import mass_spring_damper
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 
 @pytest.fixture
 def spec(tmp_path: Path) -> Path:

@@ -28,6 +28,8 @@ from orthaug.inference.measures import Measure, Points, Training
 from orthaug.models.kinds import LEARNERS
 from orthaug.models.storage import load
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 
 @dataclass(frozen=True)
 class Powers:

@@ -172,12 +172,7 @@ kind = "none"
 """
 
 
-@pytest.fixture(autouse=True, scope="module")
-def without_figures():
-    """Fits here are read as numbers; test_cli and test_cli_edges look at their figures."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orthaug.commands.fit._draw", lambda *_: None)
-        yield
+pytestmark = pytest.mark.usefixtures("without_figures")
 
 
 def fitted(folder: Path, spec: str) -> dict:

@@ -31,6 +31,8 @@ from orthaug.models.model import Model
 from orthaug.physics.baseline import Baseline, Term
 from orthaug.reports.findings import ValidationResult
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 PHYSICS = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("g", "u[k-1]")])
 BEYOND = Extrapolation("tests.far", "u[k-1]", (-1.0, 1.0), (-2.5, 2.0), 0.25)
 SMALL = {"learner": MLP(hidden=(6,)), "solver": LevenbergMarquardt(40)}
