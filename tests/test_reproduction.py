@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from test_cli import run as run_command
 
 from orthaug._base.errors import InputError
 from orthaug.studies.catalogue import catalogue
@@ -81,8 +82,13 @@ def stored_columns(one: Reproduced) -> dict[str, list]:
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory) -> list[Reproduced]:
-    return reduced(tmp_path_factory.mktemp("store"))
+def store(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("store")
+
+
+@pytest.fixture(scope="module")
+def found(store) -> list[Reproduced]:
+    return reduced(store)
 
 
 @pytest.fixture(scope="module")
@@ -225,12 +231,11 @@ def test_the_folder_holds_figures_runs_and_findings(found, page):
     assert content["findings"] == as_rows(found) and content["pipeline"] == "ours"
 
 
-def test_a_second_run_reads_the_store(found, tmp_path, monkeypatch):
-    entry = catalogue()["static_errors"]
-    (first,) = reproduce([entry], small=True, store=tmp_path)
-    study = entry.study("ours", True)
+def test_a_second_run_reads_the_store(found, store, monkeypatch):
+    (first,) = (one for one in found if one.entry.name == "static_errors")
+    study = first.entry.study("ours", True)
     monkeypatch.setattr("orthaug.studies.static_errors.estimate", lambda *a, **k: pytest.fail("it ran again"))
-    again = run(study, store=tmp_path)
+    again = run(study, store=store)
     assert again.test_rmse.tolist() == first.table.test_rmse.tolist()
 
 
@@ -303,9 +308,8 @@ def command(*arguments: str) -> list[str]:
     ],
 )
 def test_refusals_of_the_command(tmp_path, arguments, message):
-    whole = command(*arguments, "--out", str(tmp_path / "out"))
-    done = subprocess.run(whole, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 2 and message in done.stderr and "Traceback" not in done.stderr
+    done = run_command("reproduce", *arguments, "--out", tmp_path / "out")
+    assert done.code == 2 and message in done.err and "Traceback" not in done.err
     assert not (tmp_path / "out").exists()
 
 
