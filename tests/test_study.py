@@ -240,9 +240,11 @@ def test_a_store_that_cannot_be_written(tmp_path):
 
 
 PROGRAM = """
-import sys, time
+import signal, sys, time
 from pathlib import Path
 from orthaug.studies.study import Study, run
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a process in the background may have inherited none
 
 def one(seed):
     time.sleep(0.05)
