@@ -553,7 +553,7 @@ def test_a_state_that_is_no_past_output():
     assert np.all(feedback(model, record, along="measured").points.states == 1)
     whole = stability(model, record)
     assert whole.lipschitz is None and whole.warnings == () and "one-step" not in whole.text
-    assert plainly(whole) == whole.as_dict()
+    assert plainly(whole) == content(whole)
 
 
 def test_a_state_that_is_no_past_output_grows_as_its_inputs():

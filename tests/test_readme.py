@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 from test_cli import run, write_csv
 
-pytestmark = pytest.mark.usefixtures("without_figures")
-
 README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
 
 
