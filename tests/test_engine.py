@@ -278,3 +278,11 @@ def test_sums_over_lists_are_sums_over_chunks():
 def test_a_free_run_needs_rows_in_memory():
     with pytest.raises(InputError, match="a free run needs its rows in memory"):
         fit(posed(1), learner=MLP(hidden=(3,)), criterion=Simulation(20, 2), engine=Streaming())
+
+
+def test_chunks_of_uneven_size(monkeypatch):
+    monkeypatch.setattr(f"{__name__}.SIZE", 37)
+    options = {"learner": MLP(hidden=(3,)), "solver": LevenbergMarquardt(20), "regularization": 0.1}
+    memory, streamed = (fit(posed(1), engine=engine, **options) for engine in (InMemory(), Streaming()))
+    np.testing.assert_allclose(streamed.theta, memory.theta, rtol=1e-10)
+    assert streamed.status.loss == pytest.approx(memory.status.loss, rel=1e-6)

@@ -15,7 +15,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import jnp
 from orthaug._base.warning import Warning
 from orthaug.inference.measures import Measure, Points, Support
-from orthaug.inference.weighed import weigh_model
+from orthaug.inference.weighed import weigh
 from orthaug.models.model import Model
 from orthaug.models.rows import InMemory, Overlaps, learner_rows
 from orthaug.models.statistics import JointCovariance
@@ -59,7 +59,7 @@ def split_under(measure: Measure, model: Model, support: Support, joint: JointCo
     Raises:
         InputError: a measure that does not fit the model, or under which the physics is rank-deficient.
     """
-    weighed = weigh_model(measure, support, model.form, model.weight)
+    weighed = weigh(measure, support, model.form.baseline, model.form.outputs, model.weight)
     points, unit, projection = weighed.points, weighed.unit, weighed.projection
     form, numbers = model.form, model.numbers
     try:

@@ -9,7 +9,6 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug.inference.measures import Measure, Points, Support, Training
-from orthaug.models.lagged import Lagged
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.excitation import Excitation, excitation
 from orthaug.physics.problem import Problem
@@ -47,11 +46,6 @@ def weigh(measure: Measure, support: Support, baseline: Baseline, outputs: tuple
     unit = np.sqrt(points.weight)[:, None] * weight
     projection = Projection.factor(phi * unit[:, :, None])
     return Weighed(measure, points, unit, projection, excitation(projection.r, baseline.names))
-
-
-def weigh_model(measure: Measure, support: Support, form: Lagged, weight: Vector) -> Weighed:
-    """The same for a model's physics."""
-    return weigh(measure, support, form.baseline, form.outputs, weight)
 
 
 def weigh_problem(measure: Measure, problem: Problem) -> Weighed:
