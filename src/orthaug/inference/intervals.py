@@ -12,6 +12,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import scipy.linalg
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, check_choice, check_count
@@ -57,7 +58,8 @@ def joint_covariance(problem: Problem, model: Model, convention: str = "calibrat
     change = np.eye(len(outer))
     change[:nt, :nt] = projection.r / projection.scale
     outer, middle = (change.T @ gram @ change for gram in (outer, middle))
-    half = half_inverse(outer, nt)
+    # block by block, as in the proof: one inverse of both mixes rounding of the weights' singular block into θ's
+    half = scipy.linalg.block_diag(half_inverse(outer[:nt, :nt], nt), half_inverse(outer[nt:, nt:], 0))
     return (2.0 if convention == "paper" else 1.0) * half @ (half.T @ middle @ half) @ half.T
 
 
