@@ -27,7 +27,7 @@ def per_row(fit: oa.Estimate, timed: int) -> tuple[np.ndarray, float]:
     problem, model = fit.problem, fit.model
     bound, numbers = model.form.bound, model.numbers
     z = jnp.asarray((problem.feature_rows() - numbers.centre) / numbers.halfwidth)
-    phi = jnp.asarray(problem.projection.phi[:, 0]) / problem.weight  # one output
+    phi = jnp.asarray(problem.projection.phi[:, 0]) * problem.deviation  # one output
     pseudo = jnp.asarray(np.linalg.pinv(phi))
 
     def row(parameters: jax.Array, k: int) -> jax.Array:

@@ -27,7 +27,7 @@ def test_rmse(example: synthetic.Example, unit: float, seed: int, regularization
     task = OneStepTask.of(problem, oa.MLP(), usual.scaling, usual.unit * unit / OUTPUT_UNIT)
     solver = oa.LevenbergMarquardt(iterations)
     run = task.run(solver, task.bound.init(jax.random.key(seed)), regularization=regularization)
-    c = problem.projection.solve((problem.target - task.values(run.w)) * problem.weight)
+    c = problem.projection.solve((problem.target - task.values(run.w)) / problem.deviation)
     test = pose(example.test, example.baseline)
     z = task.scaling(test.feature_rows())
     values = np.asarray(jax.vmap(lambda row: task.bound.values(run.w, row))(z)) * task.unit

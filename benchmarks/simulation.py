@@ -36,7 +36,7 @@ def main() -> None:
     task = OneStepTask.of(problem, MLP((10,)))
     start = task.bound.init(jax.random.key(0))
     flight = FreeRunTask.of(task, Simulation(segment=512, washout=40))
-    c = problem.projection.solve(problem.whitened_target - task.values(start) * problem.weight)
+    c = problem.projection.solve(problem.whitened_target - task.values(start) / problem.deviation)
     numbers, states = flight.numbers(c, start), jnp.asarray(flight.segments.start)
 
     def train(iterations: int) -> None:

@@ -23,7 +23,7 @@ class Problem(NamedTuple):
     e: np.ndarray
     """P⊥Y (N, ny)."""
     gain: np.ndarray
-    """(N, ny)."""
+    """(N, ny), of each output its own."""
     rows: Chunk
     hold: Hold
 
@@ -54,7 +54,7 @@ def problem(
         e = e - q @ np.tensordot(q, e, axes=([0, 1], [0, 1]))
     gain = np.ones_like(y) if gain is None else gain
     shape = chunk_shape(rows, limit)
-    laid = Chunk(*(jnp.asarray(in_chunks(values, shape)) for values in (z, q, e, gain)))
+    laid = Chunk(*(jnp.asarray(in_chunks(values, shape)) for values in (z, q, e, gain[..., None] * np.eye(ny))))
     hold = Hold(jnp.zeros((nt, nt)), jnp.zeros(nt))
     return Problem(OneStep(Bound(learner, z.shape[1], ny)), z, q, e, gain, laid, hold)
 

@@ -41,7 +41,7 @@ def machine():
 def table(problem, suspects, **more) -> Any:
     """`bias_table` on the training rows of a problem."""
     deltas = suspect_columns(suspects, problem.rows.x, problem.layout, problem.outputs)
-    return bias_table(problem.projection, problem.baseline.names, suspects, deltas, gain=problem.weight, **more)
+    return bias_table(problem.projection, problem.baseline.names, suspects, deltas, gain=problem.weight.matrix, **more)
 
 
 def single(phi, delta) -> Any:
@@ -81,11 +81,11 @@ def test_friction_and_noise_explain_the_whole_error(machine):
     """θ̂ = θ* + Φ⁺(Δ + e) with Φ of the run with friction: the noise's part is subtracted, not estimated."""
     (found,) = table(machine, [FRICTION])
     theta = machine.projection.solve(machine.whitened_target)
-    by_noise = machine.projection.solve(paper_noise()[:, None] * machine.weight)
+    by_noise = machine.projection.solve(paper_noise()[:, None] / machine.deviation)
     np.testing.assert_allclose(found.expected, theta - THETA - by_noise, rtol=1e-6)
     # The same regression with friction's force put back into the target, noise untouched.
     delta = FRICTION.values(machine.rows.x, machine.layout, machine.outputs) * -THETA[2]
-    without = machine.projection.solve((machine.target - delta) * machine.weight)
+    without = machine.projection.solve((machine.target - delta) / machine.deviation)
     np.testing.assert_allclose(found.expected, theta - without, rtol=1e-9)
 
 
@@ -109,7 +109,8 @@ def test_weights_and_whitening_enter_through_gain():
     rng = np.random.default_rng(3)
     phi, delta = rng.normal(size=(40, 2, 3)), rng.normal(size=(1, 40, 2))
     gain = np.array([1.0, 20.0]) * np.sqrt(rng.uniform(size=(40, 1)))
-    (found,) = bias_table(Projection.factor(phi * gain[..., None]), "abc", [ANY], delta, gain=gain, certify=False)
+    each = gain[..., None] * np.eye(2)
+    (found,) = bias_table(Projection.factor(phi * gain[..., None]), "abc", [ANY], delta, gain=each, certify=False)
     stacked, target = (phi * gain[..., None]).reshape(80, 3), (delta[0] * gain).reshape(80)
     theta = np.linalg.lstsq(stacked, target, rcond=None)[0]
     np.testing.assert_allclose(found.bias, theta, rtol=1e-12)
@@ -140,7 +141,7 @@ def test_what_of_the_learner_a_suspect_explains(machine):
     assert (in_span.explained, in_span.coefficient_found) == (None, None) and in_span.cosine == pytest.approx(1.0)
     (mixed,) = table(machine, [FRICTION], learned=-3.0 * drag + 1e-7 * cubic, certify=False)
     rest = machine.projection.orthogonal_part
-    f, d = rest((-3.0 * drag + 1e-7 * cubic) * machine.weight), rest(drag * machine.weight)
+    f, d = rest((-3.0 * drag + 1e-7 * cubic) / machine.deviation), rest(drag / machine.deviation)
     assert mixed.explained == pytest.approx(np.vdot(f, d) ** 2 / np.vdot(f, f) / np.vdot(d, d), rel=1e-10)
     assert mixed.coefficient_found == pytest.approx(np.vdot(f, d) / np.vdot(d, d), rel=1e-10)
     (nothing,) = table(machine, [FRICTION], learned=np.zeros_like(drag), certify=False)
@@ -310,7 +311,7 @@ PHI = np.random.default_rng(8).normal(size=(10, 1, 2))
         ({"learned": np.zeros(10)}, r"`learned` has shape \(10,\); expected \(10, 1\)"),
         ({"physical": {"mass": [1.0]}}, r"`physical\['mass'\]` has shape \(1,\); expected \(2,\)"),
         ({"gain": np.ones(3)}, r"`gain` has shape \(3,\), which does not fit rows of shape \(10, 1\)"),
-        ({"gain": -1.0}, "`gain` must be finite and nowhere negative"),
+        ({"gain": np.array([[np.inf]])}, "`gain` must be finite"),
         ({"suspects": [ANY, ANY], "deltas": np.zeros((2, 10, 1))}, "suspect 'any' is given twice"),
     ],
 )

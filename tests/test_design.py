@@ -98,10 +98,10 @@ def test_the_prediction_is_what_the_bias_table_and_least_squares_say(designed: D
     posed = pose(record, MACHINE)
     deltas = suspect_columns([FRICTION], posed.rows.x, posed.layout, posed.outputs)
     (entry,) = bias_table(
-        posed.projection, posed.baseline.names, [FRICTION], deltas, gain=posed.weight, theta=THETA, certify=False
+        posed.projection, posed.baseline.names, [FRICTION], deltas, gain=posed.weight.matrix, theta=THETA, certify=False
     )
     assert designed.bias == pytest.approx(entry.expected, rel=1e-9)
-    factor = posed.projection.covariance_factor() * posed.weight[0]
+    factor = posed.projection.covariance_factor() / posed.deviation[0]
     assert designed.std == pytest.approx(NOISE * np.sqrt(np.sum(factor**2, axis=1)), rel=1e-9)
     assert designed.condition == pytest.approx(posed.excitation.condition, rel=1e-9)
     assert designed.cost == pytest.approx(np.sum((designed.bias**2 + designed.std**2) / THETA**2), rel=1e-12)

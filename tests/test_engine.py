@@ -263,7 +263,7 @@ def test_sums_over_lists_are_sums_over_chunks():
     """Also over chunks of uneven size."""
     ny, rng = 2, np.random.default_rng(0)
     rows = (rng.normal(size=(100, 3)), rng.normal(size=(100, ny, 2)), rng.normal(size=(100, ny)))
-    rows = (*rows, rng.uniform(0.5, 2, (100, ny)))
+    rows = (*rows, rng.uniform(0.5, 2, (100, ny, ny)))
     bound = Bound(MLP(hidden=(3,)), 3, ny)
     w, mix = jnp.asarray(bound.init(jax.random.key(0))), jnp.asarray(rng.normal(size=(ny, ny)))
     found = []

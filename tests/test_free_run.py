@@ -57,7 +57,7 @@ def free_run_loss(found, given, washout):
     squares = []
     for trajectory in found.model.simulate(given).trajectories:
         first = found.model.form.first_row + washout
-        squares.append(((trajectory.measured - trajectory.model)[first:] * found.problem.weight) ** 2)
+        squares.append(((trajectory.measured - trajectory.model)[first:] / found.problem.deviation) ** 2)
     return np.mean(np.concatenate(squares))
 
 
@@ -312,9 +312,9 @@ def test_outputs_without_common_parameters_are_those_fitted_alone():
 def test_two_outputs_with_a_learner(baseline):
     given = two_outputs(1, (0.05, 0.05), 0.2)
     found = estimate(given, baseline, learner=NETWORK, criterion=FREE, solver=LM)
-    rows, weight = found.problem.rows, found.problem.weight[:, None]
+    rows, weight = found.problem.rows, 1 / found.problem.deviation[:, None]
     phi = (found.problem.baseline.phi(rows.x, rows.layout, found.problem.outputs, np) * weight).reshape(rows.y.size, -1)
-    values = (found.model.predict(given).model[1:] * found.problem.weight).ravel()
+    values = (found.model.predict(given).model[1:] / found.problem.deviation).ravel()
     np.testing.assert_allclose(found.theta, np.linalg.lstsq(phi, values, rcond=None)[0], rtol=1e-10)
     assert found.defect <= 1e-12
     assert found.status.loss == pytest.approx(free_run_loss(found, given, 8)) and found.status.loss < 0.01
@@ -338,7 +338,7 @@ def test_validation_chooses_by_the_free_run():
     other = record(9)
     several = estimate(record(), PHYSICS, restarts=3, seed=4, validation=other, **options)
     alone = [estimate(record(), PHYSICS, seed=s, **options) for s in (4, 5, 6)]
-    expected = [np.mean((f.model.simulate(other).scores().rmse * f.problem.weight) ** 2) for f in alone]
+    expected = [np.mean((f.model.simulate(other).scores().rmse / f.problem.deviation) ** 2) for f in alone]
     np.testing.assert_allclose([r.validation for r in several.restarts], expected, rtol=1e-12)
     assert int(np.argmin(expected)) == [r.chosen for r in several.restarts].index(True)
 

@@ -39,9 +39,9 @@ class Wave(eqx.Module):
 
 
 def rows(learner_nz: int, ny: int, count: int = 11):
-    """Features (nz, m) and gains (ny, m) with the batch last."""
+    """Features (nz, m) and gains (ny, ny, m) with the batch last."""
     rng = np.random.default_rng(2)
-    return jnp.asarray(rng.uniform(-1, 1, (learner_nz, count))), jnp.asarray(rng.uniform(0.5, 2, (ny, count)))
+    return jnp.asarray(rng.uniform(-1, 1, (learner_nz, count))), jnp.asarray(rng.uniform(0.5, 2, (ny, ny, count)))
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,8 @@ def test_jacobian_is_the_derivative_of_the_values(learner, nz, ny):
     values, jacobian = jax.jit(bound.jacobian)(w, z, gain)
 
     def scaled(w):
-        return gain * jax.vmap(lambda row: bound.values(w, row), in_axes=1, out_axes=1)(z)
+        values = jax.vmap(lambda row: bound.values(w, row), in_axes=1, out_axes=1)(z)
+        return jnp.einsum("oim,im->om", gain, values)
 
     assert values.shape == (ny, 11) and jacobian.shape == (bound.size, ny, 11)
     np.testing.assert_allclose(values, scaled(w), rtol=1e-13)
@@ -172,7 +173,7 @@ def test_external_has_an_empty_jacobian():
     bound = Bound(External(product, ny=2), 2, 2)
     z, gain = rows(2, 2)
     values, jacobian = bound.jacobian(jnp.zeros(0), z, gain)
-    np.testing.assert_allclose(values, gain * product(np.asarray(z).T).T)
+    np.testing.assert_allclose(values, np.einsum("oim,im->om", gain, product(np.asarray(z).T).T), rtol=1e-13)
     assert jacobian.shape == (0, 2, 11)
 
 

@@ -52,7 +52,7 @@ def test_output_unit_is_a_multiple_of_the_baseline_s_residual(task):
     phi = problem.projection.phi.reshape(problem.target.size, -1)
     y = problem.whitened_target.ravel()
     e = (y - phi @ np.linalg.lstsq(phi, y, rcond=None)[0]).reshape(problem.target.shape)
-    np.testing.assert_allclose(task.unit, OUTPUT_UNIT * e.std(axis=0) / problem.weight, rtol=1e-9)
+    np.testing.assert_allclose(task.unit, OUTPUT_UNIT * e.std(axis=0) * problem.deviation, rtol=1e-9)
     assert task.rms == pytest.approx(np.sqrt(np.mean(e.var(axis=0))), rel=1e-9)
     rows = from_chunks(task.rows.e, len(problem.rows))
     np.testing.assert_allclose(rows, e / task.rms, atol=1e-10)
@@ -78,11 +78,11 @@ def whitened(task, w):
     """f at the training rows in whitened outputs (N·ny,), straight from the learner."""
     z = jnp.asarray(task.scaling(task.problem.feature_rows()))
     values = jax.vmap(lambda row: task.bound.values(w, row))(z)
-    return (values * task.unit * task.problem.weight).ravel()
+    return (values * task.unit / task.problem.deviation).ravel()
 
 
 def test_values(task, run):
-    expected = whitened(task, run.w).reshape(task.problem.target.shape) / task.problem.weight
+    expected = whitened(task, run.w).reshape(task.problem.target.shape) * task.problem.deviation
     np.testing.assert_allclose(task.values(run.w), expected, rtol=1e-12)
 
 

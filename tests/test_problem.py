@@ -32,7 +32,7 @@ def test_rows_and_weight():
     assert names(problem.layout) == "y[k-2] u[k-1]" and problem.outputs == ("y",)
     np.testing.assert_array_equal(problem.rows.x, np.stack([Y[:-2], U[1:-1]], axis=1))
     np.testing.assert_array_equal(problem.target[:, 0], Y[2:])
-    np.testing.assert_allclose(problem.weight, 1 / Y[2:].std())
+    np.testing.assert_allclose(problem.weight.matrix, 1 / Y[2:].std())
     np.testing.assert_allclose(problem.whitened_target.std(axis=0), 1.0)
     np.testing.assert_array_equal(problem.feature_rows(), problem.rows.x)
     assert problem.excitation.full_rank
@@ -42,7 +42,7 @@ def test_each_output_has_its_weight():
     baseline = Baseline.from_terms([Term("a", "u1[k]", output="y1"), Term("a", "u2[k]", output="y2")])
     problem = pose(PAIR, baseline)
     np.testing.assert_allclose(problem.whitened_target.std(axis=0), 1.0)
-    expected = np.stack([U, -(U**2)], axis=1) * problem.weight
+    expected = np.stack([U, -(U**2)], axis=1) / problem.deviation
     np.testing.assert_allclose(problem.projection.phi[:, :, 0], expected)
 
 
@@ -55,7 +55,7 @@ def test_fixed_terms_leave_the_target():
 def test_a_target_that_fixed_terms_explain_whole():
     record = Record.from_arrays(U, 2 * U)
     problem = pose(record, Baseline.from_terms([Term("a", "u[k]", initial=2.0, fixed=True), Term("b", "1")]))
-    assert not problem.target.any() and problem.weight == 1.0
+    assert not problem.target.any() and problem.weight.matrix == 1.0
 
 
 @pytest.mark.parametrize(

@@ -94,7 +94,7 @@ def naive(model, x, weight) -> np.ndarray:
                 known += term.initial * value
             else:
                 block[:, model.form.baseline.names.index(term.parameter)] += value
-        gain = np.sqrt(weight) * model.weight[j]
+        gain = np.sqrt(weight) * model.weight[j, j]
         rows.append(block * gain[:, None])
         target.append((values[:, j] - known) * gain)
     phi, g = np.concatenate(rows), np.concatenate(target)

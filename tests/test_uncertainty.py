@@ -53,9 +53,9 @@ def dense(fit, rows=None):
 
 def projected(fit, phi, jacobian):
     """J̃ = P⊥J of rows in whitened outputs, (N, ny, nw), by a dense basis."""
-    whitened = (phi * fit.model.weight[:, None]).reshape(-1, phi.shape[2])
+    whitened = (phi / fit.model.deviation[:, None]).reshape(-1, phi.shape[2])
     basis = np.linalg.qr(whitened / np.linalg.norm(whitened, axis=0))[0]
-    flat = (jacobian * fit.model.weight[:, None]).reshape(-1, jacobian.shape[2])
+    flat = (jacobian / fit.model.deviation[:, None]).reshape(-1, jacobian.shape[2])
     for _ in range(2):
         flat = flat - basis @ (basis.T @ flat)
     return flat.reshape(jacobian.shape)
@@ -71,7 +71,7 @@ def residual_of(fit):
 def psi_of(fit):
     """[Φ P⊥J] of every row in whitened outputs, (N, ny, nθ + nw)."""
     phi, jacobian = dense(fit)
-    return np.concatenate([phi * fit.model.weight[:, None], projected(fit, phi, jacobian)], axis=2)
+    return np.concatenate([phi / fit.model.deviation[:, None], projected(fit, phi, jacobian)], axis=2)
 
 
 def pinv(matrix, cut=1e-13):
@@ -82,7 +82,7 @@ def pinv(matrix, cut=1e-13):
 
 def paper(fit):
     """eq:cov_approx / N."""
-    psi, residual = psi_of(fit), residual_of(fit) * fit.model.weight
+    psi, residual = psi_of(fit), residual_of(fit) / fit.model.deviation
     count = len(psi)
     outer = sum(row.T @ row for row in psi) / count
     sigma = residual.T @ residual / count
@@ -145,13 +145,13 @@ def test_another_measure_has_its_price(noisy):
 
 def spread_of(fit, rows):
     """√diag(R Cov(c, w) Rᵀ) of rows R (m, nθ + nw): σ²(SᵀS + α)⁻¹ by an SVD of S with its prior's rows below it."""
-    design = np.concatenate(dense(fit), axis=2)[:, 0] * fit.model.weight[0]
+    design = np.concatenate(dense(fit), axis=2)[:, 0] / fit.model.deviation[0]
     prior = np.eye(design.shape[1])[len(fit.theta) :] * np.sqrt(fit.model.statistics.ridge)
     stacked = np.vstack([design, prior])
     unit = 1 / np.linalg.norm(stacked, axis=0)
     _, singular, vectors = np.linalg.svd(stacked * unit, full_matrices=False)
     half = (rows * unit) @ (vectors.T / singular)
-    return np.sqrt(np.sum(half**2, axis=1) * fit.model.statistics.noise[0, 0]) * fit.model.weight[0]
+    return np.sqrt(np.sum(half**2, axis=1) * fit.model.statistics.noise[0, 0]) / fit.model.deviation[0]
 
 
 def test_the_covariance_under_a_measure_is_the_delta_method(noisy):
@@ -176,7 +176,7 @@ def test_variances_of_the_learner_are_not_negative(noisy, convention):
     variance = np.einsum("kn,np,kp->k", psi, covariance, psi)
     assert variance.min() >= 0
     factor = 2 * np.mean(residual_of(noisy) ** 2) if convention == "paper" else noisy.model.statistics.noise[0, 0]
-    rank = variance.sum() / factor / noisy.model.weight[0] ** 2
+    rank = variance.sum() / factor / noisy.model.weight[0, 0] ** 2
     assert 8 < rank <= psi.shape[1] + 1e-6
 
 
@@ -251,7 +251,7 @@ def test_outputs_without_a_common_theta_have_zero_covariance():
 @pytest.mark.parametrize("convention", ["paper", "calibrated"])
 def test_the_joint_covariance_of_two_outputs_is_a_sum_over_rows(shared, convention):
     fit = two_outputs(shared)
-    psi, weight = psi_of(fit), fit.model.weight
+    psi, weight = psi_of(fit), 1 / fit.model.deviation
     residual = residual_of(fit)
     noise = residual.T @ residual / len(residual) if convention == "paper" else fit.model.statistics.noise
     whitened = noise * np.outer(weight, weight)
@@ -266,10 +266,10 @@ def test_one_pass_over_chunks_is_a_sum_over_rows(count):
     """Gram matrix and `ΣψᵀΣ_eψ` of `[Φ J]` in one piece and in several."""
     fit = two_outputs(True, *count)
     model = fit.model
-    phi, jacobian = (part * model.weight[:, None] for part in dense(fit))
+    phi, jacobian = (part / model.deviation[:, None] for part in dense(fit))
     psi = np.concatenate([phi, jacobian], axis=2)
     size = np.sqrt(np.einsum("koa,koa->a", psi, psi))
-    whitened = model.statistics.noise * np.outer(model.weight, model.weight)
+    whitened = model.statistics.noise * np.outer(1 / model.deviation, 1 / model.deviation)
     for found, mix in ((model.statistics.gram, np.eye(2)), (model.statistics.middle, whitened)):
         expected = np.einsum("koa,op,kpb->ab", psi, mix, psi, optimize=True)
         np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), rtol=0, atol=1e-10)

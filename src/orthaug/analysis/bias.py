@@ -19,6 +19,7 @@ from orthaug._base.checks import Matrix, Vector, check_unique
 from orthaug._base.errors import InputError
 from orthaug.analysis.suspects import Suspect
 from orthaug.physics.excitation import excitation, require_rank
+from orthaug.physics.output_weights import times
 from orthaug.physics.projection import Projection
 
 NEGLIGIBLE = 1e-12  # rows whose ‖φᵀδ‖ is below this share of the largest ‖φ‖‖δ‖: only weights of 1e12 could use them
@@ -135,7 +136,7 @@ def bias_table(
     suspects: Sequence[Suspect],
     deltas: Float[np.ndarray, "ns N ny"],
     *,
-    gain: np.ndarray | float = 1.0,
+    gain: np.ndarray | None = None,
     theta: Vector | None = None,
     physical: Mapping[str, Sequence[float] | Vector] | None = None,
     learned: Matrix | None = None,
@@ -144,11 +145,10 @@ def bias_table(
     """One `SuspectedBias` for each suspect, under the measure that `projection` was made with.
 
     Args:
-        projection: of the rows of φ multiplied by `gain`.
+        projection: of the rows of φ, their outputs multiplied by `gain`.
         names: the nt parameters.
         suspects: their forms; `deltas` (ns, N, ny) their values, as `suspects.suspect_columns` gives them.
-        gain: what the rows of φ were multiplied by: 1/standard deviation of the outputs (ny,), times the square
-            root of the measure's weights (N, 1); any shape that broadcasts to (N, ny).
+        gain: a matrix (ny, ny) for all rows, or one of each row (N, ny, ny); None for none.
         theta: θ (nt,), for relative biases.
         physical: a row of dp/dθ (nt,) for each physical parameter p, by name.
         learned: the learner's values (N, ny) in the outputs' units, projected or not.
@@ -162,14 +162,14 @@ def bias_table(
     if not names:
         raise InputError("the physics has no parameters; there is nothing that a suspect could bias.")
     _check_shapes(projection, names, suspects, deltas, theta, physical, learned)
-    gain = _row_gain(gain, deltas.shape[1:])
+    gain = np.eye(deltas.shape[2]) if gain is None else _row_gain(gain, deltas.shape[1:])
     require_rank(excitation(projection.r, names), projection.q.shape[0] * projection.q.shape[1])
-    tilde = None if learned is None else projection.orthogonal_part(np.asarray(learned) * gain)
+    tilde = None if learned is None else projection.orthogonal_part(times(gain, np.asarray(learned)))
     entries = []
     for suspect, delta in zip(suspects, deltas, strict=True):
         if not np.all(np.isfinite(delta)):
             raise InputError(f"suspect '{suspect.name}' is not finite on every row.")
-        weighted = delta * gain
+        weighted = times(gain, delta)
         bias = projection.solve(weighted)
         cosine, explained, coefficient = _overlaps(projection, weighted, tilde)
         entries.append(
@@ -275,15 +275,13 @@ def _numbers(values: Vector) -> tuple[float, ...]:
     return tuple(float(v) for v in values)
 
 
-def _row_gain(gain: np.ndarray | float, shape: tuple[int, ...]) -> np.ndarray:
-    """`gain` broadcast to (N, ny)."""
-    gain = np.asarray(gain, dtype=float)
-    try:
-        gain = np.broadcast_to(gain, shape)
-    except ValueError:
-        raise InputError(f"`gain` has shape {gain.shape}, which does not fit rows of shape {shape}.") from None
-    if not np.all(np.isfinite(gain)) or np.any(gain < 0):
-        raise InputError("`gain` must be finite and nowhere negative.")
+def _row_gain(gain: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """`gain`, checked against rows of the shape (N, ny)."""
+    gain, ny = np.asarray(gain, dtype=float), shape[1]
+    if gain.shape not in ((ny, ny), (*shape, ny)):
+        raise InputError(f"`gain` has shape {gain.shape}, which does not fit rows of shape {shape}.")
+    if not np.all(np.isfinite(gain)):
+        raise InputError("`gain` must be finite.")
     return gain
 
 

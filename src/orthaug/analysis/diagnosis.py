@@ -67,7 +67,7 @@ def diagnose(fit: Estimate, *, one_step: Response | None = None, free_run: Respo
     problem, model, simulated = fit.problem, fit.model, fit.criterion.flown is not None
     one_step = model.predict(problem.record) if one_step is None else one_step
     tests = _tests(problem, one_step)
-    if any(test.white is None for test in tests) or np.all(_errors(one_step) * problem.weight < _ROUNDING):
+    if any(test.white is None for test in tests) or np.all(_errors(one_step) / problem.deviation < _ROUNDING):
         return None
     white = all(_is_white(test, _PRACTICALLY_WHITE) for test in tests)
     complete = white and not any(_misfits(test) for test in tests)
@@ -240,7 +240,7 @@ def _words(
         told += [f"the residual of {test.name} still follows {name}" for name in test.correlated_inputs]
         told += [f"the residual of {test.name} is curved over {name}" for name in test.curved_regressors]
     told = [*told[:_TOLD], *(["and more"] if len(told) > _TOLD else [])]
-    share = max((t.rms or 0.0) * w for t, w in zip(tests, fit.problem.weight, strict=True))
+    share = max((t.rms or 0.0) / d for t, d in zip(tests, fit.problem.deviation, strict=True))
     text = (
         f"The one-step residual, {100 * share:.2g} % of the output's deviation, is not noise alone: {'; '.join(told)}. "
         "Dynamics or nonlinearity are missing, or the noise is coloured. Try more lags, other learner inputs or neurons"

@@ -11,6 +11,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug.analysis.bias import SuspectedBias, bias_table
 from orthaug.analysis.suspects import Suspect, suspect_columns, usual_suspects
 from orthaug.inference.weighed import Weighed
+from orthaug.physics.output_weights import times
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import Problem
 
@@ -53,7 +54,7 @@ def bias_under(
         learned=learned,
         certify=named or len(x) <= CERTIFIED_ROWS,
     )
-    sizes = [float(np.sqrt(np.sum((deltas[i] * weighed.unit) ** 2))) for i in kept]
+    sizes = [float(np.linalg.norm(times(weighed.unit, deltas[i]))) for i in kept]
     return [
         entry.as_dict()
         | {"relative_physical_bias": _relative(entry, slopes), "size": size}

@@ -94,7 +94,7 @@ def free_run_error(
     if any(trajectory.diverged for trajectory in response.trajectories):
         return math.inf
     scores = response.scores(skip)
-    relative = np.where(np.isfinite(scores.nrmse), scores.nrmse, scores.rmse * model.weight)
+    relative = np.where(np.isfinite(scores.nrmse), scores.nrmse, scores.rmse / model.deviation)
     relative = relative if unit is None else scores.rmse / unit
     return float(np.sqrt(np.mean(relative**2))) if np.isfinite(relative).all() else math.inf
 

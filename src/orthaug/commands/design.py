@@ -27,7 +27,7 @@ def design_for(job: Job) -> Design:
     if section is None:
         raise InputError(f"{job.path}: the section [design] is missing; it needs `samples` and `amplitude`.")
     theta = problem.projection.solve(problem.whitened_target)
-    residual = problem.target - np.einsum("kit,t->ki", problem.projection.phi, theta) / problem.weight
+    residual = problem.weight.outputs(problem.whitened_target - problem.projection.phi @ theta)
     given = problem.baseline.initial
     try:
         return design_input(

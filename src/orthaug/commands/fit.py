@@ -99,6 +99,7 @@ def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitt
         "measure": fit.model.measure if fit.model.structure == "orthogonal" else None,
         "measure_detail": fit.measure,
         "orthogonality_defect": fit.defect,
+        "output_weights": None if fit.problem.weight.one_output else fit.problem.weight.as_dict(),
         "excitation": fit.excitation,
         "scores": scores,
         "validation": None,

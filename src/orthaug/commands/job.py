@@ -105,10 +105,10 @@ class Job:
         """The problem that a variant of the job solves: the job's own, unless its data or lags are others."""
         if variant.fold is None:
             return self.problem.physics_alone() if variant.alone else self.problem
-        spec, baseline = self.spec, self.problem.baseline
+        spec, baseline, weights = self.spec, self.problem.baseline, self.spec.training.output_weights
         if variant.alone or spec.declared_learner() is None:
-            return pose(variant.fold, baseline)
-        return pose(variant.fold, baseline, spec.lag_orders(), spec.learner_inputs())
+            return pose(variant.fold, baseline, output_weights=weights)
+        return pose(variant.fold, baseline, spec.lag_orders(), spec.learner_inputs(), output_weights=weights)
 
     @property
     def parts(self) -> tuple[Part, ...]:
@@ -153,7 +153,8 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
         first = largest_lag(layout)
         train, tests = train.without_short(first), tuple(part.without_short(first) for part in tests)
         validation = validation.without_short(first) if validation else None
-        problem = pose(train.record, baseline, lags, learner_inputs, require_full_rank=require_full_rank)
+        options = {"output_weights": spec.training.output_weights, "require_full_rank": require_full_rank}
+        problem = pose(train.record, baseline, lags, learner_inputs, **options)
         problem.feature_rows()
         _check_scored(spec, problem)
         weighed = weigh_problem(measure_of(spec, problem, path.parent), problem)

@@ -201,6 +201,7 @@ class TrainingSection(KindSection):
     ensemble: bool = False
     seed: Annotated[int, Field(ge=0, lt=2**63, strict=True)] = 0
     regularization: Regularization | Annotated[list[Regularization], Field(min_length=1)] | None = None
+    output_weights: str | list[float] = "auto"
 
     @model_validator(mode="after")
     def _check(self) -> TrainingSection:

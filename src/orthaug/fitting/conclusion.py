@@ -72,7 +72,7 @@ def _model(
 ) -> Model:
     record, scaling = problem.record, learned.scaling
     numbers = (parameters.theta, parameters.theta_aux, learned.weights, scaling.centre, scaling.halfwidth, learned.unit)
-    middle = _middle(learned, noise, problem.weight)
+    middle = _middle(problem, learned, noise)
     return Model(
         form=Lagged(problem.baseline, problem.features, problem.layout, problem.outputs, learned.bound),
         numbers=Numbers(*numbers, learned.tilt),
@@ -82,34 +82,34 @@ def _model(
         time_column=record.time_column,
         structure=structure.name,
         largest_output=np.max([np.abs(e.outputs).max(axis=0) for e in record.experiments], axis=0),
-        weight=problem.weight,
+        deviation=problem.deviation,
+        weight=problem.weight.matrix,
         statistics=Statistics(learned.gram, middle, noise, learned.ridge, errors.freedom),
     )
 
 
 def _one_step_errors(task: OneStepTask, learned: Learned, c: Vector, fixed: Fixed) -> ErrorStatistics:
     """The statistics of the one-step residual."""
-    problem = task.problem
-    rows, weight = len(problem.rows), problem.weight
+    problem, ny = task.problem, len(task.problem.outputs)
     whitened = task.residual_gram(learned, c)
-    freedom = degrees_of_freedom(rows, problem.freedom_used, learned.effective) + len(fixed) / len(weight)
+    freedom = degrees_of_freedom(len(problem.rows), problem.freedom_used, learned.effective) + len(fixed) / ny
     finite = bool(np.isfinite(whitened).all())
-    noise = noise_covariance(whitened / np.outer(weight, weight), freedom) if finite else None
-    covariance = None
-    if noise is not None:
-        mixed = noise * np.outer(weight, weight)
-        middle = task.physics_middle(mixed) if len(weight) > 1 else mixed[0, 0] * np.eye(len(c))
+    mixed = noise_covariance(whitened, freedom) if finite else None
+    noise = covariance = None
+    if mixed is not None:
+        noise = problem.weight.covariance(mixed)
+        middle = task.physics_middle(mixed) if ny > 1 else mixed[0, 0] * np.eye(len(c))
         covariance = theta_covariance(problem.projection, middle, fixed)
     mean_square = float(np.trace(whitened)) / problem.target.size
     return ErrorStatistics(noise, covariance, float(freedom.min()), mean_square, fixed)
 
 
-def _middle(learned: Learned, noise: Matrix | None, weight: Vector) -> Matrix | None:
+def _middle(problem: Problem, learned: Learned, noise: Matrix | None) -> Matrix | None:
     """ΣψᵀΣ_eψ in whitened outputs, for the intervals of later splits and of predictions."""
     if noise is None or learned.gram is None:
         return None
-    whitened = noise * np.outer(weight, weight)
-    if len(weight) == 1:
+    whitened = problem.weight.whitened(noise)
+    if len(whitened) == 1:
         return whitened[0, 0] * learned.gram
     return None if learned.middle is None else learned.middle(whitened)
 

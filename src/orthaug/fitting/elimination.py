@@ -100,12 +100,11 @@ class Elimination:
 
 def eliminate(structure: Structure, problem: Problem) -> Elimination:
     """The elimination of θ from a problem's criterion with a structure's rows and the baseline's bounds."""
-    baseline, projection, weight = problem.baseline, problem.projection, problem.weight
-    unit = float(weight[0]) if len(weight) == 1 else 1.0  # λ counts in the output's units where there is one
+    baseline, projection = problem.baseline, problem.projection
     return Elimination(
         to_coordinates=projection.to_coordinates,
         outputs=problem.target_coordinates,
-        rows=structure.penalty(baseline.names, baseline.initial, unit),
+        rows=structure.penalty(baseline.names, baseline.initial, problem.weight.unit),
         lower=baseline.bounds[0],
         upper=baseline.bounds[1],
     )

@@ -214,7 +214,8 @@ def summary_lines(fit: Estimate) -> Sequence[str]:
     if status.message:
         lines.append(f"            {status.message}")
     if fit.defect is not None:
-        lines.append(f"orthogonal  ‖QᵀF̃‖/‖F‖ = {fit.defect:.1e}")
+        weight = fit.problem.weight
+        lines.append(f"orthogonal  ‖QᵀF̃‖/‖F‖ = {fit.defect:.1e}" + ("" if weight.one_output else f", {weight}"))
     condition = fit.excitation.condition
     lines.append(
         f"excitation  rank {fit.excitation.rank} of {fit.excitation.columns}"

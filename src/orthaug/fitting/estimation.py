@@ -23,6 +23,7 @@ from orthaug.fitting.estimates import Estimate, Restart
 from orthaug.fitting.free_run import FreeRunTask
 from orthaug.fitting.learned import Learned, Task
 from orthaug.fitting.one_step import OneStepTask
+from orthaug.fitting.reweighting import reweighted
 from orthaug.fitting.rules import check_solver, check_starts
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.solver import Solver
@@ -52,6 +53,7 @@ def estimate(
     ensemble: bool = False,
     initial: Estimate | Model | None = None,
     validation: Record | None = None,
+    output_weights: str | Sequence[float] = "auto",
     progress: Tell = SILENT,
 ) -> Estimate:
     """Fit `y_k = φ(x_k)θ + learner(x_k) + e_k` by prediction error (eq:cost_fun) or by the error of a free run.
@@ -77,6 +79,10 @@ def estimate(
         initial: warm start from an earlier estimate or model. Its learner, features, scaling and weights replace
             `learner`, `restarts` and `seed`.
         validation: a record that chooses between restarts and regularizations; it is never fitted.
+        output_weights: how several outputs are weighed against each other, in criterion and measure alike: "none" for
+            the plain sum of squares, as in the paper; "std" for each in its standard deviation; "covariance" by that
+            of their errors, fit and weights in turn until they agree; numbers for the weights of the squared errors.
+            "auto" is "std" one step ahead and "covariance" on the free run.
         progress: called about twice a second with (restart, iteration, loss).
 
     Raises:
@@ -97,7 +103,7 @@ def estimate(
     if model is not None:
         inputs = tuple(str(entry) for entry in model.form.features.entries)
     return fit(
-        pose(record, baseline, lags, inputs),
+        pose(record, baseline, lags, inputs, output_weights=output_weights),
         learner=learner,
         structure=structure,
         criterion=criterion,
@@ -155,12 +161,31 @@ def fit(
         keyed = {s: np.zeros(0) if task.bound is None else task.bound.init(jax.random.key(s)) for s in seeds}
         starts = [_PlannedRun(s, w, choice) for choice in choices for s, w in keyed.items()]
     solved = criterion.one_step and problem.baseline.linear
+    ensemble = ensemble and task.bound is not None
+    _check_ensemble(ensemble, problem)
     if task.bound is None and solved:
-        return conclude(task, structure, task.physics_learned())
-    if task.bound is None:
-        starts = [_PlannedRun(seed, np.zeros(0), "none")]
-    trained = task if solved else FreeRunTask.of(task, criterion, warm)
-    return _train(trained, task, starts, structure, solver, validation, progress, ensemble and task.bound is not None)
+        estimate = conclude(task, structure, task.physics_learned())
+    else:
+        if task.bound is None:
+            starts = [_PlannedRun(seed, np.zeros(0), "none")]
+        trained = task if solved else FreeRunTask.of(task, criterion, warm)
+        estimate = _train(trained, task, starts, structure, solver, validation, progress, ensemble)
+    if problem.weight.choice != "covariance" or problem.weight.kind == "covariance" or not solved:
+        return estimate
+
+    def again(problem: Problem, last: Estimate) -> Estimate:
+        chosen = next((r.regularization for r in last.restarts if r.chosen), "none")
+        start = None if task.bound is None else last.model
+        more: dict[str, Any] = {"learner": learner, "initial": start, "regularization": chosen, "engine": engine}
+        return fit(problem, structure=structure, criterion=criterion, solver=solver, progress=progress, **more)
+
+    return reweighted(estimate, again)
+
+
+def _check_ensemble(ensemble: bool, problem: Problem) -> None:
+    """Raise InputError for a median of outputs that are mixed with each other."""
+    if ensemble and problem.weight.choice == "covariance":
+        raise InputError("an ensemble takes the median of each output; use `output_weights` std, none or numbers.")
 
 
 def _check_splittable(structure: Structure, baseline: Baseline, learner: Learner | None) -> None:
@@ -201,7 +226,7 @@ def orthogonalize(
     values = external.values(problem.feature_rows())  # once; the sums below read what it gave
     scaling, unit = Scaling(np.zeros(nz), np.ones(nz)), np.ones(ny)
     task = OneStepTask.of(problem, None)
-    gain = np.broadcast_to(problem.weight / task.rms, values.shape)
+    gain = np.broadcast_to(problem.weight.matrix / task.rms, (*values.shape, ny))
     rows = task.engine.lay(values, problem.projection.q, problem.unexplained / task.rms, gain)
     task = replace(task, rows=rows, unit=unit, bound=Bound(_GIVEN, ny, ny))
     concluded = conclude(task, Orthogonal(), Learned(task.bound, np.zeros(0), scaling, unit, elsewhere=True))
@@ -304,7 +329,7 @@ def _validation_error(fit: Estimate, validation: Record) -> float:
     if not fit.status.ok:
         return math.nan
     rmse = fit.criterion.response(fit.model, validation).scores().rmse
-    return float(np.mean((rmse * fit.problem.weight) ** 2))
+    return float(np.mean((rmse / fit.problem.deviation) ** 2))
 
 
 def _check_record(record: Any, baseline: Any, lags: Any, learner: Any, initial: Any) -> None:

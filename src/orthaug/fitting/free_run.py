@@ -154,7 +154,7 @@ class FreeRunTask:
             initial=InitialStates(start, start.size > 0 and self.flown.estimates_pasts),
             elimination=eliminate(structure, self.problem),
             projects=structure.projects,
-            weight=np.diag(self.problem.weight) / self.task.rms,
+            weight=self.problem.weight.matrix / self.task.rms,
             colour=self.colour,
         )
 
@@ -170,10 +170,11 @@ class FreeRunTask:
         """From p to the end; several outputs are weighted by their errors' covariance in a second leg."""
         ny = len(self.problem.outputs)
         options: dict[str, Any] = {"evidence": evidence, "bounds": objective.bounds, "damping": MARQUARDT}
-        first = solver if ny == 1 else solver.at_most(solver.iterations // 2)
+        two_legs = ny > 1 and self.problem.weight.choice in ("auto", "covariance")
+        first = solver.at_most(solver.iterations // 2) if two_legs else solver
         start = Start(objective.initial.measured)
         end = first.descend(objective, p, start, ridge=ridge, progress=tell, **options)
-        noise = self._noise(objective, end) if ny > 1 and end.ending.usable else None
+        noise = self._noise(objective, end) if two_legs and end.ending.usable else None
         white = None if noise is None else whitening(noise)
         if noise is None or white is None:
             return objective, end
@@ -209,7 +210,7 @@ class FreeRunTask:
         """Mean of squared errors over whole experiments, in deviations of the outputs; NaN where it diverges."""
         with np.errstate(all="ignore"):
             errors = errors_of(self.dynamics, self.numbers(c, w, tilt), self.whole.start, self.whole)
-            scaled = errors * self.problem.weight[:, None]
+            scaled = errors / self.problem.deviation[:, None]
             mean = float(np.sum(scaled**2)) / (self.whole.count * len(self.problem.outputs))
         return mean if mean < RUNAWAY else np.nan
 
@@ -222,7 +223,7 @@ class FreeRunTask:
         def middle(noise: Matrix) -> Matrix:
             """ΣψᵀΣ_eψ of the rows of `gram`. They are white where `weight` made them so."""
             assert gram is not None
-            change = objective.weight / self.problem.weight  # of errors in whitened outputs
+            change = objective.weight @ np.linalg.inv(self.problem.weight.matrix)  # of errors in whitened outputs
             white = change @ noise @ change.T * self.task.rms**2
             return gram * float(np.trace(white)) / len(white)
 

@@ -170,7 +170,7 @@ class FreeRunObjective:
     @property
     def _largest(self) -> float:
         """A misfit beyond which a free run has diverged."""
-        return RUNAWAY * self.segments.count * float(np.sum((self.weight / self.task.problem.weight) ** 2))
+        return RUNAWAY * self.segments.count * float(np.sum((self.weight * self.task.problem.deviation) ** 2))
 
 
 def errors_of(dynamics: Dynamics, numbers: Numbers, states: Any, segments: Segments) -> Float[np.ndarray, "k T ny m"]:

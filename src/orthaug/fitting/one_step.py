@@ -70,13 +70,16 @@ class OneStepTask:
         """Scale features to [-1, 1] and the learner's output to the baseline's residual, unless both are given."""
         z = np.zeros((len(problem.rows), 0)) if learner is None else problem.feature_rows()
         bound = None if learner is None else Bound(learner, z.shape[1], len(problem.outputs))
-        e = problem.unexplained
-        spread = np.maximum(e.std(axis=0) if bound else np.sqrt(np.mean(e**2, axis=0)), _SMALLEST_RESIDUAL)
-        rms = float(np.sqrt(np.mean(spread**2)))
+        e, deviation = problem.unexplained, problem.deviation
+        spread, whitened = (
+            np.maximum(rows.std(axis=0) if bound else np.sqrt(np.mean(rows**2, axis=0)), _SMALLEST_RESIDUAL * least)
+            for rows, least in ((problem.weight.outputs(e), deviation), (e, 1.0))
+        )
+        rms = float(np.sqrt(np.mean(whitened**2)))
         scaling = Scaling.fit(z) if scaling is None else scaling
-        unit = np.asarray(OUTPUT_UNIT * spread / problem.weight if unit is None else unit)
+        unit = np.asarray(OUTPUT_UNIT * spread if unit is None else unit)
         unit = unit if bound is not None else np.zeros_like(unit)
-        gain = np.broadcast_to(unit * problem.weight / rms, e.shape)
+        gain = np.broadcast_to(problem.weight.matrix * unit / rms, (*e.shape, e.shape[1]))
         rows = engine.lay(scaling(z), problem.projection.q, e / rms, gain)
         return cls(problem, bound, scaling, unit, rms, engine, rows)
 
@@ -267,7 +270,7 @@ class OneStepTask:
 
     def share_of(self, w: Vector) -> Vector:
         """QᵀF (nθ,) of the learner with the weights w, in whitened outputs; the rows are in memory."""
-        return self.problem.projection.coordinates(self.values(w) * self.problem.weight)
+        return self.problem.projection.coordinates(self.problem.weight.rows(self.values(w)))
 
     def share_slope(self, w: Vector) -> Matrix:
         """QᵀJ (nθ, nw) of the learner with the weights w, in whitened outputs."""
@@ -327,7 +330,8 @@ def _values(bound: Bound | None, chunk: Chunk, w: Any, tilt: Any) -> Float[Array
         return jnp.zeros_like(chunk.e)
 
     def member_values(w: Any) -> Any:
-        return chunk.gain * jax.vmap(lambda z: bound.values(w, z), in_axes=-1, out_axes=-1)(chunk.z)
+        values = jax.vmap(lambda z: bound.values(w, z), in_axes=-1, out_axes=-1)(chunk.z)
+        return jnp.sum(chunk.gain * values, axis=1)
 
     if tilt is None:
         return member_values(w)

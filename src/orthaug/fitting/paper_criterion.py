@@ -87,5 +87,5 @@ class PaperCriterion:
     def _sums(self, w: Float[Array, "nw"], chunk: Chunk) -> tuple[Float[Array, ""], Float[Array, "nt"]]:
         """‖P⊥Y − F‖² and QᵀF of one chunk."""
         row_values = jax.vmap(self.bound.values, in_axes=(None, -1), out_axes=-1)
-        values = chunk.gain * row_values(w, chunk.z)
+        values = jnp.sum(chunk.gain * row_values(w, chunk.z), axis=1)
         return jnp.sum((chunk.e - values) ** 2), jnp.einsum("ytm,ym->t", chunk.q, values)

@@ -46,20 +46,20 @@ def joint_covariance(problem: Problem, model: Model, convention: str = "calibrat
     if model.numbers.tilt is not None:
         raise InputError("an ensemble has no gradient in its weights; use a single learner.")
     residual = np.concatenate([(t.measured - t.model)[t.start :] for t in model.predict(problem.record).trajectories])
-    noise = residual.T @ residual / len(residual) if convention == "paper" else model.statistics.noise
+    noise: Any = residual.T @ residual / len(residual) if convention == "paper" else model.statistics.noise
     if noise is None:
         raise InputError("the fit has no noise covariance: there are no degrees of freedom left.")
     projection, nt, ny = problem.projection, len(problem.baseline.names), len(problem.outputs)
     engine = InMemory()
-    rows = learner_rows(engine, model.form, model.numbers, problem.rows.x, problem.projection.q, problem.weight)
-    whitened = noise * np.outer(problem.weight, problem.weight)
+    rows = learner_rows(engine, model.form, model.numbers, problem.rows.x, problem.projection.q, problem.weight.matrix)
+    whitened = problem.weight.whitened(noise)
     bound, w = model.form.bound, jnp.asarray(model.numbers.weights)
     outer, middle = (projected_gram(engine, bound, w, rows, jnp.asarray(m)) for m in (np.eye(ny), mixing(whitened)))
     change = np.eye(len(outer))
     change[:nt, :nt] = projection.r / projection.scale
     outer, middle = (change.T @ gram @ change for gram in (outer, middle))
     # block by block, as in the proof: one inverse of both mixes rounding of the weights' singular block into θ's
-    half = scipy.linalg.block_diag(half_inverse(outer[:nt, :nt], nt), half_inverse(outer[nt:, nt:], 0))
+    half: Any = scipy.linalg.block_diag(half_inverse(outer[:nt, :nt], nt), half_inverse(outer[nt:, nt:], 0))
     return (2.0 if convention == "paper" else 1.0) * half @ (half.T @ middle @ half) @ half.T
 
 
@@ -100,7 +100,7 @@ def _variances(
         if form.bound is not None:
             z = form.features.evaluate(rows.T, form.layout, jnp)
             z = ((z - numbers.centre) / numbers.halfwidth).T
-            gain = jnp.broadcast_to(numbers.gain[:, None], (len(form.outputs), rows.shape[-1]))
+            gain = jnp.broadcast_to(jnp.diag(numbers.gain)[..., None], (*2 * (len(form.outputs),), rows.shape[-1]))
             columns = jnp.concatenate([columns, form.bound.jacobian(numbers.weights, z, gain)[1]])
         return jnp.sum(jnp.einsum("nom,nr->rom", columns, root) ** 2, axis=0)
 
@@ -133,7 +133,7 @@ def robust_covariance(problem: Problem, residual: Matrix, used: float, lags: int
         used: effective weights of the learner, by which the residual is too small.
     """
     projection = problem.projection
-    whitened = residual * problem.weight
+    whitened = problem.weight.rows(residual)
     scores = np.einsum("kit,ki->kt", projection.q, whitened)
     pieces, begin = [], 0
     for experiment in problem.record.experiments:

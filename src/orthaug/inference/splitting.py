@@ -20,6 +20,7 @@ from orthaug.models.model import Model
 from orthaug.models.rows import InMemory, Overlaps, learner_rows
 from orthaug.models.statistics import JointCovariance
 from orthaug.physics.excitation import require_rank
+from orthaug.physics.output_weights import times
 from orthaug.physics.projection import Projection
 
 SUPPORTED = 0.9  # share of a measure within reach of the data, below which it is warned of
@@ -63,13 +64,13 @@ def split_under(measure: Measure, model: Model, support: Support, joint: JointCo
     points, unit, projection = weighed.points, weighed.unit, weighed.projection
     form, numbers = model.form, model.numbers
     try:
-        require_rank(weighed.excitation, unit.size)
+        require_rank(weighed.excitation, len(points.x) * unit.shape[-1])
     except InputError as error:
         raise type(error)(f"under the {measure.name} measure {error}") from None
     raw = model.learner_at(points.x)
     if not np.isfinite(raw).all():
         raise InputError(f"the learner is not finite on all points of the {measure.name} measure; narrow it.")
-    values = raw * unit
+    values = times(unit, raw)
     aux = projection.solve(values)
     theta = model.theta - model.theta_aux + aux
     covariance = None
@@ -88,7 +89,7 @@ def split_under(measure: Measure, model: Model, support: Support, joint: JointCo
     return MeasureSplit(measure.name, theta, aux, covariance, defect, share, len(points.x), condition, warnings)
 
 
-def learner_slope(model: Model, points: Points, projection: Projection, unit: Matrix) -> Matrix:
+def learner_slope(model: Model, points: Points, projection: Projection, unit: np.ndarray) -> Matrix:
     """Φ_μ⁺J_μ (nθ, nw), in one pass over the points."""
     bound, numbers = model.form.bound, model.numbers
     nt = len(model.theta)

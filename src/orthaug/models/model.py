@@ -53,8 +53,8 @@ def _ahead(
 class Model:
     """A fitted model; `estimate` makes it, `orthaug.save` and `orthaug.load` keep it.
 
-    `weight` (ny,) is one over each output's deviation: it whitens outputs. From the `statistics` every function of the
-    model has an interval.
+    `weight` (ny, ny) is the inner product of criterion and measure: rows multiplied by it are whitened. `deviation`
+    (ny,) is that of the training outputs. From the `statistics` every function of the model has an interval.
     """
 
     form: Lagged
@@ -65,7 +65,8 @@ class Model:
     structure: str
     measure: str = field(default="training", kw_only=True)
     largest_output: Vector
-    weight: Vector
+    deviation: Vector
+    weight: Matrix
     time_column: str | None = None
     statistics: Statistics = Statistics()  # noqa: RUF009  (frozen)
 

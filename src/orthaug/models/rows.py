@@ -33,8 +33,8 @@ class Chunk(NamedTuple):
     """Orthonormal basis of the physics."""
     e: Float[Array, "*k ny m"]
     """P⊥Y, what the physics cannot express."""
-    gain: Float[Array, "*k ny m"]
-    """Unit of the learner's output in whitened rows."""
+    gain: Float[Array, "*k ny ny m"]
+    """What turns the learner's outputs into whitened rows."""
 
 
 class Overlap(NamedTuple):
@@ -55,7 +55,7 @@ class Engine(Protocol):
         """Whether all rows are one `Chunk` on the device, so that a whole training run may be compiled around a sum."""
         ...
 
-    def lay(self, z: Matrix, q: Any, e: Matrix, gain: Matrix) -> Any:
+    def lay(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Any:
         """Rows (N, …) as this engine keeps them."""
         ...
 
@@ -71,7 +71,7 @@ class InMemory:
     limit: int = CHUNK_ROWS
     resident: bool = True
 
-    def lay(self, z: Matrix, q: Any, e: Matrix, gain: Matrix) -> Chunk:
+    def lay(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Chunk:
         shape = chunk_shape(len(z), self.limit)
         padded = in_chunks(z, shape, repeat=True)  # zeros may be where the learner has no value
         return Chunk(*map(jnp.asarray, (padded, *(in_chunks(piece, shape) for piece in (q, e, gain)))))
@@ -126,11 +126,11 @@ def gram(columns: Float[Array, "n rows"]) -> Float[Array, "n n"]:
 
 
 def learner_rows(engine: Engine, form: Lagged, numbers: Numbers, x: Matrix, q: Any, weight: Any) -> Any:
-    """Regressors x (N, nx) as rows of the engine, multiplied by `weight`; the learner in whitened outputs."""
+    """Regressors x (N, nx) as rows of the engine, their outputs multiplied by `weight`, (ny, ny) or (N, ny, ny)."""
     z = np.asarray(form.features.evaluate(x, form.layout, np))
     scaled = (z - np.asarray(numbers.centre)) / np.asarray(numbers.halfwidth) if form.bound else np.zeros((len(x), 0))
-    gain = np.broadcast_to(weight * np.asarray(numbers.gain), (len(x), len(form.outputs)))
-    return engine.lay(scaled, q, 0 * gain, gain)
+    gain = np.broadcast_to(weight * np.asarray(numbers.gain), (len(x), *2 * (len(form.outputs),)))
+    return engine.lay(scaled, q, np.zeros(gain.shape[:2]), gain)
 
 
 @dataclass(frozen=True)

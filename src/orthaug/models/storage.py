@@ -31,7 +31,7 @@ from orthaug.models.model import Model
 from orthaug.models.statistics import Statistics
 from orthaug.physics.baseline import Baseline, Parameter, Term
 
-FORMAT = 1
+FORMAT = 2
 _DECLARATION, _ARRAYS = "model.json", "arrays.safetensors"
 
 
@@ -59,7 +59,8 @@ def write(model: Model, folder: Path) -> None:
     kept = model.statistics
     arrays |= {
         "largest_output": model.largest_output,
-        "weight": model.weight,
+        "deviation": model.deviation,
+        "output_weight": model.weight,
         "scalars": np.array([kept.ridge, kept.freedom]),
     }
     arrays |= {
@@ -210,7 +211,8 @@ def _rebuild(
         structure=declared["structure"],
         measure=declared["measure"],
         largest_output=arrays["largest_output"],
-        weight=arrays["weight"],
+        deviation=arrays["deviation"] if "deviation" in arrays else 1 / arrays["weight"],
+        weight=arrays["output_weight"] if "output_weight" in arrays else np.diag(arrays["weight"]),
         statistics=Statistics(
             gram=arrays.get("gram"),
             middle=arrays.get("middle"),

@@ -5,6 +5,7 @@ Everything that can be wrong with data and physics together is found here, witho
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,6 +19,7 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import Features, Lags, Layout, UsableRows, in_order, lag_matrix, stack_rows
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.excitation import Excitation, excitation, require_rank
+from orthaug.physics.output_weights import OutputWeights, check_output_weights, weigh_outputs
 from orthaug.physics.projection import Projection
 
 _LARGEST = 1e120  # size of outputs and regressors whose squares still add up; 1 / _LARGEST is the smallest
@@ -27,8 +29,9 @@ _LARGEST = 1e120  # size of outputs and regressors whose squares still add up; 1
 class Problem:
     """Usable rows of a record with everything that does not depend on the learner's weights.
 
-    `weight` = 1 / standard deviation whitens the outputs, for criterion and measure alike: so F1 holds for
-    several outputs too. `target` is the outputs without the fixed terms.
+    `weight` weighs the outputs, for criterion and measure alike: so F1 holds for several outputs too. Rows multiplied
+    by it are called whitened. `target` is the outputs without the fixed terms, `deviation` (ny,) their standard
+    deviation.
     """
 
     record: Record
@@ -37,7 +40,8 @@ class Problem:
     layout: Layout
     rows: UsableRows
     target: Float[np.ndarray, "N ny"]
-    weight: Vector
+    deviation: Vector
+    weight: OutputWeights
     projection: Projection
     excitation: Excitation
 
@@ -53,7 +57,7 @@ class Problem:
 
     @property
     def whitened_target(self) -> Float[np.ndarray, "N ny"]:
-        return self.target * self.weight
+        return self.weight.rows(self.target)
 
     @cached_property
     def least_squares(self) -> Vector:
@@ -83,7 +87,15 @@ class Problem:
         own = in_order(self.baseline.lags, outputs, inputs)
         if own == self.layout:
             return self
-        return pose(self.record, self.baseline)
+        return pose(self.record, self.baseline, output_weights=self.weight.choice)
+
+    def weighed(self, weight: OutputWeights) -> Problem:
+        """The same problem with other output weights."""
+        if weight is self.weight:
+            return self
+        projection = Projection.factor(weight.rows(self.weight.outputs(self.projection.phi)))
+        excited = excitation(projection.r, self.baseline.names)
+        return replace(self, weight=weight, projection=projection, excitation=excited)
 
     def feature_rows(self) -> Matrix:
         """The learner's features (N, nz).
@@ -100,6 +112,7 @@ def pose(
     lags: Lags | None = None,
     learner_inputs: tuple[str, ...] | None = None,
     *,
+    output_weights: str | Sequence[float] = "auto",
     require_full_rank: bool = True,
 ) -> Problem:
     """Check record and physics against each other and factorise.
@@ -107,6 +120,7 @@ def pose(
     Args:
         lags: the learner's regressor; None for what the baseline's expressions use.
         learner_inputs: expressions or raw lags that the learner sees instead of all lags.
+        output_weights: as in `estimate`; "covariance" and "auto" begin with standard deviations.
         require_full_rank: raise where the data do not determine θ; `check` reports it instead.
 
     Raises:
@@ -116,6 +130,7 @@ def pose(
     outputs, inputs = (tuple(c.name for c in group) for group in (record.outputs, record.inputs))
     if not outputs:
         raise InputError("the record has no outputs; there is nothing to fit.")
+    check_output_weights(output_weights, len(outputs))
     baseline.check_channels(outputs, inputs)
     layout, features = regressor_of(baseline, lags, learner_inputs, outputs, inputs)
     rows = stack_rows(record, layout)
@@ -132,12 +147,13 @@ def pose(
             f"the outputs move by {np.max(np.ptp(target, axis=0)):.3g}, too large or too small for double precision "
             "arithmetic; scale them (`scale` of the channel)."
         )
-    weight = 1.0 / np.where(deviation > 0, deviation, 1.0)
-    projection = Projection.factor(phi * weight[:, None])
+    deviation = np.where(deviation > 0, deviation, 1.0)
+    weight = weigh_outputs(output_weights, deviation)
+    projection = Projection.factor(weight.rows(phi))
     excited = excitation(projection.r, baseline.names)
     if require_full_rank:
         require_rank(excited, rows.y.size)
-    return Problem(record, baseline, features, layout, rows, target, weight, projection, excited)
+    return Problem(record, baseline, features, layout, rows, target, deviation, weight, projection, excited)
 
 
 def check_defined(problem: Problem, record: Record) -> None:

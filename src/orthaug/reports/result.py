@@ -107,6 +107,13 @@ class MeasureResult(Content):
     std_over_training: Numbers | None = Field(validation_alias="price")
 
 
+class OutputWeightsResult(Content):
+    """How the outputs are weighed against each other: errors e count as ‖matrix · e‖²."""
+
+    kind: str
+    matrix: list[Numbers]
+
+
 class ExcitationResult(Content):
     """How well the data tell the parameters apart."""
 
@@ -173,6 +180,7 @@ class FitResult(_Headed):
     measure: str | None
     measure_detail: MeasureResult | None
     orthogonality_defect: Number
+    output_weights: OutputWeightsResult | None
     excitation: ExcitationResult
     scores: dict[str, PartScores]
     bias: list[SuspectResult] | None
