@@ -130,7 +130,7 @@ def _gradient_rows(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"], widt
 def _weight_sizes(
     form: Lagged, numbers: Numbers, x: Matrix, x_scale: Vector, y_scale: Vector
 ) -> tuple[Int[np.ndarray, "r"], Vector, Vector]:
-    """‖∂²g/∂w∂x‖ plain (r,) and scaled (r,) at some rows of x (m, nx), as many as are affordable, and which they are."""
+    """Which rows of x (m, nx) are looked at, as many as are affordable, and ‖∂²g/∂w∂x‖ there: plain (r,), scaled."""
     cells, directions = len(form.outputs) * np.size(numbers.weights), np.eye(x.shape[1])
     if not form.differentiable or not cells * len(directions):
         return np.arange(0), np.zeros(0), np.zeros(0)
