@@ -66,12 +66,12 @@ THEORY: tuple[Statement, ...] = (
     ),
     Statement(
         "assum:baseline_mdl_dominant",
-        "The physics dominates: ‖Φθ*‖ > ‖Δ‖. The paper concludes e_std > e_orth (eq:eqivalence_set_std) from the member "
-        "θ = 0 of the equivalence set, whose error is θ*. That step holds in the norm ‖Φ·‖, as ‖Φθ*‖ > ‖Δ‖ ≥ ‖ΦΦ⁺Δ‖, "
-        "not in the Euclidean norm that is claimed: where columns of Φ nearly depend on each other, ‖Φ⁺Δ‖ can be a "
-        "thousand times ‖θ*‖. Repair, without the assumption: if the learner can take the values (I − ΦΦ⁺)Δ, the "
-        "orthogonal solution θ* + Φ⁺Δ is itself in the set, so the supremum is no less than its error; if it can also "
-        "take Φv more for a small v ≠ 0 with vᵀΦ⁺Δ ≤ 0, the supremum is larger.",
+        "The physics dominates: ‖Φθ*‖ > ‖Δ‖. The paper concludes e_std > e_orth from the member θ = 0 of the "
+        "equivalence set (eq:eqivalence_set_std), whose error is θ*. That step holds in the norm ‖Φ·‖, as ‖Φθ*‖ > ‖Δ‖"
+        " ≥ ‖ΦΦ⁺Δ‖, not in the Euclidean norm that is claimed: where columns of Φ nearly depend on each other, ‖Φ⁺Δ‖ "
+        "can be a thousand times ‖θ*‖. Repair, without the assumption: if the learner can take the values (I − ΦΦ⁺)Δ,"
+        " the orthogonal solution θ* + Φ⁺Δ is itself in the set, so the supremum is no less than its error; if it can"
+        " also take Φv more for a small v ≠ 0 with vᵀΦ⁺Δ ≤ 0, the supremum is larger.",
         "With θ̂ and the learner in place of what is unknown: analysis.validation.dominance, the size of the learner "
         "against the physics in `orthaug compare`. No program can take the supremum over all weights",
         "test_paper.test_a_dominant_physics_orders_the_errors_in_the_norm_of_phi_alone, "
