@@ -87,10 +87,10 @@ def lipschitz(model: Model, record: Record, *, x: Matrix | None = None) -> Lipsc
             norms = [(size(g), size(g * x_scale / scale[:, None])) for g in batches]
             plain, scaled = (np.concatenate(column) for column in zip(*norms, strict=True))
             largest += [where.worst(record, plain, entries)[0], *where.worst(record, scaled, entries)]
-    some, plain, scaled = _weight_sizes(form, model.numbers, x, x_scale, y_scale)
-    of_weights, there = where.take(some), lambda i: entries(some[i])
+    fewer, plain, scaled = _weight_sizes(form, model.numbers, x, x_scale, y_scale)
+    of_weights, there = where.take(fewer), lambda i: entries(int(fewer[i]))
     largest += [of_weights.worst(record, plain, there)[0], *of_weights.worst(record, scaled, there)]
-    return Lipschitz(*largest, rows=len(x), weights_rows=len(some))
+    return Lipschitz(*largest, rows=len(x), weights_rows=len(fewer))
 
 
 def _measured(model: Model, record: Record, x: Matrix | None) -> tuple[Matrix, Where, Vector]:
