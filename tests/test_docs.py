@@ -12,6 +12,7 @@ from test_architecture import ROOMS
 from test_cli import make_project
 
 import orthaug
+from orthaug.commands.cli import app
 from orthaug.commands.spec import load_spec
 from orthaug.models.kinds import LEARNERS
 from orthaug.models.learners import Bound
@@ -55,6 +56,13 @@ def members(name: str, nodes: list[ast.stmt]) -> set[str]:
     return names
 
 
+def commands_in(text: str) -> set[str]:
+    """What follows `orthaug` in backticks, and at the start of a line of fenced code."""
+    fenced = "\n".join(re.findall(r"^```.*?^```", text, flags=re.DOTALL | re.MULTILINE))
+    return {*re.findall(r"`orthaug ([a-z]+)", text), *re.findall(r"^(?:\$ )?orthaug ([a-z]+)", fenced, re.MULTILINE)}
+
+
+COMMANDS = {command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands}
 EVERYTHING = parsed(sorted(SOURCE.rglob("*.py")))
 WORDS = set(re.findall(r"\w+", "".join(f.read_text() for d in (SOURCE, ROOT / "tests") for f in d.rglob("*.py"))))
 
@@ -84,42 +92,29 @@ def test_every_dotted_name_exists(page):
     assert missing == set()
 
 
+@pytest.mark.parametrize("page", TEXTS)
+def test_every_command_that_is_named_exists(page):
+    assert commands_in(TEXTS[page]) <= COMMANDS
+
+
+def test_every_command_that_the_program_names_exists():
+    texts = [
+        file.read_text(encoding="utf-8") for suffix in ("py", "html", "toml") for file in SOURCE.rglob(f"*.{suffix}")
+    ]
+    named = set().union(*(commands_in(text) for text in texts))
+    assert named <= COMMANDS and len(named) > 5
+
+
+def test_commands_are_found_in_texts():
+    text = "`orthaug validate x.toml`\nso orthaug is\n```sh\northaug fit a.toml\n$ orthaug demo\n```\northaug computes"
+    assert commands_in(text) == {"validate", "fit", "demo"}
+
+
 @pytest.mark.parametrize("page", DEVELOPERS)
 def test_every_name_of_the_code_is_a_word_of_the_code(page):
     named = [text.partition("(")[0].removeprefix("@") for text in backticked(TEXTS[page])]
     named = [text for text in named if re.fullmatch(r"[A-Za-z]\w*_\w*|[A-Z]\w*[a-z]\w*|[A-Z]{3,}", text)]
     assert {name for name in named if name not in WORDS} == set()
-
-
-def rows() -> list[tuple[str, list[str], list[Path]]]:
-    """The rows of docs/notation.md that end with files: the row, its names, its files."""
-    rows = []
-    for line in TEXTS["docs/notation.md"].splitlines():
-        cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
-        files = re.findall(r"`([\w/]+\.py)`", cells[-1]) if cells else []
-        if files:
-            rows.append((cells[0] + " " + cells[1], backticked(cells[1]), [SOURCE / file for file in files]))
-    return rows
-
-
-@pytest.mark.parametrize(("row", "names", "files"), rows(), ids=[row for row, *_ in rows()])
-def test_a_symbol_s_names_are_in_the_files_of_its_row(row, names, files):
-    nodes, text = parsed(files), "".join(file.read_text(encoding="utf-8") for file in files)
-    for name in names:
-        for owner, attribute in re.findall(r"\b([A-Z]\w+)\.([a-z_]\w*)", name):
-            assert attribute in members(owner, nodes), f"{owner}.{attribute} is not in {files}"
-        words = set(re.findall(r"[A-Za-z_]\w*", name))
-        assert words <= set(re.findall(r"\w+", text)), f"{name} is not in {files}"
-    assert all(uses(file, names) for file in files), "a file of the row has none of its names"
-
-
-def uses(file: Path, names: list[str]) -> bool:
-    words = set(re.findall(r"\w+", file.read_text(encoding="utf-8")))
-    return not names or any(set(re.findall(r"[A-Za-z_]\w*", name)) <= words for name in names)
-
-
-def test_there_are_symbols():
-    assert len(rows()) > 70
 
 
 def test_the_rooms_are_told_in_their_order():

@@ -10,9 +10,10 @@ import pytest
 from scipy.optimize import minimize
 
 from orthaug._base.errors import InputError
-from orthaug._base.jax import jnp
+from orthaug._base.jax import jax, jnp
 from orthaug.analysis import contraction as metrics
 from orthaug.analysis import feedback as radii
+from orthaug.analysis import lipschitz as gradients
 from orthaug.analysis.boundedness import divergence_scaling
 from orthaug.analysis.contraction import contraction
 from orthaug.analysis.feedback import feedback
@@ -23,7 +24,7 @@ from orthaug.data.regressors import Lags, stack_rows
 from orthaug.fitting.estimation import estimate, orthogonalize
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.models.dynamics import Differentiated, Dynamics, Parts
-from orthaug.models.learners import MLP
+from orthaug.models.learners import MLP, Function
 from orthaug.models.model import Model
 from orthaug.models.storage import load, save
 from orthaug.physics.baseline import Baseline, Term
@@ -393,6 +394,50 @@ def test_lipschitz_of_known_gradients():
     rms = [np.sqrt(np.mean((y1 * y2) ** 2)), np.sqrt(np.mean(u1**2))]
     phi = np.sqrt(((y2 * y1.std()) ** 2 + (y1 * y2.std()) ** 2) / rms[0] ** 2 + (u1.std() / rms[1]) ** 2)
     assert found.phi_scaled == pytest.approx(phi.max()) and found.phi_worst.row == phi.argmax() + 2
+
+
+def test_lipschitz_of_the_weights_of_a_known_learner(monkeypatch):
+    """f = w₁ z₁ z₂ + w₂ z₁²: ∂²f/∂w∂z = [[z₂, z₁], [2 z₁, 0]], z scaled and f in its unit."""
+    learner = Function(
+        lambda w, z: w[:1] * z[0] * z[1] + w[1:] * z[0] ** 2, lambda key: jnp.zeros(2), ("u[k]", "u[k-1]")
+    )
+    u, y = 1 + 0.5 * noise(200), 3 * noise(200, 2)
+    record = Record.from_arrays(u, y)
+    model = estimate(record, Baseline.from_terms([Term("a", "u[k]")]), learner=learner, solver=FEW).model
+    numbers, x = model.numbers, np.stack([u[1:], u[:-1]], axis=1)
+    z = (x - numbers.centre) / numbers.halfwidth
+    columns = [z[:, 1] ** 2 + 4 * z[:, 0] ** 2, z[:, 0] ** 2]  # Σ over the weights, for each entry of x
+    squares = np.stack(columns, axis=1) * (numbers.gain / numbers.halfwidth) ** 2
+    found = lipschitz(model, record)
+    assert found.weights == pytest.approx(np.sqrt(squares.sum(axis=1)).max()) and found.weights_rows == 199
+    scaled = np.sqrt((squares * x.std(axis=0) ** 2).sum(axis=1)) / y.std()
+    assert found.weights_scaled == pytest.approx(scaled.max()) and found.weights_worst.row == scaled.argmax() + 1
+    monkeypatch.setattr(gradients, "_MOST_CELLS", 4 * 50)
+    few, some = lipschitz(model, record), np.linspace(0, 198, 50).round().astype(int)
+    assert few.weights_rows == 50 and few.weights == pytest.approx(np.sqrt(squares[some].sum(axis=1)).max())
+    assert few.weights_worst.row == some[scaled[some].argmax()] + 1 and few.rows == 199
+
+
+def test_lipschitz_of_the_weights_of_a_network(network):
+    """Two outputs and a network: the largest over rows of what JAX differentiates one row at a time."""
+    model, record = network
+    x, form, numbers = stack_rows(record, model.form.layout).x, model.form, model.numbers
+
+    def size(row):
+        slope = jax.jacfwd(lambda w, x: form.at(numbers._replace(weights=w), x).total)
+        return jnp.linalg.norm(jax.jacfwd(slope, 1)(numbers.weights, row).ravel())
+
+    assert lipschitz(model, record).weights == pytest.approx(float(jax.vmap(size)(x).max()))
+
+
+def test_lipschitz_of_no_weights(duffing):
+    """Physics alone, and a learner from elsewhere, have none."""
+    model, record = duffing
+    split = orthogonalize(record, Baseline.from_terms([DUFFING[0]]), lambda x: x[:, 0], lags=Lags(na=2, nb=1)).model
+    for one in (model, split):
+        found = lipschitz(one, record.rows(None, 300))
+        assert (found.weights, found.weights_scaled, found.weights_worst, found.weights_rows) == (None, None, None, 0)
+        assert found.gradient > 0 and found.rows == 298
 
 
 def test_lipschitz_says_nothing_about_the_free_run():

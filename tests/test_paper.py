@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from orthaug.data.record import Record
-from orthaug.fitting.estimation import estimate
+from orthaug.fitting.estimation import estimate, orthogonalize
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive
 from orthaug.models.learners import MLP
 from orthaug.physics.baseline import Baseline, Term
+from orthaug.physics.projection import Projection
 from orthaug.studies.synthetic import mass_spring_damper, static
 
 SEEDS = range(10)
@@ -165,6 +166,65 @@ def test_error_of_the_additive_structure(additive):
         expected = np.linalg.lstsq(phi, learner - (0.01 - 0.5 * u**2), rcond=None)[0]
         np.testing.assert_allclose(example.theta - fit.theta, expected, atol=1e-10)
         assert np.linalg.norm(example.theta - fit.theta) == pytest.approx(np.linalg.norm(expected), abs=1e-10)
+
+
+THETA = np.array([1.0, 1.0])
+TWINS = Baseline.from_terms([Term("a", "u[k]"), Term("b", "v[k]")])
+
+
+def twins() -> tuple[Record, np.ndarray, np.ndarray]:
+    """Record, Φ and Δ of `y = u + v + δ`, u and v nearly the same signal and δ a function of what they differ in."""
+    u, w = np.random.default_rng(4).normal(size=(2, 400))
+    phi = np.stack([u, u + 1e-3 * w], axis=1)
+    delta = missing(phi)
+    return Record.from_arrays(phi, phi @ THETA + delta, inputs=["u", "v"]), phi, delta
+
+
+def missing(x: np.ndarray) -> np.ndarray:
+    """δ(x) (N,)."""
+    w = 1e3 * (x[:, 1] - x[:, 0])
+    return w + 0.5 * (w**2 - 1)
+
+
+def test_a_dominant_physics_orders_the_errors_in_the_norm_of_phi_alone():
+    """‖Φθ*‖ > ‖Δ‖, yet the member θ = 0 of the equivalence set is nearer to θ* than θ̂ = θ* + Φ⁺Δ."""
+    record, phi, delta = twins()
+    error = estimate(record, TWINS, learner=None).theta - THETA
+    np.testing.assert_allclose(error, np.linalg.lstsq(phi, delta, rcond=None)[0], rtol=1e-9)
+    assert np.linalg.norm(phi @ THETA) > 1.3 * np.linalg.norm(delta)  # the assumption, with room to spare
+    assert np.linalg.norm(error) > 500 * np.linalg.norm(THETA)
+    assert np.linalg.norm(phi @ THETA) > np.linalg.norm(delta) > np.linalg.norm(phi @ error)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_dominant_physics_errs_least_in_the_norm_of_phi(seed):
+    """‖Φθ*‖ > ‖Δ‖ ≥ ‖ΦΦ⁺Δ‖ of any physics, however its columns depend on each other; by a thousandth here."""
+    rng = np.random.default_rng(seed)
+    phi = rng.normal(size=(30, 4)) @ np.diag(10.0 ** rng.uniform(-4, 4, 4)) @ rng.normal(size=(4, 4))
+    theta, delta = rng.normal(size=4), phi @ rng.normal(size=4) + 0.1 * rng.normal(size=30)
+    delta *= 0.999 * np.linalg.norm(phi @ theta) / np.linalg.norm(delta)
+    assert np.linalg.norm(phi @ theta) > np.linalg.norm(Projection.factor(phi[:, None]).solve(delta[:, None]) @ phi.T)
+
+
+@pytest.mark.parametrize("further", [0.0, 0.01, -0.5])
+def test_the_orthogonal_solution_is_in_the_equivalence_set(further):
+    """A member (θ, F) has Φθ + F = Φθ* + Δ (eq:eqivalence_set_std). With F = (I − ΦΦ⁺)Δ it is the orthogonal one.
+
+    So the supremum of ‖θ* − θ‖ is no less than its error, and larger where the learner reaches a little further.
+    """
+    record, phi, delta = twins()
+    exact = orthogonalize(record, TWINS, lambda x: x @ THETA + missing(x))  # fits without error
+    error = exact.theta - THETA
+    (orthogonal,) = exact.model.components(record).trajectories
+    rest = delta - phi @ np.linalg.lstsq(phi, delta, rcond=None)[0]
+    np.testing.assert_allclose(orthogonal.learner[:, 0], rest, atol=1e-9)
+    np.testing.assert_allclose(orthogonal.model[:, 0], phi @ THETA + delta, atol=1e-9)
+    theta = exact.theta + further * error
+    values = orthogonal.learner[:, 0] - further * (phi @ error)
+    np.testing.assert_allclose(phi @ theta + values, phi @ THETA + delta, atol=1e-9)
+    shown = np.linalg.norm(np.linalg.lstsq(phi, values - delta, rcond=None)[0])  # eq:baseline_error_simple_augm
+    assert shown == pytest.approx((1 + further) * np.linalg.norm(error), rel=1e-9)
+    assert (shown > (1 + 1e-9) * np.linalg.norm(error)) == (further > 0)
 
 
 LINEAR = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "u[k-1]"), Term("offset", "1")])

@@ -7,11 +7,9 @@ own: they show that nothing changed unnoticed. What is published is compared in 
 from __future__ import annotations
 
 import csv
-import importlib
 import json
 import math
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -42,11 +40,6 @@ NAMES = (
     "coverage",
     "solver_times",
 )
-LABELS = """assum:phi_full_rank assum:data_gen_sys_recovered assum:baseline_mdl_dominant exmp:non-uniqueness
-cond:special_PE cond:stable_sys cond:pred_stab cond:PE property:orthogonality lem:minimal_cost thm:error_val
-thm:convergence thm:consistency thm:zero_cov"""
-PAPER = Path(__file__).resolve().parents[2] / "shared" / "paper" / "orthogonal-by-construction.tex"
-
 # columns of each study: relative and absolute tolerance. θ that is solved is exact on every machine; what training
 # found moves with rounding, so it is compared loosely; what is absent is compared nowhere (seconds, lottery)
 TOLERANCES: dict[str, dict[str, tuple[float, float]]] = {
@@ -237,44 +230,6 @@ def test_a_second_run_reads_the_store(found, store, monkeypatch):
     monkeypatch.setattr("orthaug.studies.static_errors.estimate", lambda *a, **k: pytest.fail("it ran again"))
     again = run(study, store=store)
     assert again.test_rmse.tolist() == first.table.test_rmse.tolist()
-
-
-def test_the_theory_has_every_label_of_the_paper():
-    labels = LABELS.split()
-    if PAPER.is_file():
-        kinds = "assum|exmp|cond|lem|thm|rem"
-        source = PAPER.read_text(encoding="utf-8")
-        found = re.findall(rf"\\begin\{{(?:{kinds})\}}(?:\[[^]]*\])?\s*\\label\{{([^}}]*)\}}", source)
-        assert sorted(found) == sorted(labels)
-        remarks = len(re.findall(r"\\begin\{rem\}", source))
-        assert remarks == sum("emark" in statement.label for statement in THEORY)
-    given = [statement.label for statement in THEORY]
-    assert [label for label in labels if label not in given] == []
-    assert all("\\" not in part and part.strip() for statement in THEORY for part in statement)
-
-
-def test_what_the_theory_names_exists():
-    root = Path(__file__).parent
-    sources = {path.stem: path.read_text(encoding="utf-8") for path in root.glob("test_*.py")}
-    for statement in THEORY:
-        for place in re.findall(r"\b([a-z_]+(?:\.[a-z_]+)*)\.([A-Za-z_]+(?:\.[a-z_]+)*)", statement.computed):
-            try:
-                module = importlib.import_module(f"orthaug.{place[0]}")
-            except ModuleNotFoundError:
-                parts = place[1].split(".")
-                module = importlib.import_module(f"orthaug.{place[0]}.{parts[0]}")
-                place = (place[0], ".".join(parts[1:]))
-            for name in filter(None, place[1].split(".")):
-                module = getattr(module, name)
-        for file in re.findall(r"tests/(test_\w+)\.py", statement.shown):
-            assert file in sources
-        file = ""
-        for given, test in re.findall(r"(?:(test_\w+)\.)?(test_\w+)", statement.shown.replace("tests/", "/")):
-            file = given or file
-            if test not in sources:
-                assert f"def {test}(" in sources[file], (file, test)
-        for study in re.findall(r"stud(?:y|ies) (\w+)(?: and (\w+))?", statement.shown, flags=re.IGNORECASE):
-            assert all(name in NAMES for name in study if "_" in name)
 
 
 @pytest.mark.parametrize(

@@ -8,11 +8,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
-from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.jax import Array, jax, jnp, padded_length
 from orthaug.analysis.local_dynamics import by_differences, difference_width
 from orthaug.analysis.visited import MOST_STEPS, Place, Where, evenly, positive, usable
 from orthaug.data.record import Record
@@ -21,14 +21,18 @@ from orthaug.models.lagged import Lagged
 from orthaug.models.model import Model
 
 _BATCH = 1024  # rows per compiled call
+_BATCH_CELLS = 4_000_000  # entries of ∂g/∂w in a batch
+_MOST_CELLS = 40_000_000  # entries of ∂²g/∂w∂x of all rows that are looked at
+_FEWEST = 16  # rows, however many weights
 
 
 @dataclass(frozen=True)
 class Lipschitz:
-    """Largest ‖∂g/∂x‖ and ‖∂φ/∂x‖ (Frobenius, no less than ‖·‖₂) over measured rows; None where none is finite.
+    """Largest ‖∂g/∂x‖, ‖∂φ/∂x‖ and ‖∂²g/∂w∂x‖ (Frobenius, no less than ‖·‖₂) over rows; None where none is finite.
 
-    ∂g/∂x is (ny, nx) in output units per regressor unit, ∂φ/∂x is (ny nθ, nx). The scaled ones, and the places, are
-    for regressors and outputs in their standard deviations and columns of φ in their RMS.
+    ∂g/∂x is (ny, nx) in output units per regressor unit, ∂φ/∂x is (ny nθ, nx), ∂²g/∂w∂x is (ny nw, nx) at
+    `weights_rows` of the rows. The scaled ones, and the places, are for regressors and outputs in their standard
+    deviations and columns of φ in their RMS. Of a learner without weights or derivative `weights` is None.
     """
 
     gradient: float | None
@@ -37,17 +41,25 @@ class Lipschitz:
     phi: float | None
     phi_scaled: float | None
     phi_worst: Place | None
+    weights: float | None
+    weights_scaled: float | None
+    weights_worst: Place | None
     rows: int
+    weights_rows: int
 
 
 def lipschitz(model: Model, record: Record, *, x: Matrix | None = None) -> Lipschitz | None:
-    """Gradients of the one-step predictor g, and of ∂g/∂θ = φ, over measured regressors (`cond:pred_stab`).
+    """Gradients of the one-step predictor g, of ∂g/∂θ = φ and of ∂g/∂w, over measured regressors (`cond:pred_stab`).
 
     The predictor γ_k = g(x_k) reads the last n samples only. With ‖∂g/∂x‖ ≤ L on a convex set of all regressors,
     `|γ − γ̃| ≤ L Σ_{i≥k−n} (|u_i − ũ_i| + |y_i − ỹ_i|) ≤ L λ⁻ⁿ Γ_k` for every λ in (0, 1), because λ^{k−i} ≥ λⁿ there:
-    the condition holds with `C = max(L λ⁻ⁿ, |g(0)|)`, and likewise for ∂γ/∂θ. Bounded gradients are all that it asks
-    of a finite memory. Here L is that of at most 20000 measured rows and of this θ; it may be larger elsewhere, and the
-    learner's weights are not in φ. None of it tells about the free run: y_k = 2 y_{k−1} fulfils the condition.
+    the condition holds with `C = max(L λ⁻ⁿ, |g(0)|)`, and likewise for ∂γ/∂θ and ∂γ/∂w. Bounded gradients are all that
+    it asks of a finite memory. Here θ_aux is a number. Where it follows w, as in the paper, ∂γ/∂w is `∂g/∂w − φK` with
+    the constant K = ∂θ_aux/∂w, and bounded when these two are.
+
+    The bounds are those of at most 20000 measured rows, fewer for many weights, and of these θ and w, where the
+    condition asks for all; they may be larger elsewhere. A kink, as of relu, makes ∂g/∂w jump between rows and is not
+    seen. None of it tells about the free run: y_k = 2 y_{k−1} fulfils the condition.
     A model whose state is not made of measured signals has no such predictor: None.
 
     Args:
@@ -75,7 +87,10 @@ def lipschitz(model: Model, record: Record, *, x: Matrix | None = None) -> Lipsc
             norms = [(size(g), size(g * x_scale / scale[:, None])) for g in batches]
             plain, scaled = (np.concatenate(column) for column in zip(*norms, strict=True))
             largest += [where.worst(record, plain, entries)[0], *where.worst(record, scaled, entries)]
-    return Lipschitz(*largest, rows=len(x))
+    fewer, plain, scaled = _weight_sizes(form, model.numbers, x, x_scale, y_scale)
+    of_weights, there = where.take(fewer), lambda i: entries(int(fewer[i]))
+    largest += [of_weights.worst(record, plain, there)[0], *of_weights.worst(record, scaled, there)]
+    return Lipschitz(*largest, rows=len(x), weights_rows=len(fewer))
 
 
 def _measured(model: Model, record: Record, x: Matrix | None) -> tuple[Matrix, Where, Vector]:
@@ -110,3 +125,35 @@ def _gradient_rows(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"], widt
 
     slope = jax.jacrev(g) if form.differentiable else partial(by_differences, g, width=width)
     return jax.vmap(jax.jacfwd(phi) if of_phi else slope)(x)
+
+
+def _weight_sizes(
+    form: Lagged, numbers: Numbers, x: Matrix, x_scale: Vector, y_scale: Vector
+) -> tuple[Int[np.ndarray, "r"], Vector, Vector]:
+    """Which rows of x (m, nx) are looked at, as many as are affordable, and ‖∂²g/∂w∂x‖ there: plain (r,), scaled."""
+    cells, directions = len(form.outputs) * np.size(numbers.weights), np.eye(x.shape[1])
+    if not form.differentiable or not cells * len(directions):
+        return np.arange(0), np.zeros(0), np.zeros(0)
+    some = evenly(len(x), max(_FEWEST, _MOST_CELLS // (cells * len(directions))))
+    size = min(_BATCH, padded_length(len(some)), max(1, _BATCH_CELLS // cells))
+    squares = []
+    for begin in range(0, len(some), size):
+        rows = some[np.minimum(np.arange(begin, begin + size), len(some) - 1)]  # the last one again: one shape
+        columns = [_weight_squares(form, numbers, x[rows], direction) for direction in directions]
+        squares.append(np.stack([np.asarray(column) for column in columns], axis=-1)[: len(some) - begin])
+    every = np.concatenate(squares)
+    scaled = every * (x_scale / y_scale[:, None]) ** 2
+    return some, np.sqrt(every.sum(axis=(1, 2))), np.sqrt(scaled.sum(axis=(1, 2)))
+
+
+@partial(jax.jit, static_argnames="form")
+def _weight_squares(
+    form: Lagged, numbers: Numbers, x: Float[Array, "m nx"], direction: Float[Array, "nx"]
+) -> Float[Array, "m ny"]:
+    """Σ_w (∂²g/∂w∂x)² along one direction of x."""
+
+    def slopes(row: Any) -> Any:
+        return jax.jacrev(lambda w: form.at(numbers._replace(weights=w), row).total)(numbers.weights)
+
+    change = jax.vmap(lambda row: jax.jvp(slopes, (row,), (direction,))[1])(x)
+    return jnp.sum(change.reshape(*change.shape[:2], -1) ** 2, axis=2)

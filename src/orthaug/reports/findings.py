@@ -174,7 +174,11 @@ class LipschitzResult(Content):
     phi: Number
     phi_scaled: Number
     phi_worst: PlaceResult | None
+    weights: Number
+    weights_scaled: Number
+    weights_worst: PlaceResult | None
     rows: Whole
+    weights_rows: Whole
 
 
 class StabilityResult(Content):
