@@ -14,8 +14,8 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1]
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
-# Most of a test's time is XLA compiling small programs. These two leave out what only makes large ones faster: the suite
-# takes three quarters of the time. Unset, it passes as well.
+# Most of a test's time is XLA compiling small programs. These two leave out what only makes large ones faster: it
+# takes three quarters of the time then. Unset, it passes as well.
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_llvm_disable_expensive_passes=true")
 
 settings.register_profile(
