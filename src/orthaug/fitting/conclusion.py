@@ -9,7 +9,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.warning import Warning
-from orthaug.fitting.elimination import Fixed, ThetaSplit, split_theta
+from orthaug.fitting.elimination import Fixed, ThetaSplit, directions, eliminate, split_theta
 from orthaug.fitting.estimates import NOT_UNIQUE, Estimate
 from orthaug.fitting.learned import ErrorStatistics, Learned
 from orthaug.fitting.one_step import OneStepTask, Share
@@ -19,7 +19,7 @@ from orthaug.inference.covariance import degrees_of_freedom, noise_covariance, t
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
 from orthaug.models.model import Model
-from orthaug.models.statistics import Statistics
+from orthaug.models.statistics import JointCovariance, Statistics
 from orthaug.physics.excitation import ILL_CONDITIONED
 from orthaug.physics.problem import Problem
 
@@ -42,7 +42,7 @@ def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estim
         there = share.coordinates if ending.usable else 0.0 * problem.target_coordinates
         held = learned.errors.fixed if learned.errors else None
         theta, theta_aux, fixed = split_theta(structure, problem, there, learned.coefficients, held)
-    errors = learned.errors or _one_step_errors(task, learned, theta - theta_aux, fixed)
+    errors = learned.errors or _one_step_errors(task, structure, learned, theta - theta_aux, fixed)
     noise = errors.noise if ending.usable else None
     identified = structure.projects or (learned.bound is None and structure.identifies)
     known = noise is not None and identified and not learned.elsewhere
@@ -54,7 +54,7 @@ def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estim
         covariance=errors.covariance if known else None,
         freedom=errors.freedom,
         effective_weights=learned.effective,
-        defect=_defect(task, learned, share, theta_aux),
+        defect=_defect(task, structure, learned, share, theta_aux),
         problem=problem,
         criterion=task.criterion,
         at_bound={problem.baseline.names[i]: value for i, value in fixed.items()},
@@ -84,11 +84,14 @@ def _model(
         largest_output=np.max([np.abs(e.outputs).max(axis=0) for e in record.experiments], axis=0),
         deviation=problem.deviation,
         weight=problem.weight.matrix,
+        shared=directions(structure, problem),
         statistics=Statistics(learned.gram, middle, noise, learned.ridge, errors.freedom),
     )
 
 
-def _one_step_errors(task: OneStepTask, learned: Learned, c: Vector, fixed: Fixed) -> ErrorStatistics:
+def _one_step_errors(
+    task: OneStepTask, structure: Structure, learned: Learned, c: Vector, fixed: Fixed
+) -> ErrorStatistics:
     """The statistics of the one-step residual."""
     problem, ny = task.problem, len(task.problem.outputs)
     whitened = task.residual_gram(learned, c)
@@ -98,10 +101,26 @@ def _one_step_errors(task: OneStepTask, learned: Learned, c: Vector, fixed: Fixe
     noise = covariance = None
     if mixed is not None:
         noise = problem.weight.covariance(mixed)
-        middle = task.physics_middle(mixed) if ny > 1 else mixed[0, 0] * np.eye(len(c))
-        covariance = theta_covariance(problem.projection, middle, fixed)
+        taken = eliminate(structure, problem).taken
+        if learned.bound is None or not taken.any() or np.array_equal(taken, np.eye(len(c))):
+            middle = task.physics_middle(mixed) if ny > 1 else mixed[0, 0] * np.eye(len(c))
+            covariance = theta_covariance(problem.projection, middle, fixed)
+        elif not fixed:
+            covariance = _beside_the_learner(problem, learned, mixed, taken)
     mean_square = float(np.trace(whitened)) / problem.target.size
     return ErrorStatistics(noise, covariance, float(freedom.min()), mean_square, fixed)
+
+
+def _beside_the_learner(problem: Problem, learned: Learned, whitened: Matrix, taken: Matrix) -> Matrix | None:
+    """Cov θ̂ where only some directions are split off: `K Cov(c, w) Kᵀ` with `K = [I, ∂θ_aux/∂w]` (F8)."""
+    gram = learned.gram
+    middle = _middle(problem, learned, problem.weight.covariance(whitened))
+    if gram is None or middle is None:
+        return None
+    factor, nt = problem.projection, len(taken)
+    overlap = np.linalg.solve(factor.to_coordinates.T, gram[:nt, nt:])  # QᵀJ
+    k = np.column_stack([np.eye(nt), factor.from_coordinates(taken @ overlap)])
+    return JointCovariance(gram, learned.ridge, middle, nt).of(k)
 
 
 def _middle(problem: Problem, learned: Learned, noise: Matrix | None) -> Matrix | None:
@@ -114,12 +133,13 @@ def _middle(problem: Problem, learned: Learned, noise: Matrix | None) -> Matrix 
     return None if learned.middle is None else learned.middle(whitened)
 
 
-def _defect(task: OneStepTask, learned: Learned, share: Share, theta_aux: Vector) -> float | None:
-    """‖QᵀF̃‖ / ‖F‖ with F̃ = F − Φ θ_aux (eq:orth_property); None for F = 0."""
+def _defect(task: OneStepTask, structure: Structure, learned: Learned, share: Share, theta_aux: Vector) -> float | None:
+    """‖QᵀF̃‖ / ‖F‖ with F̃ = F − Φ θ_aux (eq:orth_property), along the shared directions; None for F = 0."""
     size = np.sqrt(share.square)
     if not 0 < size < np.inf:
         return None
-    return float(np.linalg.norm(task.left_share(learned, theta_aux)) / size)
+    along = task.problem.projection.along(directions(structure, task.problem))
+    return float(np.linalg.norm(along @ task.left_share(learned, theta_aux)) / size)
 
 
 def _warnings(

@@ -18,14 +18,16 @@ Fixed = dict[int, float]
 
 @dataclass(frozen=True, eq=False)
 class Elimination:
-    """θ eliminated from `‖p − f − Tθ‖² + ‖e − A θ − B f‖²`, with f = QᵀF, p = QᵀY, `T` = coordinates of θ.
+    """θ eliminated from `‖p − (I − P) f − Tθ‖² + ‖e − A θ − B f‖²`, f = QᵀF, p = QᵀY, `T` = coordinates of θ.
 
-    `(A, B, e)` are the structure's rows. An active set meets the bounds: some entries of θ stand at a bound, and the
-    others minimise the rest.
+    P, `taken`, is the projector onto what a split moves from the learner to θ: all in the paper's structure, nothing in
+    the additive one. `(A, B, e)` are the structure's rows. An active set meets the bounds: some entries of θ stand at a
+    bound, and the others minimise the rest.
     """
 
     to_coordinates: Matrix
     outputs: Vector
+    taken: Matrix
     rows: PenaltyRows
     lower: Vector
     upper: Vector
@@ -36,12 +38,22 @@ class Elimination:
         return bool(np.isfinite(self.lower).any() or np.isfinite(self.upper).any())
 
     @property
+    def projects(self) -> bool:
+        """Whether anything is moved from the learner to θ."""
+        return bool(self.taken.any())
+
+    @property
+    def decoupled(self) -> bool:
+        """Whether θ does not depend on the learner (F1)."""
+        return not self._learner.any()
+
+    @property
     def _theta(self) -> Matrix:
         return np.concatenate([self.to_coordinates, self.rows.theta])
 
     @property
     def _learner(self) -> Matrix:
-        return np.concatenate([np.eye(len(self.outputs)), self.rows.learner])
+        return np.concatenate([np.eye(len(self.outputs)) - self.taken, self.rows.learner])
 
     @property
     def _target(self) -> Vector:
@@ -101,13 +113,20 @@ class Elimination:
 def eliminate(structure: Structure, problem: Problem) -> Elimination:
     """The elimination of θ from a problem's criterion with a structure's rows and the baseline's bounds."""
     baseline, projection = problem.baseline, problem.projection
+    nt = len(baseline.names)
     return Elimination(
         to_coordinates=projection.to_coordinates,
         outputs=problem.target_coordinates,
+        taken=projection.along(directions(structure, problem)) if structure.projects else np.zeros((nt, nt)),
         rows=structure.penalty(baseline.names, baseline.initial, problem.weight.unit),
         lower=baseline.bounds[0],
         upper=baseline.bounds[1],
     )
+
+
+def directions(structure: Structure, problem: Problem) -> Matrix | None:
+    """The directions of θ (nθ, s) along which a split makes the learner orthogonal; None for all."""
+    return None if structure.shared == "all" or problem.shared.all else problem.shared.basis
 
 
 class ThetaSplit(NamedTuple):
@@ -125,24 +144,23 @@ def split_theta(
     coefficients: Vector | None = None,
     fixed: Fixed | None = None,
 ) -> ThetaSplit:
-    """θ for the learner's share QᵀF (nθ,) in the physics, and its part θ_aux = Φ⁺F that the structure moves to θ.
+    """θ for the learner's share QᵀF (nθ,) in the physics, and its part θ_aux that the structure moves to θ.
 
     Args:
         coefficients: c = θ − θ_aux (nθ,) where it was an unknown of training; None to solve for θ.
         fixed: what stands at a bound, where training knows that.
     """
-    baseline = problem.baseline
-    aux = problem.projection.from_coordinates(share)
+    baseline, factor = problem.baseline, problem.projection
     elimination = eliminate(structure, problem)
-    f = 0.0 * share if structure.projects else share
+    aux = factor.from_coordinates(elimination.taken @ share)
     if coefficients is not None:
-        theta = coefficients + (aux if structure.projects else 0.0)
+        theta = coefficients + aux
         if fixed is None:  # an iterate need not satisfy what only its end satisfies
             inside = np.clip(theta, *baseline.bounds)
-            fixed = elimination.active(f) | {i: value for i, value in enumerate(inside) if value != theta[i]}
+            fixed = elimination.active(share) | {i: value for i, value in enumerate(inside) if value != theta[i]}
         theta = np.array([fixed.get(i, value) for i, value in enumerate(theta)])
-    elif (fixed := elimination.active(f)) or len(elimination.rows.target):
-        theta = elimination.theta(f, fixed)
+    elif (fixed := elimination.active(share)) or len(elimination.rows.target):
+        theta = elimination.theta(share, fixed)
     else:  # refined least squares, as exact as double precision allows
-        theta = problem.least_squares - (0.0 if structure.projects else aux)
-    return ThetaSplit(theta, aux if structure.projects else 0.0 * aux, fixed)
+        theta = problem.least_squares - factor.from_coordinates(share - elimination.taken @ share)
+    return ThetaSplit(theta, aux, fixed)

@@ -153,7 +153,6 @@ class FreeRunTask:
             segments=self.segments,
             initial=InitialStates(start, start.size > 0 and self.flown.estimates_pasts),
             elimination=eliminate(structure, self.problem),
-            projects=structure.projects,
             weight=self.problem.weight.matrix / self.task.rms,
             colour=self.colour,
         )
@@ -261,7 +260,7 @@ class FreeRunTask:
         covariance = None
         if noise is not None and end.linear is not None:
             information = end.linear.information
-            if objective.projects and self.bound is not None:
+            if objective.elimination.projects and self.bound is not None:
                 change = objective.change(end.flown.w)
                 information = change.T @ information @ change
             white = objective.weight @ noise @ objective.weight.T

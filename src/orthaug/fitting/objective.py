@@ -1,7 +1,7 @@
 """The free-run criterion as a function of p = (θ, w): a trial, and its linearisation. Both are pure.
 
 Without bounds or penalties the unknown θ is `c = θ − θ_aux`, split at the end (F2). Where an orthogonal θ has bounds,
-it is the unknown itself and `c = θ − Φ⁺F(w)` follows, so that the split cannot leave them.
+it is the unknown itself and `c = θ − θ_aux(w)` follows, so that the split cannot leave them.
 """
 
 from __future__ import annotations
@@ -65,7 +65,6 @@ class FreeRunObjective:
     segments: Segments
     initial: InitialStates
     elimination: Elimination
-    projects: bool
     weight: Matrix
     colour: Segments | None = None
 
@@ -76,30 +75,26 @@ class FreeRunObjective:
 
     @property
     def follows(self) -> bool:
-        """Whether c follows θ, `c = θ − Φ⁺F(w)`."""
-        return self.projects and self.elimination.bounded and self.task.bound is not None
+        """Whether c follows θ, `c = θ − θ_aux(w)`."""
+        return self.elimination.projects and self.elimination.bounded and self.task.bound is not None
 
     @property
     def bounds(self) -> tuple[Vector, Vector] | None:
         """Of θ; None where the unknown is c."""
-        if self.projects and not self.follows and self.task.bound is not None:
+        if self.elimination.projects and not self.follows and self.task.bound is not None:
             return None
         return self.elimination.lower, self.elimination.upper
 
     def begin(self, w: Vector) -> Vector:
         """p of the one-step θ for the weights w."""
-        f, factor = self.task.share_of(w), self.task.problem.projection
-        if not self.projects:
-            theta = self.elimination.theta(f, self.elimination.active(f))
-        else:
-            theta = self.elimination.theta(0 * f, self.elimination.active(0 * f))
-            theta = theta if self.follows else theta - factor.from_coordinates(f)
-        return np.concatenate([theta, w])
+        f = self.task.share_of(w)
+        theta = self.elimination.theta(f, self.elimination.active(f))
+        return np.concatenate([theta if self.follows else theta - self._taken(f), w])
 
     def place(self, p: Vector) -> tuple[Vector, Vector, Vector]:
         """(unknown θ, c, w) of p; without bounds on an orthogonal θ the unknown is c itself."""
         theta, w = p[: self.physics], p[self.physics :]
-        c = theta - self.task.problem.projection.from_coordinates(self.task.share_of(w)) if self.follows else theta
+        c = theta - self._taken(self.task.share_of(w)) if self.follows else theta
         return theta, c, w
 
     def fly(self, p: Vector, start: Start) -> Flown:
@@ -162,10 +157,14 @@ class FreeRunObjective:
         return errors.T @ errors if np.abs(errors).max(initial=0.0) < _LARGEST_ERROR else None
 
     def change(self, w: Vector) -> Matrix:
-        """∂(c, w)/∂(θ, w) for `c = θ − Φ⁺F(w)`."""
-        slope = self.task.problem.projection.from_coordinates(self.task.share_slope(w))
+        """∂(c, w)/∂(θ, w) for `c = θ − θ_aux(w)`."""
+        slope = self._taken(self.task.share_slope(w))
         nt, nw = slope.shape
         return np.block([[np.eye(nt), -slope], [np.zeros((nw, nt)), np.eye(nw)]])
+
+    def _taken(self, share: Any) -> Any:
+        """θ_aux of the learner's share QᵀF, or of its slope."""
+        return self.task.problem.projection.from_coordinates(self.elimination.taken @ share)
 
     @property
     def _largest(self) -> float:

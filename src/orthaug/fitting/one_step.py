@@ -107,7 +107,7 @@ class OneStepTask:
         for _ in range(_ACTIVE_SETS):
             run = self._run_held(solver, w, structure, elimination, fixed, regularization, tell)
             seconds, iterations = seconds + run.seconds, iterations + run.iterations
-            at_bounds = {} if structure.projects else elimination.active(self.coordinates(run))
+            at_bounds = {} if elimination.decoupled else elimination.active(self.coordinates(run))
             if at_bounds == fixed or not run.ending.usable:
                 break
             w, fixed = run.w, at_bounds

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, NamedTuple, Protocol, runtime_checkable
+from typing import Annotated, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from annotated_types import Ge
@@ -48,6 +48,11 @@ class Structure(Protocol):
         ...
 
     @property
+    def shared(self) -> str:
+        """Along which directions of θ the learner is made orthogonal: "auto" for those it could imitate, or "all"."""
+        ...
+
+    @property
     def measure(self) -> Measure:
         """The points over which θ is split; training itself knows the training measure only."""
         ...
@@ -65,14 +70,18 @@ def _no_rows(nt: int) -> PenaltyRows:
 class Orthogonal:
     """ŷ = φ(θ − θ_aux) + f with θ_aux = Φ_μ⁺F_μ (eq:orth_param).
 
-    Under the training measure θ̂ = Φ⁺Y for every learner (F1). Under another `measure` training is the same; at the end
-    the fitted function is split over the measure's points (F2).
+    Under the training measure θ̂ = Φ⁺Y for every learner that sees all lags (F1). Under another `measure` training is
+    the same; at the end the fitted function is split over the measure's points (F2).
+
+    A learner that sees less can imitate only some directions of θ. `shared` "auto" projects along these alone,
+    `θ_aux = B(Φ_μB)⁺F_μ`; the others are what the fit determines beside the learner (F8). "all" is the paper.
     """
 
     projects = True
     identifies = True
 
     measure: Measure = field(default=Training(), metadata=LIBRARY_ONLY)  # noqa: RUF009  (frozen)
+    shared: Literal["auto", "all"] = "auto"
     name: str = field(default="orthogonal", metadata=LIBRARY_ONLY)
 
     def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> PenaltyRows:
@@ -87,6 +96,7 @@ class Additive:
     projects = False
     identifies = True
     measure = Training()
+    shared = "auto"
 
     def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> PenaltyRows:
         return _no_rows(len(names))
@@ -102,6 +112,7 @@ class OrthogonalPenalty:
     projects = False
     identifies = True
     measure = Training()
+    shared = "auto"
 
     weight: Annotated[float, Ge(0)] = 1.0
     name: str = field(default="orthogonal-penalty", metadata=LIBRARY_ONLY)
@@ -124,6 +135,7 @@ class BaselinePenalty:
     projects = False
     identifies = False
     measure = Training()
+    shared = "auto"
 
     weight: Annotated[float, Ge(0)] = 1.0
     name: str = field(default="baseline-penalty", metadata=LIBRARY_ONLY)

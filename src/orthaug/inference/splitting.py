@@ -71,7 +71,7 @@ def split_under(measure: Measure, model: Model, support: Support, joint: JointCo
     if not np.isfinite(raw).all():
         raise InputError(f"the learner is not finite on all points of the {measure.name} measure; narrow it.")
     values = times(unit, raw)
-    aux = projection.solve(values)
+    aux = projection.solve_along(values, model.shared)
     theta = model.theta - model.theta_aux + aux
     covariance = None
     if joint is not None and numbers.tilt is None:
@@ -79,7 +79,8 @@ def split_under(measure: Measure, model: Model, support: Support, joint: JointCo
         covariance = joint.of(np.column_stack([np.eye(len(theta)), slope]))
     size = np.linalg.norm(values)
     rest = values - projection.phi @ aux
-    defect = float(np.linalg.norm(projection.coordinates(rest)) / size) if 0 < size < np.inf else None
+    left = projection.along(model.shared) @ projection.coordinates(rest)
+    defect = float(np.linalg.norm(left) / size) if 0 < size < np.inf else None
     share = support.share(points)
     reach = f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the training data"
     learns = form.bound is not None
@@ -90,7 +91,7 @@ def split_under(measure: Measure, model: Model, support: Support, joint: JointCo
 
 
 def learner_slope(model: Model, points: Points, projection: Projection, unit: np.ndarray) -> Matrix:
-    """Φ_μ⁺J_μ (nθ, nw), in one pass over the points."""
+    """∂θ_aux/∂w, `Φ_μ⁺J_μ` or `B(Φ_μB)⁺J_μ` (nθ, nw), in one pass over the points."""
     bound, numbers = model.form.bound, model.numbers
     nt = len(model.theta)
     if bound is None or not bound.size:
@@ -98,4 +99,4 @@ def learner_slope(model: Model, points: Points, projection: Projection, unit: np
     engine = InMemory()
     rows = learner_rows(engine, model.form, numbers, points.x, projection.q, unit)
     overlap = engine.sum(Overlaps(bound), rows, jnp.asarray(numbers.weights))
-    return projection.from_coordinates(np.asarray(overlap.jacobian))
+    return projection.from_coordinates(projection.along(model.shared) @ np.asarray(overlap.jacobian))

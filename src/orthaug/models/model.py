@@ -67,6 +67,8 @@ class Model:
     largest_output: Vector
     deviation: Vector
     weight: Matrix
+    shared: Matrix | None = None
+    """Directions of θ (nθ, s) along which a split makes the learner orthogonal; None for all."""
     time_column: str | None = None
     statistics: Statistics = Statistics()  # noqa: RUF009  (frozen)
 

@@ -65,7 +65,12 @@ def write(model: Model, folder: Path) -> None:
     }
     arrays |= {
         name: value
-        for name, value in (("gram", kept.gram), ("noise", kept.noise), ("middle", kept.middle))
+        for name, value in (
+            ("gram", kept.gram),
+            ("noise", kept.noise),
+            ("middle", kept.middle),
+            ("shared", model.shared),
+        )
         if value is not None
     }
     packed = save_arrays({name: np.ascontiguousarray(value, dtype=np.float64) for name, value in arrays.items()})
@@ -213,6 +218,7 @@ def _rebuild(
         largest_output=arrays["largest_output"],
         deviation=arrays["deviation"] if "deviation" in arrays else 1 / arrays["weight"],
         weight=arrays["output_weight"] if "output_weight" in arrays else np.diag(arrays["weight"]),
+        shared=arrays.get("shared"),
         statistics=Statistics(
             gram=arrays.get("gram"),
             middle=arrays.get("middle"),

@@ -21,6 +21,7 @@ from orthaug.physics.baseline import Baseline
 from orthaug.physics.excitation import Excitation, excitation, require_rank
 from orthaug.physics.output_weights import OutputWeights, check_output_weights, weigh_outputs
 from orthaug.physics.projection import Projection
+from orthaug.physics.shared import Shared, shared_directions
 
 _LARGEST = 1e120  # size of outputs and regressors whose squares still add up; 1 / _LARGEST is the smallest
 
@@ -73,6 +74,11 @@ class Problem:
     def unexplained(self) -> Float[np.ndarray, "N ny"]:
         """P⊥Y, what the physics cannot express of the whitened outputs."""
         return self.projection.orthogonal_part(self.whitened_target)
+
+    @cached_property
+    def shared(self) -> Shared:
+        """The directions of θ that a learner on these features could imitate."""
+        return shared_directions(self.baseline, self.features, self.layout, self.outputs, self.rows.x)
 
     @cached_property
     def freedom_used(self) -> Vector:

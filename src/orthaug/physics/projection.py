@@ -50,6 +50,13 @@ class Factor:
             return coordinates
         return (self.scale * scipy.linalg.solve_triangular(self.r, coordinates, check_finite=False).T).T
 
+    def along(self, directions: Float[np.ndarray, "nt s"] | None) -> Matrix:
+        """The projector (nθ, nθ) onto some directions of θ, in coordinates of Q; None for all of them."""
+        if directions is None:
+            return np.eye(len(self.r))
+        basis = np.linalg.qr(self.to_coordinates @ directions)[0]
+        return basis @ basis.T
+
     def covariance_factor(self, free: Sequence[int] | None = None) -> Float[np.ndarray, "nf nt"]:
         """A factor L with `L Lᵀ = (Φ_fᵀΦ_f)⁻¹` for the free columns, all by default; `L = Φ_f⁺Q`."""
         chosen = list(range(len(self.scale))) if free is None else list(free)
@@ -85,6 +92,14 @@ class Projection(Factor):
         """Φ⁺v, (nθ,), refined once: θ̂ for outputs (F1), θ_aux for a learner's values (eq:theta_aux)."""
         theta = self.from_coordinates(self.coordinates(values))
         return theta + self.from_coordinates(self.coordinates(values - self.phi @ theta))
+
+    def solve_along(self, values: Float[np.ndarray, "N ny"], directions: Float[np.ndarray, "nt s"] | None) -> Vector:
+        """B(ΦB)⁺v, (nθ,): least squares along some directions of θ only, refined once; None for all of them."""
+        if directions is None:
+            return self.solve(values)
+        along = self.along(directions)
+        theta = self.from_coordinates(along @ self.coordinates(values))
+        return theta + self.from_coordinates(along @ self.coordinates(values - self.phi @ theta))
 
     def orthogonal_part(self, values: Float[np.ndarray, "N ny"]) -> Float[np.ndarray, "N ny"]:
         """P⊥v = v − QQᵀv, projected twice so that what is left is orthogonal to rounding."""

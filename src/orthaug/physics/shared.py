@@ -1,0 +1,149 @@
+"""Which directions of θ could the learner imitate? Only along these does it have to be made orthogonal to the physics.
+
+A direction a of θ is shared if φ(x)a is a function of the learner's features z(x) alone. A change of θ along it can be
+undone by the learner, so there θ is arbitrary until it is split off. Every other direction is determined by the fit
+itself, as in a partially linear regression. A learner that sees all lags shares everything: that is the paper.
+
+Found by moves: pairs of regressors x, x′ with z(x) = z(x′) that differ otherwise. A direction is shared where φ(x)a and
+φ(x′)a agree on all of them. Finite moves, not derivatives, so that a jump such as sign(v) counts too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from jaxtyping import Float
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug.data.regressors import Features, Layout
+from orthaug.physics.baseline import Baseline
+
+_MOVES = 400
+_FEWEST = 4  # moves that succeed, for each parameter
+_TOLERANCE = 1e-6  # change of φa over a move, against the size of φa
+_NEWTON = 30
+_SEED = 20_240_808
+
+
+@dataclass(frozen=True, eq=False)
+class Shared:
+    """The shared directions of θ.
+
+    `basis` (nθ, s) spans them, in reduced form: each column has an entry of one that is zero in all others.
+    """
+
+    names: tuple[str, ...]
+    basis: Matrix
+
+    @property
+    def all(self) -> bool:
+        """Whether the learner could imitate all of the physics."""
+        return self.basis.shape[1] == len(self.names)
+
+    @property
+    def untouched(self) -> tuple[str, ...]:
+        """Parameters that no shared direction moves: the fit determines them beside any learner."""
+        return tuple(name for name, row in zip(self.names, self.basis, strict=True) if not row.any())
+
+    @property
+    def directions(self) -> tuple[dict[str, float], ...]:
+        """Each direction by the parameters that it moves."""
+        return tuple(
+            {name: float(a) for name, a in zip(self.names, column, strict=True) if a} for column in self.basis.T
+        )
+
+
+def shared_directions(
+    baseline: Baseline, features: Features, layout: Layout, outputs: Sequence[str], x: Float[np.ndarray, "N nx"]
+) -> Shared:
+    """The directions of θ that a learner on these features could imitate.
+
+    Args:
+        x: measured regressors, where the moves begin.
+    """
+    names, everything = baseline.names, Shared(baseline.names, np.eye(len(baseline.names)))
+    read = set(baseline.lags) if baseline.function is None else set(layout)
+    raw = {str(entry) for entry in features.entries}
+    if not names or not features.entries or {str(lag) for lag in read} <= raw:
+        return everything
+    start, end = _moves(features, layout, x)
+    with np.errstate(all="ignore"):
+        phi = [np.asarray(baseline.phi(rows, layout, tuple(outputs), np)) for rows in (start, end)]
+    kept = np.isfinite(phi[0]).all(axis=(1, 2)) & np.isfinite(phi[1]).all(axis=(1, 2))
+    if np.sum(kept) < _FEWEST * len(names):  # nothing is known: the paper's projection is right for any learner
+        return everything
+    before, after = (part[kept].reshape(-1, len(names)) for part in phi)
+    return Shared(names, _agreeing(before, after))
+
+
+def _agreeing(before: Matrix, after: Matrix) -> Matrix:
+    """The directions a with `before a = after a`, relative to the size of `before a`, in reduced form."""
+    scale = np.sqrt(np.mean(before**2 + after**2, axis=0))
+    unit = 1 / np.where(scale > 0, scale, 1.0)
+    r = np.linalg.qr(np.concatenate([before, after]) * unit, mode="r")
+    _, sigma, vt = np.linalg.svd(r)
+    seen = sigma > 1e-13 * sigma[0]  # what Φ does not see has no size to compare with
+    root = vt[seen].T / sigma[seen]
+    _, change, directions = np.linalg.svd((after - before) * unit @ root, full_matrices=False)
+    agreeing = root @ directions[change <= _TOLERANCE].T
+    return unit[:, None] * _reduced(agreeing, unit)
+
+
+def _reduced(basis: Matrix, unit: Vector) -> Matrix:
+    """The same span in reduced column echelon form, in θ's own units times `1/unit`."""
+    if not basis.size:
+        return basis
+    q = np.linalg.qr(basis)[0]
+    order = scipy.linalg.qr(q.T, mode="r", pivoting=True)[-1]
+    pivots = np.sort(order[: q.shape[1]])
+    reduced = np.linalg.solve(q[pivots].T, q.T).T
+    reduced[np.abs(reduced) < 1e-9] = 0.0
+    reduced[pivots] = np.eye(len(pivots))
+    return reduced / unit[pivots]
+
+
+def _moves(
+    features: Features, layout: Layout, x: Float[np.ndarray, "N nx"]
+) -> tuple[Float[np.ndarray, "M nx"], Float[np.ndarray, "M nx"]]:
+    """Pairs of regressors with equal features, of the size of the data's spread.
+
+    A step towards another row, or in any direction, is led back to the features' values by Newton's method; every other
+    one along the null space of ∂z/∂x first. The free ones find other branches: −u beside u where the learner sees u².
+    """
+    rng = np.random.default_rng(_SEED)
+    spread = np.where(x.std(axis=0) > 0, x.std(axis=0), np.maximum(np.abs(x).max(axis=0), 1.0))
+    start = x[rng.integers(len(x), size=_MOVES)]
+    other = x[rng.integers(len(x), size=_MOVES)]
+    drawn = rng.normal(size=start.shape) * spread
+    step = np.where(rng.uniform(size=(_MOVES, 1)) < 0.5, other - start, drawn)
+
+    def values(rows: Matrix) -> Matrix:
+        with np.errstate(all="ignore"):
+            return np.asarray(features.evaluate(rows, layout, np))
+
+    def slopes(rows: Matrix) -> Float[np.ndarray, "M nz nx"]:
+        columns = []
+        for j in range(rows.shape[1]):
+            small = np.zeros(rows.shape[1])
+            small[j] = 1e-6 * spread[j]
+            columns.append((values(rows + small) - values(rows - small)) / 2e-6)  # in units of the spread
+        return np.nan_to_num(np.stack(columns, axis=-1))
+
+    target, size = values(start), np.maximum(np.nanstd(values(x), axis=0), 1e-300)
+    slope = slopes(start) / size[:, None]
+    inverse = np.linalg.pinv(slope, rcond=1e-7)
+    along = np.einsum("kij,kj->ki", inverse @ slope, step / spread)
+    end = start + step - np.where(rng.uniform(size=(_MOVES, 1)) < 0.5, along, 0.0) * spread
+    for _ in range(_NEWTON):
+        miss = np.nan_to_num((values(end) - target) / size)
+        if np.abs(miss).max(initial=0.0) < 1e-13:
+            break
+        back = np.linalg.pinv(slopes(end) / size[:, None], rcond=1e-7)
+        end = end - np.einsum("kij,kj->ki", back, miss) * spread
+    with np.errstate(all="ignore"):
+        met = np.abs((values(end) - target) / size).max(axis=1) < 1e-9
+        moved = np.abs((end - start) / spread).max(axis=1) > 1e-3
+    return start[met & moved], end[met & moved]
