@@ -42,7 +42,7 @@ def bias_under(
         deltas = suspect_columns(suspects, x, problem.layout, problem.outputs)
     kept = [i for i in range(len(suspects)) if named or np.any(deltas[i])]
     theta = problem.least_squares if theta is None else theta
-    slopes = _slopes(physics, problem, theta)
+    slopes = physical_slopes(physics, problem, theta)
     table = bias_table(
         weighed.projection,
         problem.baseline.names,
@@ -87,7 +87,9 @@ def _relative(entry: SuspectedBias, slopes: tuple[dict[str, Vector], Vector] | N
     return {name: bias / p if p else None for (name, bias), p in zip(entry.physical, slopes[1], strict=True)}
 
 
-def _slopes(physics: PhysicsMap | None, problem: Problem, theta: Vector) -> tuple[dict[str, Vector], Vector] | None:
+def physical_slopes(
+    physics: PhysicsMap | None, problem: Problem, theta: Vector
+) -> tuple[dict[str, Vector], Vector] | None:
     """dp/dθ, in the order of the baseline's θ, at the p that θ gives; and that p."""
     if physics is None:
         return None

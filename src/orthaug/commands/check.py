@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from orthaug.commands.bias import bias_of
 from orthaug.commands.job import Job
+from orthaug.commands.shared import shared_of
 from orthaug.physics.excitation import identifiability
 from orthaug.reports.result import CheckResult
 
@@ -19,6 +20,7 @@ def check_job(job: Job) -> CheckResult:
             "rows": len(problem.rows),
             "excitation": problem.excitation,
             "identifiability": identifiability(problem.baseline, problem.layout, problem.outputs, problem.rows.x),
+            "shared": shared_of(job),
             "bias": bias_of(job) if problem.excitation.full_rank else None,
             "warnings": job.warnings,
         }

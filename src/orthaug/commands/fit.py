@@ -17,6 +17,7 @@ from orthaug.commands.bias import bias_of
 from orthaug.commands.folder import is_result
 from orthaug.commands.job import ALONE, AS_DECLARED, Job, Variant, run_fit
 from orthaug.commands.parts import Part
+from orthaug.commands.shared import shared_of
 from orthaug.data.regressors import lag_rows
 from orthaug.reports.fields import WarningResult
 from orthaug.reports.result import (
@@ -99,6 +100,7 @@ def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitt
         "measure": fit.model.measure if fit.model.structure == "orthogonal" else None,
         "measure_detail": fit.measure,
         "orthogonality_defect": fit.defect,
+        "shared": shared_of(job, others=False),
         "output_weights": None if fit.problem.weight.one_output else fit.problem.weight.as_dict(),
         "excitation": fit.excitation,
         "scores": scores,

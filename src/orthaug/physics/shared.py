@@ -50,10 +50,12 @@ class Shared:
 
     @property
     def directions(self) -> tuple[dict[str, float], ...]:
-        """Each direction by the parameters that it moves."""
-        return tuple(
-            {name: float(a) for name, a in zip(self.names, column, strict=True) if a} for column in self.basis.T
-        )
+        """Each direction by the parameters that it moves, the first one by one."""
+        told = []
+        for column in self.basis.T:
+            first = column[np.flatnonzero(column)[0]]
+            told.append({name: float(f"{a / first:.12g}") for name, a in zip(self.names, column, strict=True) if a})
+        return tuple(told)
 
 
 def shared_directions(

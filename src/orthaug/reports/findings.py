@@ -7,6 +7,29 @@ from pydantic import Field
 from orthaug.reports.fields import ByName, Content, Flag, Number, Numbers, WarningResult, Whole, Wholes
 
 
+class AlternativeResult(Content):
+    """Other learner inputs, and what is determined beside a learner of these."""
+
+    inputs: list[str]
+    shared: Whole
+    determined: list[str]
+    physical: list[str] | None
+
+
+class SharedResult(Content):
+    """What the learner could imitate of the physics: there θ is split off."""
+
+    absent = frozenset({"alternatives"})
+
+    inputs: list[str]
+    everything: Flag
+    directions: list[ByName]
+    determined: list[str]
+    physical: list[str] | None
+    text: str
+    alternatives: list[AlternativeResult] | None = None
+
+
 class CertificateResult(Content):
     """Whether some weighting of the points leaves no bias."""
 

@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field
 from orthaug import __version__
 from orthaug.physics.baseline import Parameter
 from orthaug.reports.fields import ByName, Content, Flag, Number, Numbers, WarningResult, Whole
-from orthaug.reports.findings import DiagnosisResult, StabilityResult, SuspectResult, ValidationResult
+from orthaug.reports.findings import DiagnosisResult, SharedResult, StabilityResult, SuspectResult, ValidationResult
 
 if TYPE_CHECKING:
     from orthaug.analysis.design import Design
@@ -181,6 +181,7 @@ class FitResult(_Headed):
     measure_detail: MeasureResult | None
     orthogonality_defect: Number
     output_weights: OutputWeightsResult | None
+    shared: SharedResult | None
     excitation: ExcitationResult
     scores: dict[str, PartScores]
     bias: list[SuspectResult] | None
@@ -199,6 +200,7 @@ class CheckResult(_Headed):
     rows: Whole
     excitation: GroupedExcitation
     identifiability: IdentifiabilityResult
+    shared: SharedResult | None
     bias: list[SuspectResult] | None
     warnings: list[WarningResult]
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from orthaug.reports.fields import WarningResult
-from orthaug.reports.findings import SuspectResult
+from orthaug.reports.findings import SharedResult, SuspectResult
 from orthaug.reports.result import (
     CheckResult,
     CompareResult,
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from orthaug.fitting.estimates import Estimate
 
 SHOWN = 8  # signals of a design that are listed
+WIDTH = 100  # of wrapped sentences
 
 
 def fit_text(fit: Estimate, result: FitResult) -> str:
@@ -36,6 +38,8 @@ def fit_text(fit: Estimate, result: FitResult) -> str:
     if result.physical_parameters:
         blocks.append(_physical_lines(result))
     blocks.append(_score_lines(fit, result))
+    if result.shared is not None and not result.shared.everything:
+        blocks.append([result.shared.text])
     told = [finding.text for finding in (result.residuals, result.validation) if finding]
     blocks += [told, _warning_lines(w for w in dict.fromkeys(result.warnings) if w.text not in told)]
     return "\n\n".join("\n".join(lines) for lines in blocks if lines)
@@ -58,6 +62,8 @@ def check_text(result: CheckResult) -> str:
     if physics.identifiable:
         for group in data.collinear:
             lines.append(f"  not excited separately by these data: {', '.join(group)}")
+    if result.shared is not None:
+        lines += ["", *_shared_lines(result.shared)]
     if result.bias:
         lines += [
             "",
@@ -66,6 +72,19 @@ def check_text(result: CheckResult) -> str:
             *_suspect_lines(result.bias),
         ]
     return "\n".join([*lines, *_warning_lines(result.warnings)])
+
+
+def _shared_lines(shared: SharedResult) -> list[str]:
+    """What the learner could imitate, and a table of what other inputs would make of it."""
+    lines = textwrap.wrap(shared.text, WIDTH)
+    if shared.alternatives:
+        head = ["with learner.inputs", "shared directions", "determined beside it"]
+        rows = [
+            [", ".join(other.inputs), str(other.shared), ", ".join([*other.determined, *(other.physical or [])]) or "–"]
+            for other in shared.alternatives
+        ]
+        lines += [f"  {line}" for line in _table([head, *rows])]
+    return lines
 
 
 def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:

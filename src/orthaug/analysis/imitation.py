@@ -1,0 +1,129 @@
+"""What a learner could imitate of the physics, in words, in physical parameters, and with other learner inputs (F8)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthaug._base.errors import InputError
+from orthaug.analysis.measure_bias import physical_slopes
+from orthaug.data.expressions import parse
+from orthaug.data.regressors import Features
+from orthaug.physics.parameters import PhysicsMap
+from orthaug.physics.problem import Problem
+from orthaug.physics.shared import Shared, shared_directions
+
+_STILL = 1e-8  # change of a physical parameter along a shared direction, relative: rounding
+_ALTERNATIVES = 8
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Other learner inputs: how many directions they share, and what is determined beside such a learner."""
+
+    inputs: tuple[str, ...]
+    shared: int
+    determined: tuple[str, ...]
+    physical: tuple[str, ...] | None
+
+
+@dataclass(frozen=True)
+class Imitation:
+    """What a learner on these inputs could imitate.
+
+    `directions` are those of θ that it shares with the physics. `determined` are the parameters, and `physical` the
+    physical parameters, that no shared direction moves: the fit determines them beside any learner of these inputs.
+    """
+
+    inputs: tuple[str, ...]
+    everything: bool
+    directions: tuple[dict[str, float], ...]
+    determined: tuple[str, ...]
+    physical: tuple[str, ...] | None
+    alternatives: tuple[Alternative, ...]
+
+    @property
+    def text(self) -> str:
+        """In sentences."""
+        sees = f"The learner sees {_listed(self.inputs)}"
+        if self.everything:
+            return (
+                f"{sees} and could imitate all of the physics: θ is split off along every direction, which makes it "
+                "the least-squares estimate of the physics alone."
+            )
+        if not self.directions:
+            return f"{sees} and could imitate nothing of the physics: the fit determines every parameter beside it."
+        could = _listed([_combination(direction) for direction in self.directions])
+        told = [f"{sees} and could imitate {could}: there, and only there, θ is split off."]
+        if self.determined:
+            told.append(f"The fit determines {_listed(self.determined)} beside any learner of these inputs.")
+        if self.physical:
+            told.append(f"Of the physical parameters it determines {_listed(self.physical)} so.")
+        return " ".join(told)
+
+
+def imitation(problem: Problem, physics: PhysicsMap | None = None, *, others: bool = True) -> Imitation:
+    """What the problem's learner could imitate, and what `others`, other inputs, would make of it."""
+    slopes = _slopes(problem, physics)
+    own = problem.shared
+    inputs = tuple(str(entry) for entry in problem.features.entries)
+    alternatives = []
+    for other in _other_inputs(problem) if others else ():
+        features = Features(tuple(parse(text, {}) for text in other))
+        shared = shared_directions(problem.baseline, features, problem.layout, problem.outputs, problem.rows.x)
+        if not shared.all and set(other) != set(inputs):
+            determined = Alternative(other, shared.basis.shape[1], shared.untouched, _untouched(shared, slopes))
+            alternatives.append(determined)
+    return Imitation(
+        inputs, own.all, own.directions, own.untouched, _untouched(own, slopes), tuple(alternatives[:_ALTERNATIVES])
+    )
+
+
+def _slopes(problem: Problem, physics: PhysicsMap | None) -> dict[str, np.ndarray] | None:
+    """dp/dθ by name, at the spec's initial values or, without any, at least squares; None where there is none."""
+    if physics is None:
+        return None
+    initial = problem.baseline.initial
+    try:
+        found = physical_slopes(physics, problem, initial if np.all(initial) else problem.least_squares)
+    except InputError:
+        return None
+    return None if found is None else found[0]
+
+
+def _untouched(shared: Shared, slopes: dict[str, np.ndarray] | None) -> tuple[str, ...] | None:
+    """Physical parameters that no shared direction moves."""
+    if slopes is None:
+        return None
+    return tuple(
+        name
+        for name, row in slopes.items()
+        if all(abs(row @ column) <= _STILL * np.sum(np.abs(row * column)) for column in shared.basis.T)
+    )
+
+
+def _other_inputs(problem: Problem) -> Iterator[tuple[str, ...]]:
+    """Choices of learner inputs that an engineer would think of: velocities, outputs, inputs, single lags."""
+    for name in problem.outputs:
+        lags = [str(lag) for lag in problem.layout if lag.channel == name]
+        yield from ((f"{one}-{two}",) for one, two in zip(lags, lags[1:], strict=False))
+    outputs = tuple(str(lag) for lag in problem.layout if lag.channel in problem.outputs)
+    inputs = tuple(str(lag) for lag in problem.layout if lag.channel not in problem.outputs)
+    yield from (several for several in (outputs, inputs) if len(several) > 1)
+    yield from ((str(lag),) for lag in problem.layout)
+
+
+def _combination(direction: dict[str, float]) -> str:
+    """A direction as a sum: `theta1 - theta2`."""
+    text = ""
+    for name, factor in direction.items():
+        size = "" if abs(abs(factor) - 1) < 1e-9 else f"{abs(factor):.4g}*"
+        sign = ("-" if factor < 0 else "") if not text else (" - " if factor < 0 else " + ")
+        text += f"{sign}{size}{name}"
+    return text
+
+
+def _listed(words: tuple[str, ...] | list[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}" if words else "nothing"
