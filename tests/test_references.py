@@ -107,13 +107,14 @@ def test_every_configuration_of_the_shipped_file_can_be_read():
 @pytest.mark.parametrize(
     ("ours", "smaller", "met", "words"),
     [
-        ([1.0, 3.0], False, True, "our mean is within the smallest and the largest of the scripts' 4 runs"),
+        ([1.0, 3.0], False, True, "mean within the scripts' smallest and largest of 4 runs"),
         ([3.0], False, True, "within"),
-        ([0.5], False, False, "our mean is below the smallest of the scripts' 4 runs (1/2 of it)"),
-        ([0.5], True, True, "below the smallest"),
-        ([3.06], True, False, "our mean is above the largest of the scripts' 4 runs (by 2 %)"),
+        ([3.004], False, True, "mean, to three digits, the scripts' largest of 4 runs"),
+        ([3.006], False, False, "mean above the scripts' largest of 4 runs (by 0.2 %)"),
+        ([0.5], False, False, "mean below the scripts' smallest of 4 runs (0.5 times it)"),
+        ([0.5], True, True, "below the scripts' smallest"),
         ([9.0], True, False, "(3 times it)"),
-        ([0.0], True, True, "(it is 0)"),
+        ([0.0], True, True, "(0 times it)"),
     ],
 )
 def test_a_number_beside_a_spread(ours, smaller, met, words):

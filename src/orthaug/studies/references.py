@@ -1,6 +1,7 @@
 """What the authors' published scripts gave when they were run: per configuration mean, smallest and largest value.
 
-`references.json` says how these were measured. `python tests/test_references.py FOLDER` makes it from one entry per run.
+`references.json` says how these were measured. `python tests/test_references.py FOLDER` makes it from
+the single runs.
 """
 
 from __future__ import annotations
@@ -36,24 +37,24 @@ class Spread(NamedTuple):
     def beside(self, values: Any, *, smaller_is_better: bool = False) -> tuple[bool, str]:
         """Whether the mean of our runs lies between the smallest and the largest of theirs, and that in words.
 
+        Three digits count, as they are shown.
+
         Args:
             smaller_is_better: below all of theirs is met too, as for an error of prediction.
         """
         ours = float(np.mean(np.asarray(values, dtype=float)))
         if self.low <= ours <= self.high:
-            return True, f"our mean is within the smallest and the largest of the scripts' {self.runs} runs"
-        side, end = ("below the smallest", self.low) if ours < self.low else ("above the largest", self.high)
-        text = f"our mean is {side} of the scripts' {self.runs} runs ({_ratio(ours, end)})"
+            return True, f"mean within the scripts' smallest and largest of {self.runs} runs"
+        side, which, end = ("below", "smallest", self.low) if ours < self.low else ("above", "largest", self.high)
+        if f"{ours:.3g}" == f"{end:.3g}":
+            return True, f"mean, to three digits, the scripts' {which} of {self.runs} runs"
+        text = f"mean {side} the scripts' {which} of {self.runs} runs ({_ratio(ours, end)})"
         return smaller_is_better and ours < self.low, text
 
 
 def _ratio(ours: float, end: float) -> str:
     ratio = ours / end
-    if ratio == 0:
-        return "it is 0"
-    if abs(ratio - 1) < 0.1:
-        return f"by {100 * abs(ratio - 1):.2g} %"
-    return f"{ratio:.3g} times it" if ratio > 1 else f"1/{1 / ratio:.3g} of it"
+    return f"by {100 * abs(ratio - 1):.2g} %" if abs(ratio - 1) < 0.1 else f"{ratio:.2g} times it"
 
 
 @cache

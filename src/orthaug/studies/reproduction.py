@@ -86,9 +86,7 @@ def reproduce(
         tell = None if progress is None else lambda done, total, e=entry: progress(e.title, done, total)
         done = runs(entry.study(pipeline, small), store=store, progress=tell)
         table = as_table(done)
-        reproduced.append(
-            Reproduced(entry, done, table, dict(entry.figures(table)), entry.findings(table), small)
-        )
+        reproduced.append(Reproduced(entry, done, table, dict(entry.figures(table)), entry.findings(table), small))
     return reproduced
 
 
