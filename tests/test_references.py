@@ -1,6 +1,6 @@
 """What the scripts gave: the file that is shipped, and how a number stands beside it.
 
-`python tests/test_references.py FOLDER` writes src/orthaug/studies/references.json anew from the measurements in a folder,
+`python tests/test_references.py FOLDER` writes src/orthaug/studies/references.json anew from measurements in a folder,
 static_example.json and mass_spring_damper.json with one entry per run.
 """
 
@@ -27,9 +27,9 @@ MADE = (
     "The authors' published scripts (Python, JAX, jax-sysid 1.0.1, jaxopt), unchanged in method, their printing "
     "silenced, run with jax 0.10.2 in double precision on one CPU core, once per initialisation. Per configuration: "
     "mean, smallest and largest value over the runs. test_rmse is a true root mean square, test_sse the sum of squares "
-    "over the static example's 1024 test samples, which is what the scripts print; theta_error is the norm of the error "
-    "of theta in the static example and of its relative error in the mass-spring-damper, test_rmse there one step ahead "
-    "[m]; seconds include compilation."
+    "over the static example's 1024 test samples, which is what the scripts print; theta_error is the norm of the "
+    "error of theta in the static example and of its relative error in the mass-spring-damper, test_rmse there one "
+    "step ahead [m]; seconds include compilation."
 )
 
 
@@ -109,7 +109,7 @@ def test_every_configuration_of_the_shipped_file_can_be_read():
     [
         ([1.0, 3.0], False, True, "mean within the scripts' smallest and largest of 4 runs"),
         ([3.0], False, True, "within"),
-        ([3.004], False, True, "mean, to three digits, the scripts' largest of 4 runs"),
+        ([3.004], False, True, "mean, in three digits, equal to the scripts' largest of 4 runs"),
         ([3.006], False, False, "mean above the scripts' largest of 4 runs (by 0.2 %)"),
         ([0.5], False, False, "mean below the scripts' smallest of 4 runs (0.5 times it)"),
         ([0.5], True, True, "below the scripts' smallest"),
@@ -126,6 +126,7 @@ def test_a_spread_in_words_and_in_other_units():
     spread = Spread(2e-4, 1e-4, 3e-4, 5)
     assert str(spread) == "0.0002 (0.0001 … 0.0003)"
     assert str(spread.scaled(1000.0)) == "0.2 (0.1 … 0.3)"
+    assert str(Spread(0.0132546, 0.0132534, 0.0132569, 5)) == "0.0132546 (0.0132534 … 0.0132569)"
 
 
 if __name__ == "__main__":

@@ -29,7 +29,8 @@ class Spread(NamedTuple):
     runs: int
 
     def __str__(self) -> str:
-        return f"{self.mean:.4g} ({self.low:.3g} … {self.high:.3g})"
+        digits = 3 if self.high - self.low > 0.01 * self.mean else 6  # as many as tell the ends apart
+        return f"{self.mean:.{digits}g} ({self.low:.{digits}g} … {self.high:.{digits}g})"
 
     def scaled(self, factor: float) -> Spread:
         return Spread(factor * self.mean, factor * self.low, factor * self.high, self.runs)
@@ -47,7 +48,7 @@ class Spread(NamedTuple):
             return True, f"mean within the scripts' smallest and largest of {self.runs} runs"
         side, which, end = ("below", "smallest", self.low) if ours < self.low else ("above", "largest", self.high)
         if f"{ours:.3g}" == f"{end:.3g}":
-            return True, f"mean, to three digits, the scripts' {which} of {self.runs} runs"
+            return True, f"mean, in three digits, equal to the scripts' {which} of {self.runs} runs"
         text = f"mean {side} the scripts' {which} of {self.runs} runs ({_ratio(ours, end)})"
         return smaller_is_better and ours < self.low, text
 

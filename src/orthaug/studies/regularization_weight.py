@@ -20,6 +20,7 @@ from orthaug.studies.common import (
     legend,
     panels,
     pick,
+    plain_ticks,
     scripts_bars,
     solver,
     span,
@@ -107,7 +108,8 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
             "penalties against their weight λ; the orthogonal structure, which has no weight, is the horizontal line.",
             "Marks are medians over initial weights; bars and the band go from the smallest to the largest. A cross "
             "with a bar is the mean of the scripts, from their smallest to their largest run; of the free run there "
-            "is none. Curves are shifted sideways, so that the bars can be told apart.",
+            "is none. The axes of errors are logarithmic but for the last, whose values lie within a few per cent. "
+            "Curves are shifted sideways, so that the bars can be told apart.",
         )
     }
 
@@ -127,7 +129,10 @@ def _panel(axis: Axes, table: pd.DataFrame, quantity: str) -> None:
         if found:
             scripts_bars(axis, np.array([*found]) * 1.75 ** (2 * k - 1), [*found.values()], structure)
     axis.set_xscale("log")
-    axis.set_yscale("log")
+    if quantity == "one_step":
+        plain_ticks(axis)
+    else:
+        axis.set_yscale("log" if quantity == "theta_error" else "linear")
     ticks = [zero, *sorted(positive.unique())]
     axis.set_xticks(ticks, ["0", *(f"$10^{{{np.log10(t):.0f}}}$" for t in ticks[1:])])
     axis.xaxis.minorticks_off()
@@ -185,7 +190,7 @@ def _prices(table: pd.DataFrame) -> list[Finding]:
     theirs = np.array(scripts["orthogonal-penalty"]) / _mean("orthogonal", 0.0)
     ratio, end = float(ratios.mean()), float(base.iloc[-1] / base.iloc[0])
     first, last = (scripts["baseline-penalty"][i] for i in (0, -1))
-    price = "the penalty costs {:.2g} % of test RMSE, which counts from 5 %".format
+    price = "{:+.2g} % of test RMSE; a price is counted from +5 %".format
     return [
         Finding(
             "one-step test RMSE of the orthogonal penalty over the orthogonal structure's, mean over λ > 0",

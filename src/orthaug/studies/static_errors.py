@@ -72,13 +72,14 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
             f"Test error (left) and error of θ (right) of {starts} initial weights on each data set, additive and "
             "orthogonal structure beside what the scripts gave.",
             "Filled marks are single starts; a cross with a bar is the mean of the scripts, from their smallest to "
-            f"their largest run. Errors of θ below {FLOOR:.0e} are rounding and drawn at {FLOOR:.0e}.",
+            "their largest run. Errors of θ below 10⁻⁹ are rounding, and drawn in the grey band at 10⁻⁹.",
         ),
         "theta": Drawing(
             _theta(table),
             f"The estimated θ of {starts} initial weights on each data set, with the true θ where the dashed lines "
             "cross.",
-            "All panels have the same scale. The starts of the orthogonal structure lie on each other.",
+            "All panels have the same scale, which is finer for θ₃ than for θ₁. The starts of the orthogonal structure "
+            "lie on each other.",
         ),
         "learner": Drawing(
             _learner(table),
@@ -104,6 +105,9 @@ def _errors(table: pd.DataFrame) -> Figure:
             rows = table[table.structure == "orthogonal"]
             style = {"color": COLOURS["uniform"], "alpha": 0.6, "markersize": 4.5, "label": LABELS["uniform"]}
             axis.plot(rows.data_set + 0.32, np.maximum(rows.uniform_error, FLOOR), MARKERS["uniform"], **style)
+            if table.theta_error.min() <= FLOOR:
+                axis.axhspan(FLOOR / 4, FLOOR * 4, color="#B8B8B8", alpha=0.4, linewidth=0)
+                axis.text(3.45, FLOOR, "rounding", fontsize=8, ha="right", va="center")
         axis.set_yscale("log")
         axis.set_xticks((1, 2, 3))
         axis.set_xlim(0.5, 3.5)
@@ -141,6 +145,7 @@ def _learner(table: pd.DataFrame) -> Figure:
             axis.plot(GRID, values, label=f"{LABELS[structure]}, each start", **style)
         axis.plot(GRID, 0.01 - 0.5 * GRID**2, "--", color=COLOURS["truth"], label="what the physics lacks")
         axis.set_xlabel("u")
+        axis.set_xticks((-1.0, -0.5, 0.0, 0.5, 1.0))
         axis.set_title(LABELS[structure], fontsize=9)
     axes[0].set_ylabel("learner's part of y")
     legend(figure, axes)

@@ -9,7 +9,18 @@ import numpy as np
 
 from orthaug.fitting.estimation import estimate
 from orthaug.studies import references
-from orthaug.studies.common import COLOURS, LABELS, MARKERS, STRUCTURES, agreement, legend, panels, solver, span
+from orthaug.studies.common import (
+    COLOURS,
+    LABELS,
+    MARKERS,
+    STRUCTURES,
+    agreement,
+    legend,
+    panels,
+    plain_ticks,
+    solver,
+    span,
+)
 from orthaug.studies.entry import Drawing, Finding, Reproduction
 from orthaug.studies.study import Study
 from orthaug.studies.synthetic import static
@@ -60,11 +71,12 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
             value = rmse if quantity == "test_rmse" else ERRORS[structure]
             style = {"linestyle": "--", "linewidth": 0.9, "color": COLOURS[structure]}
             axis.axhline(value, label=f"the paper's table, {LABELS[structure]}", **style)
-        axis.set_yscale("log")
         axis.set_xticks(range(len(kinds)), kinds)
         axis.set_xlabel("regularization")
         axis.set_xlim(-0.6, len(kinds) - 0.4)
         axis.grid(visible=False, axis="x")
+    plain_ticks(axes[0])
+    axes[1].set_yscale("log")
     axes[0].set_ylabel("test RMSE of y")
     axes[1].set_ylabel("‖θ* − θ̂‖")
     legend(figure, axes, ncols=2)
