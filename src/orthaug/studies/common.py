@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from orthaug.data.record import Record
 from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
@@ -102,14 +101,6 @@ def legend(figure: Figure, axes: Axes | Iterable[Axes], ncols: int = 4) -> None:
         unique.update(dict(zip(labels, handles, strict=True)))
     ncols = min(ncols, len(unique))
     figure.legend(unique.values(), unique.keys(), loc="outside upper center", ncols=ncols, frameon=False, fontsize=8)
-
-
-def plain_ticks(axis: Axes) -> None:
-    """A logarithmic axis of errors with numbers such as 0.02, for a range of few decades."""
-    axis.set_yscale("log")
-    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.yaxis.set_major_formatter(FormatStrFormatter("%g"))
-    axis.yaxis.set_minor_formatter(NullFormatter())
 
 
 def extremes(rows: pd.DataFrame, by: str, column: str) -> pd.DataFrame:

@@ -12,7 +12,7 @@ from orthaug.data.record import Record
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.inference.covariance import interval
-from orthaug.studies.common import COLOURS, UNIFORM, legend, panels, plain_ticks
+from orthaug.studies.common import COLOURS, UNIFORM, legend, panels
 from orthaug.studies.entry import Drawing, Finding, Reproduction
 from orthaug.studies.study import Study
 from orthaug.studies.synthetic import NOISE_30_DB, static
@@ -82,7 +82,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
     axes[0].set_ylabel("intervals that hold the truth [%]")
     axes[0].set_ylim(-4, 104)
     axes[1].set_ylabel("mean width of the interval")
-    plain_ticks(axes[1])
+    axes[1].set_ylim(bottom=0)
     for axis in axes:
         axis.set_xticks(range(4), ["set 1\nθ₁", "set 1\nθ₃", "set 3\nθ₁", "set 3\nθ₃"])
         axis.grid(visible=False, axis="x")

@@ -7,6 +7,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
@@ -20,7 +21,6 @@ from orthaug.studies.common import (
     legend,
     panels,
     pick,
-    plain_ticks,
     scripts_bars,
     solver,
     span,
@@ -130,9 +130,12 @@ def _panel(axis: Axes, table: pd.DataFrame, quantity: str) -> None:
             scripts_bars(axis, np.array([*found]) * 1.75 ** (2 * k - 1), [*found.values()], structure)
     axis.set_xscale("log")
     if quantity == "one_step":
-        plain_ticks(axis)
-    else:
-        axis.set_yscale("log" if quantity == "theta_error" else "linear")
+        axis.set_yscale("log")
+        axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+        axis.yaxis.set_minor_formatter(NullFormatter())
+    elif quantity == "theta_error":
+        axis.set_yscale("log")
     ticks = [zero, *sorted(positive.unique())]
     axis.set_xticks(ticks, ["0", *(f"$10^{{{np.log10(t):.0f}}}$" for t in ticks[1:])])
     axis.xaxis.minorticks_off()

@@ -139,7 +139,7 @@ def when(done: Sequence[Run]) -> str:
             dates = days[0] if len(days) == 1 else f"{days[0]} to {days[-1]}"
             origin = "read from the store, made on" if stored else "made now, on"
             parts.append(f"{len(some)} {origin} {dates} in {sum(run.seconds for run in some):.3g} s")
-    return f"{len(done)} runs: {'; '.join(parts)}, summed over runs"
+    return f"{len(done)} run{'s' * (len(done) != 1)}: {'; '.join(parts)}, summed over runs"
 
 
 def text(reproduced: Sequence[Reproduced]) -> str:

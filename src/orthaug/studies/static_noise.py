@@ -17,7 +17,6 @@ from orthaug.studies.common import (
     agreement,
     legend,
     panels,
-    plain_ticks,
     solver,
     span,
 )
@@ -60,24 +59,23 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
     """Figure "errors": test RMSE and error of θ of every start."""
     figure, axes = panels(2, height=3.6)
     kinds = list(dict.fromkeys(table.regularization))
-    for axis, quantity in zip(axes, ("test_rmse", "theta_error"), strict=True):
+    for axis, quantity, scale in zip(axes, ("test_rmse", "theta_error"), (1e3, 1.0), strict=True):
         for i, structure in enumerate(STRUCTURES):
             for j, kind in enumerate(kinds):
                 rows = table[(table.structure == structure) & (table.regularization == kind)]
                 place = np.full(len(rows), j + 0.24 * (i - 0.5))
                 style = {"color": COLOURS[structure], "alpha": 0.6, "markersize": 4.5, "label": LABELS[structure]}
-                axis.plot(place, rows[quantity], MARKERS[structure], **style)
+                axis.plot(place, scale * rows[quantity], MARKERS[structure], **style)
             rmse = np.sqrt(SQUARES[structure] / TEST_SAMPLES)
             value = rmse if quantity == "test_rmse" else ERRORS[structure]
             style = {"linestyle": "--", "linewidth": 0.9, "color": COLOURS[structure]}
-            axis.axhline(value, label=f"the paper's table, {LABELS[structure]}", **style)
+            axis.axhline(scale * value, label=f"the paper's table, {LABELS[structure]}", **style)
         axis.set_xticks(range(len(kinds)), kinds)
         axis.set_xlabel("regularization")
         axis.set_xlim(-0.6, len(kinds) - 0.4)
         axis.grid(visible=False, axis="x")
-    plain_ticks(axes[0])
     axes[1].set_yscale("log")
-    axes[0].set_ylabel("test RMSE of y")
+    axes[0].set_ylabel("test RMSE of y [10⁻³]")
     axes[1].set_ylabel("‖θ* − θ̂‖")
     legend(figure, axes, ncols=2)
     return {
