@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -31,6 +32,7 @@ from orthaug.studies.common import extremes, panels, scripts_bars, whiskers
 from orthaug.studies.entry import Counts, Finding
 from orthaug.studies.references import Spread
 from orthaug.studies.reproduction import (
+    HYPHEN,
     WIDTH,
     Reproduced,
     as_rows,
@@ -321,7 +323,7 @@ def test_the_page_holds_every_figure_and_finding(found, page):
     alts = [drawing.shows for one in found for drawing in one.figures.values()]
     assert [image["alt"] for image in tags.images] == alts
     assert tags.ids == [*NAMES, "theory"] and tags.links == [f"#{name}" for name in tags.ids]
-    plain = html.replace("&#39;", "'").replace("&#34;", '"').replace("&lt;", "<").replace("&gt;", ">")
+    plain = unescape(html.replace(HYPHEN, "-"))
     for finding in (finding for one in found for finding in one.findings):
         assert finding.quantity in plain and finding.verdict in plain and finding.ours in plain
     for statement in THEORY:

@@ -129,6 +129,11 @@ def scripts_bars(axis: Axes, x: Any, spreads: Sequence[Spread], name: str, **sty
     axis.errorbar(x, mean, np.stack([mean - low, high - mean]), color=COLOURS[name], alpha=0.6, **style)
 
 
+def signed(exponent: float) -> str:
+    """Two decimals with a true minus."""
+    return f"{exponent:.2f}".replace("-", "−")
+
+
 def agreement(values: Any) -> str:
     """How far rows of values, one per start, lie apart."""
     apart = float(np.ptp(np.asarray(values, dtype=float), axis=0).max())

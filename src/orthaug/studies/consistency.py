@@ -16,6 +16,7 @@ from orthaug.studies.common import (
     extremes,
     legend,
     panels,
+    signed,
     slope,
     solver,
     span,
@@ -120,7 +121,7 @@ def findings(table: pd.DataFrame) -> list[Finding]:
         first, last = (f"{means.theta_error.iloc[i]:.2g} at N = {means.samples.iloc[i]}" for i in (0, -1))
         why = f"the mean goes from {first} to {last}; 1/√N is −0.5"
         quantity = f"set {data_set}, 30 dB, {curve}: exponent of ‖θ* − θ̂‖ in N"
-        compared.append(Finding(quantity, f"{rate:.2f}", why, published, as_published=met))
+        compared.append(Finding(quantity, signed(rate), why, published, as_published=met))
     last = _means(table, 3, "orthogonal").iloc[-1]
     quantity = f"set 3, 30 dB, orthogonal: ‖θ* − θ̂‖ at N = {int(last.samples)}"
     away = 100 * abs(last.theta_error / limit(3) - 1)

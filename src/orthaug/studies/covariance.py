@@ -112,7 +112,7 @@ REPRODUCTION = Reproduction(
     "covariance",
     "The asymptotic covariance matrix",
     "eq:cov_approx of the orthogonal structure on data set 1 with 30 dB of noise, for 2 + 49 parameters. The first two "
-    "rows and columns are θ: zero outside their own block.",
+    "rows and columns are θ.",
     study,
     figures,
     findings,

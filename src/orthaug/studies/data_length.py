@@ -16,6 +16,7 @@ from orthaug.studies.common import (
     extremes,
     legend,
     panels,
+    signed,
     slope,
     solver,
     whiskers,
@@ -112,7 +113,7 @@ def findings(table: pd.DataFrame) -> list[Finding]:
     first, last = (float(two.theta_error.iloc[i]) for i in (0, -1))
     why = f"the mean falls from {first:.2g} to {last:.2g} between N = {two.samples.iloc[0]} and {two.samples.iloc[-1]}"
     quantity, met = "set 2, no noise: exponent of ‖θ* − θ̂‖ in N", bool(-0.7 < rate < -0.3)
-    compared.append(Finding(quantity, f"{rate:.2f}", f"{why}; 1/√N is −0.5", "converges to 0", as_published=met))
+    compared.append(Finding(quantity, signed(rate), f"{why}; 1/√N is −0.5", "converges to 0", as_published=met))
     last = float(three.theta_error.iloc[-1])
     away = last / limit(3) - 1
     quantity = f"set 3, no noise: ‖θ* − θ̂‖ at N = {int(three.samples.iloc[-1])}"

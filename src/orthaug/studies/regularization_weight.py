@@ -244,8 +244,7 @@ REPRODUCTION = Reproduction(
     "Five initial weights for every regularization weight. θ⁰ is the scripts' rounded (0.61, −0.52, 4.7e-5), which is "
     "what a large baseline weight tends to "
     "(relative error 0.296; m = 1.1, c = 90, k = 1100 unrounded would give 0.309). The record is the paper's, with "
-    "θ₁ = (2m − c Ts)/Γ; backward Euler has 2m + c Ts. The friction is not orthogonal to the physics on this record, "
-    "so the orthogonal structure's own error is 0.01325, for every start.",
+    "θ₁ = (2m − c Ts)/Γ; backward Euler has 2m + c Ts. The friction is not orthogonal to the physics on this record.",
     study,
     figures,
     findings,

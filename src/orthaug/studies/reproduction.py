@@ -32,6 +32,7 @@ PIPELINES = {  # name, and how the page says who trained
     "ours": "trained by Levenberg-Marquardt",
     "paper": "with the paper's own training: Adam, then L-BFGS",
 }
+HYPHEN = "\N{NON-BREAKING HYPHEN}"  # a line of the page never ends within 1e-6
 WIDTH = 100  # characters of a line in a terminal
 MARK = "reproduction.json"
 StudiesTell = Callable[[str, int, int], None]
@@ -179,6 +180,7 @@ def _page(reproduced: Sequence[Reproduced], pipeline: str) -> str:
     """One HTML file with its figures inside."""
     source = files("orthaug.studies").joinpath("templates/reproduction.html").read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    environment.filters["whole"] = lambda words: words.replace("e-", f"e{HYPHEN}")
     studies = [
         {
             "entry": study.entry,

@@ -200,9 +200,8 @@ def _theta_finding(table: pd.DataFrame, data_set: int, structure: str) -> Findin
 REPRODUCTION = Reproduction(
     "static_errors",
     "Static example without noise",
-    "Ten initial weights on each of the three data sets. Both structures predict alike; θ of the additive one depends "
-    "on the initial weights, θ of the orthogonal one does not, and on sets 2 and 3 it errs by what the measure leaves "
-    "correlated. The same fits are also split under the uniform measure on [−0.6, 0.6].",
+    "Ten initial weights on each of the three data sets: 1 symmetric, 2 drawn at random, 3 drawn about a mean of "
+    "−0.01. The fits of the orthogonal structure are also split under the uniform measure on [−0.6, 0.6].",
     study,
     figures,
     findings,

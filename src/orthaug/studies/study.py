@@ -148,8 +148,9 @@ def runs(
         result = _plain(study, study.one(**cases[i]))
         seconds = round(time.perf_counter() - began, 3)
         made = datetime.now(UTC).isoformat(timespec="seconds")
-        found[i] = Run(cases[i], result, made, seconds, stored=False)
-        _write(store, study, found[i])
+        run = Run(cases[i], result, made, seconds, stored=False)
+        _write(store, study, run)
+        found[i] = run
         done += 1
         if progress is not None:
             progress(done, len(cases))
