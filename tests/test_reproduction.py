@@ -251,6 +251,29 @@ def test_the_papers_record_has_the_scripts_error_at_every_place_where_it_is_solv
         np.testing.assert_allclose(of, paper.theta_error.iloc[0], rtol=1e-9)
 
 
+def test_the_papers_sums_of_squares_are_compared_with_sums_of_squares(found):
+    one = next(o for o in found if o.entry.name == "static_noise")
+    rows = one.table.query("regularization == 'none' and structure == 'orthogonal'")
+    finding = by_quantity(found, "static_noise", "set 1, 30 dB, orthogonal: sum of squared test errors")
+    squares = 1024 * rows.test_rmse**2
+    assert finding.published == "0.000535" and finding.ours.startswith(f"{squares.mean():.3g}")
+    assert finding.as_published is bool(squares.min() <= 5.35e-4 <= squares.max())
+    # on the axis of RMSE the printed sum is drawn as the RMSE that it amounts to, which the scripts' own runs have
+    axis = one.figures["errors"].figure.axes[0]
+    (line,) = (line for line in axis.lines if line.get_label() == "the paper's table, orthogonal")
+    assert float(np.asarray(line.get_ydata())[0]) == pytest.approx(1e3 * (5.35e-4 / 1024) ** 0.5)
+
+
+@pytest.mark.parametrize(("slowest", "noisy"), [(1.2, False), (1.3, True)])
+def test_a_time_that_differs_from_start_to_start_is_no_result(found, slowest, noisy):
+    one = next(o for o in found if o.entry.name == "solver_times")
+    rows = [dict(one.table.iloc[i]) | {"seed": seed} for i in range(len(one.table)) for seed in range(2)]
+    seconds = [row["iterations"] * (slowest if row["seed"] else 1.0) for row in rows]
+    findings = one.entry.findings(pd.DataFrame(rows).assign(seconds=seconds))
+    assert all(("noisy" in finding.ours) is noisy for finding in findings)
+    assert all(("no result in time" in finding.verdict) is noisy for finding in findings)
+
+
 def test_counts_keep_the_three_kinds_apart():
     rows = [
         Finding("a", "1", "x", "1", "2", as_published=True, as_scripts=False),

@@ -16,6 +16,7 @@ from orthaug.studies.common import (
     extremes,
     legend,
     panels,
+    pick,
     signed,
     slope,
     solver,
@@ -71,7 +72,7 @@ def study(pipeline: str, small: bool) -> Study:
 
 
 def _of(table: pd.DataFrame, data_set: int, curve: str) -> pd.DataFrame:
-    return table[(table.data_set == data_set) & (table.curve == curve)]
+    return pick(table, (table.data_set == data_set) & (table.curve == curve))
 
 
 def _means(table: pd.DataFrame, data_set: int, curve: str) -> pd.DataFrame:

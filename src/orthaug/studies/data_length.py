@@ -16,6 +16,7 @@ from orthaug.studies.common import (
     extremes,
     legend,
     panels,
+    pick,
     signed,
     slope,
     solver,
@@ -68,7 +69,7 @@ def limit(data_set: int) -> float:
 
 
 def _of(table: pd.DataFrame, data_set: int, measure: str) -> pd.DataFrame:
-    return table[(table.data_set == data_set) & (table.measure == measure)]
+    return pick(table, (table.data_set == data_set) & (table.measure == measure))
 
 
 def _means(table: pd.DataFrame, data_set: int, measure: str) -> pd.DataFrame:
@@ -84,7 +85,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
             label = "orthogonal, training measure" if measure == "training" else ""
             whiskers(axis, errors.samples, errors, name, label=label)
         own = _of(table, data_set, "training")
-        own = own[own.draw == 0].sort_values("samples")
+        own = pick(own, own.draw == 0).sort_values("samples")
         style = {"color": COLOURS["orthogonal"], "linewidth": 1.0, "label": "the paper's record"}
         axis.plot(own.samples, own.theta_error, ":", **style)
         if data_set == 3:

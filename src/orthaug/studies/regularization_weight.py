@@ -117,9 +117,9 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
 def _panel(axis: Axes, table: pd.DataFrame, quantity: str) -> None:
     positive = table.weight[table.weight > 0]
     zero = positive.min() / 100  # where a logarithmic axis shows the weight 0
-    band = _of(table, "orthogonal")[quantity]
-    axis.axhspan(float(band.min()), float(band.max()), color=COLOURS["orthogonal"], alpha=0.2, linewidth=0)
-    axis.axhline(float(band.median()), color=COLOURS["orthogonal"], linewidth=1.2, label=LABELS["orthogonal"])
+    band = np.array(_of(table, "orthogonal")[quantity])
+    axis.axhspan(band.min(), band.max(), color=COLOURS["orthogonal"], alpha=0.2, linewidth=0)
+    axis.axhline(float(np.median(band)), color=COLOURS["orthogonal"], linewidth=1.2, label=LABELS["orthogonal"])
     for k, structure in enumerate(PENALTIES):
         errors = extremes(_of(table, structure), "weight", quantity)
         place = errors.weight.where(errors.weight > 0, zero) * 1.3 ** (k - 0.5)

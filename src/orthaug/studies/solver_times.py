@@ -15,7 +15,7 @@ from orthaug.fitting.structures import Orthogonal
 from orthaug.models.learners import MLP
 from orthaug.physics.problem import pose
 from orthaug.studies import references
-from orthaug.studies.common import PIPELINES, legend, panels, pick
+from orthaug.studies.common import PIPELINES, extremes, legend, panels, pick
 from orthaug.studies.entry import Drawing, Finding, Reproduction
 from orthaug.studies.study import Study
 from orthaug.studies.synthetic import mass_spring_damper, static
@@ -88,17 +88,17 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
             f"{' and '.join(EXAMPLES[example] for example in examples)}.",
             f"Marks are medians over {table.seed.nunique()} initial weights; bars go from the smallest to the largest, "
             "sideways for seconds. The static example has a logarithmic axis of errors, the mass-spring-damper a "
-            "linear one, because there all solvers end within a few per cent.",
+            "linear one, because there all solvers end within a few per cent. Times that the table marks as noisy are no "
+            "results.",
         )
     }
 
 
 def _line(axis: Axes, rows: pd.DataFrame, label: str, colour: str, marker: str) -> None:
-    of = rows.groupby("share")[["seconds", "error"]]
-    middle, low, high = of.median(), of.min(), of.max()
-    reach = {part: np.stack([middle[part] - low[part], high[part] - middle[part]]) for part in ("seconds", "error")}
-    style = {"color": colour, "linewidth": 1.0, "elinewidth": 0.7, "markersize": 4, "label": label}
-    axis.errorbar(middle.seconds, middle.error, reach["error"], reach["seconds"], marker=marker, **style)
+    seconds, error = (extremes(rows, "share", column) for column in ("seconds", "error"))
+    sideways, upwards = (np.stack([of["median"] - of["min"], of["max"] - of["median"]]) for of in (seconds, error))
+    style = {"color": colour, "marker": marker, "linewidth": 1.0, "elinewidth": 0.7, "markersize": 4, "label": label}
+    axis.errorbar(seconds["median"], error["median"], xerr=sideways, yerr=upwards, **style)
 
 
 def findings(table: pd.DataFrame) -> list[Finding]:

@@ -17,6 +17,7 @@ from orthaug.studies.common import (
     agreement,
     legend,
     panels,
+    pick,
     solver,
     span,
 )
@@ -92,7 +93,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
 def findings(table: pd.DataFrame) -> list[Finding]:
     """The table's four numbers from the fits as published, without regularization; what regularization changes."""
     compared = []
-    plain = table[table.regularization == "none"]
+    plain = pick(table, table.regularization == "none")
     for structure in ("additive", "orthogonal"):
         rows = plain[plain.structure == structure]
         where, scripts = f"set 1, 30 dB, {structure}", _scripts(structure)
@@ -150,23 +151,27 @@ def _theta_finding(rows: pd.DataFrame, structure: str) -> Finding:
 
 def _regularized(table: pd.DataFrame, kind: str) -> list[Finding]:
     """What a regularization makes of the errors without any; one row where both structures predict the same."""
-    of = {structure: rows.set_index("regularization") for structure, rows in table.groupby("structure")}
+    of = {structure: pick(table, table.structure == structure) for structure in ("additive", "orthogonal")}
     alike = bool(np.allclose(of["additive"].test_rmse, of["orthogonal"].test_rmse, rtol=1e-6))
     compared = []
-    for structure in ("both structures",) if alike else ("additive", "orthogonal"):
-        rows = of["additive" if alike else structure]
-        rmse, weights = (rows[column].groupby(level=0).mean() for column in ("test_rmse", "effective_weights"))
-        words = "after 50 iterations" if kind == "stopping" else f"under {kind}"
+    for structure in ("both structures",) if alike else tuple(of):
+        rows, plain = (_under(of["additive" if alike else structure], which) for which in (kind, "none"))
+        weights = (f"{float(part.effective_weights.mean()):.3g}" for part in (rows, plain))
         why = (
-            f"{rmse[kind] / rmse['none']:.3g} times that without, {words}; effective weights {weights[kind]:.3g} "
-            f"instead of {weights['none']:.3g}"
+            f"{float(rows.test_rmse.mean()) / float(plain.test_rmse.mean()):.3g} times that without, "
+            f"{'after 50 iterations' if kind == 'stopping' else f'under {kind}'}; effective weights "
+            f"{' instead of '.join(weights)}"
         )
         quantity = f"set 1, 30 dB, {structure}, regularization {kind}: test RMSE"
-        compared.append(Finding(quantity, span(rows.test_rmse[kind]), why))
-    errors = of["additive"].theta_error[kind]
+        compared.append(Finding(quantity, span(rows.test_rmse), why))
+    errors = _under(of["additive"], kind).theta_error
     why = f"differs by up to {errors.max() - errors.min():.3g} from start to start"
     compared.append(Finding(f"set 1, 30 dB, additive, regularization {kind}: ‖θ* − θ̂‖", span(errors), why))
     return compared
+
+
+def _under(rows: pd.DataFrame, kind: str) -> pd.DataFrame:
+    return pick(rows, rows.regularization == kind)
 
 
 REPRODUCTION = Reproduction(
