@@ -87,9 +87,8 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
             "Training error of each solver against its seconds, when stopped at a share of its iterations: "
             f"{' and '.join(EXAMPLES[example] for example in examples)}.",
             f"Marks are medians over {table.seed.nunique()} initial weights; bars go from the smallest to the largest, "
-            "sideways for seconds. The static example has a logarithmic axis of errors, the mass-spring-damper a "
-            "linear one, because there all solvers end within a few per cent. Times that the table marks as noisy are no "
-            "results.",
+            "sideways for seconds. The axis of errors is logarithmic for the static example and linear for the "
+            "mass-spring-damper, whose errors lie close together. Times that the table marks as noisy are no results.",
         )
     }
 
