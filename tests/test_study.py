@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ import pytest
 
 from orthaug._base.errors import InputError
 from orthaug.studies import study as study_module
-from orthaug.studies.study import Study, run
+from orthaug.studies.study import Study, as_table, run, runs
 
 GRID = {"level": [0.1, 0.3], "seed": range(3)}
 
@@ -122,7 +123,10 @@ def test_another_version_runs_all(tmp_path):
     assert len(calls) == 12
 
 
-@pytest.mark.parametrize("content", ["", '{"value": 0.', "[1, 2]", "\x00\x00", "null"])
+@pytest.mark.parametrize(
+    "content",
+    ["", '{"value": 0.', "[1, 2]", "\x00\x00", "null", '{"value": 0.1}', '{"made": "", "seconds": 1, "result": 3}'],
+)
 def test_cut_files_are_as_good_as_none(tmp_path, content):
     calls = []
     study = Study("s", counted(calls), GRID)
@@ -171,7 +175,23 @@ def test_stored_results_are_json_that_others_can_read(tmp_path):
     run(Study("s", lambda: {"a": math.nan, "b": "θ"}, {}), store=tmp_path)
     (path,) = (tmp_path / "s").iterdir()
     content = json.loads(path.read_text(encoding="utf-8"), parse_constant=lambda text: pytest.fail(text))
-    assert content == {"a": None, "b": "θ"}
+    assert content["result"] == {"a": None, "b": "θ"}
+
+
+def test_a_stored_result_keeps_when_it_was_made_and_how_long_it_took(tmp_path):
+    def slow(seed: int) -> dict[str, int]:
+        time.sleep(0.02)
+        return {"value": seed}
+
+    before = datetime.now(UTC).replace(microsecond=0)
+    first = runs(Study("s", slow, {"seed": range(2)}), store=tmp_path)
+    second = runs(Study("s", slow, {"seed": range(3)}), store=tmp_path)
+    assert [one.stored for one in first] == [False, False] and [one.stored for one in second] == [True, True, False]
+    assert all(before <= datetime.fromisoformat(one.made) <= datetime.now(UTC) for one in second)
+    assert all(one.seconds >= 0.02 for one in second)
+    assert [(one.made, one.seconds) for one in second[:2]] == [(one.made, one.seconds) for one in first]
+    # the table is the same whether results are new or stored
+    pd.testing.assert_frame_equal(as_table(first), as_table(second[:2]))
 
 
 @pytest.mark.parametrize("workers", [1, 2, 5])
@@ -242,7 +262,7 @@ def test_a_store_that_cannot_be_written(tmp_path):
 PROGRAM = """
 import signal, sys, time
 from pathlib import Path
-from orthaug.studies.study import Study, run
+from orthaug.studies.study import Study, as_table, run, runs
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a process in the background may have inherited none
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +18,8 @@ from orthaug.studies.synthetic import NOISE_30_DB, Example, static
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from orthaug.studies.references import Spread
 
 # Okabe-Ito, told apart by every reader; each structure keeps its colour and marker in all figures
 COLOURS = {
@@ -71,10 +73,19 @@ def slope(samples: Any, errors: Any) -> float:
     return float(np.polyfit(np.log(np.asarray(samples, dtype=float)), np.log(np.asarray(errors, dtype=float)), 1)[0])
 
 
-def panels(count: int, *, width: float = 7.0, height: float = 2.8, sharey: bool = False) -> tuple[Figure, list[Axes]]:
-    """Axes side by side at column width."""
+def panels(
+    count: int,
+    *,
+    width: float = 7.0,
+    height: float = 3.0,
+    sharex: bool = False,
+    sharey: bool = False,
+    rows: bool = False,
+) -> tuple[Figure, list[Axes]]:
+    """Axes side by side at column width, or one above the other."""
     figure = Figure(figsize=(width, height), layout="constrained")
-    axes = list(np.atleast_1d(figure.subplots(1, count, sharey=sharey)))
+    shape = (count, 1) if rows else (1, count)
+    axes = list(np.atleast_1d(figure.subplots(*shape, sharex=sharex, sharey=sharey)))
     for axis in axes:
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)
@@ -92,12 +103,41 @@ def legend(figure: Figure, axes: Axes | Iterable[Axes], ncols: int = 4) -> None:
     figure.legend(unique.values(), unique.keys(), loc="outside upper center", ncols=ncols, frameon=False, fontsize=8)
 
 
-def bars(axis: Axes, x: Any, means: Any, reach: Any, name: str, *, label: str = "", **style: Any) -> None:
-    """Means with bars of ± `reach` on a logarithmic axis; a bar that would reach zero ends at a tenth of its mean."""
-    means, reach = np.asarray(means, dtype=float), np.asarray(reach, dtype=float)
-    low = np.minimum(reach, 0.9 * means)
-    style = {"color": COLOURS[name], "markersize": 4.0, "linewidth": 1.0, "capsize": 2.5} | style
-    axis.errorbar(x, means, np.stack([low, reach]), marker=MARKERS[name], label=label or LABELS[name], **style)
+def extremes(rows: pd.DataFrame, by: str, column: str) -> pd.DataFrame:
+    """Per value of `by` the median, the smallest and the largest of a column."""
+    return rows.groupby(by)[column].agg(["median", "min", "max"]).reset_index()
+
+
+def whiskers(axis: Axes, x: Any, of: pd.DataFrame, name: str, *, label: str = "", **style: Any) -> None:
+    """Medians with bars from the smallest to the largest value, which a logarithmic axis shows whole."""
+    reach = np.stack([of["median"] - of["min"], of["max"] - of["median"]])
+    style = {
+        "color": COLOURS[name],
+        "marker": MARKERS[name],
+        "markersize": 4.0,
+        "linewidth": 1.0,
+        "capsize": 2.5,
+    } | style
+    axis.errorbar(x, of["median"], reach, label=label or LABELS[name], **style)
+
+
+def scripts_bars(axis: Axes, x: Any, spreads: Sequence[Spread], name: str, **style: Any) -> None:
+    """What the scripts gave: a cross at each mean with a bar from the smallest to the largest run."""
+    low, mean, high = (np.array([getattr(spread, part) for spread in spreads]) for part in ("low", "mean", "high"))
+    style = {"marker": "x", "markersize": 5.0, "linewidth": 0.0, "elinewidth": 0.8, "capsize": 2.5} | style
+    style["label"] = f"scripts, {LABELS[name]}"
+    axis.errorbar(x, mean, np.stack([mean - low, high - mean]), color=COLOURS[name], alpha=0.6, **style)
+
+
+def signed(exponent: float) -> str:
+    """Two decimals with a true minus."""
+    return f"{exponent:.2f}".replace("-", "−")
+
+
+def agreement(values: Any) -> str:
+    """How far rows of values, one per start, lie apart."""
+    apart = float(np.ptp(np.asarray(values, dtype=float), axis=0).max())
+    return f"starts agree within {apart:.1g}" if apart else "the same number for every start"
 
 
 def span(values: Any) -> str:

@@ -9,14 +9,26 @@ import numpy as np
 
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.structures import Additive
-from orthaug.studies.common import LARGEST_TRAINED, UNIFORM, bars, drawn, legend, panels, slope, solver, span
+from orthaug.studies.common import (
+    LARGEST_TRAINED,
+    UNIFORM,
+    drawn,
+    extremes,
+    legend,
+    panels,
+    pick,
+    signed,
+    slope,
+    solver,
+    span,
+    whiskers,
+)
 from orthaug.studies.data_length import limit
-from orthaug.studies.entry import Finding, Reproduction
+from orthaug.studies.entry import Drawing, Finding, Reproduction
 from orthaug.studies.study import Study
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
 
 SIZES = (1_000_000, 262_144, 65_536, 16_384, 4096, 1024, 256)
 
@@ -59,20 +71,23 @@ def study(pipeline: str, small: bool) -> Study:
     return Study("consistency", one, grid, where=_runs)
 
 
+def _of(table: pd.DataFrame, data_set: int, curve: str) -> pd.DataFrame:
+    return pick(table, (table.data_set == data_set) & (table.curve == curve))
+
+
 def _means(table: pd.DataFrame, data_set: int, curve: str) -> pd.DataFrame:
-    rows = table[(table.data_set == data_set) & (table.curve == curve)]
-    return rows.groupby("samples").theta_error.agg(["mean", "std"]).reset_index()
+    return _of(table, data_set, curve).groupby("samples").theta_error.mean().reset_index()
 
 
-def figures(table: pd.DataFrame) -> Mapping[str, Figure]:
-    """Figure "theta_error": sets 1 and 3, all curves; bars of two standard deviations."""
-    figure, axes = panels(2, sharey=True, height=3.2)
+def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
+    """Figure "theta_error": sets 1 and 3, all curves."""
+    figure, axes = panels(2, sharey=True, height=3.4)
     for axis, data_set in zip(axes, (1, 3), strict=True):
-        for curve in ("additive", "orthogonal", "uniform"):
-            means = _means(table, data_set, curve)
-            if len(means):
+        for i, curve in enumerate(("additive", "orthogonal", "uniform")):
+            errors = extremes(_of(table, data_set, curve), "samples", "theta_error")
+            if len(errors):
                 label = "orthogonal, training measure" if curve == "orthogonal" else ""
-                bars(axis, means.samples, means["mean"], 2 * means["std"], curve, label=label)
+                whiskers(axis, errors.samples * 1.08 ** (i - 1), errors, curve, label=label)
         if data_set == 3:
             axis.axhline(limit(3), linestyle="--", linewidth=0.9, color="black", label="limit of set 3, N → ∞")
         axis.set_xscale("log")
@@ -81,47 +96,52 @@ def figures(table: pd.DataFrame) -> Mapping[str, Figure]:
         axis.set_title(f"data set {data_set}, 30 dB", fontsize=9)
     axes[0].set_ylabel("‖θ* − θ̂‖")
     legend(figure, axes)
-    return {"theta_error": figure}
+    return {
+        "theta_error": Drawing(
+            figure,
+            "Error of θ against the number of samples under 30 dB of noise, data set 1 (left) and 3 (right), for the "
+            "additive structure and for the orthogonal one under two measures.",
+            "Marks are medians over runs, bars go from the smallest to the largest of them; the curves are shifted "
+            "sideways by a few per cent, so that the bars can be told apart.",
+        )
+    }
 
 
 def findings(table: pd.DataFrame) -> list[Finding]:
-    """Consistent or not, and the uniform measure's price."""
+    """Consistent or not, and the uniform measure's price. The paper's record of 1024 is in `static_noise`."""
     compared = []
-    for data_set, curve, published, low, high, why in (
-        (1, "orthogonal", "converges to 0", -0.65, -0.35, "consistent at the rate 1/√N (thm:consistency)"),
-        (1, "additive", "does not converge", -0.25, 9.0, "no consistency: more data do not tell θ from the learner"),
-        (3, "uniform", "–", -9.0, -0.3, "consistent where the training measure is not"),
-        (1, "uniform", "–", -9.0, -0.3, "consistent too"),
+    for data_set, curve, published in (
+        (1, "orthogonal", "converges to 0"),
+        (1, "additive", "does not converge"),
+        (1, "uniform", ""),
+        (3, "uniform", ""),
     ):
         means = _means(table, data_set, curve)
-        rate = slope(means.samples, means["mean"])
+        rate = slope(means.samples, means.theta_error)
+        met = {"converges to 0": -0.65 < rate < -0.35, "does not converge": rate > -0.25}.get(published)
+        first, last = (f"{means.theta_error.iloc[i]:.2g} at N = {means.samples.iloc[i]}" for i in (0, -1))
+        why = f"the mean goes from {first} to {last}; 1/√N is −0.5"
         quantity = f"set {data_set}, 30 dB, {curve}: exponent of ‖θ* − θ̂‖ in N"
-        text = f"{rate:.2f}; {means['mean'].iloc[-1]:.2g} at N = {int(means.samples.iloc[-1])}"
-        compared.append(Finding(quantity, published, "–", text, bool(low < rate < high), why))
+        compared.append(Finding(quantity, signed(rate), why, published, as_published=met))
     last = _means(table, 3, "orthogonal").iloc[-1]
     quantity = f"set 3, 30 dB, orthogonal: ‖θ* − θ̂‖ at N = {int(last.samples)}"
-    text, met = f"{last['mean']:.4g}; limit {limit(3):.4g}", bool(abs(last["mean"] / limit(3) - 1) < 0.25)
-    compared.append(Finding(quantity, "–", "–", text, met, "tends to the bias of set 3, not to 0"))
-    own = table[(table.data_set == 1) & (table.curve == "orthogonal") & (table.run == 0) & (table.samples == 1024)]
-    error = float(own.theta_error.iloc[0])
-    quantity = "set 1, 30 dB, the paper's record of 1024: ‖θ* − θ̂‖"
-    met = bool(abs(error - 0.0089013) < 5e-8)
-    compared.append(Finding(quantity, "0.0089", "0.0089019", f"{error:.5g}", met, "least squares"))
+    away = 100 * abs(last.theta_error / limit(3) - 1)
+    why = f"{away:.2g} % from the limit without noise, {limit(3):.4g}: it does not go to 0"
+    compared.append(Finding(quantity, f"{last.theta_error:.4g}", why))
     rows = table[(table.data_set == 1) & (table.curve == "uniform") & (table.samples == 1024)]
     prices = np.array([price for price in rows.price if price is not None], dtype=float)
     text = f"θ₁ {span(prices[:, 0])}, θ₃ {span(prices[:, 1])}"
-    quantity = "set 1, N = 1024, uniform measure: standard error over the training measure's"
-    met = bool((prices > 1).all())
-    why = "the price: θ shares the learner's variance, and the box reaches where data are few"
-    compared.append(Finding(quantity, "–", "–", text, met, why))
+    quantity = "set 1, 30 dB, N = 1024, uniform measure: standard error over the training measure's"
+    above = int((prices > 1).all(axis=1).sum())
+    compared.append(Finding(quantity, text, f"above 1 for both parameters in {above} of {len(prices)} runs"))
     return compared
 
 
 REPRODUCTION = Reproduction(
     "consistency",
     "Error of θ against N, with noise",
-    "Ten runs for each N, each with its own record and initial weights (run 0 has the paper's record), bars of two "
-    "standard deviations. The paper varies the initial weights only, which moves the additive structure alone. θ under "
+    "Ten runs for each N, each with its own record and initial weights (run 0 has the paper's record). "
+    "The paper varies the initial weights only, which moves the additive structure alone. θ under "
     "the training measure is least squares and needs no learner; trained curves end at N = "
     f"{LARGEST_TRAINED['ours']}, or {LARGEST_TRAINED['paper']} by the paper's pipeline. Under the uniform measure our "
     "solver trains with evidence regularization, the paper's without any.",

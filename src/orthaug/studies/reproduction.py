@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import json
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -21,15 +20,20 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import check_replaceable, whole_folder
 from orthaug.reports import plots
 from orthaug.studies.catalogue import catalogue
-from orthaug.studies.entry import Finding, Reproduction
-from orthaug.studies.study import run
+from orthaug.studies.entry import Counts, Drawing, Finding, Reproduction
+from orthaug.studies.study import Run, as_table, runs
 from orthaug.studies.theory import THEORY
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-PIPELINES = ("ours", "paper")
+PIPELINES = {  # name, and how the page says who trained
+    "ours": "trained by Levenberg-Marquardt",
+    "paper": "with the paper's own training: Adam, then L-BFGS",
+}
+HYPHEN = "\N{NON-BREAKING HYPHEN}"  # a line of the page never ends within 1e-6
+WIDTH = 100  # characters of a line in a terminal
 MARK = "reproduction.json"
 StudiesTell = Callable[[str, int, int], None]
 """Called with the study's title, the runs done and all of them."""
@@ -40,10 +44,10 @@ class Reproduced:
     """One study with its table, figures and findings."""
 
     entry: Reproduction
+    runs: list[Run]
     table: pd.DataFrame
-    figures: dict[str, Figure]
+    figures: dict[str, Drawing]
     findings: list[Finding]
-    seconds: float
     small: bool = False
 
 
@@ -80,11 +84,10 @@ def reproduce(
     store = Path(platformdirs.user_cache_dir("orthaug")) / "studies" if store is None else store
     reproduced = []
     for entry in entries:
-        began = time.perf_counter()
         tell = None if progress is None else lambda done, total, e=entry: progress(e.title, done, total)
-        table = run(entry.study(pipeline, small), store=store, progress=tell)
-        drawn, compared = dict(entry.figures(table)), entry.findings(table)
-        reproduced.append(Reproduced(entry, table, drawn, compared, time.perf_counter() - began, small))
+        done = runs(entry.study(pipeline, small), store=store, progress=tell)
+        table = as_table(done)
+        reproduced.append(Reproduced(entry, done, table, dict(entry.figures(table)), entry.findings(table), small))
     return reproduced
 
 
@@ -105,9 +108,15 @@ def write(reproduced: Sequence[Reproduced], folder: Path, pipeline: str) -> None
             place = partial / study.entry.name
             place.mkdir()
             study.table.to_csv(place / "runs.csv", index=False)
-            for name, figure in study.figures.items():
-                plots.save(figure, place / f"{name}.png")
-        content = {"orthaug": __version__, "pipeline": pipeline, "findings": as_rows(reproduced)}
+            for name, drawing in study.figures.items():
+                plots.save(drawing.figure, place / f"{name}.png")
+        content = {
+            "orthaug": __version__,
+            "pipeline": pipeline,
+            "counts": _counts(reproduced)._asdict(),
+            "findings": as_rows(reproduced),
+            "runs": {study.entry.name: when(study.runs) for study in reproduced},
+        }
         (partial / MARK).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
         (partial / "index.html").write_text(_page(reproduced, pipeline), encoding="utf-8")
 
@@ -117,42 +126,78 @@ def as_rows(reproduced: Sequence[Reproduced]) -> list[dict[str, Any]]:
     return [{"study": study.entry.name, **finding._asdict()} for study in reproduced for finding in study.findings]
 
 
+def _counts(reproduced: Sequence[Reproduced]) -> Counts:
+    return Counts.of(finding for study in reproduced for finding in study.findings)
+
+
+def when(done: Sequence[Run]) -> str:
+    """How many runs were made now and how many came from a store, when those were made, and their seconds."""
+    parts = []
+    for stored in (False, True):
+        some = [run for run in done if run.stored is stored]
+        if some:
+            days = sorted({run.made[:10] for run in some})
+            dates = days[0] if len(days) == 1 else f"{days[0]} to {days[-1]}"
+            origin = "read from the store, made on" if stored else "made now, on"
+            parts.append(f"{len(some)} {origin} {dates} in {sum(run.seconds for run in some):.3g} s")
+    return f"{len(done)} run{'s' * (len(done) != 1)}: {'; '.join(parts)}, summed over runs"
+
+
 def text(reproduced: Sequence[Reproduced]) -> str:
-    """The table: quantity, published, the published scripts as measured, ours, verdict."""
-    head = ("quantity", "published", "scripts", "ours", "", "verdict")
-    rows: list[tuple[str, ...]] = [head]
-    for finding in (finding for study in reproduced for finding in study.findings):
-        mark = "met" if finding.met else "differs"
-        rows.append((finding.quantity, finding.published, finding.scripts, finding.ours, mark, finding.verdict))
-    widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
-    return "\n".join("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows)
+    """A table per study, in lines for a terminal, and what is met."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    buffer = io.StringIO()
+    console = Console(file=buffer, width=WIDTH, color_system=None, legacy_windows=False)
+    for study in reproduced:
+        table = Table(title=study.entry.title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1), expand=True)
+        for name, ratio in (("quantity", 24), ("published", 14), ("scripts", 18), ("ours", 18), ("verdict", 26)):
+            table.add_column(name, ratio=ratio, overflow="fold")
+        for row in study.findings:
+            marked = (_marked(row.published, row.as_published), _marked(row.scripts, row.as_scripts))
+            table.add_row(row.quantity, *marked, row.ours, row.verdict)
+        console.print(table, markup=False, highlight=False)
+    counts = _counts(reproduced)
+    console.print(
+        f"met against the printed paper: {counts.published_met} of {counts.published}\n"
+        f"met against its scripts, as measured: {counts.scripts_met} of {counts.scripts}\n"
+        f"beyond the paper, neither met nor missed: {counts.beyond}",
+        markup=False,
+        highlight=False,
+    )
+    return "\n".join(line.rstrip() for line in buffer.getvalue().splitlines())
+
+
+def _marked(reference: str, met: bool | None) -> str:
+    if met is None:
+        return reference or "–"
+    return f"{reference} ({'met' if met else 'differs'})"
 
 
 def _page(reproduced: Sequence[Reproduced], pipeline: str) -> str:
     """One HTML file with its figures inside."""
     source = files("orthaug.studies").joinpath("templates/reproduction.html").read_text(encoding="utf-8")
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    environment.filters["whole"] = lambda words: words.replace("e-", f"e{HYPHEN}")
     studies = [
         {
-            "name": study.entry.name,
-            "title": study.entry.title,
-            "text": study.entry.text,
+            "entry": study.entry,
             "findings": study.findings,
-            "figures": {name: _inline(figure) for name, figure in study.figures.items()},
-            "runs": len(study.table),
-            "seconds": f"{study.seconds:.0f}",
+            "figures": [(drawing, _inline(drawing.figure)) for drawing in study.figures.values()],
+            "counts": Counts.of(study.findings),
+            "when": when(study.runs),
         }
         for study in reproduced
     ]
-    findings = [finding for study in reproduced for finding in study.findings]
     return environment.from_string(source).render(
         studies=studies,
         theory=THEORY,
-        pipeline=pipeline,
+        trained=PIPELINES[pipeline],
         version=__version__,
         small=any(study.small for study in reproduced),
-        compared=len(findings),
-        met=sum(finding.met for finding in findings),
+        counts=_counts(reproduced),
     )
 
 

@@ -13,8 +13,10 @@ import inspect
 import json
 import os
 import tempfile
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -65,6 +67,23 @@ class Study:
         return hashlib.sha256(json.dumps(declared, sort_keys=True).encode()).hexdigest()[:24]
 
 
+@dataclass(frozen=True)
+class Run:
+    """One case with its result, and when that was made.
+
+    Args:
+        made: when the result was made, ISO 8601 in UTC, whole seconds.
+        seconds: that the case took then; other cases may have shared the machine.
+        stored: whether it was read from a store instead of made now.
+    """
+
+    case: Case
+    result: dict[str, Any]
+    made: str
+    seconds: float
+    stored: bool
+
+
 @cache
 def _sources() -> str:
     """A digest of this package's code: results of older code do not count."""
@@ -97,11 +116,27 @@ def run(
     Raises:
         InputError: a result that is not plain values; a store that cannot be written.
     """
+    return as_table(runs(study, store=store, workers=workers, progress=progress))
+
+
+def as_table(done: Sequence[Run]) -> pd.DataFrame:
+    """A row per run, axes first. It does not tell stored results from those made now."""
     import pandas as pd
 
+    return pd.DataFrame([{**run.case, **run.result} for run in done])
+
+
+def runs(
+    study: Study,
+    *,
+    store: Path | None = None,
+    workers: int | None = None,
+    progress: CasesTell | None = None,
+) -> list[Run]:
+    """`run`, with the time of every result instead of a table."""
     cases = study.cases()
-    results = [_read(store, study, case) for case in cases]
-    todo = [i for i, result in enumerate(results) if result is None]
+    found = [_read(store, study, case) for case in cases]
+    todo = [i for i, run in enumerate(found) if run is None]
     done = len(cases) - len(todo)
     if progress is not None:
         progress(done, len(cases))
@@ -109,41 +144,46 @@ def run(
     def run_case(i: int, check: Callable[[], None]) -> None:
         nonlocal done
         check()
+        began = time.perf_counter()
         result = _plain(study, study.one(**cases[i]))
-        _write(store, study, cases[i], result)
-        results[i] = result
+        seconds = round(time.perf_counter() - began, 3)
+        made = datetime.now(UTC).isoformat(timespec="seconds")
+        run = Run(cases[i], result, made, seconds, stored=False)
+        _write(store, study, run)
+        found[i] = run
         done += 1
         if progress is not None:
             progress(done, len(cases))
 
     spread(run_case, todo, study.workers if workers is None else workers)
-    return pd.DataFrame([{**case, **(result or {})} for case, result in zip(cases, results, strict=True)])
+    return [run for run in found if run is not None]
 
 
 def _path(store: Path, study: Study, case: Case) -> Path:
     return store / study.name / f"{study.key(case)}.json"
 
 
-def _read(store: Path | None, study: Study, case: Case) -> dict[str, Any] | None:
+def _read(store: Path | None, study: Study, case: Case) -> Run | None:
     """A stored result; None where there is none, or where it was cut."""
     if store is None:
         return None
     try:
         content = json.loads(_path(store, study, case).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return Run(case, dict(content["result"]), str(content["made"]), float(content["seconds"]), stored=True)
+    except (OSError, ValueError, TypeError, KeyError):
         return None
-    return content if isinstance(content, dict) else None
 
 
-def _write(store: Path | None, study: Study, case: Case, result: dict[str, Any]) -> None:
+def _write(store: Path | None, study: Study, run: Run) -> None:
     if store is None:
         return
-    path = _path(store, study, case)
+    content = {"made": run.made, "seconds": run.seconds, "result": run.result}
+    path = _path(store, study, run.case)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, partial = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".partial")
         with os.fdopen(handle, "w", encoding="utf-8") as file:
-            json.dump(result, file, allow_nan=False)
+            json.dump(content, file, allow_nan=False)
         Path(partial).replace(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}).") from None
