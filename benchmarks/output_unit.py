@@ -1,4 +1,4 @@
-"""Which unit of the learner's output to choose (DESIGN F5): test RMSE for units of 1 to 100 residual deviations.
+"""Which unit of the learner's output to choose (F5 of docs/design.md): test RMSE for 1 to 100 residual deviations.
 
 The unit is the prior under evidence regularisation, and the size of a Xavier start without. Medians over
 12 noise draws (the first is the paper's) or over initialisations. Run: python benchmarks/output_unit.py
@@ -7,6 +7,7 @@ The unit is the prior under evidence regularisation, and the size of a Xavier st
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 
 import numpy as np
 from machine import describe
@@ -31,7 +32,7 @@ def test_rmse(example: synthetic.Example, unit: float, seed: int, regularization
     test = pose(example.test, example.baseline)
     z = task.scaling(test.feature_rows())
     values = np.asarray(jax.vmap(lambda row: task.bound.values(run.w, row))(z)) * task.unit
-    model = test.projection.phi @ c / test.weight + values
+    model = test.projection.phi @ c * test.deviation + values
     return float(np.sqrt(np.mean((test.target - model) ** 2)))
 
 
@@ -45,12 +46,8 @@ def noisy(data_set: int, draw: int) -> synthetic.Example:
     return dataclasses.replace(example, train=oa.Record.from_arrays(experiment.inputs, experiment.outputs + noise))
 
 
-def main() -> None:
-    print(describe())
-    print(
-        "| unit | set 1, noise | set 3, noise | set 1, 10 starts, paper's draw | set 1, no noise | MSD, no reg. | MSD |"
-    )
-    print("|---|---|---|---|---|---|---|")
+def rows() -> Iterator[tuple[int, list[tuple[float, float]]]]:
+    """Each unit with the median and the largest test RMSE of every column."""
     msd, clean = synthetic.mass_spring_damper(), synthetic.static(1)
     for unit in UNITS:
         columns = (
@@ -61,7 +58,22 @@ def main() -> None:
             [test_rmse(msd, unit, seed, "none", 100) for seed in range(5)],
             [test_rmse(msd, unit, seed, "evidence", 100) for seed in range(5)],
         )
-        cells = " | ".join(f"{np.median(c):.2e} (≤ {max(c):.1e})" for c in columns)
+        yield unit, [(float(np.median(column)), max(column)) for column in columns]
+
+
+def table() -> list[list[tuple[float, float]]]:
+    """The numbers of docs/design.md."""
+    return [columns for _, columns in rows()]
+
+
+def main() -> None:
+    print(describe())
+    print(
+        "| unit | set 1, noise | set 3, noise | set 1, 10 starts, paper's draw | set 1, no noise | MSD, no reg. | MSD |"
+    )
+    print("|---|---|---|---|---|---|---|")
+    for unit, columns in rows():
+        cells = " | ".join(f"{median:.2e} (≤ {largest:.1e})" for median, largest in columns)
         print(f"| {unit} | {cells} |", flush=True)
 
 
