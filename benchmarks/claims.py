@@ -67,12 +67,13 @@ def compare(claim: Claim, values: Sequence[float | None]) -> tuple[bool, str]:
     wrong = [(told.value, value) for told, value in pairs if not claim.tolerance.met(told, value)]
     listed = ", ".join(f"{told:g} (computed {value:.4g})" for told, value in wrong)
     absent = f", {len(values) - len(pairs)} left out: no data" if len(pairs) < len(values) else ""
+    count = f"{len(pairs)} number{'s' * (len(pairs) > 1)}"
     if wrong:
         return False, f"differs  {head}: {listed}{absent}"
     if not pairs:
         return True, f"skipped  {head}: no data"
     few = "" if len(pairs) > 4 else ": " + ", ".join(f"{told.value:g} ({value:.4g})" for told, value in pairs)
-    return True, f"met      {head}, {len(pairs)} numbers{few}{absent}"
+    return True, f"met      {head}, {count}{few}{absent}"
 
 
 def stored() -> dict[str, dict]:

@@ -167,7 +167,7 @@ def test_a_number_that_cannot_be_measured_here_is_left_out() -> None:
     (claim,) = block("<!-- measured: a.b -->\n1.0 and 2.0").claims
     assert claims.compare(claim, [None, 2.0]) == (
         True,
-        "met      page.md:2  a.b, 1 numbers: 2 (2), 1 left out: no data",
+        "met      page.md:2  a.b, 1 number: 2 (2), 1 left out: no data",
     )
     assert claims.compare(claim, [None, None]) == (True, "skipped  page.md:2  a.b: no data")
     assert claims.compare(claim, [1.0, None, 2.0])[1].endswith("2 numbers in the text, 3 computed")
@@ -193,7 +193,7 @@ def project(tmp_path, monkeypatch) -> Path:
 def test_all_claims_are_compared(project, capsys) -> None:
     assert claims.main([]) == 0
     assert capsys.readouterr().out.splitlines() == [
-        "met      README.md:2  one.value, 1 numbers: 1 (1)",
+        "met      README.md:2  one.value, 1 number: 1 (1)",
         "met      README.md:5  two.rows, 2 numbers: 2 (2), 3.05 (3)",
     ]
     assert claims.main(["--list"]) == 0
