@@ -2,7 +2,7 @@
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test check bench clean
+.PHONY: help setup demo test check bench claims clean
 
 BIN := .venv/bin
 STAMP := .venv/ready
@@ -27,9 +27,12 @@ check: $(STAMP)  ## ruff, pyright and the architecture test
 	@$(BIN)/python -m pytest -q tests/test_architecture.py
 
 bench: $(STAMP)  ## run the benchmarks, one after another
-	@set -e; for file in benchmarks/*.py; do \
+	@set -e; for file in $(filter-out benchmarks/claims.py,$(wildcard benchmarks/*.py)); do \
 	    if grep -qs __main__ "$$file"; then echo "== $$file"; $(BIN)/python "$$file"; fi; \
 	done
+
+claims: $(STAMP)  ## recompute every measured number of the documents and compare
+	@$(BIN)/python benchmarks/claims.py
 
 clean:  ## remove the environment and everything that was built
 	@rm -rf .venv build dist .pytest_cache .ruff_cache .hypothesis orthaug-out

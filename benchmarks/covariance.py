@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -18,12 +19,8 @@ import orthaug as oa
 ROWS, NEURONS = 1024, 16
 
 
-def per_row(fit: oa.Estimate, timed: int) -> tuple[np.ndarray, float]:
-    """`Σψψᵀ` inverted times σ², ψ from one `jacrev` of the whole training prediction per row; and seconds for all rows.
-
-    Every row's θ_aux depends on all rows, so that each derivative passes over the whole record; this loop is not
-    compiled, like that of the scripts. All rows are needed for the covariance, but only the first ones are timed.
-    """
+def one_row(fit: oa.Estimate) -> Callable[[int], jax.Array]:
+    """ψ of a row, from one `jacrev` of the whole training prediction: θ_aux depends on all rows."""
     problem, model = fit.problem, fit.model
     bound, numbers = model.form.bound, model.numbers
     z = jnp.asarray((problem.feature_rows() - numbers.centre) / numbers.halfwidth)
@@ -36,28 +33,46 @@ def per_row(fit: oa.Estimate, timed: int) -> tuple[np.ndarray, float]:
         return phi[k] @ (theta - pseudo @ learner) + learner[k]
 
     parameters = jnp.concatenate([jnp.asarray(fit.theta), jnp.asarray(numbers.weights)])
-    gradient = jax.jacrev(row)
-    gradient(parameters, 0).block_until_ready()
-    began = time.perf_counter()
-    for k in range(timed):
-        gradient(parameters, k).block_until_ready()
-    seconds = (time.perf_counter() - began) * len(phi) / timed
-    psi = np.asarray(jax.lax.map(lambda k: gradient(parameters, k), jnp.arange(len(phi))))
+    return lambda k: jax.jacrev(row)(parameters, k)
+
+
+def per_row(fit: oa.Estimate) -> np.ndarray:
+    """`Σψψᵀ` inverted times σ², from the ψ of every row."""
+    psi = np.asarray(jax.lax.map(one_row(fit), jnp.arange(len(fit.problem.rows))))
     scale = 1 / np.linalg.norm(psi, axis=0)
     inverse = np.linalg.pinv((psi * scale).T @ (psi * scale), rcond=psi.shape[1] * np.finfo(float).eps, hermitian=True)
-    return model.statistics.noise[0, 0] * inverse * np.outer(scale, scale), seconds
+    return fit.model.statistics.noise[0, 0] * inverse * np.outer(scale, scale)
+
+
+def seconds_per_row(fit: oa.Estimate, timed: int) -> float:
+    """Seconds for all rows in a loop that is not compiled, like that of the scripts; the first ones are timed."""
+    gradient = one_row(fit)
+    gradient(0).block_until_ready()
+    began = time.perf_counter()
+    for k in range(timed):
+        gradient(k).block_until_ready()
+    return (time.perf_counter() - began) * len(fit.problem.rows) / timed
+
+
+def fitted() -> oa.Estimate:
+    example = oa.synthetic.static(1, noise=True, samples=ROWS)
+    return oa.estimate(example.train, example.baseline, learner=oa.MLP((NEURONS,)))
+
+
+def theta_block(fit: oa.Estimate | None = None) -> float:
+    """The largest relative difference of both in the θ block, for benchmarks/README.md."""
+    fit = fit or fitted()
+    nt = len(fit.theta)
+    return float(np.abs(fit.joint_covariance()[:nt, :nt] / per_row(fit)[:nt, :nt] - 1).max())
 
 
 def main(timed: int) -> None:
     print(describe())
-    example = oa.synthetic.static(1, noise=True, samples=ROWS)
-    fit = oa.estimate(example.train, example.baseline, learner=oa.MLP((NEURONS,)))
+    fit = fitted()
     fast = median_seconds(fit.joint_covariance, 20)
-    reference, slow = per_row(fit, min(timed, ROWS))
+    slow, worst = seconds_per_row(fit, min(timed, ROWS)), theta_block(fit)
     found, nt = fit.joint_covariance(), len(fit.theta)
-    theta = [matrix[:nt, :nt] for matrix in (found, reference)]
-    worst = np.abs(theta[0] / theta[1] - 1).max()
-    across = np.abs(found[:nt, nt:]).max() / np.sqrt(theta[0].max() * np.diag(found)[nt:].max())
+    across = np.abs(found[:nt, nt:]).max() / np.sqrt(found[:nt, :nt].max() * np.diag(found)[nt:].max())
     print("| rows | weights | one pass | a Jacobian per row | ratio | allowed | θ block, largest relative difference |")
     print("|---|---|---|---|---|---|---|")
     print(

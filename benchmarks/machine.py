@@ -1,4 +1,4 @@
-"""What the numbers were measured on, and how a ratio is taken."""
+"""What the numbers were measured on, where the measured data are, and how a ratio is taken."""
 
 from __future__ import annotations
 
@@ -11,6 +11,13 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def data_folder() -> Path:
+    """Where the measured data sets are: ORTHAUG_DATA, or ../shared/data beside the project."""
+    return Path(os.environ.get("ORTHAUG_DATA", ROOT.parent / "shared" / "data"))
 
 
 def describe() -> str:

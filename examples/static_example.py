@@ -20,18 +20,27 @@ BLACK, BLUE, ORANGE = "#000000", "#0072B2", "#E69F00"
 SEEDS = range(10)
 
 
-def main(picture: str | None = None) -> dict[str, np.ndarray]:
-    """Fit, print θ of every initialisation, and draw if a file is named."""
-    example = oa.synthetic.static(data_set=1)
-    fits = {
+def estimates(example: oa.synthetic.Example) -> dict[str, list[oa.Estimate]]:
+    """Each structure from every initialisation."""
+    return {
         structure.name: [oa.estimate(example.train, example.baseline, structure=structure, seed=seed) for seed in SEEDS]
         for structure in (oa.Additive(), oa.Orthogonal())
     }
+
+
+def largest_rmse(example: oa.synthetic.Example, fits: list[oa.Estimate]) -> float:
+    """On the test record."""
+    return max(fit.model.predict(example.test).scores().rmse[0] for fit in fits)
+
+
+def main(picture: str | None = None) -> dict[str, np.ndarray]:
+    """Fit, print θ of every initialisation, and draw if a file is named."""
+    example = oa.synthetic.static(data_set=1)
+    fits = estimates(example)
     for name, group in fits.items():
         thetas = np.array([fit.theta for fit in group])
-        rmse = [fit.model.predict(example.test).scores().rmse[0] for fit in group]
         spread = ", ".join(f"{t.min():.6f} … {t.max():.6f}" for t in thetas.T)
-        print(f"{name:<11} θ = {spread}; true {example.theta}; test RMSE ≤ {max(rmse):.1e}")
+        print(f"{name:<11} θ = {spread}; true {example.theta}; test RMSE ≤ {largest_rmse(example, group):.1e}")
     if picture:
         draw(example, fits).savefig(picture, dpi=160)
     return {name: np.array([fit.theta for fit in group]) for name, group in fits.items()}
