@@ -219,3 +219,13 @@ def test_bound_is_hashable_so_that_programs_are_reused():
     assert Bound(MLP(hidden=[4]), 2, 1) == Bound(MLP(hidden=(4,), inputs=None), 2, 1)
     assert hash(Bound(MLP(hidden=[4], inputs=["y[k-1]"]), 2, 1)) == hash(Bound(MLP((4,), inputs=("y[k-1]",)), 2, 1))
     assert Bound(MLP(), 2, 1) != Bound(MLP(), 3, 1)
+
+
+@pytest.mark.parametrize(("hidden", "nz", "ny"), [((16,), 3, 1), ((40, 30), 50, 2), ((2000,), 3, 1)])
+def test_weights_are_those_of_a_draw_at_their_own_size(hidden, nz, ny):
+    sizes = (nz, *hidden, ny)
+    keys = jax.random.split(KEY, len(sizes) - 1)
+    for i, (weight, _) in enumerate(MLP(hidden, activation="relu").init(KEY, nz, ny)):
+        a = math.sqrt(6 / (sizes[i] + sizes[i + 1])) * (math.sqrt(2) if i < len(hidden) else 1.0)
+        shape = (sizes[i + 1], sizes[i])
+        np.testing.assert_array_equal(weight, jax.random.uniform(keys[i], shape, minval=-a, maxval=a, dtype=float))

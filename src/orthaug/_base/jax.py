@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 else:
     Array = Any  # in annotations; at run time jaxtyping checks shape and type of whatever is an array
 
-__all__ = ["Array", "jax", "jnp", "padded_length", "use_compilation_cache"]
+__all__ = ["Array", "is_traced", "jax", "jnp", "padded_length", "use_compilation_cache"]
 
 
 def _real_jax() -> Any:
@@ -74,6 +74,13 @@ def _late_jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any
         return made[0](*args, **kwargs)
 
     return call
+
+
+def is_traced(value: Any) -> bool:
+    """Whether a value stands for numbers that are not there yet, because a program is being made of it."""
+    from jax.core import Tracer
+
+    return isinstance(value, Tracer)
 
 
 def padded_length(rows: int) -> int:

@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError
-from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.jax import Array, is_traced, jax, jnp
 from orthaug._base.registry import OneOf, check_fields
 
 Tree = Any  # a pytree of weight arrays
@@ -95,8 +95,7 @@ class MLP:
         for i, (fan_in, fan_out) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
             gain = _GAIN.get(self.activation, 1.0) if i < len(self.hidden) else 1.0
             a = gain * math.sqrt(6.0 / (fan_in + fan_out))
-            weight = jax.random.uniform(keys[i], (fan_out, fan_in), minval=-a, maxval=a, dtype=float)
-            layers.append((weight, jnp.zeros(fan_out)))
+            layers.append((_uniform(keys[i], (fan_out, fan_in), a), np.zeros(fan_out)))
         return layers
 
     def apply(self, tree: Tree, z: Float[Array, "nz"]) -> Float[Array, "ny"]:
@@ -105,6 +104,17 @@ class MLP:
             z = activation(weight @ z + bias)
         weight, bias = tree[-1]
         return weight @ z + bias
+
+
+def _uniform(key: Array, shape: tuple[int, int], a: float) -> Any:
+    """Uniform on [−a, a], drawn in a multiple of 1024: one compiled program for layers of all sizes.
+
+    JAX makes each number from its place alone, so they are those that would be drawn at the layer's own size.
+    """
+    count = math.prod(shape)
+    drawn = jax.random.uniform(key, (-(-count // 1024) * 1024,), minval=-a, maxval=a, dtype=float)
+    drawn = drawn if is_traced(drawn) else np.asarray(drawn)
+    return drawn[:count].reshape(shape)
 
 
 @dataclass(frozen=True)
@@ -263,8 +273,10 @@ class Bound:
 
     @staticmethod
     def ravel(leaves: list[Any]) -> Float[Array, "nw"]:
-        flat = [jnp.ravel(jnp.asarray(leaf, dtype=float)) for leaf in leaves]
-        return jnp.concatenate(flat) if flat else jnp.zeros(0)
+        if any(map(is_traced, leaves)):
+            return jnp.concatenate([jnp.ravel(leaf) for leaf in leaves])
+        flat = [np.ravel(np.asarray(leaf, dtype=float)) for leaf in leaves]  # nothing to compile
+        return jnp.asarray(np.concatenate([np.zeros(0), *flat]))
 
     def leaves(self, w: Float[Array | np.ndarray, "nw"]) -> list[Float[Array, "..."]]:
         """The weight arrays that the vector holds, in the tree's order."""
@@ -294,7 +306,8 @@ class Bound:
 
         def one_row(leaves: list[Any], z_row: Any, gain_row: Any) -> tuple[Any, list[Any]]:
             value, pullback = jax.vjp(lambda tree: self.from_leaves(tree, z_row), leaves)
-            return jnp.sum(gain_row * value, axis=1), [pullback(seed)[0] for seed in gain_row]
+            scaled = sum(gain_row[:, i] * value[i] for i in range(self.ny))
+            return scaled, [pullback(gain_row[i])[0] for i in range(self.ny)]
 
         values, per_output = jax.vmap(one_row, in_axes=(None, -1, -1), out_axes=-1)(self.leaves(w), z, gain)
         batch = z.shape[-1]
