@@ -53,6 +53,7 @@ class Nearness:
 
     projects = False
     identifies = False
+    from_initial = False
     measure = Training()
 
     stiffness: Annotated[float, Ge(0)] = 1.0

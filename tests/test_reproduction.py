@@ -124,7 +124,7 @@ def test_values_are_the_stored_ones(found, references, name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("pipeline", ["ours", "paper"])
+@pytest.mark.parametrize("pipeline", ["ours", "paper", "scripts"])
 def test_the_full_size_is_larger_and_holds_the_reduced_axes(name, pipeline):
     entry = catalogue()[name]
     full, small = (entry.study(pipeline, reduced) for reduced in (False, True))
@@ -234,7 +234,7 @@ def test_the_folder_holds_figures_runs_and_findings(found, page):
 def test_a_second_run_reads_the_store(found, store, monkeypatch):
     (first,) = (one for one in found if one.entry.name == "static_errors")
     study = first.entry.study("ours", True)
-    monkeypatch.setattr("orthaug.studies.static_errors.estimate", lambda *a, **k: pytest.fail("it ran again"))
+    monkeypatch.setattr("orthaug.studies.static_errors.trained", lambda *a, **k: pytest.fail("it ran again"))
     again = run(study, store=store)
     assert again.test_rmse.tolist() == first.table.test_rmse.tolist()
 
@@ -286,7 +286,7 @@ def test_an_unknown_study_has_a_nearest_one(name, hint):
 
 
 def test_an_unknown_pipeline_is_refused():
-    with pytest.raises(InputError, match="--pipeline must be one of ours, paper; got 'nonsense'"):
+    with pytest.raises(InputError, match="--pipeline must be one of ours, paper, scripts; got 'nonsense'"):
         reproduce([], pipeline="nonsense")
 
 
@@ -304,7 +304,7 @@ def command(*arguments: str) -> list[str]:
     ("arguments", "message"),
     [
         (["static_error"], "did you mean 'static_errors'?"),
-        (["--pipeline", "nonsense"], "must be one of ours, paper"),
+        (["--pipeline", "nonsense"], "must be one of ours, paper, scripts"),
     ],
 )
 def test_refusals_of_the_command(tmp_path, arguments, message):

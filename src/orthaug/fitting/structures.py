@@ -16,7 +16,7 @@ import numpy as np
 from annotated_types import Ge
 from jaxtyping import Float
 
-from orthaug._base.checks import Vector
+from orthaug._base.checks import Vector, check_type
 from orthaug._base.errors import InputError
 from orthaug._base.registry import LIBRARY_ONLY, check_fields
 from orthaug.inference.measures import Measure, Training
@@ -48,6 +48,11 @@ class Structure(Protocol):
         ...
 
     @property
+    def from_initial(self) -> bool:
+        """Whether one-step training takes θ from θ⁰ beside the weights; otherwise it solves θ for any weights."""
+        ...
+
+    @property
     def measure(self) -> Measure:
         """The points over which θ is split; training itself knows the training measure only."""
         ...
@@ -71,6 +76,7 @@ class Orthogonal:
 
     projects = True
     identifies = True
+    from_initial = False
 
     measure: Measure = field(default=Training(), metadata=LIBRARY_ONLY)  # noqa: RUF009  (frozen)
     name: str = field(default="orthogonal", metadata=LIBRARY_ONLY)
@@ -81,12 +87,21 @@ class Orthogonal:
 
 @dataclass(frozen=True)
 class Additive:
-    """ŷ = φθ + f (eqs:additive_struct): θ takes what this learner happens to leave, so it is not unique."""
+    """ŷ = φθ + f (eqs:additive_struct): θ takes what this learner happens to leave, so it is not unique.
 
-    name: str = field(default="additive", metadata=LIBRARY_ONLY)
+    With `from_initial` θ starts at θ⁰ and is trained with the weights, one step ahead; without, it is solved for any
+    weights and never sees θ⁰.
+    """
+
     projects = False
     identifies = True
     measure = Training()
+
+    from_initial: bool = False
+    name: str = field(default="additive", metadata=LIBRARY_ONLY)
+
+    def __post_init__(self) -> None:
+        check_type(self.from_initial, bool, "from_initial", "true or false")
 
     def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> PenaltyRows:
         return _no_rows(len(names))
@@ -101,6 +116,7 @@ class OrthogonalPenalty:
 
     projects = False
     identifies = True
+    from_initial = False
     measure = Training()
 
     weight: Annotated[float, Ge(0)] = 1.0
@@ -123,6 +139,7 @@ class BaselinePenalty:
 
     projects = False
     identifies = False
+    from_initial = False
     measure = Training()
 
     weight: Annotated[float, Ge(0)] = 1.0

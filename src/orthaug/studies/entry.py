@@ -29,8 +29,8 @@ class Finding(NamedTuple):
 class Reproduction:
     """One entry of `orthaug reproduce`.
 
-    `study(pipeline, small)` declares the runs: pipeline "ours" or "paper"; `small` for the reduced size of the tests.
-    `figures(table)` draws, by file name; `findings(table)` compares. `text` says what is shown.
+    `study(pipeline, small)` declares the runs: pipeline "ours", "paper" or "scripts"; `small` for the size of the
+    tests. `figures(table)` draws, by file name; `findings(table)` compares. `text` says what is shown.
     """
 
     name: str

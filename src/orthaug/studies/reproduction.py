@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-PIPELINES = ("ours", "paper")
+PIPELINES = ("ours", "paper", "scripts")
 MARK = "reproduction.json"
 StudiesTell = Callable[[str, int, int], None]
 """Called with the study's title, the runs done and all of them."""
@@ -72,7 +72,8 @@ def reproduce(
     """Run the studies; what a store holds already is not run again.
 
     Args:
-        pipeline: "ours", or "paper" for Adam and L-BFGS with the published iterations.
+        pipeline: "ours", "paper" for Adam and L-BFGS with the published iterations on normalised data, or "scripts"
+            for what the published scripts do, un-normalised and from θ⁰.
         small: at the reduced size of the tests.
         store: where results are kept as they are made; None for the user's cache folder.
     """

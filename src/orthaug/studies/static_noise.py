@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orthaug.fitting.estimation import estimate
-from orthaug.studies.common import COLOURS, LABELS, MARKERS, STRUCTURES, legend, panels, solver, span
+from orthaug.studies.common import COLOURS, LABELS, MARKERS, STRUCTURES, legend, panels, span, trained
 from orthaug.studies.entry import Finding, Reproduction
 from orthaug.studies.study import Study
 from orthaug.studies.synthetic import static
@@ -27,10 +26,9 @@ LEAST_SQUARES = 0.0089013
 def one(structure: str, regularization: str, seed: int, pipeline: str) -> dict[str, Any]:
     """One start: θ and its error, test RMSE, effective weights; "stopping" is after 50 iterations."""
     example, stopped = static(1, noise=True), regularization == "stopping"
-    chosen = solver(pipeline, "static", 50 if stopped else 300)
-    prior = "none" if stopped else regularization
-    options = {"structure": STRUCTURES[structure], "regularization": prior, "seed": seed}
-    fit = estimate(example.train, example.baseline, solver=chosen, **options)
+    prior, iterations = ("none", 50) if stopped else (regularization, 300)
+    options = {"structure": STRUCTURES[structure], "regularization": prior, "iterations": iterations}
+    fit = trained(example, "static", pipeline, seed=seed, **options)
     return {
         "theta": fit.theta,
         "theta_error": float(np.linalg.norm(fit.theta - example.theta)),
@@ -40,8 +38,8 @@ def one(structure: str, regularization: str, seed: int, pipeline: str) -> dict[s
 
 
 def study(pipeline: str, small: bool) -> Study:
-    """Structures × regularizations × starts; the gradient pipeline has no evidence."""
-    kinds = ("none",) if pipeline == "paper" else ("none", "stopping", "evidence")
+    """Structures × regularizations × starts; the gradient pipelines have no evidence."""
+    kinds = ("none",) if pipeline != "ours" else ("none", "stopping", "evidence")
     seeds = range(2) if small else range(10)
     grid = {"structure": tuple(STRUCTURES), "regularization": kinds, "seed": seeds, "pipeline": (pipeline,)}
     return Study("static_noise", one, grid)
@@ -82,7 +80,7 @@ def findings(table: pd.DataFrame) -> list[Finding]:
             where = f"set 1, 30 dB, {structure}, regularization {kind}"
             met = bool(rows.test_rmse.mean() < 1.1 * scripts_rmse)
             texts = (f"{rmse:.3g}", f"{scripts_rmse:.3g}", span(rows.test_rmse))
-            paper = bool((rows.pipeline == "paper").any())
+            paper = bool((rows.pipeline != "ours").any())
             compared.append(Finding(f"{where}: test RMSE", *texts, met, _why_rmse(kind, structure, paper)))
             if structure == "orthogonal":
                 met = bool(np.allclose(rows.theta_error, LEAST_SQUARES, rtol=0, atol=5e-8))
