@@ -197,7 +197,8 @@ REPRODUCTION = Reproduction(
     "on the initial weights. Our solver trains it twice: with θ eliminated, that is solved for any weights, so that it "
     "never sees θ⁰; and from θ⁰, θ and weights together, as everybody does: then θ stays about as far from the truth "
     "as θ⁰ is (0.212). The other pipelines train it from θ⁰ only. θ of the orthogonal one depends on no start, and on "
-    "sets 2 and 3 it errs by what the measure leaves correlated: split under the uniform measure on [−0.6, 0.6], the same fits err by a thousandth of that.",
+    "sets 2 and 3 it errs by what the measure leaves correlated: split under the uniform measure on [−0.6, 0.6], the "
+    "same fits err by a thousandth of that.",
     study,
     figures,
     findings,
