@@ -173,9 +173,7 @@ def findings(table: pd.DataFrame) -> list[Finding]:
 
 def _converged(table: pd.DataFrame) -> Finding:
     done = int(table.converged.sum())
-    longest = int((table.iterations == table.iterations.max()).sum())
-    why = f"{span(table.iterations)} iterations; {longest} of the runs took the most"
-    return Finding("runs that converged", f"{done} of {len(table)}", why)
+    return Finding("runs that converged", f"{done} of {len(table)}", f"iterations of a run: {span(table.iterations)}")
 
 
 def _ends(table: pd.DataFrame) -> list[Finding]:

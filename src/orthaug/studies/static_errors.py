@@ -176,7 +176,7 @@ def _learner(table: pd.DataFrame) -> Figure:
         axis.set_xticks((-1.0, -0.5, 0.0, 0.5, 1.0))
         axis.set_title(_label(structure, table), fontsize=9)
     axes[0].set_ylabel("learner's part of y")
-    legend(figure, axes)
+    legend(figure, axes, ncols=2)
     return figure
 
 
