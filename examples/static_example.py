@@ -3,8 +3,8 @@
     python examples/static_example.py [picture.png]
 
 `y = 0.01 + u - 0.5 u² + 0.1 u³` is modelled as `θ1 u + θ3 u³` plus a network. Both structures fit the data
-to 1e-6; the additive one shares the odd part between physics and network as the initial weights please, the
-orthogonal one leaves to the network exactly what the physics cannot express.
+to 1e-6. The additive one, trained as is usual, from θ⁰ and with the weights, shares the odd part between physics and
+network as its start pleases; the orthogonal one leaves to the network exactly what the physics cannot express.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def estimates(example: oa.synthetic.Example) -> dict[str, list[oa.Estimate]]:
     """Each structure from every initialisation."""
     return {
         structure.name: [oa.estimate(example.train, example.baseline, structure=structure, seed=seed) for seed in SEEDS]
-        for structure in (oa.Additive(), oa.Orthogonal())
+        for structure in (oa.Additive(from_initial=True), oa.Orthogonal())
     }
 
 
@@ -64,6 +64,7 @@ def draw(example: oa.synthetic.Example, fits: dict[str, list[oa.Estimate]]) -> F
     for row, (name, color) in enumerate((("additive", ORANGE), ("orthogonal", BLUE))):
         thetas = np.array([fit.theta for fit in fits[name]])
         right.scatter(thetas[:, 0], thetas[:, 1], s=28, color=color, label=name, zorder=2 + row)
+    right.scatter(*example.baseline.initial, marker="x", s=60, color=BLACK, linewidth=1.2, label="θ⁰, start", zorder=5)
     right.scatter(*example.theta, marker="+", s=160, color=BLACK, linewidth=1.6, label="true", zorder=5)
     right.set_xlabel("estimated θ1")
     right.set_ylabel("estimated θ3")

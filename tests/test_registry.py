@@ -53,6 +53,7 @@ class Nearness:
 
     projects = False
     identifies = False
+    from_initial = False
     shared = "auto"
     measure = Training()
 

@@ -132,7 +132,7 @@ def test_values_are_the_stored_ones(found, references, name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("pipeline", ["ours", "paper"])
+@pytest.mark.parametrize("pipeline", ["ours", "paper", "scripts"])
 def test_the_full_size_is_larger_and_holds_the_reduced_axes(name, pipeline):
     entry = catalogue()[name]
     full, small = (entry.study(pipeline, reduced) for reduced in (False, True))
@@ -210,11 +210,15 @@ def by_quantity(found: list[Reproduced], name: str, start: str) -> Finding:
         ("static_errors", "set 2, no noise, orthogonal: ‖", True, True),
         ("static_errors", "set 3, no noise, orthogonal: ‖", True, True),
         ("static_errors", "set 3, no noise, uniform measure", None, None),
+        ("static_errors", "set 1, no noise, additive from θ⁰: ‖", True, True),
+        ("static_errors", "set 1, no noise, additive, θ eliminated: ‖", None, None),
+        ("static_errors", "set 1, no noise, additive, θ eliminated: test", None, None),
         ("static_noise", "set 1, 30 dB, orthogonal: ‖", True, True),
         ("covariance", "P̂ between θ and the weights: share of entries below 10⁻⁶ of the geometric", True, None),
         ("regularization_weight", "orthogonal: relative error", None, True),
         ("regularization_weight", "orthogonal-penalty, λ = 100", True, None),
         ("regularization_weight", "baseline-penalty, λ = 100", True, None),
+        ("regularization_weight", "runs that converged", None, None),
         ("coverage", "set 1, 30 dB, training measure", None, None),
         ("solver_times", "static example, Adam, then L-BFGS", None, None),
     ],
@@ -223,6 +227,15 @@ def test_what_no_sample_size_excuses(found, name, start, by_paper, by_scripts):
     finding = by_quantity(found, name, start)
     assert (finding.as_published, finding.as_scripts) == (by_paper, by_scripts)
     assert finding.beyond is (by_paper is None and by_scripts is None)
+
+
+def test_the_only_additive_structure_of_a_pipeline_is_compared_with_the_scripts(found):
+    """As both other pipelines have it, whose θ always starts at θ⁰."""
+    one = next(one for one in found if one.entry.name == "static_errors")
+    findings = one.entry.findings(one.table[one.table.structure != "additive-initial"])
+    alone = [finding for finding in findings if ", additive: " in finding.quantity]
+    assert len(alone) == 6 and all(finding.as_scripts is not None for finding in alone)
+    assert not any("eliminated" in finding.quantity for finding in findings)
 
 
 def test_the_uniform_measure_leaves_a_hundredth_of_the_error(found):
@@ -381,7 +394,7 @@ def test_runs_of_a_store_are_the_same_file_and_said_to_be_stored(found, page, st
 def test_a_second_run_reads_the_store(found, store, monkeypatch):
     (first,) = (one for one in found if one.entry.name == "static_errors")
     study = first.entry.study("ours", True)
-    monkeypatch.setattr("orthaug.studies.static_errors.estimate", lambda *a, **k: pytest.fail("it ran again"))
+    monkeypatch.setattr("orthaug.studies.static_errors.trained", lambda *a, **k: pytest.fail("it ran again"))
     again = run(study, store=store)
     assert again.test_rmse.tolist() == first.table.test_rmse.tolist()
 
@@ -395,7 +408,7 @@ def test_an_unknown_study_has_a_nearest_one(name, hint):
 
 
 def test_an_unknown_pipeline_is_refused():
-    with pytest.raises(InputError, match="--pipeline must be one of ours, paper; got 'nonsense'"):
+    with pytest.raises(InputError, match="--pipeline must be one of ours, paper, scripts; got 'nonsense'"):
         reproduce([], pipeline="nonsense")
 
 
@@ -413,7 +426,7 @@ def command(*arguments: str) -> list[str]:
     ("arguments", "message"),
     [
         (["static_error"], "did you mean 'static_errors'?"),
-        (["--pipeline", "nonsense"], "must be one of ours, paper"),
+        (["--pipeline", "nonsense"], "must be one of ours, paper, scripts"),
     ],
 )
 def test_refusals_of_the_command(tmp_path, arguments, message):

@@ -288,7 +288,9 @@ def schema(
 def reproduce(
     name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="One study; all without it.")] = None,
     out: OutFolder = None,
-    pipeline: Annotated[str, typer.Option("--pipeline", metavar="ours|paper", help="Who trains.")] = "ours",
+    pipeline: Annotated[
+        str, typer.Option("--pipeline", metavar="ours|paper|scripts", help="Who trains; scripts: as published.")
+    ] = "ours",
     small: Annotated[bool, typer.Option("--small", help="The reduced size that the tests run.")] = False,
 ) -> None:
     """The paper's figures and tables, each number beside the published one; goes on where it was interrupted."""

@@ -17,9 +17,10 @@ from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.elimination import Elimination, Fixed, eliminate
 from orthaug.fitting.learned import Learned
 from orthaug.fitting.normal_equations import Blocks, Hold, Normal, OneStep, Streamed, linearise
-from orthaug.fitting.paper_criterion import PaperCriterion, Physics
+from orthaug.fitting.paper_criterion import JointOneStep, PaperCriterion, Physics
 from orthaug.fitting.rules import ridge_of
 from orthaug.fitting.solvers import compiled
+from orthaug.fitting.solvers.adam_lbfgs import GradientRun
 from orthaug.fitting.solvers.descent import IDENTITY
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Orthogonal, Structure
@@ -132,14 +133,15 @@ class OneStepTask:
         matrix, target = elimination.hold(fixed)
         hold = Hold(jnp.asarray(matrix), jnp.asarray(target / self.rms))
         ridge, evidence = ridge_of(regularization)
-        if solver.gauss_newton:
+        if solver.gauss_newton and not structure.from_initial:
             return self._least_squares(solver, w, hold, ridge, evidence, progress)
-        if evidence or not self.engine.resident:
-            what = "evidence regularization" if evidence else "training on rows that are not in memory"
-            raise InputError(f"{what} needs the Gauss-Newton matrix of the levenberg-marquardt solver.")
+        self._check_joint(solver, ridge, evidence)
         physics = Physics.of(self.problem, elimination, fixed, ridge, self.rms, solved=structure.projects)
-        joint = PaperCriterion(self.bound, structure.projects)
-        end = solver.minimise(joint, w, self.rows, physics, progress=progress)
+        if solver.gauss_newton:
+            end = self._joint_least_squares(solver, w, physics, progress)
+        else:
+            joint = PaperCriterion(self.bound, structure.projects)
+            end = solver.minimise(joint, w, self.rows, physics, progress=progress)
         normal = linearise(OneStep(self.bound), end.w, (self.rows, hold), self._nothing)
         coordinates = np.asarray(physics.start + physics.basis @ end.v) * self.rms
         coefficients = None if structure.projects else self.problem.projection.from_coordinates(coordinates)
@@ -147,6 +149,25 @@ class OneStepTask:
         return compiled.TrainingRun(
             end.w, normal, ridge, effective, end.iterations, end.ending, end.seconds, coefficients
         )
+
+    def _check_joint(self, solver: Any, ridge: float, evidence: bool) -> None:
+        """Raise InputError for what needs θ to be solved, or the solver to see normal equations."""
+        if solver.gauss_newton and (ridge or not self.engine.resident):  # evidence starts with a ridge
+            what = "regularization" if ridge else "training on rows that are not in memory"
+            raise InputError(f"{what} needs a solved θ; leave out `from_initial`, which trains θ from θ⁰.")
+        if evidence or not self.engine.resident:
+            what = "evidence regularization" if evidence else "training on rows that are not in memory"
+            raise InputError(f"{what} needs the Gauss-Newton matrix of the levenberg-marquardt solver.")
+
+    def _joint_least_squares(self, solver: Any, w: Any, physics: Physics, progress: RunTell) -> GradientRun:
+        """Levenberg-Marquardt over θ, from θ⁰, and the weights together."""
+        assert self.bound is not None
+        nt = len(physics.outputs)
+        nothing = Overlap(jnp.zeros((nt, nt + self.bound.size)), jnp.zeros(nt))
+        unknowns = jnp.concatenate([jnp.zeros(nt), w])
+        options: dict[str, Any] = {"samples": self.problem.target.size, "progress": progress}
+        end = solver.minimise(JointOneStep(self.bound), unknowns, (self.rows, physics), nothing, **options)
+        return GradientRun(end.w[:nt], end.w[nt:], end.iterations, end.ending, end.seconds)
 
     def _least_squares(
         self, solver: Any, w: Any, hold: Hold, ridge: float, evidence: bool, progress: RunTell

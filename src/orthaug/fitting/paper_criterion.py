@@ -1,4 +1,4 @@
-"""The paper's own criterion: of θ and the learner's weights together, for gradient solvers."""
+"""The paper's own criterion: of θ and the learner's weights together, as a value and as normal equations."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from jaxtyping import Float
 
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.fitting.elimination import Elimination, Fixed
+from orthaug.fitting.normal_equations import Blocks, Normal
 from orthaug.models.learners import Bound
-from orthaug.models.rows import Chunk, row_sum
+from orthaug.models.rows import Chunk, Overlap, row_sum
 from orthaug.physics.problem import Problem
 
 
@@ -89,3 +90,29 @@ class PaperCriterion:
         row_values = jax.vmap(self.bound.values, in_axes=(None, -1), out_axes=-1)
         values = jnp.sum(chunk.gain * row_values(w, chunk.z), axis=1)
         return jnp.sum((chunk.e - values) ** 2), jnp.einsum("ytm,ym->t", chunk.q, values)
+
+
+@dataclass(frozen=True)
+class JointOneStep:
+    """One-step prediction error `‖Y − Φθ − F‖²` over p = (v, w), θ's unknowns and the weights, as normal equations."""
+
+    bound: Bound
+
+    def __call__(self, p: Float[Array, "n"], rows: Chunk, physics: Physics, before: Overlap) -> Normal:
+        nt = len(physics.outputs)
+        v, w = p[:nt], p[nt:]
+        known = Overlap(before.jacobian[:, nt:], before.values)  # of QᵀJ and QᵀF, subtracted from the rows
+        blocks = Blocks(self.bound)
+        total = row_sum(lambda chunk: blocks(chunk, w, known), rows)
+        g_qr, g_qj = total[:nt, nt], total[:nt, nt + 1 :]
+        g_rr, g_jr, g_jj = total[nt, nt], total[nt + 1 :, nt], total[nt + 1 :, nt + 1 :]
+        share = Overlap(known.jacobian + g_qj, known.values - g_qr)
+        miss = physics.outputs - physics.start - physics.basis @ v - share.values  # Qᵀ(Y − Φθ − F)
+        slope = jnp.concatenate([physics.basis, share.jacobian], axis=1)  # Qᵀ of all columns
+        inner = jnp.pad(g_jj - g_qj.T @ g_qj, ((nt, 0), (nt, 0)))  # and what is orthogonal to Q
+        return Normal(
+            hessian=inner + slope.T @ slope,
+            gradient=jnp.pad(g_jr - g_qj.T @ g_qr, (nt, 0)) + slope.T @ miss,
+            loss=jnp.maximum(g_rr - g_qr @ g_qr, 0.0) + miss @ miss,
+            overlap=Overlap(jnp.pad(share.jacobian, ((0, 0), (nt, 0))), share.values),
+        )

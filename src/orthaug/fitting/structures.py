@@ -16,7 +16,7 @@ import numpy as np
 from annotated_types import Ge
 from jaxtyping import Float
 
-from orthaug._base.checks import Vector
+from orthaug._base.checks import Vector, check_type
 from orthaug._base.errors import InputError
 from orthaug._base.registry import LIBRARY_ONLY, check_fields
 from orthaug.inference.measures import Measure, Training
@@ -45,6 +45,11 @@ class Structure(Protocol):
     @property
     def identifies(self) -> bool:
         """Whether the data alone determine θ where nothing is learned."""
+        ...
+
+    @property
+    def from_initial(self) -> bool:
+        """Whether one-step training takes θ from θ⁰ beside the weights; otherwise it solves θ for any weights."""
         ...
 
     @property
@@ -79,6 +84,7 @@ class Orthogonal:
 
     projects = True
     identifies = True
+    from_initial = False
 
     measure: Measure = field(default=Training(), metadata=LIBRARY_ONLY)  # noqa: RUF009  (frozen)
     shared: Literal["auto", "all"] = "auto"
@@ -90,13 +96,22 @@ class Orthogonal:
 
 @dataclass(frozen=True)
 class Additive:
-    """ŷ = φθ + f (eqs:additive_struct): θ takes what this learner happens to leave, so it is not unique."""
+    """ŷ = φθ + f (eqs:additive_struct): θ takes what this learner happens to leave, so it is not unique.
 
-    name: str = field(default="additive", metadata=LIBRARY_ONLY)
+    With `from_initial` θ starts at θ⁰ and is trained with the weights, one step ahead; without, it is solved for any
+    weights and never sees θ⁰.
+    """
+
     projects = False
     identifies = True
     measure = Training()
     shared = "auto"
+
+    from_initial: bool = False
+    name: str = field(default="additive", metadata=LIBRARY_ONLY)
+
+    def __post_init__(self) -> None:
+        check_type(self.from_initial, bool, "from_initial", "true or false")
 
     def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> PenaltyRows:
         return _no_rows(len(names))
@@ -111,6 +126,7 @@ class OrthogonalPenalty:
 
     projects = False
     identifies = True
+    from_initial = False
     measure = Training()
     shared = "auto"
 
@@ -134,6 +150,7 @@ class BaselinePenalty:
 
     projects = False
     identifies = False
+    from_initial = False
     measure = Training()
     shared = "auto"
 

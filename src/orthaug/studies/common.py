@@ -10,10 +10,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from orthaug.data.record import Record
+from orthaug.fitting.estimates import Estimate
+from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import Additive, Orthogonal
+from orthaug.fitting.structures import Additive, Orthogonal, Structure
 from orthaug.inference.measures import Samples
+from orthaug.studies import published
 from orthaug.studies.synthetic import NOISE_30_DB, Example, static
 
 if TYPE_CHECKING:
@@ -25,30 +28,62 @@ if TYPE_CHECKING:
 COLOURS = {
     "orthogonal": "#0072B2",
     "additive": "#E69F00",
+    "additive-initial": "#56B4E9",
     "uniform": "#009E73",
     "truth": "#000000",
     "orthogonal-penalty": "#CC79A7",
     "baseline-penalty": "#D55E00",
 }
-MARKERS = {"orthogonal": "o", "additive": "s", "uniform": "^", "orthogonal-penalty": "D", "baseline-penalty": "v"}
+MARKERS = {
+    "orthogonal": "o",
+    "additive": "s",
+    "additive-initial": "P",
+    "uniform": "^",
+    "orthogonal-penalty": "D",
+    "baseline-penalty": "v",
+}
 LABELS = {
     "orthogonal": "orthogonal",
     "additive": "additive",
+    "additive-initial": "additive from θ⁰",
     "uniform": "orthogonal, uniform measure",
     "orthogonal-penalty": "orthogonal penalty",
     "baseline-penalty": "baseline penalty",
 }
-STRUCTURES = {"orthogonal": Orthogonal(), "additive": Additive()}
+ORTHOGONAL = Orthogonal()
+STRUCTURES = {"orthogonal": ORTHOGONAL, "additive": Additive()}
 PIPELINES = {"static": (500, 1000), "mass_spring_damper": (2500, 500)}  # the paper's Adam and L-BFGS iterations
-LARGEST_TRAINED = {"ours": 65_536, "paper": 16_384}  # samples up to which a learner is trained: the run is to end
+LARGEST_TRAINED = {
+    "ours": 65_536,
+    "paper": 16_384,
+    "scripts": 4096,
+}  # samples up to which a learner is trained: the run is to end
 _NODES = np.polynomial.legendre.leggauss(64)
 UNIFORM = Samples({"u[k]": 0.6 * _NODES[0]}, weights=_NODES[1], name="uniform")
 """Uniform on [−0.6, 0.6]: `measures.Uniform` with fewer nodes, which changes no digit shown and is quicker."""
 
 
-def solver(pipeline: str, example: str, iterations: int = 300) -> Any:
-    """Our solver, or the paper's pipeline with its iterations for an example."""
-    return AdamLBFGS(*PIPELINES[example]) if pipeline == "paper" else LevenbergMarquardt(iterations)
+def trained(
+    example: Example,
+    which: str,
+    pipeline: str,
+    *,
+    structure: Structure = ORTHOGONAL,
+    seed: int = 0,
+    iterations: int = 300,
+    regularization: str = "none",
+) -> Estimate:
+    """One fit of an example by a pipeline; `which` names the paper's iterations.
+
+    Args:
+        pipeline: "ours", Levenberg-Marquardt with `iterations` and `regularization`; "paper", Adam and L-BFGS on
+            normalised data; "scripts", the published scripts' own.
+    """
+    if pipeline == "scripts":
+        return published.train(example, structure, PIPELINES[which], seed)
+    solver = AdamLBFGS(*PIPELINES[which]) if pipeline == "paper" else LevenbergMarquardt(iterations)
+    options: dict[str, Any] = {"structure": structure, "solver": solver, "regularization": regularization}
+    return estimate(example.train, example.baseline, seed=seed, **options)
 
 
 def drawn(data_set: int, *, samples: int = 1024, draw: int = 0, noise: bool = False) -> Example:

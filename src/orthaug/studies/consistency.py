@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from orthaug.fitting.estimation import estimate
-from orthaug.fitting.structures import Additive
 from orthaug.studies.common import (
     LARGEST_TRAINED,
+    STRUCTURES,
     UNIFORM,
     drawn,
     extremes,
@@ -19,8 +19,8 @@ from orthaug.studies.common import (
     pick,
     signed,
     slope,
-    solver,
     span,
+    trained,
     whiskers,
 )
 from orthaug.studies.data_length import limit
@@ -41,12 +41,10 @@ def one(data_set: int, samples: int, curve: str, run: int, pipeline: str) -> dic
         fit = estimate(example.train, example.baseline, learner=None)
     else:
         # evidence for the uniform measure, which looks at the learner; the additive structure as published
-        prior = "evidence" if curve == "uniform" and pipeline != "paper" else "none"
-        iterations = 100 if samples < 10_000 else 50
-        options = {"solver": solver(pipeline, "static", iterations), "regularization": prior, "seed": run}
-        if curve == "additive":
-            options["structure"] = Additive()
-        fit = estimate(example.train, example.baseline, **options)
+        prior = "evidence" if curve == "uniform" and pipeline == "ours" else "none"
+        structure = STRUCTURES["additive" if curve == "additive" else "orthogonal"]
+        options = {"structure": structure, "iterations": 100 if samples < 10_000 else 50, "regularization": prior}
+        fit = trained(example, "static", pipeline, seed=run, **options)
         if curve == "uniform":
             fit = fit.split(UNIFORM)
             price = fit.measure.price if fit.measure is not None else None
@@ -143,8 +141,8 @@ REPRODUCTION = Reproduction(
     "Ten runs for each N, each with its own record and initial weights (run 0 has the paper's record). "
     "The paper varies the initial weights only, which moves the additive structure alone. θ under "
     "the training measure is least squares and needs no learner; trained curves end at N = "
-    f"{LARGEST_TRAINED['ours']}, or {LARGEST_TRAINED['paper']} by the paper's pipeline. Under the uniform measure our "
-    "solver trains with evidence regularization, the paper's without any.",
+    f"{LARGEST_TRAINED['ours']}, {LARGEST_TRAINED['paper']} by the paper's pipeline and {LARGEST_TRAINED['scripts']} "
+    "by the scripts'. Under the uniform measure our solver trains with evidence regularization, the others with none.",
     study,
     figures,
     findings,

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orthaug.fitting.estimation import estimate
-from orthaug.studies.common import panels, solver
+from orthaug.studies.common import panels, trained
 from orthaug.studies.entry import Drawing, Finding, Reproduction
 from orthaug.studies.study import Study
 from orthaug.studies.synthetic import static
@@ -21,8 +20,7 @@ ZERO = 1e-6  # what is shown in black; in the paper in absolute value
 
 def one(seed: int, pipeline: str) -> dict[str, Any]:
     """P̂ of eq:cov_approx for one start, as it stands and as correlations; θ's standard errors in both conventions."""
-    example = static(1, noise=True)
-    fit = estimate(example.train, example.baseline, solver=solver(pipeline, "static"), seed=seed)
+    fit = trained(static(1, noise=True), "static", pipeline, seed=seed)
     matrix = fit.joint_covariance("paper") * len(fit.problem.rows)
     nt, deviation = len(fit.theta), np.sqrt(np.maximum(np.diag(matrix), 0.0))
     product = np.outer(deviation, deviation)  # 0 for a weight that the data do not see

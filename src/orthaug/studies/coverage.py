@@ -58,7 +58,7 @@ def one(data_set: int, draw: int) -> dict[str, Any]:
 
 
 def study(pipeline: str, small: bool) -> Study:
-    """Data sets × draws of the noise; intervals belong to a converged fit, so both pipelines share these runs."""
+    """Data sets × draws of the noise; intervals belong to a converged fit, so all pipelines share these runs."""
     return Study("coverage", one, {"data_set": (1, 3), "draw": range(8 if small else 400)})
 
 
@@ -134,7 +134,7 @@ REPRODUCTION = Reproduction(
     "coverage",
     "Do the intervals hold?",
     "Repeated draws of 30 dB noise on the paper's inputs, trained on from the noiseless fit with a ridge of 1e-4, by "
-    "Levenberg-Marquardt under either pipeline. An interval promises 95 %: θ's own under the training measure, the "
+    "Levenberg-Marquardt under every pipeline. An interval promises 95 %: θ's own under the training measure, the "
     "same with the paper's covariance, and θ's under the uniform measure.",
     study,
     figures,

@@ -19,7 +19,7 @@ from orthaug.studies.common import (
     pick,
     signed,
     slope,
-    solver,
+    trained,
     whiskers,
 )
 from orthaug.studies.entry import Drawing, Finding, Reproduction
@@ -38,7 +38,7 @@ def one(data_set: int, samples: int, measure: str, draw: int, pipeline: str) -> 
     if measure == "training":
         fit = estimate(example.train, example.baseline, learner=None)
     else:
-        fit = estimate(example.train, example.baseline, solver=solver(pipeline, "static", 100)).split(UNIFORM)
+        fit = trained(example, "static", pipeline, iterations=100).split(UNIFORM)
     return {"theta": fit.theta, "theta_error": float(np.linalg.norm(fit.theta - example.theta))}
 
 
@@ -135,7 +135,7 @@ REPRODUCTION = Reproduction(
     "Ten records for each N; the paper shows one, dotted in the figure. θ under the "
     "training measure is least squares whatever the learner does, so those runs have no learner; only the uniform "
     f"measure needs training, on {TRAINED_DRAWS} records of up to {LARGEST_TRAINED['ours']} samples "
-    f"({LARGEST_TRAINED['paper']} by the paper's pipeline).",
+    f"({LARGEST_TRAINED['paper']} by the paper's pipeline, {LARGEST_TRAINED['scripts']} by the scripts').",
     study,
     figures,
     findings,

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 PIPELINES = {  # name, and how the page says who trained
     "ours": "trained by Levenberg-Marquardt",
     "paper": "with the paper's own training: Adam, then L-BFGS",
+    "scripts": "as the published scripts train: un-normalised, from θ⁰, with their seeds",
 }
 HYPHEN = "\N{NON-BREAKING HYPHEN}"  # a line of the page never ends within 1e-6
 WIDTH = 100  # characters of a line in a terminal
@@ -76,7 +77,8 @@ def reproduce(
     """Run the studies; what a store holds already is not run again.
 
     Args:
-        pipeline: "ours", or "paper" for Adam and L-BFGS with the published iterations.
+        pipeline: "ours", "paper" for Adam and L-BFGS with the published iterations on normalised data, or "scripts"
+            for what the published scripts do, un-normalised and from θ⁰.
         small: at the reduced size of the tests.
         store: where results are kept as they are made; None for the user's cache folder.
     """

@@ -56,7 +56,7 @@ def one(example: str, solver: str, share: float, seed: int) -> dict[str, Any]:
 
 
 def study(pipeline: str, small: bool) -> Study:
-    """Examples × solvers × shares of the iterations × starts, one after the other; the same under either pipeline."""
+    """Examples × solvers × shares of the iterations × starts, one after the other; the same under every pipeline."""
     grid = {
         "example": ("static",) if small else tuple(EXAMPLES),
         "solver": tuple(SOLVERS)[:2] if small else tuple(SOLVERS),

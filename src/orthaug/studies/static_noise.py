@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orthaug.fitting.estimation import estimate
 from orthaug.studies import references
 from orthaug.studies.common import (
     COLOURS,
@@ -18,8 +17,8 @@ from orthaug.studies.common import (
     legend,
     panels,
     pick,
-    solver,
     span,
+    trained,
 )
 from orthaug.studies.entry import Drawing, Finding, Reproduction
 from orthaug.studies.study import Study
@@ -36,10 +35,9 @@ TEST_SAMPLES = 1024
 def one(structure: str, regularization: str, seed: int, pipeline: str) -> dict[str, Any]:
     """One start: θ and its error, test RMSE, effective weights; "stopping" is after 50 iterations."""
     example, stopped = static(1, noise=True), regularization == "stopping"
-    chosen = solver(pipeline, "static", 50 if stopped else 300)
-    prior = "none" if stopped else regularization
-    options = {"structure": STRUCTURES[structure], "regularization": prior, "seed": seed}
-    fit = estimate(example.train, example.baseline, solver=chosen, **options)
+    prior, iterations = ("none", 50) if stopped else (regularization, 300)
+    options = {"structure": STRUCTURES[structure], "regularization": prior, "iterations": iterations}
+    fit = trained(example, "static", pipeline, seed=seed, **options)
     return {
         "theta": fit.theta,
         "theta_error": float(np.linalg.norm(fit.theta - example.theta)),
@@ -49,8 +47,8 @@ def one(structure: str, regularization: str, seed: int, pipeline: str) -> dict[s
 
 
 def study(pipeline: str, small: bool) -> Study:
-    """Structures × regularizations × starts; the gradient pipeline has no evidence."""
-    kinds = ("none",) if pipeline == "paper" else ("none", "stopping", "evidence")
+    """Structures × regularizations × starts; the gradient pipelines have no evidence."""
+    kinds = ("none",) if pipeline != "ours" else ("none", "stopping", "evidence")
     seeds = range(2) if small else range(10)
     grid = {"structure": tuple(STRUCTURES), "regularization": kinds, "seed": seeds, "pipeline": (pipeline,)}
     return Study("static_noise", one, grid)
