@@ -84,7 +84,9 @@ def findings(table: pd.DataFrame) -> list[Finding]:
             compared.append(Finding(f"{where}: test RMSE", *texts, met, _why_rmse(kind, structure, paper)))
             if structure == "orthogonal":
                 met = bool(np.allclose(rows.theta_error, LEAST_SQUARES, rtol=0, atol=5e-8))
-                why = "exact least squares for every start; the scripts end within 1e-6 of it"
+                iterated = bool((rows.pipeline == "scripts").any())
+                why = "exact least squares for every start; the scripts end within 1.1e-5 of it"
+                why = "θ is iterated here, so it ends near least squares, not at it" if iterated else why
                 texts = (f"{error:.2g}", f"{scripts_error:.5g}", f"{rows.theta_error.mean():.5g}")
             else:
                 met = bool(rows.theta_error.min() <= error <= rows.theta_error.max())
