@@ -3,7 +3,7 @@
     python examples/static_example.py [picture.png]
 
 `y = 0.01 + u - 0.5 u² + 0.1 u³` is modelled as `θ1 u + θ3 u³` plus a network. Both structures fit the data
-to 1e-6. The additive one, trained as is usual, from θ⁰ and with the weights, shares the odd part between physics and
+to 3e-6. The additive one, trained as is usual, from θ⁰ and with the weights, shares the odd part between physics and
 network as its start pleases; the orthogonal one leaves to the network exactly what the physics cannot express.
 """
 
