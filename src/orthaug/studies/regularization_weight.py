@@ -110,7 +110,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
             "penalties against their weight λ; the orthogonal structure, which has no weight, is the horizontal line.",
             "Marks are medians over initial weights; bars and the band go from the smallest to the largest. A cross "
             "with a bar is the mean of the scripts, from their smallest to their largest run; of the free run there "
-            "is none. The axes of errors are logarithmic but for the last, whose values lie within a few per cent. "
+            "is none. The axes of errors are logarithmic but for the last. "
             "Curves are shifted sideways, so that the bars can be told apart.",
         )
     }
