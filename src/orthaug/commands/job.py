@@ -141,6 +141,7 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
         baseline, learner_inputs, physics = spec.declared_baseline(), spec.learner_inputs(), spec.physics_map()
         if physics is not None:
             baseline = with_initial(physics, baseline)
+        baseline.check_initial()
         check_channels(spec.channels(spec.data.inputs), spec.channels(spec.data.outputs))
         structure_of(spec).penalty(baseline.names, baseline.initial, 1.0)
         baseline.check_channels(spec.data.outputs, spec.data.inputs)

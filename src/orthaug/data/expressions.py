@@ -31,7 +31,9 @@ class Lag(NamedTuple):
         return f"{self.channel}[k-{self.lag}]" if self.lag else f"{self.channel}[k]"
 
 
-FUNCTIONS = tuple("sin cos tan atan atan2 exp log sqrt abs sign floor tanh min max".split())
+_OF_ONE = ("sin", "cos", "tan", "atan", "exp", "log", "sqrt", "abs", "sign", "floor", "tanh")
+_OF_MANY = ("min", "max")
+FUNCTIONS = (*_OF_ONE, "atan2", *_OF_MANY)
 _ELSEWHERE = {"atan": "arctan", "atan2": "arctan2"}  # as NumPy and JAX call them, where that is another name
 RESERVED = frozenset((*FUNCTIONS, "k"))
 LARGEST_LAG = 100_000  # more is a mistake, and would fill the memory
@@ -175,7 +177,7 @@ def _check_call(node: ast.Call, text: str) -> None:
         raise InputError(
             f"'{text}': unknown function '{name}'{nearest(name, FUNCTIONS)}; known are {', '.join(FUNCTIONS)}."
         )
-    many, exact = name in ("min", "max"), 2 if name == "atan2" else 1
+    many, exact = name in _OF_MANY, 1 if name in _OF_ONE else 2
     wanted = "two or more arguments" if many else "two arguments" if exact == 2 else "one argument"
     if (len(node.args) < 2) if many else (len(node.args) != exact):
         raise InputError(f"'{text}': {name} takes {wanted}, got {len(node.args)}.")

@@ -18,7 +18,7 @@ from annotated_types import Ge
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, shown
 from orthaug._base.jax import Array, jax, jnp
 from orthaug._base.registry import OneOf, check_fields
 
@@ -78,14 +78,14 @@ class MLP:
 
     def __post_init__(self) -> None:
         if not isinstance(self.hidden, tuple | list):
-            raise InputError(f"`hidden` must be a tuple of neurons per layer, such as (16,); got {self.hidden!r}.")
+            raise InputError(f"`hidden` must be a tuple of neurons per layer, such as (16,); got {shown(self.hidden)}.")
         if isinstance(self.inputs, str):
             raise InputError(f"`inputs` must be a tuple of expressions, such as ('{self.inputs}',); got one text.")
         object.__setattr__(self, "hidden", tuple(self.hidden))
         if self.inputs is not None:
             object.__setattr__(self, "inputs", tuple(self.inputs))
         if any(isinstance(n, bool) or not isinstance(n, int) or n < 1 for n in self.hidden):
-            raise InputError(f"`hidden` must be whole numbers of neurons, 1 or more; got {self.hidden}.")
+            raise InputError(f"`hidden` must be whole numbers of neurons, 1 or more; got {shown(self.hidden)}.")
         check_fields(self)
 
     def init(self, key: Array, nz: int, ny: int) -> Tree:

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.checks import Matrix, Vector, check_unique, is_number, nearest
+from orthaug._base.checks import Matrix, Vector, check_label, check_unique, is_number, nearest
 from orthaug._base.errors import InputError, shown
 from orthaug.data.expressions import FUNCTIONS, RESERVED, Expression, is_name, parse
-from orthaug.physics.baseline import Baseline
+from orthaug.physics.baseline import Baseline, check_bounds
 from orthaug.physics.excitation import Excitation, excitation
 
 AGREEMENT = 1e-6  # relative difference up to which a term's `initial` is what the physics gives
@@ -44,7 +44,6 @@ _COMPLEX = SimpleNamespace(
     maximum=lambda a, b: np.where(np.real(a) >= np.real(b), a, b),
     **{name: getattr(np, name) for name in ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh")},
 )
-
 
 
 @dataclass(frozen=True)
@@ -207,10 +206,8 @@ def _check_parameters(parameters: Sequence[PhysicalParameter], constants: Mappin
             raise InputError(f"'{p.name}' is a physical parameter and a constant; give one of them another name.")
         if not is_number(p.initial):
             raise InputError(f"the initial value of '{p.name}' must be a finite number; got {shown(p.initial)}.")
-        if any(isinstance(b, bool) or not isinstance(b, int | float | np.number) for b in (p.min, p.max)):
-            raise InputError(f"the bounds of '{p.name}' must be numbers; got min = {shown(p.min)}, max = {shown(p.max)}.")
-        if not p.min < p.max:
-            raise InputError(f"the bounds of '{p.name}' are empty or reversed: min = {p.min:g}, max = {p.max:g}.")
+        check_label(p.unit, f"the unit of '{p.name}'")
+        check_bounds(p.name, p.min, p.max)
         if not p.min <= p.initial <= p.max:
             raise InputError(
                 f"the initial value of '{p.name}' is {p.initial:g}; its bounds are {p.min:g} and {p.max:g}."
