@@ -115,6 +115,9 @@ def _read_text(path: Path, columns: Sequence[str]) -> Table:
         )[[*place.values(), beyond]]
 
     try:
+        commas = separator == ";" and _DECIMAL_COMMA.search(path.read_text(encoding="utf-8-sig")) is not None
+        if commas:
+            raise ValueError("decimal commas are read as text")
         types = dict.fromkeys((*place.values(), beyond), np.float64)
         frame = read(dtype=types, na_values=[""], float_precision="round_trip")
         texts, held = None, frame.notna()
@@ -125,7 +128,6 @@ def _read_text(path: Path, columns: Sequence[str]) -> Table:
             if "found 0" in str(error) or isinstance(error, pd.errors.EmptyDataError):
                 raise InputError(f"{path}: there are no data rows below the header.") from None
             raise InputError(f"{path}: not a readable table ({short(error)}).") from None
-        commas = separator == ";" and _DECIMAL_COMMA.search(path.read_text(encoding="utf-8-sig")) is not None
         number = _comma_number if commas else text_number
         frame = texts.apply(lambda column: column.map(number))
         held = texts != ""
@@ -223,7 +225,8 @@ def _read_variables(path: Path, columns: Sequence[str]) -> Table:
 
 def _full(path: Path, columns: Mapping[str, Vector]) -> Table:
     """A table of a file type that has no empty cells."""
-    return Table(path, columns, {name: len(values) for name, values in columns.items()})
+    filled = {name: len(values) for name, values in columns.items()}
+    return Table(path, columns, filled, cell=lambda column, row: str(columns[column][row]))
 
 
 def _as_floats(array: np.ndarray, name: str, path: Path) -> Vector:
