@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Matrix, as_signal, check_label, check_type, check_unique, is_number
-from orthaug._base.errors import LONGEST, InputError, shown
+from orthaug._base.errors import LONGEST, InputError, shown, visible
 from orthaug.data.expressions import RESERVED, is_name
 
 _LONGEST_STEP = 1e12  # s; a longer one overflows somewhere in a time axis
@@ -124,7 +124,7 @@ class Experiment:
         """`run.csv: line 17 (row 15)` for a row of this experiment, as much of it as is known."""
         row = self.first_row + self.stride * row
         place = f"row {row}" if self.first_line is None else f"line {self.first_line + row} (row {row})"
-        return f"{self.source}: {place}" if self.source else place
+        return f"{visible(self.source)}: {place}" if self.source else place
 
     def rows(self, start: int | None, stop: int | None) -> Experiment:
         """The half-open range of rows `[start, stop)` as an experiment of its own."""

@@ -18,6 +18,7 @@ from orthaug._base.progress import SILENT, Tell
 from orthaug.data.record import Record
 from orthaug.data.regressors import Features, Lags
 from orthaug.fitting.conclusion import conclude
+from orthaug.fitting.cost import check_cost
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.estimates import Estimate, Restart
 from orthaug.fitting.free_run import FreeRunTask
@@ -150,6 +151,9 @@ def fit(
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
     check_starts(restarts if initial is None else 1, seed, ensemble=ensemble)
     check_solver(solver, criterion, () if learner is None else choices)
+    if initial is None:
+        sizes = {"rows": len(problem.rows), "features": len(problem.features.entries), "outputs": len(problem.outputs)}
+        check_cost(learner, **sizes, iterations=solver.iterations, runs=restarts * len(choices))
     problem = replace(problem, features=Features(())) if learner is None and initial is None else problem
     warm = None
     if initial is not None:

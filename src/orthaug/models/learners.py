@@ -35,6 +35,7 @@ ACTIVATIONS: dict[str, Callable[[Any], Any]] = {
     "identity": lambda a: a,
 }
 """By name. They call JAX only when they are called, so that a spec is read without it."""
+MOST_LAYERS = 10  # hidden ones; ten take half a minute to compile
 _GAIN = {"tanh": 5 / 3, "relu": math.sqrt(2.0)}  # Xavier gains; 1 for the others
 
 
@@ -86,7 +87,16 @@ class MLP:
             object.__setattr__(self, "inputs", tuple(self.inputs))
         if any(isinstance(n, bool) or not isinstance(n, int) or n < 1 for n in self.hidden):
             raise InputError(f"`hidden` must be whole numbers of neurons, 1 or more; got {shown(self.hidden)}.")
+        if len(self.hidden) > MOST_LAYERS:
+            raise InputError(
+                f"`hidden` has {len(self.hidden)} layers; at most {MOST_LAYERS} are taken: more compile for minutes."
+            )
         check_fields(self)
+
+    def weights(self, nz: int, ny: int) -> int:
+        """How many weights it has for `nz` features and `ny` outputs."""
+        sizes = (nz, *self.hidden, ny)
+        return sum((fan_in + 1) * fan_out for fan_in, fan_out in zip(sizes, sizes[1:], strict=False))
 
     def init(self, key: Array, nz: int, ny: int) -> Tree:
         sizes = (nz, *self.hidden, ny)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Matrix, Vector, as_signal, check_count
+from orthaug._base.checks import Matrix, Vector, as_signal, check_count, check_type
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, jnp, padded_length
 from orthaug.data.record import Channel, Experiment, Record, same_step
@@ -208,6 +208,8 @@ class Model:
         Raises:
             InputError: a channel is missing, or the sampling time differs by more than 0.1 %.
         """
+        wanted = f"a Record, such as Record.from_arrays(u=u, sampling_time={self.sampling_time:g})"
+        check_type(record, Record, "record", wanted)
         if not same_step(record.sampling_time, self.sampling_time):
             raise InputError(
                 f"the record is sampled every {record.sampling_time:g} s, the model every {self.sampling_time:g} s; "
