@@ -28,7 +28,7 @@ def as_signal(values: Any, name: str) -> Matrix:
         if np.iscomplexobj(array):
             raise InputError(f"`{name}` is complex; expected real numbers.")
         array = np.array(array, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"`{name}` is not an array of numbers: {error}.") from None
     if array.ndim == 1:
         array = array[:, None]

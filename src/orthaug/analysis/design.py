@@ -142,7 +142,7 @@ def design_input(
 def _numbers(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
     try:
         numbers = np.broadcast_to(np.asarray(values, dtype=float), shape)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = np.array(math.nan)
     if not np.all(np.isfinite(numbers)):
         raise InputError(f"`{name}` must be finite numbers of shape {shape}, or a single one.")
@@ -157,7 +157,11 @@ def _weights(weights: Any, plant: Plant) -> Matrix:
             zero = plant.names[int(np.argmin(np.abs(plant.theta)))]
             raise InputError(f"θ of {zero} is 0, so that its relative error has no meaning; give `weights`.")
         weights = 1 / np.abs(plant.theta)
-    matrix = _numbers(weights, np.shape(weights) if np.ndim(weights) == 2 else (nt,), "weights")
+    try:
+        shape = np.shape(weights)
+    except ValueError:  # rows of unequal lengths
+        shape = ()
+    matrix = _numbers(weights, shape if len(shape) == 2 else (nt,), "weights")
     if matrix.shape[-1] != nt or not matrix.any():
         raise InputError(f"`weights` must be of shape ({nt},) or (m, {nt}), and not all 0.")
     return np.diag(matrix) if matrix.ndim == 1 else matrix

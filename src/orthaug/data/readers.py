@@ -88,7 +88,8 @@ def read_record(
                 f"{path}: column '{time}' steps by {step:g} s in one row range and by {other:g} s in another."
             )
     left_out = recorded - sum(len(experiment) for experiment in experiments)
-    return Record(tuple(channels[0]), tuple(channels[1]), step * every, tuple(experiments), time, left_out)
+    step *= min(every, 10**15)  # what is longer is refused
+    return Record(tuple(channels[0]), tuple(channels[1]), step, tuple(experiments), time, left_out)
 
 
 def read_samples(
@@ -158,7 +159,7 @@ def _check_time(time: Any, sampling_time: Any, outputs: Mapping[str, str]) -> No
 
 
 def _listed(value: Any) -> bool:
-    return isinstance(value, list | tuple | np.ndarray)
+    return isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim > 0)
 
 
 def _whole(value: Any) -> bool:
@@ -169,10 +170,10 @@ def _ranges(rows: RowRange | Sequence[RowRange] | None, total: int, path: Path) 
     """Half-open ranges of rows, each checked against the file."""
     if rows is None:
         return [(0, total)]
-    pairs: list = list(rows) if _listed(rows) else [rows]
+    pairs: list = list(rows) if _listed(rows) else []
     if not any(map(_listed, pairs)):
         pairs = [pairs]
-    if not all(_listed(pair) and all(map(_whole, pair)) for pair in pairs):
+    if not _listed(rows) or not all(_listed(pair) and all(map(_whole, pair)) for pair in pairs):
         raise InputError(
             f"{path}: `rows` must be two whole numbers, [start, stop], or a list of such pairs; got {shown(rows)}."
         )

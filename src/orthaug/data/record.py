@@ -65,7 +65,7 @@ def as_channels(given: Any, what: str) -> tuple[Channel, ...]:
     Raises:
         InputError: one text instead of several, or anything else that names no channels.
     """
-    if isinstance(given, str) or not isinstance(given, Iterable):
+    if isinstance(given, str) or not isinstance(given, Iterable) or isinstance(given, np.ndarray) and not given.ndim:
         example = given if isinstance(given, str) else "y"
         raise InputError(f"`{what}` must be a list of names or Channels, such as ['{example}']; got {shown(given)}.")
     return tuple(name if isinstance(name, Channel) else Channel(name) for name in given)
@@ -161,7 +161,7 @@ class Record:
             object.__setattr__(self, name, as_channels(getattr(self, name), name))
         check_channels(self.inputs, self.outputs)
         object.__setattr__(self, "sampling_time", check_step(self.sampling_time))
-        if isinstance(self.experiments, Iterable):
+        if isinstance(self.experiments, list):
             object.__setattr__(self, "experiments", tuple(self.experiments))
         check_type(self.experiments, tuple, "experiments", "a tuple of Experiments")
         if not self.experiments:

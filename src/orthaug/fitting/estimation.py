@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Vector, check_choice, check_count, check_type, finite_or_none
-from orthaug._base.errors import InputError
+from orthaug._base.checks import Vector, check_choice, check_count, check_type, finite_or_none, is_number
+from orthaug._base.errors import InputError, shown
 from orthaug._base.jax import Array, jax, jnp
 from orthaug._base.parallel import spread
 from orthaug._base.progress import SILENT, Tell
@@ -362,9 +362,9 @@ def _regularizations(given: Any, validation: Record | None) -> tuple[Regularizat
         if isinstance(choice, str):
             check_choice(choice, ("none", "evidence"), "`regularization`")
         elif isinstance(choice, bool) or not isinstance(choice, int | float | np.number):
-            raise InputError(f"`regularization` must be none, evidence or a number; got {choice!r}.")
-        elif not (np.isfinite(choice) and choice >= 0):
-            raise InputError(f"`regularization` must be 0 or more; got {choice}.")
+            raise InputError(f"`regularization` must be none, evidence or a number; got {shown(choice)}.")
+        elif not (is_number(choice) and choice >= 0):
+            raise InputError(f"`regularization` must be 0 or more; got {shown(choice)}.")
     if not choices:
         raise InputError("`regularization` is empty; give none, evidence or a number.")
     return choices

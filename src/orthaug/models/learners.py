@@ -82,6 +82,10 @@ class MLP:
             raise InputError(f"`hidden` must be a tuple of neurons per layer, such as (16,); got {shown(self.hidden)}.")
         if isinstance(self.inputs, str):
             raise InputError(f"`inputs` must be a tuple of expressions, such as ('{self.inputs}',); got one text.")
+        if not isinstance(self.inputs, list | tuple | None) or any(not isinstance(i, str) for i in self.inputs or ()):
+            raise InputError(
+                f"`inputs` must be a tuple of expressions, or None for all lags; got {shown(self.inputs)}."
+            )
         object.__setattr__(self, "hidden", tuple(self.hidden))
         if self.inputs is not None:
             object.__setattr__(self, "inputs", tuple(self.inputs))

@@ -238,7 +238,7 @@ def _agreed(terms: Sequence[Term]) -> list[Term]:
     said: dict[tuple[str, str], Any] = {}
     for term in terms:
         check_parameter_name(term.parameter)
-        check_label(term.unit or "", f"the unit of '{term.parameter}'")
+        check_label("" if term.unit is None else term.unit, f"the unit of '{term.parameter}'")
         check_type(term.fixed, bool, f"fixed of '{term.parameter}'", "true or false")
         check_type(term.output, str | None, f"output of '{term.parameter}'", "the name of an output")
         for what, value in (("initial value", term.initial), ("lower bound", term.min), ("upper bound", term.max)):
