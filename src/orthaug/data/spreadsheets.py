@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import functools
+import re
 import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import iterparse
 
 import numpy as np
 
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, shown
 from orthaug._base.memory import check_memory
 
+_ROWS, _COLUMNS = 1_048_576, 16_384  # of a sheet at most
 Place = Callable[[Sequence[str]], Sequence[int]]
 _PROLOGUE = 4096  # bytes of a part in which a document type would stand
 
@@ -35,6 +39,7 @@ def read_sheet(path: Path, place: Place) -> tuple[int, list[list[Any]]]:
             if not book.worksheets:
                 raise InputError(f"{path}: the workbook has no worksheet with cells.")
             sheet = book.worksheets[0]
+            _check_order(path, sheet)
             _check_strings(path, sheet)
             return _pick(path, sheet, place)
         finally:
@@ -54,6 +59,34 @@ def _check_parts(path: Path, file: Any) -> None:
                 if b"<!DOCTYPE" in part.read(_PROLOGUE):
                     raise InputError(f"{path}: '{info.filename}' declares a document type, which no workbook has.")
     file.seek(0)
+
+
+def _check_order(path: Path, sheet: Any) -> None:
+    """Raise InputError unless rows and cells follow each other: openpyxl would leave out what does not."""
+    row, column = 0, 0
+    with sheet._get_source() as source:
+        for event, element in iterparse(source, ("start", "end")):
+            kind = element.tag.rpartition("}")[2]
+            if event == "start" and kind == "row":
+                before, row, column = row, int(element.get("r", row + 1)), 0
+                if not before < row <= _ROWS:
+                    raise InputError(f"{path}: the rows of the sheet are out of order at row {shown(row)}.")
+            elif event == "start" and kind == "c":
+                place = element.get("r")
+                there = (row, column + 1) if place is None else _place(place)
+                if there[0] != row or not column < there[1] <= _COLUMNS:
+                    raise InputError(f"{path}: the cells of the sheet are out of order at '{place}'.")
+                column = there[1]
+            elif event == "end" and kind == "row":
+                element.clear()
+
+
+def _place(name: str) -> tuple[int, int]:
+    """Row and column, counted from 1, of a cell such as `B7`; of no cell (0, 0)."""
+    found = re.fullmatch(r"([A-Z]{1,3})([1-9][0-9]{0,6})", name)
+    if found is None:
+        return 0, 0
+    return int(found[2]), functools.reduce(lambda total, letter: 26 * total + ord(letter) - 64, found[1], 0)
 
 
 class _Strings(tuple[str, ...]):

@@ -154,6 +154,8 @@ def _from_hdf5(path: Path, names: Sequence[str]) -> dict[str, Vector]:
                 held[key] = Held("empty", None)
             elif item.dtype.kind not in "fiubc" and item.dtype.names is None:
                 held[key] = Held(f"{item.dtype} values", None)
+            elif item.dtype.kind in "fiu" and item.id.get_type() != h5py.h5t.py_create(item.dtype):
+                held[key] = Held("numbers in a format of their own", None)
             else:
                 shape = item.shape[::-1] if matlab else item.shape
                 held[key] = _lazy(path, shape, item.dtype.itemsize, lambda: item[()].T if matlab else item[()])
