@@ -16,8 +16,10 @@ import numpy as np
 from orthaug._base.checks import Vector, nearest
 from orthaug._base.errors import InputError, MissingColumnError
 from orthaug._base.memory import check_memory, in_words
+from orthaug.data.matlab import Variable, read_mat5
 
 _NAMED = 30  # variables that a message lists
+_HDF5, _USERBLOCK = b"\x89HDF\r\n", 4096  # how such a file begins, and before which byte it does
 _DIGITS = 10  # of an index at most
 
 
@@ -92,42 +94,24 @@ def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Held
 
 
 def _from_mat(path: Path, names: Sequence[str]) -> dict[str, Vector]:
-    import scipy.io
-
-    try:
-        shapes = scipy.io.whosmat(path)
-    except NotImplementedError:  # v7.3 is HDF5
+    content = path.read_bytes()
+    if _HDF5 in content[:_USERBLOCK] or content[124:126] in (b"\x00\x02", b"\x02\x00"):  # v7.3
         return _from_hdf5(path, names)
-    numeric = ("double", "single", "logical", "int", "uint")
+    variables = read_mat5(content, path)
+    structs = {name.partition(".")[0] for name in names if name not in variables}
     held: dict[str, Held] = {}
-    for name, shape, kind in shapes:
-        if kind.startswith(numeric):
-            held[name] = _lazy(path, shape, 8, lambda name=name: _loaded(path, name))
-        else:
-            held[name] = Held({"char": "text", "sparse": "a sparse matrix"}.get(kind, f"a {kind}"), None)
-    wanted = {name.split(".")[0] for name in names if name not in held and "." in name}
-    for name in wanted & {name for name, held_as in held.items() if held_as.what in ("a struct", "a object")}:
-        held |= _fields(path, name, _loaded(path, name))
+    for name, variable in variables.items():
+        held |= _held(path, variable, deep=name in structs)
     return {name: _pick(path, name, held) for name in names}
 
 
-def _loaded(path: Path, name: str) -> Any:
-    import scipy.io
-
-    return scipy.io.loadmat(path, variable_names=[name])[name]
-
-
-def _fields(path: Path, name: str, value: Any) -> dict[str, Held]:
-    """The fields of a struct or object, and theirs, by their paths."""
-    if not isinstance(value, np.ndarray) or value.dtype.names is None:
-        if isinstance(value, np.ndarray) and value.dtype.kind in "fiubc":
-            return {name: _lazy(path, value.shape, value.itemsize, lambda: value)}
-        return {name: Held("text" if getattr(value, "dtype", np.dtype("O")).kind in "US" else "no numbers", None)}
-    if value.size != 1:
-        return {name: Held(f"{value.size} structs", None)}
-    held = {name: Held(f"a struct of {', '.join(value.dtype.names)}", None)}
-    for field in value.dtype.names:
-        held |= _fields(path, f"{name}.{field}", value.ravel()[0][field])
+def _held(path: Path, variable: Variable, *, deep: bool) -> dict[str, Held]:
+    """A variable, with the fields in it if wanted, by their paths."""
+    if not variable.what:
+        return {variable.name: _lazy(path, variable.shape, 8, variable.numbers)}
+    held = {variable.name: Held(variable.what, None)}
+    for field in variable.fields() if deep else ():
+        held |= _held(path, field, deep=True)
     return held
 
 
