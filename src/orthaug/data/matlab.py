@@ -23,7 +23,7 @@ _HEADER, _PREFIX = 128, 4096  # bytes of the file's header; of a compressed vari
 
 @dataclass(frozen=True, eq=False)
 class Variable:
-    """A variable of a file, or a field of one: `what` says in words why it holds no numbers, and is "" where it does."""
+    """A variable of a file, or a field of one; `what` says in words why it holds no numbers, "" where it does."""
 
     name: str
     what: str

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -88,57 +89,23 @@ def check_readable(path: Path) -> None:
 
 def _read_text(path: Path, columns: Sequence[str]) -> Table:
     """CSV and TSV as they occur: byte-order mark, trailing separators, units in headers, decimal commas."""
-    import pandas as pd
-
     try:
         _check_no_nul(path)
         header, header_line, separator = _header(path)
+        _check_present(path, columns, header)
+        commas = separator == ";" and _DECIMAL_COMMA.search(path.read_text(encoding="utf-8-sig")) is not None
     except (UnicodeDecodeError, csv.Error):
         raise InputError(f"{path}: not a text table; expected UTF-8 text with a header row.") from None
-    _check_present(path, columns, header)
     place = {name: str(header.index(name)) for name in columns}
     beyond = str(len(header))  # a column that must stay empty: cells behind the last header
-
-    def read(**options: Any) -> pd.DataFrame:
-        return pd.read_csv(
-            path,
-            sep=separator,
-            header=None,
-            names=[str(i) for i in range(len(header) + 1)],
-            index_col=False,
-            skiprows=header_line,
-            skip_blank_lines=False,
-            keep_default_na=False,
-            encoding="utf-8-sig",
-            low_memory=False,
-            **options,
-        )[[*place.values(), beyond]]
-
-    try:
-        commas = separator == ";" and _DECIMAL_COMMA.search(path.read_text(encoding="utf-8-sig")) is not None
-        if commas:
-            raise ValueError("decimal commas are read as text")
-        types = dict.fromkeys((*place.values(), beyond), np.float64)
-        frame = read(dtype=types, na_values=[""], float_precision="round_trip")
-        texts, held = None, frame.notna()
-    except ValueError:  # something is no number: read again as text, to be able to name it
-        try:
-            texts = read(dtype=str).fillna("").apply(lambda column: column.str.strip())
-        except ValueError as error:
-            if "found 0" in str(error) or isinstance(error, pd.errors.EmptyDataError):
-                raise InputError(f"{path}: there are no data rows below the header.") from None
-            raise InputError(f"{path}: not a readable table ({short(error)}).") from None
-        number = _comma_number if commas else text_number
-        frame = texts.apply(lambda column: column.map(number))
-        held = texts != ""
-
+    numbers, texts, held = _cells(path, header_line, len(header), separator, [*place.values(), beyond], commas)
     extra = np.flatnonzero(np.asarray(held[beyond]))
     if extra.size:
         raise InputError(
             f"{path}: line {header_line + 1 + extra[0]} has {len(header) + 1} cells under {len(header)} headers; "
             "is a separator or a decimal comma wrong?"
         )
-    values = {name: np.asarray(frame[place[name]], dtype=float) for name in columns}
+    values = {name: np.asarray(numbers[place[name]], dtype=float) for name in columns}
 
     def cell(column: str, row: int) -> str:
         if texts is not None:
@@ -148,6 +115,38 @@ def _read_text(path: Path, columns: Sequence[str]) -> Table:
 
     filled = {name: _up_to_last(np.asarray(held[place[name]])) for name in columns}
     return Table(path, values, filled, header_line + 1, cell)
+
+
+def _cells(path: Path, skipped: int, count: int, separator: str, used: list[str], commas: bool) -> tuple[Any, Any, Any]:
+    """The used of `count` columns as numbers, as text (None where all are numbers or empty), and what is not empty."""
+    import pandas as pd
+
+    def read(**options: Any) -> pd.DataFrame:
+        return pd.read_csv(
+            path,
+            sep=separator,
+            header=None,
+            names=[str(i) for i in range(count + 1)],
+            index_col=False,
+            skiprows=skipped,
+            skip_blank_lines=False,
+            keep_default_na=False,
+            encoding="utf-8-sig",
+            low_memory=False,
+            **options,
+        )[used]
+
+    if not commas:
+        with suppress(ValueError):  # something is no number: read again as text, to be able to name it
+            numbers = read(dtype=dict.fromkeys(used, np.float64), na_values=[""], float_precision="round_trip")
+            return numbers, None, numbers.notna()
+    try:
+        texts = read(dtype=str).fillna("").apply(lambda column: column.str.strip())
+    except ValueError as error:
+        if "found 0" in str(error) or isinstance(error, pd.errors.EmptyDataError):
+            raise InputError(f"{path}: there are no data rows below the header.") from None
+        raise InputError(f"{path}: not a readable table ({short(error)}).") from None
+    return texts.apply(lambda column: column.map(_comma_number if commas else text_number)), texts, texts != ""
 
 
 def _check_no_nul(path: Path) -> None:
