@@ -45,3 +45,9 @@ def test_specs(tmp_path):
 def test_saved_models(tmp_path):
     content = model_files(tmp_path / "model")
     assert judged(lambda seed: try_model(seed, content, tmp_path / "model"), range(60))["refused"] > 40
+
+
+@pytest.mark.parametrize("seed", [453, 952, 969, 1471, 1680])
+def test_matlab_files_on_which_scipy_ends_the_process(tmp_path, seed):
+    write_original("v5.mat", original := tmp_path / "original.mat")
+    assert try_file("v5.mat", seed, original.read_bytes(), tmp_path) == "refused"

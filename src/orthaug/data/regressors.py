@@ -49,8 +49,9 @@ class Lags:
 
 
 def _per_channel(value: int | Sequence[int], names: Sequence[str], key: str, kind: str) -> list[int]:
-    several = isinstance(value, Sequence) or (isinstance(value, np.ndarray) and value.ndim > 0)
-    values = list(value) if several else [value] * len(names)  # type: ignore[call-overload]
+    given: Any = value
+    several = isinstance(given, Sequence) or (isinstance(given, np.ndarray) and given.ndim > 0)
+    values = list(given) if several else [given] * len(names)
     if len(values) != len(names):
         raise InputError(
             f"`{key}` has {len(values)} numbers but there are {len(names)} {kind}s; give one number, or one per {kind}."
