@@ -51,7 +51,7 @@ class Lags:
 def _per_channel(value: int | Sequence[int], names: Sequence[str], key: str, kind: str) -> list[int]:
     given: Any = value
     several = isinstance(given, Sequence) or (isinstance(given, np.ndarray) and given.ndim > 0)
-    values = list(given) if several else [given] * len(names)
+    values: list[Any] = list(given) if several else [given] * len(names)
     if len(values) != len(names):
         raise InputError(
             f"`{key}` has {len(values)} numbers but there are {len(names)} {kind}s; give one number, or one per {kind}."
