@@ -47,6 +47,12 @@ def test_saved_models(tmp_path):
     assert judged(lambda seed: try_model(seed, content, tmp_path / "model"), range(60))["refused"] > 40
 
 
+def test_an_hdf5_file_whose_visit_never_ends(tmp_path):
+    pytest.importorskip("h5py")
+    write_original("h5", original := tmp_path / "original.h5")
+    assert try_file("h5", 5487, original.read_bytes(), tmp_path) == "refused"
+
+
 @pytest.mark.parametrize("seed", [453, 952, 969, 1471, 1680])
 def test_matlab_files_on_which_scipy_ends_the_process(tmp_path, seed):
     write_original("v5.mat", original := tmp_path / "original.mat")

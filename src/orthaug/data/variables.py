@@ -145,6 +145,7 @@ def _from_hdf5(path: Path, names: Sequence[str]) -> dict[str, Vector]:
                 held[key] = _lazy(path, shape, item.dtype.itemsize, lambda: item[()].T if matlab else item[()])
 
     with h5py.File(path, "r") as file:
+        _ = [name in file for name in names]  # complains of broken tables on which a visit never ends
         file.visititems(note)
         if matlab:
             names_in = {name: name.replace("/", ".") for name in names}
