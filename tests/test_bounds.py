@@ -286,6 +286,7 @@ regressor = "u2[k]"
 [[baseline.terms]]
 parameter = "c"
 regressor = "u3[k]"
+initial = 0.2
 min = 0.1
 [learner]
 kind = "none"
@@ -325,6 +326,8 @@ def test_a_fit_from_a_spec(tmp_path, kind):
     [
         ("max = 0.8", "max = 0", ("'a'", "min = 0", "max = 0")),
         ("max = 0.8", "max = -3", ("'a'", "min = 0", "max = -3")),
+        ("max = 0.8", "max = 0.8\ninitial = 0.9", ("initial value of 'a' is 0.9", "0 and 0.8")),
+        ("initial = 0.2\n", "", ("initial value of 'c' is 0;", "0.1 and inf", "Give an `initial`")),
         ("max = 0.8", "max = inf", ("max", "finite")),
         ("max = 0.8", "max = nan", ("max", "finite")),
         ("max = 0.8", 'max = "high"', ("max", "high", "number")),

@@ -344,7 +344,7 @@ def test_a_declaration_nested_too_deeply(tmp_path, monkeypatch, text):
         (('outputs = ["y"]', 'outputs = ["y", "y_model"]'), "an output cannot be called 'y_model'"),
         (("[learner]", "[baseline.constants]\nu = 2.0\n[learner]"), "'u' is a constant and a channel"),
         (("[learner]", "[baseline.constants]\ny = 2.0\n[learner]"), "'y' is a constant and a channel"),
-        (('parameter = "c"', 'parameter = "c\\nd"'), "cannot name a parameter; use visible characters"),
+        (('parameter = "c"', 'parameter = "c\\nd"'), "cannot name a parameter; use letters, digits"),
         (('parameter = "c"', 'parameter = "  "'), "cannot name a parameter"),
         (
             ('["run.csv"] }', '["run.csv"], rows = [[0, 60], [50, 120]] }'),

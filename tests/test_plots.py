@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import matplotlib.image
 import numpy as np
 import pytest
@@ -10,6 +12,8 @@ from matplotlib.figure import Figure
 from orthaug.data.record import Channel
 from orthaug.models.response import Response, Trajectory
 from orthaug.reports import plots
+from orthaug.reports.findings import SuspectResult
+from orthaug.reports.result import ParameterResult, RowResult
 
 CHANNELS = (Channel("position", "m"), Channel("angle"))
 
@@ -62,8 +66,35 @@ def test_legends():
     assert legend(plots.output_figure(response(), "").axes[0]) == ["measured", "model"]
     assert legend(plots.output_figure(response(measured=False), "").axes[0]) == ["model"]
     upper, lower = plots.components_figure(response(), "").axes
-    assert legend(upper) == [r"baseline part of position, $\varphi\,\theta$"]
-    assert legend(lower) == [r"learner part of position, $f - \varphi\,\theta_{\mathrm{aux}}$"]
+    assert legend(upper) == ["baseline part of position, φ θ"]
+    assert legend(lower) == ["learner part of position, f − φ θ_aux"]
+
+
+@pytest.mark.parametrize("text", ["$", "a $x$ b", r"$\frac{", "$$", r"\$^_{", "µ 力"])
+def test_text_that_looks_like_a_formula_is_drawn_as_it_is(tmp_path, text):
+    """In units, titles, names of parameters, suspects and rows."""
+    odd = Response(response().trajectories, 1, (Channel("position", text),), 0.1)
+    parameter = ParameterResult(name="a", unit=text, initial=0.0, value=1.0, std=0.1, ci95=[0.8, 1.2])
+    unknown = dict.fromkeys(("structure", "residuals", "learner_to_physics", "validation", "seconds"))
+    row = RowResult.model_construct(name=text, parameters=[parameter], scores={}, **unknown)
+    suspect = SuspectResult.model_construct(
+        name=text,
+        relative_bias={text: 0.1, "b": -0.2},
+        coefficient=1.0,
+        size=1.0,
+        relative_physical_bias=None,
+        expected_physical_bias=None,
+    )
+    for i, figure in enumerate(
+        [
+            *(make(odd, text) for make, _ in FIGURES.values()),
+            plots.comparison_figure([row]),
+            plots.bias_figure([suspect]),
+        ]
+    ):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert drawn(figure, tmp_path / f"{i}.png")
 
 
 def test_output_shows_a_window_from_the_first_value_on():

@@ -369,3 +369,47 @@ def test_expressions_are_read_when_the_physics_is_asked_for(tmp_path, text, mess
     spec = load_spec(put(tmp_path, edited(LEAST, '"y[k-1]"', f'"{text}"')))
     with pytest.raises(InputError, match=message):
         spec.declared_baseline()
+
+
+def test_deep_nesting_is_one_line(tmp_path):
+    for text in (
+        "a = " + "[" * 5000,
+        "a = " + "[" * 5000 + "]" * 5000,
+        "a." * 5000 + "b = 1",
+        "[" + "a." * 5000 + "b]",
+    ):
+        with pytest.raises(InputError) as refused:
+            load_spec(put(tmp_path, text))
+        assert str(refused.value).isprintable() and len(str(refused.value)) < 400
+
+
+@pytest.mark.parametrize("number", ["9" * 5000, "-" + "9" * 5000, "1e999"])
+def test_numbers_beyond_all_bounds(tmp_path, number):
+    for old in ("restarts = 3", "hidden = [16, 8]", "iterations = 50", "rows = [0, 9000]", "g = 9.81"):
+        with pytest.raises(InputError, match="machine.toml"):
+            load_spec(put(tmp_path, edited(FULL, old, re.sub(r"\d[\d.]*", number, old, count=1)))).declared_baseline()
+
+
+@pytest.mark.parametrize("name", ["train", "validation"])
+def test_a_test_is_called_otherwise_than_another_part(tmp_path, name):
+    with pytest.raises(InputError, match=f"`tests.{name}` has the name of another part of the data"):
+        load_spec(put(tmp_path, edited(FULL, "[data.tests.steps]", f"[data.tests.{name}]")))
+
+
+@pytest.mark.parametrize("name", ['"a\\nb"', '"\\u001b[31m"', '"' + "x" * 61 + '"'])
+def test_names_of_tests_are_visible_and_short(tmp_path, name):
+    with pytest.raises(InputError, match="the name of a test must be visible characters on one line, at most 60"):
+        load_spec(put(tmp_path, edited(FULL, "[data.tests.steps]", f"[data.tests.{name}]")))
+
+
+def test_long_keys_and_values_are_cut(tmp_path):
+    for old, new in (("restarts = 3", "x" * 10_000 + " = 3"), ("seed = 7", 'seed = "' + "y" * 10_000 + '"')):
+        with pytest.raises(InputError) as refused:
+            load_spec(put(tmp_path, edited(FULL, old, new)))
+        assert len(str(refused.value)) < 900
+
+
+@pytest.mark.parametrize("value", ["[true, 2]", "[0.0, 2.0]", "5", "[[0, 2], [true, 3]]"])
+def test_rows_are_whole_numbers(tmp_path, value):
+    with pytest.raises(InputError, match="data.tests.steps.rows"):
+        load_spec(put(tmp_path, edited(FULL, "rows = [0, 9000]", f"rows = {value}")))

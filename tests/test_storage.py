@@ -307,3 +307,30 @@ def test_a_model_of_the_first_format_loads(tmp_path):
     save(model, tmp_path / "again")
     kept = [json.loads((folder / "model.json").read_text())["learner"] for folder in (tmp_path / "again", FIRST)]
     assert kept[0] == kept[1]
+
+
+def test_files_that_cannot_be_read(tmp_path, monkeypatch):
+    save(estimate(ONE, TERMS, learner=None).model, tmp_path / "model")
+    for wrong in (5, None, b"x", "no\0name", tmp_path / "model" / "model.json"):
+        with pytest.raises(InputError):
+            load(wrong)
+
+    def denied(path, **options):
+        raise PermissionError(13, "Permission denied")
+
+    for reads in ("read_text", "read_bytes"):
+        with monkeypatch.context() as patched:
+            patched.setattr(Path, reads, denied)
+            with pytest.raises(InputError, match=r"model: cannot be read \(Permission denied\)"):
+                load(tmp_path / "model")
+
+
+NO_DECLARATIONS = ["[" * 100_000, '{"format": 2, "a": ' + "9" * 5000 + "}", "[]", "null", '"x"', "\ud800"]
+
+
+@pytest.mark.parametrize("text", NO_DECLARATIONS, ids=range(len(NO_DECLARATIONS)))
+def test_declarations_that_are_none(tmp_path, text):
+    save(estimate(ONE, TERMS, learner=None).model, tmp_path / "model")
+    (tmp_path / "model" / "model.json").write_bytes(text.encode("utf-8", "surrogatepass"))
+    with pytest.raises(InputError, match="model.json: (the file is cut or altered|not a model of orthaug)"):
+        load(tmp_path / "model")

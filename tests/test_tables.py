@@ -225,7 +225,7 @@ REFUSED_NPZ = [
     ("y", {"y": np.ones((2, 2, 2))}, "'y' is no vector"),
     ("y[3]", {"y": np.ones((2, 3))}, r"'y\[3\]': no such column \(counted from 0\); the file holds y \(2×3\)"),
     ("y[0]", {"y": np.ones(3)}, r"'y\[0\]': no such column"),
-    ("y[-1]", {"y": np.ones((2, 3))}, r"'y\[-1\]': a column of a matrix is written \"y\[0\]\", counted from 0"),
+    ("y[-1]", {"y": np.ones((2, 3))}, r"'y\[-1\]': a column of a matrix is written \"y\[0\]\", a row .*counted from"),
     ("x[0]", {"y": np.ones(3)}, "no variable 'x'"),
     ("y", {"y": np.array([1j, 2])}, "'y' is complex; expected real numbers"),
     ("y", {"y": np.array(["a", "b"])}, "'y' is text, no numbers; the file holds y"),

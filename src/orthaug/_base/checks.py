@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.errors import InputError
+from orthaug._base.errors import LONGEST, InputError, shown
 
+_COMPARED = 1000  # names that a misspelt one is compared with
 Vector = Float[np.ndarray, "_"]
 Matrix = Float[np.ndarray, "_ _"]
 
@@ -27,7 +28,7 @@ def as_signal(values: Any, name: str) -> Matrix:
         if np.iscomplexobj(array):
             raise InputError(f"`{name}` is complex; expected real numbers.")
         array = np.array(array, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"`{name}` is not an array of numbers: {error}.") from None
     if array.ndim == 1:
         array = array[:, None]
@@ -52,17 +53,26 @@ def check_unique(names: Iterable[str], what: str) -> None:
         seen.add(name)
 
 
+def check_label(value: Any, what: str) -> str:
+    """Return `value` if it is text that stands on one line, at most `LONGEST` long, otherwise raise InputError."""
+    if not isinstance(value, str) or not value.isprintable() or len(value) > LONGEST:
+        raise InputError(
+            f"{what} must be visible characters on one line, at most {LONGEST} of them; got {shown(value)}."
+        )
+    return value
+
+
 def check_choice(value: str, choices: Iterable[str], what: str) -> str:
     """Return `value` if it is one of `choices`, otherwise raise InputError naming them."""
     choices = tuple(choices)
-    if value not in choices:
-        raise InputError(f"{what} must be one of {', '.join(choices)}; got '{value}'.")
+    if not isinstance(value, str) or value not in choices:
+        raise InputError(f"{what} must be one of {', '.join(choices)}; got {shown(value)}.")
     return value
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """`, did you mean 'x'?` for the closest known name, or nothing."""
-    known = list(known)
+    name, known = name[:LONGEST], list(known)[:_COMPARED]
     close = [k for k in known if k.lower().startswith(name.lower())] or difflib.get_close_matches(name, known, n=1)
     return f", did you mean '{close[0]}'?" if close else ""
 
@@ -71,7 +81,7 @@ def check_count(value: Any, name: str, least: int = 1, *, of: str = "") -> int:
     """Return `value` if it is a whole number (`of` something) of at least `least`, otherwise raise InputError."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         counted = f" of {of}" if of else ""
-        raise InputError(f"`{name}` must be a whole number{counted}, {least} or more; got {value!r}.")
+        raise InputError(f"`{name}` must be a whole number{counted}, {least} or more; got {shown(value)}.")
     return int(value)
 
 
@@ -94,7 +104,7 @@ def check_number(value: Any, name: str, *, positive: bool = False) -> float:
     """Return `value` if it is a finite number, 0 or more (above 0 if `positive`), otherwise raise InputError."""
     if not is_number(value) or value < 0 or (positive and value == 0):
         raise InputError(
-            f"`{name}` must be {'a positive number' if positive else 'a number, 0 or more'}; got {value!r}."
+            f"`{name}` must be {'a positive number' if positive else 'a number, 0 or more'}; got {shown(value)}."
         )
     return float(value)
 
@@ -102,4 +112,4 @@ def check_number(value: Any, name: str, *, positive: bool = False) -> float:
 def check_type(value: Any, kinds: Any, name: str, wanted: str) -> None:
     """Raise InputError unless `value` is an instance of `kinds` (a class itself is none)."""
     if isinstance(value, type) or not isinstance(value, kinds):
-        raise InputError(f"`{name}` must be {wanted}; got {value!r}.")
+        raise InputError(f"`{name}` must be {wanted}; got {shown(value)}.")

@@ -1,10 +1,60 @@
-"""What can go wrong because of what was asked, always with the remedy in the text."""
+"""What can go wrong because of what was asked, always with the remedy in the text, on one line."""
 
 from __future__ import annotations
+
+import re
+from typing import Any
+
+LONGEST = 60  # characters of a name or value in a message
+_MOST, _HEAD = 1200, 900  # characters of a message, and of its beginning where the middle is left out
+_SEARCHED = 6 * _MOST  # characters that are looked at for names and values
+_QUOTED = re.compile(r"""(?<!\w)(['"`])(?!\1)(.*?)\1(?!\w)""")
+_LISTED = re.compile(r"\[[^][]+\]")
+_WORD = re.compile(r"""[^\s/\\'"`]+""")
+
+
+def visible(text: str) -> str:
+    """The text with line breaks, terminal controls and invisible characters escaped."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else _escaped(c) for c in text)
+
+
+def shown(value: Any) -> str:
+    """A value as Python writes it, on one line, cut where it is long."""
+    try:
+        return cut(visible(" ".join(repr(value)[:_MOST].split())))
+    except Exception:  # a foreign `__repr__` may do anything, and one of a huge whole number fails
+        return f"a {type(value).__name__} that cannot be written"
+
+
+def cut(text: str) -> str:
+    """At most `LONGEST` characters of a text."""
+    return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
+
+
+def message(text: str) -> str:
+    """A message as users see it: one line, its names, values and paths visible and cut where they are long."""
+    text = visible(_ends(text, _SEARCHED))
+    text = _QUOTED.sub(lambda found: f"{found[1]}{cut(found[2])}{found[1]}", text)
+    text = _LISTED.sub(lambda found: f"[{cut(found[0][1:-1])}]", text)
+    text = _WORD.sub(lambda found: cut(found[0]), text)
+    return _ends(text, _MOST)
+
+
+def _ends(text: str, most: int) -> str:
+    """The text without its middle where it is longer."""
+    head = most * _HEAD // _MOST
+    return text if len(text) <= most else f"{text[:head]} … {text[head - most :]}"
+
+
+def _escaped(character: str) -> str:
+    return character.encode("unicode_escape").decode("ascii")
 
 
 class InputError(ValueError):
     """Bad input. The text says what is there and what was expected. The command line exits with 2."""
+
+    def __init__(self, text: str = "") -> None:
+        super().__init__(message(str(text)))
 
 
 class KeyedError(InputError):
@@ -35,3 +85,6 @@ class PrecisionError(InputError, ImportError):
 
 class TrainingError(ArithmeticError):
     """Training produced no finite model. The command line exits with 1."""
+
+    def __init__(self, text: str = "") -> None:
+        super().__init__(message(str(text)))

@@ -23,7 +23,8 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector, check_choice, check_count, check_number
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, shown
+from orthaug._base.memory import check_memory
 from orthaug.analysis.candidates import Pattern, families, starting_patterns
 from orthaug.analysis.plant import Plant
 from orthaug.analysis.suspects import Suspect
@@ -33,6 +34,9 @@ SEARCH_ROWS, SEARCH_PERIODS = 512, 40  # of the shortened record: samples, or pe
 STARTS, FINALISTS = 6, 12  # patterns that are improved, each of another length; that are tried over all N samples
 LEAST_GAIN = 1e-4  # of the cost, relative, for another change of a pattern
 SINGULAR = 1e12  # condition number of Φ above which neither bias nor variance is computed
+MOST_SAMPLES = 10_000_000  # of a design: its candidates take hours then
+LARGEST = 1e100  # amplitude, and one over the smallest: squares are finite
+_SIGNALS = 120  # of N samples that are held at once
 BATCH = 2_000_000  # samples that are simulated side by side
 
 Factors = Float[np.ndarray, "M 2 n n"]  # per candidate the R of rows [Φ Δ] and of σ[Φ Δ], n = nt + 1
@@ -106,6 +110,8 @@ def design_input(
             a simulated output that runs away, no candidate within the cap on the condition number.
     """
     amplitude = check_number(amplitude, "amplitude", positive=True)
+    if not 1 / LARGEST <= amplitude <= LARGEST:
+        raise InputError(f"`amplitude` must lie between {1 / LARGEST:g} and {LARGEST:g}; got {amplitude:g}.")
     sampling_time = check_number(sampling_time, "sampling_time", positive=True)
     step = math.inf if rate is None else check_number(rate, "rate", positive=True) * sampling_time
     iterations, seed, suspects = check_count(iterations, "iterations", 0), check_count(seed, "seed", 0), tuple(suspects)
@@ -114,6 +120,9 @@ def design_input(
     theta = _numbers(baseline.initial if theta is None else theta, (len(baseline.names),), "theta")
     plant = Plant(baseline, (tuple(outputs), tuple(inputs)), suspects, theta, channel)
     samples = check_count(samples, "samples", plant.start + 4 * len(theta) + 16)
+    if samples > MOST_SAMPLES:
+        raise InputError(f"`samples` is {shown(samples)}; at most {MOST_SAMPLES} are simulated.")
+    check_memory(8.0 * samples * (_SIGNALS + 4 * len(outputs) * (len(theta) + 2)), f"a design of {samples} samples")
     for name, values in (known_inputs or {}).items():
         check_choice(name, plant.others, "a channel of `known_inputs`")
         plant.others[name] = _numbers(values, (samples,), f"known_inputs['{name}']")[:, None]
@@ -121,13 +130,19 @@ def design_input(
     sigma = np.array([check_number(value, "noise") for value in _numbers(noise, (len(outputs),), "noise")])
     sigma = (sigma if suspects or sigma.any() else np.ones(len(outputs))) / math.sqrt(samples - plant.start)
     limits = amplitude, step, check_number(condition, "condition", positive=True), samples
-    return _Search(plant, _weights(weights, plant), sigma, *limits).run(seed, iterations)
+    try:
+        with np.errstate(all="ignore"):
+            return _Search(plant, _weights(weights, plant), sigma, *limits).run(seed, iterations)
+    except np.linalg.LinAlgError:
+        raise InputError(
+            "the simulated rows are too large or too small for double precision; change `amplitude` or the units."
+        ) from None
 
 
 def _numbers(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
     try:
         numbers = np.broadcast_to(np.asarray(values, dtype=float), shape)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = np.array(math.nan)
     if not np.all(np.isfinite(numbers)):
         raise InputError(f"`{name}` must be finite numbers of shape {shape}, or a single one.")
@@ -142,7 +157,11 @@ def _weights(weights: Any, plant: Plant) -> Matrix:
             zero = plant.names[int(np.argmin(np.abs(plant.theta)))]
             raise InputError(f"θ of {zero} is 0, so that its relative error has no meaning; give `weights`.")
         weights = 1 / np.abs(plant.theta)
-    matrix = _numbers(weights, np.shape(weights) if np.ndim(weights) == 2 else (nt,), "weights")
+    try:
+        shape = np.shape(weights)
+    except ValueError:  # rows of unequal lengths
+        shape = ()
+    matrix = _numbers(weights, shape if len(shape) == 2 else (nt,), "weights")
     if matrix.shape[-1] != nt or not matrix.any():
         raise InputError(f"`weights` must be of shape ({nt},) or (m, {nt}), and not all 0.")
     return np.diag(matrix) if matrix.ndim == 1 else matrix

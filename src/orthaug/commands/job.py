@@ -15,6 +15,7 @@ from orthaug.commands.suspects import check_suspects
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Record, check_channels
 from orthaug.data.regressors import largest_lag
+from orthaug.fitting.cost import check_cost
 from orthaug.fitting.rules import check_scored
 from orthaug.fitting.structures import Structure
 from orthaug.inference.measure_files import MeasurePlace
@@ -141,6 +142,7 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
         baseline, learner_inputs, physics = spec.declared_baseline(), spec.learner_inputs(), spec.physics_map()
         if physics is not None:
             baseline = with_initial(physics, baseline)
+        baseline.check_initial()
         check_channels(spec.channels(spec.data.inputs), spec.channels(spec.data.outputs))
         structure_of(spec).penalty(baseline.names, baseline.initial, 1.0)
         baseline.check_channels(spec.data.outputs, spec.data.inputs)
@@ -157,6 +159,7 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
         problem = pose(train.record, baseline, lags, learner_inputs, **options)
         problem.feature_rows()
         _check_scored(spec, problem)
+        _check_cost(spec, problem, validation is not None)
         weighed = weigh_problem(measure_of(spec, problem, path.parent), problem)
         _check_measure(weighed, problem)
         job = Job(path, spec, train, validation, tests, problem, weighed, physics, ())
@@ -177,6 +180,14 @@ def _check_scored(spec: Spec, problem: Problem) -> None:
         check_scored(spec.declared_criterion(), longest)
     except KeyedError as error:
         raise InputError(f"'training.{error.key}'{error.words}.") from None
+
+
+def _check_cost(spec: Spec, problem: Problem, validated: bool) -> None:
+    """`check_cost` before JAX is loaded."""
+    sizes = {"rows": len(problem.rows), "features": len(problem.features.entries), "outputs": len(problem.outputs)}
+    choices = spec.training.regularizations(validated)
+    runs = spec.training.restarts * (len(choices) if isinstance(choices, tuple) else 1)
+    check_cost(spec.declared_learner(), **sizes, iterations=spec.declared_solver().iterations, runs=runs)
 
 
 def structure_of(spec: Spec, kind: str | None = None, measure: Measure | None = None) -> Structure:

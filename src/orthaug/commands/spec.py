@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, create_model, model_validator
 
+from orthaug._base.checks import check_label
 from orthaug._base.errors import InputError
 from orthaug._base.registry import resolve
 from orthaug.commands.sections import KindSection, Section, with_kinds
@@ -87,6 +88,10 @@ class Data(Section):
             if name not in (*self.inputs, *self.outputs):
                 known = ", ".join((*self.inputs, *self.outputs))
                 raise ValueError(f"`channels.{name}` is neither an input nor an output; expected one of {known}")
+        for name in self.tests:
+            check_label(name, "the name of a test")
+            if name in ("train", "validation"):
+                raise ValueError(f"`tests.{name}` has the name of another part of the data; expected another name")
         return self
 
 
@@ -339,9 +344,17 @@ def load_spec(path: Path) -> Spec:
         raise InputError(f"{path}: broken TOML: {' '.join(str(error).split())}.") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file; expected TOML in UTF-8.") from None
+    except RecursionError:
+        raise InputError(f"{path}: broken TOML: tables or lists are nested too deeply.") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+    except ValueError as error:  # a whole number of thousands of digits
+        raise InputError(f"{path}: broken TOML: {str(error).split(';')[0]}.") from None
     model = spec_model()
     try:
         return model.model_validate(content)
     except ValidationError as error:
         message = first_message(error, content, model)
         raise InputError(f"{path}: {message}{'' if message.endswith('?') else '.'}") from None
+    except RecursionError:
+        raise InputError(f"{path}: tables or lists are nested too deeply.") from None

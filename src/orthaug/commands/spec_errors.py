@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from orthaug._base.checks import nearest
-from orthaug._base.errors import KeyedError
+from orthaug._base.errors import KeyedError, cut
 
 
 def first_message(error: ValidationError, content: dict[str, Any], model: type[BaseModel]) -> str:
@@ -38,8 +38,11 @@ def first_message(error: ValidationError, content: dict[str, Any], model: type[B
 
 def _shown(value: Any) -> str:
     """A value as the file writes it, cut where it is long."""
-    text = json.dumps(value, default=str, ensure_ascii=False).replace("Infinity", "inf").replace("NaN", "nan")
-    return text if len(text) <= 80 else text[:77] + "…"
+    try:
+        text = json.dumps(value, default=str, ensure_ascii=False).replace("Infinity", "inf").replace("NaN", "nan")
+    except RecursionError:
+        return "what is nested too deeply"
+    return cut(text)
 
 
 def _plain(message: str) -> str:

@@ -18,7 +18,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 from orthaug._base.checks import nearest
-from orthaug._base.errors import InputError
+from orthaug._base.errors import LONGEST, InputError, shown
 
 
 class Lag(NamedTuple):
@@ -31,7 +31,10 @@ class Lag(NamedTuple):
         return f"{self.channel}[k-{self.lag}]" if self.lag else f"{self.channel}[k]"
 
 
-FUNCTIONS = ("sin", "cos", "tan", "exp", "log", "sqrt", "abs", "sign", "tanh", "min", "max")
+_OF_ONE = ("sin", "cos", "tan", "atan", "exp", "log", "sqrt", "abs", "sign", "floor", "tanh")
+_OF_MANY = ("min", "max")
+FUNCTIONS = (*_OF_ONE, "atan2", *_OF_MANY)
+_ELSEWHERE = {"atan": "arctan", "atan2": "arctan2"}  # as NumPy and JAX call them, where that is another name
 RESERVED = frozenset((*FUNCTIONS, "k"))
 LARGEST_LAG = 100_000  # more is a mistake, and would fill the memory
 _MAX_LENGTH = 500  # characters; a longer expression is a mistake, and messages stay readable
@@ -83,11 +86,16 @@ class Expression:
 def is_name(name: str) -> bool:
     """Whether expressions can use `name`: Python reads an identifier in its normal form only."""
     return (
-        name.isidentifier()
+        is_identifier(name)
         and not keyword.iskeyword(name)
         and name not in RESERVED
         and unicodedata.normalize("NFKC", name) == name
     )
+
+
+def is_identifier(name: Any) -> bool:
+    """Whether `name` is made of letters, digits and underscores, does not start with a digit and is not too long."""
+    return isinstance(name, str) and name.isidentifier() and len(name) <= LONGEST
 
 
 def parse(text: str, constants: Mapping[str, float] | None = None) -> Expression:
@@ -98,7 +106,7 @@ def parse(text: str, constants: Mapping[str, float] | None = None) -> Expression
     """
     constants = dict(constants or {})
     if not isinstance(text, str):
-        raise InputError(f"an expression must be text such as 'y[k-1]'; got {text!r}.")
+        raise InputError(f"an expression must be text such as 'y[k-1]'; got {shown(text)}.")
     text = " ".join(text.split())
     if not text:
         raise InputError("An expression is empty; write for example y[k-1], or 1 for an offset.")
@@ -126,7 +134,7 @@ def _check(node: ast.AST, text: str, constants: Mapping[str, float], used: set[s
     """Walk the tree once; raise InputError at the first node that is not on the list."""
     if isinstance(node, ast.Constant):
         if isinstance(node.value, bool) or not isinstance(node.value, int | float):
-            raise InputError(f"'{text}': {node.value!r} is not a number.")
+            raise InputError(f"'{text}': {shown(node.value)} is not a number.")
         try:
             finite = math.isfinite(float(node.value))
         except OverflowError:
@@ -149,6 +157,8 @@ def _check(node: ast.AST, text: str, constants: Mapping[str, float], used: set[s
         for argument in node.args:
             _check(argument, text, constants, used)
     else:
+        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.BitXor):
+            raise InputError(f"'{text}': '^' is not a power here; write **, as in y[k-1]**2.")
         what = ast.unparse(node) if isinstance(node, ast.expr) else type(node).__name__
         raise InputError(f"'{text}': '{what}' is not allowed in an expression; allowed are {_ALLOWED}.")
 
@@ -158,11 +168,18 @@ def _check_call(node: ast.Call, text: str) -> None:
     if name is None or node.keywords or any(isinstance(a, ast.Starred) for a in node.args):
         raise InputError(f"'{text}': '{ast.unparse(node)}' is not allowed; functions are {', '.join(FUNCTIONS)}.")
     if name not in FUNCTIONS:
+        inner = list(ast.walk(node.args[0])) if len(node.args) == 1 else []
+        if {n.id for n in inner if isinstance(n, ast.Name)} == {"k"} and not any(
+            isinstance(n, ast.Subscript) for n in inner
+        ):
+            lag = f"{name}[{ast.unparse(node.args[0]).replace(' ', '')}]"
+            raise InputError(f"'{text}': a channel at a lag has square brackets; write {lag}.")
         raise InputError(
             f"'{text}': unknown function '{name}'{nearest(name, FUNCTIONS)}; known are {', '.join(FUNCTIONS)}."
         )
-    wanted = "two or more arguments" if name in ("min", "max") else "one argument"
-    if (len(node.args) < 2) if name in ("min", "max") else (len(node.args) != 1):
+    many, exact = name in _OF_MANY, 1 if name in _OF_ONE else 2
+    wanted = "two or more arguments" if many else "two arguments" if exact == 2 else "one argument"
+    if (len(node.args) < 2) if many else (len(node.args) != exact):
         raise InputError(f"'{text}': {name} takes {wanted}, got {len(node.args)}.")
 
 
@@ -214,7 +231,7 @@ def _evaluate(node: ast.expr, columns: Mapping[Lag, Any], constants: Mapping[str
         for other in arguments[1:]:
             value = pick(value, other)
         return value
-    return getattr(xp, node.func.id)(arguments[0])
+    return getattr(xp, _ELSEWHERE.get(node.func.id, node.func.id))(*arguments)
 
 
 def _unknown_name(name: str, text: str, constants: Mapping[str, float]) -> str:

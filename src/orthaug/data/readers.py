@@ -5,6 +5,7 @@ Rows count from 0 behind the header; messages name the file's own line, column a
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,13 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.checks import Vector, check_choice, check_count
-from orthaug._base.errors import InputError
-from orthaug.data.record import Channel, Experiment, Record, same_step
+from orthaug._base.checks import Vector, check_choice, check_count, check_type
+from orthaug._base.errors import InputError, shown
+from orthaug.data.record import Channel, Experiment, Record, as_channels, check_step, same_step
 from orthaug.data.tables import Table, check_readable, has_column, read_table
 
 RowRange = tuple[int, int] | list[int]
-_MISSING = ("", "nan", "na", "n/a", "null", "none")  # how files write a sample that is not there
+_JITTER = 0.45  # largest deviation of a step from the usual one, relative: one lost sample is a deviation of 1 or ½
+_DRIFT = 0.02  # largest change of the mean step over the record, relative; it must also displace half a sample
+_RESOLUTION = 1e-6  # what rounding of the instants may change the mean step by, relative
+_MISSING = ("", "nan", "na", "n/a", "#n/a", "null", "none")  # how files write a sample that is not there
 
 
 def read_record(
@@ -36,7 +40,7 @@ def read_record(
     """Read one file; several row ranges are experiments of their own.
 
     Args:
-        path: `.csv`, `.tsv`, `.parquet` or `.npz`.
+        path: of a file with one of the endings in docs/spec.md, such as `.csv`, `.xlsx` or `.mat`.
         inputs, outputs: channel names, or `Channel`s with column, unit, scale and offset.
         sampling_time: seconds between rows; or `time`, the column that holds the instants.
         rows: half-open range `(start, stop)` of data rows, or several; None for all.
@@ -48,11 +52,11 @@ def read_record(
     Raises:
         InputError: no such file, wrong type, missing columns, cells that are empty or no finite numbers.
     """
-    path = Path(path)
-    channels = [[c if isinstance(c, Channel) else Channel(c) for c in group] for group in (inputs, outputs)]
-    column_of = {c.name: (columns or {}).get(c.name, c.file_column) for group in channels for c in group}
-    if sampling_time is not None and time is not None:
-        raise InputError("give `sampling_time` or `time`, not both.")
+    path = _path(path)
+    channels = [as_channels(inputs, "inputs"), as_channels(outputs, "outputs")]
+    column_of = _columns(channels, columns)
+    _check_time(time, sampling_time, {name: column_of[name] for name in (c.name for c in channels[1])})
+    check_choice(missing, ("error", "skip"), "`missing`")
     check_count(every, "every")
     wanted: list[str] = list(dict.fromkeys([*column_of.values(), *([time] if time else [])]))
     if not wanted:
@@ -77,14 +81,15 @@ def read_record(
                 steps.append(_uniform_step(table, time, start, stop))
     if time and not steps:
         raise InputError(f"{path}: no two rows without missing cells follow each other; the sampling time is unknown.")
-    step = steps[0] if time else (1.0 if sampling_time is None else sampling_time)
+    step = steps[0] if time else (1.0 if sampling_time is None else float(sampling_time))
     for other in steps:
         if not same_step(other, step):
             raise InputError(
                 f"{path}: column '{time}' steps by {step:g} s in one row range and by {other:g} s in another."
             )
     left_out = recorded - sum(len(experiment) for experiment in experiments)
-    return Record(tuple(channels[0]), tuple(channels[1]), step * every, tuple(experiments), time, left_out)
+    step *= min(every, 10**15)  # what is longer is refused
+    return Record(tuple(channels[0]), tuple(channels[1]), step, tuple(experiments), time, left_out)
 
 
 def read_samples(
@@ -96,7 +101,7 @@ def read_samples(
         InputError: no such file, missing columns, cells that are no finite numbers.
     """
     pieces, weighted = [], None
-    for path in map(Path, paths):
+    for path in map(_path, paths):
         check_readable(path)
         own = has_column(path, "weight")
         if weighted not in (None, own):
@@ -126,11 +131,52 @@ def _trim(table: Table, *, uneven: bool = False) -> Table:
     return replace(table, columns={name: values[:longest] for name, values in table.columns.items()})
 
 
+def _path(path: Any) -> Path:
+    check_type(path, str | os.PathLike, "path", "a file's name")
+    return Path(path)
+
+
+def _columns(channels: Sequence[Sequence[Channel]], columns: Any) -> dict[str, str]:
+    """The file's column for each channel."""
+    check_type(columns, Mapping | None, "columns", "this file's column by channel, such as {'y': 'yVal'}")
+    given = dict(columns or {})
+    for name, column in given.items():
+        if not isinstance(column, str):
+            raise InputError(f"`columns`: the column of {shown(name)} must be a name; got {shown(column)}.")
+    return {c.name: given.get(c.name, c.file_column) for group in channels for c in group}
+
+
+def _check_time(time: Any, sampling_time: Any, outputs: Mapping[str, str]) -> None:
+    """Raise InputError for instants that are no column, given twice, or an output as well."""
+    check_type(time, str | None, "time", "a column's name")
+    if sampling_time is not None and time is not None:
+        raise InputError("give `sampling_time` or `time`, not both.")
+    if sampling_time is not None:
+        check_step(sampling_time)
+    for name, column in outputs.items():
+        if column == time:
+            raise InputError(f"the column '{time}' is `time` and the output '{name}'; one of them is wrong.")
+
+
+def _listed(value: Any) -> bool:
+    return isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim > 0)
+
+
+def _whole(value: Any) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool | np.bool_)
+
+
 def _ranges(rows: RowRange | Sequence[RowRange] | None, total: int, path: Path) -> list[tuple[int, int]]:
     """Half-open ranges of rows, each checked against the file."""
     if rows is None:
         return [(0, total)]
-    pairs: list = [rows] if all(isinstance(entry, int | np.integer) for entry in rows) else list(rows)
+    pairs: list = list(rows) if _listed(rows) else []
+    if not any(map(_listed, pairs)):
+        pairs = [pairs]
+    if not _listed(rows) or not all(_listed(pair) and all(map(_whole, pair)) for pair in pairs):
+        raise InputError(
+            f"{path}: `rows` must be two whole numbers, [start, stop], or a list of such pairs; got {shown(rows)}."
+        )
     for pair in pairs:
         if len(pair) != 2 or not 0 <= pair[0] < pair[1]:
             raise InputError(f"{path}: rows {list(pair)} is no half-open range [start, stop] with 0 ≤ start < stop.")
@@ -149,7 +195,6 @@ def _stretches(
     table: Table, columns: Sequence[str], begin: int, end: int, every: int, missing: str
 ) -> list[tuple[int, int]]:
     """Half-open row ranges without missing cells; the whole range where missing cells are errors."""
-    check_choice(missing, ("error", "skip"), "`missing`")
     if missing == "error":
         _check_cells(table, columns, begin, end)
         return [(begin, end)]
@@ -176,17 +221,31 @@ def _check_cells(table: Table, columns: Sequence[str], start: int, stop: int) ->
 
 
 def _uniform_step(table: Table, time: str, start: int, stop: int) -> float:
-    """Mean step of the time column, checked to be even enough that no sample is missing."""
+    """Mean step of the time column, checked to be even: no sample is missing, and the rate stays the same."""
     instants = table.columns[time][start:stop]
     if len(instants) < 2:
         raise InputError(f"{table.path}: one row is too few to tell the sampling time from column '{time}'.")
     steps = np.diff(instants)
-    mean = float(steps.mean())
-    odd = np.flatnonzero(np.abs(steps - mean) > 0.5 * abs(mean)) if mean > 0 else np.array([0])
+    mean, usual = float(steps.mean()), float(np.sort(steps)[(len(steps) - 1) // 2])
+    odd = np.flatnonzero(np.abs(steps - usual) > _JITTER * usual) if usual > 0 else np.array([0])
+    remedy = "expected evenly sampled, rising time. Resample, or take row ranges without gaps."
     if odd.size:
         row = start + int(odd[0]) + 1
         raise InputError(
-            f"{table.path}: {table.where(row)}, column '{time}': a step of {steps[odd[0]]:g} s where {mean:g} s is the "
-            "mean; expected evenly sampled, rising time. Resample, or take row ranges without gaps."
+            f"{table.path}: {table.where(row)}, column '{time}': a step of {steps[odd[0]]:g} s where {usual:g} s is "
+            f"usual; {remedy}"
+        )
+    third = len(steps) // 3
+    if third:
+        rates = [float(piece.mean()) for piece in (steps[:third], steps[third:-third], steps[-third:])]
+        change = max(rates) - min(rates)
+        if change > _DRIFT * mean and change * third > 0.5 * mean:
+            drifts = f"the step drifts between {min(rates):g} s and {max(rates):g} s"
+            raise InputError(f"{table.path}: column '{time}': {drifts}; {remedy}")
+    resolution = float(np.spacing(np.abs(instants).max())) / len(steps)
+    if resolution > _RESOLUTION * mean:
+        raise InputError(
+            f"{table.path}: column '{time}': instants of {np.abs(instants).max():.3g} s are too large for steps of "
+            f"{mean:g} s in double precision; subtract the first instant, and write seconds."
         )
     return mean

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.checks import Matrix, as_signal, check_unique
-from orthaug._base.errors import InputError
+from orthaug._base.checks import Matrix, as_signal, check_label, check_type, check_unique, is_number
+from orthaug._base.errors import LONGEST, InputError, shown, visible
 from orthaug.data.expressions import RESERVED, is_name
 
 _LONGEST_STEP = 1e12  # s; a longer one overflows somewhere in a time axis
@@ -33,14 +33,15 @@ class Channel:
     def __post_init__(self) -> None:
         if not is_name(self.name):
             raise InputError(
-                f"'{self.name}' cannot name a channel; use letters, digits and underscores, "
+                f"{_quoted(self.name)} cannot name a channel; use letters, digits and underscores, at most {LONGEST}, "
                 f"not starting with a digit, and none of {', '.join(sorted(RESERVED))}."
             )
-
-        if not (np.isfinite(self.scale) and self.scale != 0 and np.isfinite(self.offset)):
+        check_label(self.unit, f"the unit of '{self.name}'")
+        check_type(self.column, str, f"column of '{self.name}'", "a column's name")
+        if not (is_number(self.scale) and self.scale != 0 and is_number(self.offset)):
             raise InputError(
                 f"channel '{self.name}': `scale` must be finite and not 0, `offset` finite; "
-                f"got {self.scale} and {self.offset}."
+                f"got {shown(self.scale)} and {shown(self.offset)}."
             )
 
     @property
@@ -52,6 +53,31 @@ class Channel:
     def label(self) -> str:
         """`name [unit]`, as it stands at an axis."""
         return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+
+def _quoted(name: Any) -> str:
+    return f"'{name}'" if isinstance(name, str) else shown(name)
+
+
+def as_channels(given: Any, what: str) -> tuple[Channel, ...]:
+    """Channels of names or `Channel`s.
+
+    Raises:
+        InputError: one text instead of several, or anything else that names no channels.
+    """
+    if isinstance(given, str) or not isinstance(given, Iterable) or isinstance(given, np.ndarray) and not given.ndim:
+        example = given if isinstance(given, str) else "y"
+        raise InputError(f"`{what}` must be a list of names or Channels, such as ['{example}']; got {shown(given)}.")
+    return tuple(name if isinstance(name, Channel) else Channel(name) for name in given)
+
+
+def check_step(value: Any) -> float:
+    """Return `value` if it is a sampling time in seconds, otherwise raise InputError."""
+    if not is_number(value) or not 0 < value <= _LONGEST_STEP:
+        raise InputError(
+            f"the sampling time must be a positive number of seconds, at most {_LONGEST_STEP:g}; got {shown(value)}."
+        )
+    return float(value)
 
 
 def check_channels(inputs: Sequence[Channel], outputs: Sequence[Channel]) -> None:
@@ -84,11 +110,21 @@ class Experiment:
     def __len__(self) -> int:
         return len(self.inputs)
 
+    def check(self, inputs: int, outputs: int) -> None:
+        """Raise InputError unless there are as many columns, and as many rows of both."""
+        wanted = (len(self), inputs), (len(self), outputs)
+        found = np.shape(self.inputs), np.shape(self.outputs)
+        if found != wanted:
+            raise InputError(
+                f"{self.source or 'an experiment'}: `inputs` and `outputs` have the shapes {found[0]} and {found[1]}; "
+                f"expected (rows, {inputs}) and (rows, {outputs}), one column for each channel."
+            )
+
     def where(self, row: int) -> str:
         """`run.csv: line 17 (row 15)` for a row of this experiment, as much of it as is known."""
         row = self.first_row + self.stride * row
         place = f"row {row}" if self.first_line is None else f"line {self.first_line + row} (row {row})"
-        return f"{self.source}: {place}" if self.source else place
+        return f"{visible(self.source)}: {place}" if self.source else place
 
     def rows(self, start: int | None, stop: int | None) -> Experiment:
         """The half-open range of rows `[start, stop)` as an experiment of its own."""
@@ -121,14 +157,18 @@ class Record:
     """Rows that were left out because a sample was missing."""
 
     def __post_init__(self) -> None:
+        for name in ("inputs", "outputs"):
+            object.__setattr__(self, name, as_channels(getattr(self, name), name))
         check_channels(self.inputs, self.outputs)
-        if not 0 < self.sampling_time <= _LONGEST_STEP:
-            raise InputError(
-                f"the sampling time must be a positive number of seconds, at most {_LONGEST_STEP:g}; "
-                f"got {self.sampling_time}."
-            )
+        object.__setattr__(self, "sampling_time", check_step(self.sampling_time))
+        if isinstance(self.experiments, list):
+            object.__setattr__(self, "experiments", tuple(self.experiments))
+        check_type(self.experiments, tuple, "experiments", "a tuple of Experiments")
         if not self.experiments:
             raise InputError("a record needs at least one experiment; got none.")
+        for experiment in self.experiments:
+            check_type(experiment, Experiment, "experiments", "a tuple of Experiments")
+            experiment.check(len(self.inputs), len(self.outputs))
 
     @classmethod
     def from_arrays(
@@ -168,7 +208,7 @@ class Record:
         return cls(
             _channels(inputs, "u", u_signal.shape[1]),
             _channels(outputs, "y", y_signal.shape[1]),
-            float(sampling_time),
+            sampling_time,
             (Experiment(u_signal, y_signal, source),),
         )
 
@@ -176,6 +216,8 @@ class Record:
     def join(cls, records: Iterable[Record]) -> Record:
         """One record with the experiments of several, each kept as it is."""
         records = tuple(records)
+        for record in records:
+            check_type(record, Record, "records", "several Records")
         if not records:
             raise InputError("a record needs at least one experiment; got none.")
         first = records[0]
@@ -209,12 +251,14 @@ class Record:
 
     def rows(self, start: int | None = None, stop: int | None = None) -> Record:
         """The half-open range of rows `[start, stop)` of a single experiment."""
+        for name, value in (("start", start), ("stop", stop)):
+            check_type(value, int | np.integer | None, name, "a whole number or None")
         return replace(self, experiments=(self._only("rows").rows(start, stop),))
 
     def split(self, fraction: float) -> tuple[Record, Record]:
         """The first `fraction` of the rows of a single experiment, and the rest."""
-        if not 0 < fraction < 1:
-            raise InputError(f"`fraction` must lie between 0 and 1; got {fraction}.")
+        if not is_number(fraction) or not 0 < fraction < 1:
+            raise InputError(f"`fraction` must lie between 0 and 1; got {shown(fraction)}.")
         cut = round(fraction * len(self._only("split")))
         return self.rows(None, cut), self.rows(cut, None)
 
@@ -227,6 +271,7 @@ class Record:
 def _channels(given: Sequence[str | Channel] | None, default: str, count: int) -> tuple[Channel, ...]:
     if given is None:
         given = [default] if count == 1 else [f"{default}{i + 1}" for i in range(count)]
+    given = as_channels(given, "inputs" if default == "u" else "outputs")
     if len(given) != count:
         raise InputError(f"{len(given)} names for {count} channels of `{default}`; give one name for each column.")
-    return tuple(name if isinstance(name, Channel) else Channel(name) for name in given)
+    return given

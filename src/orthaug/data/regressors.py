@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Matrix
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, shown
 from orthaug.data.expressions import LARGEST_LAG, Expression, Lag
 from orthaug.data.record import Experiment, Record
 
@@ -49,15 +49,17 @@ class Lags:
 
 
 def _per_channel(value: int | Sequence[int], names: Sequence[str], key: str, kind: str) -> list[int]:
-    values = list(value) if isinstance(value, Sequence | np.ndarray) else [value] * len(names)
+    given: Any = value
+    several = isinstance(given, Sequence) or (isinstance(given, np.ndarray) and given.ndim > 0)
+    values: list[Any] = list(given) if several else [given] * len(names)
     if len(values) != len(names):
         raise InputError(
             f"`{key}` has {len(values)} numbers but there are {len(names)} {kind}s; give one number, or one per {kind}."
         )
     if any(isinstance(v, bool) or not isinstance(v, int | np.integer) or v < 0 for v in values):
-        raise InputError(f"`{key}` must be whole numbers, 0 or more; got {value}.")
+        raise InputError(f"`{key}` must be whole numbers, 0 or more; got {shown(value)}.")
     if any(v > LARGEST_LAG for v in values):
-        raise InputError(f"`{key}` must be at most {LARGEST_LAG}; got {value}.")
+        raise InputError(f"`{key}` must be at most {LARGEST_LAG}; got {shown(value)}.")
     return [int(v) for v in values]
 
 

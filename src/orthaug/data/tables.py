@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import csv
 import re
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,12 @@ import numpy as np
 
 from orthaug._base.checks import Vector, nearest
 from orthaug._base.errors import InputError, MissingColumnError
-from orthaug.data.variables import ENDINGS, read_variables
+from orthaug._base.memory import check_memory
+from orthaug.data.spreadsheets import as_number, read_sheet, text_number
+from orthaug.data.variables import ENDINGS, foreign, read_variables, short
+
+_NAMED = 30  # columns that a message lists
+_DECIMAL_COMMA = re.compile(r'(?:^|;)[ \t]*"?[ \t]*[+-]?(?:\d[\d.]*)?,\d+', re.MULTILINE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +51,8 @@ def read_table(path: Path, columns: Sequence[str]) -> Table:
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise InputError(f"{path}: unknown file type '{path.suffix}'; known are {', '.join(_READERS)}.")
-    return reader(path, columns)
+    with foreign(path):
+        return reader(path, columns)
 
 
 def has_column(path: Path, name: str) -> bool:
@@ -71,60 +77,35 @@ def check_readable(path: Path) -> None:
             raise InputError(f"{path}: not a file.")
         with path.open("rb") as file:
             empty = not file.read(1)
+    except InputError:
+        raise
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+    except ValueError:
+        raise InputError(f"{path}: no such file.") from None
     if empty:
         raise InputError(f"{path}: the file is empty (0 bytes).")
 
 
 def _read_text(path: Path, columns: Sequence[str]) -> Table:
     """CSV and TSV as they occur: byte-order mark, trailing separators, units in headers, decimal commas."""
-    import pandas as pd
-
     try:
+        _check_no_nul(path)
         header, header_line, separator = _header(path)
+        _check_present(path, columns, header)
+        commas = separator == ";" and _DECIMAL_COMMA.search(path.read_text(encoding="utf-8-sig")) is not None
     except (UnicodeDecodeError, csv.Error):
         raise InputError(f"{path}: not a text table; expected UTF-8 text with a header row.") from None
-    _check_present(path, columns, header)
     place = {name: str(header.index(name)) for name in columns}
     beyond = str(len(header))  # a column that must stay empty: cells behind the last header
-    decimal = "," if separator == ";" else "."
-
-    def read(**options: Any) -> pd.DataFrame:
-        return pd.read_csv(
-            path,
-            sep=separator,
-            header=None,
-            names=[str(i) for i in range(len(header) + 1)],
-            index_col=False,
-            skiprows=header_line,
-            skip_blank_lines=False,
-            keep_default_na=False,
-            encoding="utf-8-sig",
-            low_memory=False,
-            **options,
-        )[[*place.values(), beyond]]
-
-    try:
-        frame = read(dtype=dict.fromkeys((*place.values(), beyond), np.float64), na_values=[""], decimal=decimal)
-        texts, held = None, frame.notna()
-    except ValueError:  # something is no number: read again as text, to be able to name it
-        try:
-            texts = read(dtype=str).fillna("").apply(lambda column: column.str.strip())
-        except ValueError as error:
-            if "found 0" in str(error) or isinstance(error, pd.errors.EmptyDataError):
-                raise InputError(f"{path}: there are no data rows below the header.") from None
-            raise InputError(f"{path}: not a readable table ({_short(error)}).") from None
-        frame = texts.apply(lambda column: pd.to_numeric(column.str.replace(decimal, "."), errors="coerce"))
-        held = texts != ""
-
+    numbers, texts, held = _cells(path, header_line, len(header), separator, [*place.values(), beyond], commas)
     extra = np.flatnonzero(np.asarray(held[beyond]))
     if extra.size:
         raise InputError(
             f"{path}: line {header_line + 1 + extra[0]} has {len(header) + 1} cells under {len(header)} headers; "
             "is a separator or a decimal comma wrong?"
         )
-    values = {name: np.asarray(frame[place[name]], dtype=float) for name in columns}
+    values = {name: np.asarray(numbers[place[name]], dtype=float) for name in columns}
 
     def cell(column: str, row: int) -> str:
         if texts is not None:
@@ -134,6 +115,50 @@ def _read_text(path: Path, columns: Sequence[str]) -> Table:
 
     filled = {name: _up_to_last(np.asarray(held[place[name]])) for name in columns}
     return Table(path, values, filled, header_line + 1, cell)
+
+
+def _cells(path: Path, skipped: int, count: int, separator: str, used: list[str], commas: bool) -> tuple[Any, Any, Any]:
+    """The used of `count` columns as numbers, as text (None where all are numbers or empty), and what is not empty."""
+    import pandas as pd
+
+    def read(**options: Any) -> pd.DataFrame:
+        return pd.read_csv(
+            path,
+            sep=separator,
+            header=None,
+            names=[str(i) for i in range(count + 1)],
+            index_col=False,
+            skiprows=skipped,
+            skip_blank_lines=False,
+            keep_default_na=False,
+            encoding="utf-8-sig",
+            low_memory=False,
+            **options,
+        )[used]
+
+    if not commas:
+        with suppress(ValueError):  # something is no number: read again as text, to be able to name it
+            numbers = read(dtype=dict.fromkeys(used, np.float64), na_values=[""], float_precision="round_trip")
+            return numbers, None, numbers.notna()
+    try:
+        texts = read(dtype=str).fillna("").apply(lambda column: column.str.strip())
+    except ValueError as error:
+        if "found 0" in str(error) or isinstance(error, pd.errors.EmptyDataError):
+            raise InputError(f"{path}: there are no data rows below the header.") from None
+        raise InputError(f"{path}: not a readable table ({short(error)}).") from None
+    return texts.apply(lambda column: column.map(_comma_number if commas else text_number)), texts, texts != ""
+
+
+def _check_no_nul(path: Path) -> None:
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            if b"\0" in block:
+                raise csv.Error("NUL byte")
+
+
+def _comma_number(text: str) -> float:
+    """A number where decimals are commas; a point would be one of thousands, and is refused."""
+    return np.nan if "." in text else text_number(text.replace(",", "."))
 
 
 def _header(path: Path) -> tuple[list[str], int, str]:
@@ -163,34 +188,34 @@ def _read_parquet(path: Path, columns: Sequence[str]) -> Table:
     except ImportError:
         raise InputError(f"{path}: reading Parquet needs pyarrow; install orthaug[parquet].") from None
     try:
-        names = pq.read_schema(path).names
-        _check_present(path, columns, names)
-        frame = pq.read_table(path, columns=list(columns)).to_pandas()
-    except (pa.ArrowInvalid, OSError) as error:
-        raise InputError(f"{path}: not a readable Parquet file ({_short(error)}).") from None
-    return _full(path, {name: _as_floats(frame[name].to_numpy(), name, path) for name in columns})
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+            _check_present(path, columns, file.schema_arrow.names)
+            check_memory(16 * file.metadata.num_rows * len(columns), f"{path}: reading {file.metadata.num_rows} rows")
+            table = file.read(columns=list(columns))
+        table.validate(full=True)
+    except (pa.ArrowException, OSError) as error:
+        raise InputError(f"{path}: not a readable Parquet file ({short(error)}).") from None
+    return _full(
+        path, {name: _as_floats(table.column(name).to_numpy(zero_copy_only=False), name, path) for name in columns}
+    )
 
 
 def _read_excel(path: Path, columns: Sequence[str]) -> Table:
-    """The first sheet; the first row that holds anything is the header."""
-    import pandas as pd
+    """The first worksheet."""
 
-    try:
-        sheet = pd.read_excel(path, header=None, dtype=object)
-    except ImportError:
-        raise InputError(f"{path}: reading Excel needs openpyxl; install orthaug[excel].") from None
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: not a readable Excel file ({_short(error)}).") from None
-    rows = sheet.notna().any(axis=1).to_numpy()
-    if not rows.any():
-        raise InputError(f"{path}: the first sheet is empty.")
-    top = int(np.argmax(rows))
-    header = ["" if pd.isna(name) else str(name).strip() for name in sheet.iloc[top]]
-    _check_present(path, columns, header)
-    cells = {name: sheet.iloc[top + 1 :, header.index(name)].reset_index(drop=True) for name in columns}
-    values = {name: np.asarray(pd.to_numeric(column, errors="coerce"), dtype=float) for name, column in cells.items()}
-    filled = {name: _up_to_last(column.notna().to_numpy()) for name, column in cells.items()}
-    return Table(path, values, filled, top + 2, lambda column, row: str(cells[column].fillna("").iloc[row]))
+    def place(header: Sequence[str]) -> list[int]:
+        _check_present(path, columns, header)
+        return [header.index(name) for name in columns]
+
+    top, found = read_sheet(path, place)
+    cells = dict(zip(columns, found, strict=True))
+    values = {name: np.array([as_number(cell) for cell in column]) for name, column in cells.items()}
+    filled = {name: _up_to_last(np.array([c is not None for c in column])) for name, column in cells.items()}
+
+    def cell(column: str, row: int) -> str:
+        return "" if cells[column][row] is None else str(cells[column][row])
+
+    return Table(path, values, filled, top + 1, cell)
 
 
 def _read_variables(path: Path, columns: Sequence[str]) -> Table:
@@ -199,7 +224,8 @@ def _read_variables(path: Path, columns: Sequence[str]) -> Table:
 
 def _full(path: Path, columns: Mapping[str, Vector]) -> Table:
     """A table of a file type that has no empty cells."""
-    return Table(path, columns, {name: len(values) for name, values in columns.items()})
+    filled = {name: len(values) for name, values in columns.items()}
+    return Table(path, columns, filled, cell=lambda column, row: str(columns[column][row]))
 
 
 def _as_floats(array: np.ndarray, name: str, path: Path) -> Vector:
@@ -223,11 +249,8 @@ _READERS: dict[str, Callable[[Path, Sequence[str]], Table]] = {
 def _check_present(path: Path, columns: Sequence[str], header: Sequence[str]) -> None:
     for name in columns:
         if name not in header:
-            known = ", ".join(f"'{h}'" for h in header if h) or "no column names"
+            known = ", ".join(f"'{h}'" for h in list(header)[:_NAMED] if h) or "no column names"
+            known += f" and {len(header) - _NAMED} more" if len(header) > _NAMED else ""
             raise MissingColumnError(f"{path}: no column '{name}'{nearest(name, header)}; the file has {known}.")
         if list(header).count(name) > 1:
             raise InputError(f"{path}: the column '{name}' stands {list(header).count(name)} times; names must differ.")
-
-
-def _short(error: Exception) -> str:
-    return " ".join(str(error).split())[:120]

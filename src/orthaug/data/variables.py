@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +15,12 @@ import numpy as np
 
 from orthaug._base.checks import Vector, nearest
 from orthaug._base.errors import InputError, MissingColumnError
+from orthaug._base.memory import check_memory, in_words
+from orthaug.data.matlab import Variable, read_mat5
+
+_NAMED = 30  # variables that a message lists
+_HDF5, _USERBLOCK = b"\x89HDF\r\n", 4096  # how such a file begins, and before which byte it does
+_DIGITS = 10  # of an index at most
 
 
 @dataclass(frozen=True)
@@ -23,55 +32,87 @@ class Held:
 
 
 def read_variables(path: Path, names: Sequence[str]) -> dict[str, Vector]:
-    """The named channels: a vector (1×N or N×1), or a column of a matrix written `"U[2]"`, counted from 0.
+    """The named channels: a vector (1×N or N×1), or a line of a matrix, counted from 0.
+
+    A column is written `"U[2]"`, a row `"U[2,:]"`, a field of a MATLAB struct `"data.u"`.
 
     Raises:
-        InputError: a corrupt file, a missing variable, a struct, text, complex numbers; the message lists
+        InputError: a missing variable, a struct, text, complex numbers, a corrupt file; the message lists
             what the file holds.
     """
-    try:
+    with foreign(path):
         return _FORMATS[path.suffix.lower()](path, names)
+
+
+@contextmanager
+def foreign(path: Path) -> Iterator[None]:
+    """Inside, libraries read a file's bytes: what they raise is an InputError, and what they remark is not told."""
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            yield
     except InputError:
         raise
-    except _CORRUPT as error:
-        reason = "no archive of plain arrays" if path.suffix.lower() == ".npz" else " ".join(str(error).split())[:120]
+    except MemoryError:
+        raise InputError(f"{path}: reading the file takes more memory than there is.") from None
+    except Exception as error:  # there is no list of what they raise for corrupt files
+        reason = "no archive of plain arrays" if path.suffix.lower() == ".npz" else short(error)
         raise InputError(f"{path}: cannot be read as {path.suffix.lower()} ({reason}); is it cut or corrupt?") from None
 
 
-_CORRUPT = (OSError, ValueError, TypeError, KeyError, IndexError, AttributeError, EOFError, zipfile.BadZipFile)
-
-
 def _from_npz(path: Path, names: Sequence[str]) -> dict[str, Vector]:
-    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-        held = {}
-        for name in archive.files:
+    with zipfile.ZipFile(path) as archive:
+        held: dict[str, Held] = {}
+        for info in archive.infolist():
             try:
-                array = archive[name]
-            except ValueError:  # pickled objects, which are never opened
-                held[name] = Held("Python objects", None)
-            else:
-                held[name] = _array(array)
+                held[info.filename.removesuffix(".npy")] = _member(path, archive, info)
+            except Exception as error:  # one that cannot be read matters only where it is asked for
+                held[info.filename.removesuffix(".npy")] = Held(f"unreadable: {short(error)}", None)
         return {name: _pick(path, name, held) for name in names}
 
 
-def _from_mat(path: Path, names: Sequence[str]) -> dict[str, Vector]:
-    import scipy.io
-    import scipy.io.matlab
+def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Held:
+    """An array of an archive by its header; Python objects are never opened."""
+    with archive.open(info) as member:
+        version = np.lib.format.read_magic(member)
+        read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
+        shape, _, kind = read(member)
+        begin = member.tell()
+    if kind.hasobject:
+        return Held("Python objects", None)
+    if kind.kind not in "fiubc":
+        return Held("text" if kind.kind in "US" else f"{kind} values", None)
+    size = math.prod(shape) * kind.itemsize
+    if size != info.file_size - begin:
+        return Held(f"cut: {in_words(info.file_size - begin)} of {in_words(size)}", None)
 
-    try:
-        shapes = scipy.io.whosmat(path)
-    except NotImplementedError:  # v7.3 is HDF5
+    def load() -> np.ndarray:
+        with archive.open(info) as member:
+            return np.lib.format.read_array(member, allow_pickle=False)
+
+    return _lazy(path, shape, kind.itemsize, load)
+
+
+def _from_mat(path: Path, names: Sequence[str]) -> dict[str, Vector]:
+    content = path.read_bytes()
+    if _HDF5 in content[:_USERBLOCK] or content[124:126] in (b"\x00\x02", b"\x02\x00"):  # v7.3
         return _from_hdf5(path, names)
-    except scipy.io.matlab.MatReadError as error:
-        raise InputError(f"{path}: cannot be read as .mat ({error}); is it cut or corrupt?") from None
-    numeric = ("double", "single", "logical", "int", "uint")
-    held = {}
-    for name, shape, kind in shapes:
-        if kind.startswith(numeric):
-            held[name] = _lazy(shape, lambda name=name: scipy.io.loadmat(path, variable_names=[name])[name])
-        else:
-            held[name] = Held({"char": "text", "sparse": "a sparse matrix"}.get(kind, f"a {kind}"), None)
+    variables = read_mat5(content, path)
+    structs = {name.partition(".")[0] for name in names if name not in variables}
+    held: dict[str, Held] = {}
+    for name, variable in variables.items():
+        held |= _held(path, variable, deep=name in structs)
     return {name: _pick(path, name, held) for name in names}
+
+
+def _held(path: Path, variable: Variable, *, deep: bool) -> dict[str, Held]:
+    """A variable, with the fields in it if wanted, by their paths."""
+    if not variable.what:
+        return {variable.name: _lazy(path, variable.shape, 8, variable.numbers)}
+    held = {variable.name: Held(variable.what, None)}
+    for field in variable.fields() if deep else ():
+        held |= _held(path, field, deep=True)
+    return held
 
 
 def _from_hdf5(path: Path, names: Sequence[str]) -> dict[str, Vector]:
@@ -84,22 +125,31 @@ def _from_hdf5(path: Path, names: Sequence[str]) -> dict[str, Vector]:
     held: dict[str, Held] = {}
 
     def note(name: str, item: Any) -> None:
+        key = name.replace("/", ".") if matlab else name
         if isinstance(item, h5py.Group):
             if not name.startswith("#"):
                 sparse = "MATLAB_sparse" in item.attrs
-                held[name] = Held("a sparse matrix" if sparse else "a struct" if matlab else "a group", None)
+                held[key] = Held("a sparse matrix" if sparse else "a struct" if matlab else "a group", None)
         elif not name.startswith("#") and "MATLAB_sparse" not in item.parent.attrs:
             kind = item.attrs.get("MATLAB_class", b"")
             if kind in (b"char", b"cell", "char", "cell"):
-                held[name] = Held("text" if kind in (b"char", "char") else "a cell", None)
+                held[key] = Held("text" if kind in (b"char", "char") else "a cell", None)
+            elif item.shape is None:
+                held[key] = Held("empty", None)
             elif item.dtype.kind not in "fiubc" and item.dtype.names is None:
-                held[name] = Held(f"{item.dtype} values", None)
+                held[key] = Held(f"{item.dtype} values", None)
+            elif item.dtype.kind in "fiu" and item.id.get_type() != h5py.h5t.py_create(item.dtype):
+                held[key] = Held("numbers in a format of their own", None)
             else:
                 shape = item.shape[::-1] if matlab else item.shape
-                held[name] = _lazy(shape, lambda: item[()].T if matlab else item[()])
+                held[key] = _lazy(path, shape, item.dtype.itemsize, lambda: item[()].T if matlab else item[()])
 
     with h5py.File(path, "r") as file:
+        _ = [name in file for name in names]  # complains of broken tables on which a visit never ends
         file.visititems(note)
+        if matlab:
+            names_in = {name: name.replace("/", ".") for name in names}
+            return {name: _pick(path, key, held) for name, key in names_in.items()}
         return {name: _pick(path, name, held) for name in names}
 
 
@@ -111,42 +161,62 @@ _FORMATS: dict[str, Callable[[Path, Sequence[str]], dict[str, Vector]]] = {
 ENDINGS = tuple(_FORMATS)
 
 
-def _array(array: np.ndarray) -> Held:
-    if array.dtype.kind not in "fiubc":
-        return Held("text" if array.dtype.kind in "US" else f"{array.dtype} values", None)
-    return _lazy(array.shape, lambda: array)
+def short(error: Exception) -> str:
+    """What a library says, on one line."""
+    return " ".join(str(error).split())[:120] or type(error).__name__
 
 
-def _lazy(shape: Sequence[int], read: Callable[[], Any]) -> Held:
-    return Held("×".join(map(str, shape)) or "a scalar", read)
+def _lazy(path: Path, shape: Sequence[int], itemsize: int, read: Callable[[], Any]) -> Held:
+    what = "×".join(map(str, shape)) or "a scalar"
+
+    def fitting() -> Any:
+        check_memory(2 * math.prod(shape) * max(itemsize, 8), f"{path}: an array of {what} numbers")
+        return read()
+
+    return Held(what, fitting)
 
 
 def _pick(path: Path, name: str, held: Mapping[str, Held]) -> Vector:
-    variable, column = name, None
-    if name not in held and name.endswith("]") and "[" in name:
-        variable, _, index = name[:-1].rpartition("[")
-        if not index.strip().isdecimal():
-            raise InputError(f"{path}: '{name}': a column of a matrix is written \"{variable}[0]\", counted from 0.")
-        column = int(index)
-    listing = ", ".join(f"{key} ({value.what})" for key, value in held.items()) or "nothing"
+    variable, axis, index = (name, 0, 0) if name in held else _line(path, name)
+    listing = ", ".join(f"{key} ({value.what})" for key, value in list(held.items())[:_NAMED]) or "nothing"
+    listing += f" and {len(held) - _NAMED} more" if len(held) > _NAMED else ""
     if variable not in held:
         raise MissingColumnError(
             f"{path}: no variable '{variable}'{nearest(variable, held)}; the file holds {listing}."
         )
     read = held[variable].read
     if read is None:
-        raise InputError(f"{path}: '{variable}' is {held[variable].what}, no numbers; the file holds {listing}.")
+        hint = f' Name a field of it, such as "{variable}.u".' if held[variable].what.startswith("a struct") else ""
+        raise InputError(f"{path}: '{variable}' is {held[variable].what}, no numbers; the file holds {listing}.{hint}")
     array = np.asarray(read())
     if np.iscomplexobj(array) or array.dtype.names is not None:
         raise InputError(f"{path}: '{variable}' is complex; expected real numbers. The file holds {listing}.")
-    if column is not None:
-        if array.ndim != 2 or column >= array.shape[1]:
-            raise InputError(f"{path}: '{name}': no such column (counted from 0); the file holds {listing}.")
-        array = array[:, column]
+    if variable != name:
+        if array.ndim != 2 or index >= array.shape[axis]:
+            kind = "column" if axis else "row"
+            raise InputError(f"{path}: '{name}': no such {kind} (counted from 0); the file holds {listing}.")
+        array = array.take(index, axis=axis)
     if array.ndim == 2 and 1 in array.shape:
         array = array.ravel()
     if array.ndim != 1:
         raise InputError(
-            f"{path}: '{name}' is no vector; write a column of a matrix as \"{variable}[0]\". The file holds {listing}."
+            f"{path}: '{name}' is no vector; write a column of a matrix as \"{variable}[0]\", a row as "
+            f'"{variable}[0,:]". The file holds {listing}.'
         )
     return np.asarray(array, dtype=float)
+
+
+def _line(path: Path, name: str) -> tuple[str, int, int]:
+    """Variable, axis and index of a column `U[2]` or a row `U[2,:]`."""
+    if not (name.endswith("]") and "[" in name):
+        return name, 0, 0
+    variable, _, place = name[:-1].rpartition("[")
+    first, comma, second = (part.strip() for part in place.partition(","))
+    axis = 0 if comma and second == ":" else 1
+    index = second if comma and first == ":" else first
+    if not (index.isascii() and index.isdecimal() and len(index) < _DIGITS) or (comma and ":" not in (first, second)):
+        raise InputError(
+            f'{path}: \'{name}\': a column of a matrix is written "{variable}[0]", a row "{variable}[0,:]", '
+            "counted from 0."
+        )
+    return variable, axis, int(index)

@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Vector, check_choice, check_count, check_type, finite_or_none
-from orthaug._base.errors import InputError
+from orthaug._base.checks import Vector, check_choice, check_count, check_type, finite_or_none, is_number
+from orthaug._base.errors import InputError, shown
 from orthaug._base.jax import Array, jax, jnp
 from orthaug._base.parallel import spread
 from orthaug._base.progress import SILENT, Tell
 from orthaug.data.record import Record
 from orthaug.data.regressors import Features, Lags
 from orthaug.fitting.conclusion import conclude
+from orthaug.fitting.cost import check_cost
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.estimates import Estimate, Restart
 from orthaug.fitting.free_run import FreeRunTask
@@ -150,6 +151,9 @@ def fit(
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
     check_starts(restarts if initial is None else 1, seed, ensemble=ensemble)
     check_solver(solver, criterion, () if learner is None else choices)
+    if initial is None:
+        sizes = {"rows": len(problem.rows), "features": len(problem.features.entries), "outputs": len(problem.outputs)}
+        check_cost(learner, **sizes, iterations=solver.iterations, runs=restarts * len(choices))
     problem = replace(problem, features=Features(())) if learner is None and initial is None else problem
     warm = None
     if initial is not None:
@@ -358,9 +362,9 @@ def _regularizations(given: Any, validation: Record | None) -> tuple[Regularizat
         if isinstance(choice, str):
             check_choice(choice, ("none", "evidence"), "`regularization`")
         elif isinstance(choice, bool) or not isinstance(choice, int | float | np.number):
-            raise InputError(f"`regularization` must be none, evidence or a number; got {choice!r}.")
-        elif not (np.isfinite(choice) and choice >= 0):
-            raise InputError(f"`regularization` must be 0 or more; got {choice}.")
+            raise InputError(f"`regularization` must be none, evidence or a number; got {shown(choice)}.")
+        elif not (is_number(choice) and choice >= 0):
+            raise InputError(f"`regularization` must be 0 or more; got {shown(choice)}.")
     if not choices:
         raise InputError("`regularization` is empty; give none, evidence or a number.")
     return choices

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from orthaug._base.errors import KeyedError
+from orthaug._base.errors import KeyedError, shown
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.kinds import SOLVERS
 from orthaug.fitting.solvers.solver import Solver
@@ -13,10 +13,10 @@ from orthaug.fitting.solvers.solver import Solver
 def check_starts(restarts: int, seed: int, *, ensemble: bool) -> None:
     """Raise InputError for seeds that are too large, or an ensemble of one."""
     if seed + restarts >= 2**63:
-        words = f": found {seed}; expected seeds below 2**63 for all restarts"
-        raise KeyedError(f"`seed` must be below 2**63; got {seed}.", "seed", words)
+        words = f": found {shown(seed)}; expected seeds below 2**63 for all restarts"
+        raise KeyedError(f"`seed` must be below 2**63; got {shown(seed)}.", "seed", words)
     if ensemble and restarts < 2:
-        words = f": found {restarts}; expected 2 or more for an ensemble"
+        words = f": found {shown(restarts)}; expected 2 or more for an ensemble"
         raise KeyedError("an ensemble needs `restarts` of 2 or more to be the median of.", "restarts", words)
 
 

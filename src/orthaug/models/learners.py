@@ -18,7 +18,7 @@ from annotated_types import Ge
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, shown
 from orthaug._base.jax import Array, is_traced, jax, jnp
 from orthaug._base.registry import OneOf, check_fields
 
@@ -35,6 +35,7 @@ ACTIVATIONS: dict[str, Callable[[Any], Any]] = {
     "identity": lambda a: a,
 }
 """By name. They call JAX only when they are called, so that a spec is read without it."""
+MOST_LAYERS = 10  # hidden ones; ten take half a minute to compile
 _GAIN = {"tanh": 5 / 3, "relu": math.sqrt(2.0)}  # Xavier gains; 1 for the others
 
 
@@ -78,15 +79,28 @@ class MLP:
 
     def __post_init__(self) -> None:
         if not isinstance(self.hidden, tuple | list):
-            raise InputError(f"`hidden` must be a tuple of neurons per layer, such as (16,); got {self.hidden!r}.")
+            raise InputError(f"`hidden` must be a tuple of neurons per layer, such as (16,); got {shown(self.hidden)}.")
         if isinstance(self.inputs, str):
             raise InputError(f"`inputs` must be a tuple of expressions, such as ('{self.inputs}',); got one text.")
+        if not isinstance(self.inputs, list | tuple | None) or any(not isinstance(i, str) for i in self.inputs or ()):
+            raise InputError(
+                f"`inputs` must be a tuple of expressions, or None for all lags; got {shown(self.inputs)}."
+            )
         object.__setattr__(self, "hidden", tuple(self.hidden))
         if self.inputs is not None:
             object.__setattr__(self, "inputs", tuple(self.inputs))
         if any(isinstance(n, bool) or not isinstance(n, int) or n < 1 for n in self.hidden):
-            raise InputError(f"`hidden` must be whole numbers of neurons, 1 or more; got {self.hidden}.")
+            raise InputError(f"`hidden` must be whole numbers of neurons, 1 or more; got {shown(self.hidden)}.")
+        if len(self.hidden) > MOST_LAYERS:
+            raise InputError(
+                f"`hidden` has {len(self.hidden)} layers; at most {MOST_LAYERS} are taken: more compile for minutes."
+            )
         check_fields(self)
+
+    def weights(self, nz: int, ny: int) -> int:
+        """How many weights it has for `nz` features and `ny` outputs."""
+        sizes = (nz, *self.hidden, ny)
+        return sum((fan_in + 1) * fan_out for fan_in, fan_out in zip(sizes, sizes[1:], strict=False))
 
     def init(self, key: Array, nz: int, ny: int) -> Tree:
         sizes = (nz, *self.hidden, ny)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Matrix, Vector, as_signal, check_count
-from orthaug._base.errors import InputError
+from orthaug._base.checks import Matrix, Vector, as_signal, check_count, check_type
+from orthaug._base.errors import InputError, shown
 from orthaug._base.jax import Array, jax, jnp, padded_length
 from orthaug.data.record import Channel, Experiment, Record, same_step
 from orthaug.models.dynamics import Dynamics, Numbers, Parts
@@ -202,7 +202,7 @@ class Model:
         """Raises InputError where an experiment ends before the row `first`."""
         if len(experiment) <= first:
             name = experiment.source or "the record"
-            raise InputError(f"{name} has {len(experiment)} rows, too few: the first value is at row {first}.")
+            raise InputError(f"{name} has {len(experiment)} rows, too few: the first value is at row {shown(first)}.")
 
     def fitting(self, record: Record, *, need_outputs: bool) -> Record:
         """The record's channels in the model's order, by name.
@@ -210,6 +210,8 @@ class Model:
         Raises:
             InputError: a channel is missing, or the sampling time differs by more than 0.1 %.
         """
+        wanted = f"a Record, such as Record.from_arrays(u=u, sampling_time={self.sampling_time:g})"
+        check_type(record, Record, "record", wanted)
         if not same_step(record.sampling_time, self.sampling_time):
             raise InputError(
                 f"the record is sampled every {record.sampling_time:g} s, the model every {self.sampling_time:g} s; "

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from safetensors.numpy import load as load_arrays
 from safetensors.numpy import save as save_arrays
 
 from orthaug import __version__
+from orthaug._base.checks import check_type
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
 from orthaug._base.registry import frozen
@@ -90,6 +92,7 @@ def load(folder: str | Path, *, baseline: Baseline | None = None, learner: Learn
     Raises:
         InputError: no model there; a file that is cut, altered, or from a newer version.
     """
+    check_type(folder, str | os.PathLike, "folder", "a folder's name")
     folder = Path(folder)
     try:
         if not (folder / _DECLARATION).exists() and (folder / "model" / _DECLARATION).exists():
@@ -97,12 +100,18 @@ def load(folder: str | Path, *, baseline: Baseline | None = None, learner: Learn
         there = (folder / _DECLARATION).is_file() and (folder / _ARRAYS).is_file()
     except OSError as error:
         raise InputError(f"{folder}: cannot be read ({error.strerror}).") from None
+    except ValueError:  # a NUL byte in the name
+        there = False
     if not there:
         raise InputError(f"{folder}: no saved model there; expected {_DECLARATION} and {_ARRAYS}.")
     path = folder / _DECLARATION
     try:
-        declared = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError):
+        declared, packed = json.loads(path.read_text(encoding="utf-8")), (folder / _ARRAYS).read_bytes()
+        given = declared.pop("checksum", None) if isinstance(declared, dict) else None
+        checksum = _checksum(declared)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read ({error.strerror}).") from None
+    except (ValueError, RecursionError):
         raise InputError(f"{path}: the file is cut or altered (no JSON); fit again, or copy it again.") from None
     if not isinstance(declared, dict) or type(declared.get("format")) is not int or declared["format"] < 1:
         raise InputError(f"{path}: not a model of orthaug.")
@@ -111,10 +120,9 @@ def load(folder: str | Path, *, baseline: Baseline | None = None, learner: Learn
             f"{path}: written by orthaug {declared.get('orthaug')} in format {declared['format']}; this version "
             f"({__version__}) reads up to {FORMAT}. Update orthaug."
         )
-    if declared.pop("checksum", None) != _checksum(declared):
+    if given != checksum:
         raise InputError(f"{path}: the file was altered (its checksum differs); fit again, or copy it again.")
-    packed = (folder / _ARRAYS).read_bytes()
-    if hashlib.sha256(packed).hexdigest() != declared["arrays_sha256"]:
+    if hashlib.sha256(packed).hexdigest() != declared.get("arrays_sha256"):
         raise InputError(f"{folder / _ARRAYS}: the file is cut or altered (its checksum differs); copy it again.")
     try:
         arrays = load_arrays(packed)
@@ -122,7 +130,9 @@ def load(folder: str | Path, *, baseline: Baseline | None = None, learner: Learn
         raise InputError(f"{folder / _ARRAYS}: cannot be read ({error}).") from None
     try:
         return _rebuild(declared, arrays, baseline, learner, path)
-    except (KeyError, TypeError, AttributeError, IndexError) as error:
+    except InputError:
+        raise
+    except Exception as error:  # the checksum holds, so someone made it: there is no list of what that can hold
         raise InputError(f"{path}: not a model of this version (missing or misplaced: {error}).") from None
 
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.checks import check_unique, is_number
-from orthaug._base.errors import InputError
-from orthaug.data.expressions import RESERVED, Expression, Lag, is_name, parse
+from orthaug._base.checks import check_label, check_type, check_unique, is_number
+from orthaug._base.errors import LONGEST, InputError, shown
+from orthaug.data.expressions import RESERVED, Expression, Lag, is_identifier, is_name, parse
 from orthaug.data.regressors import Layout, in_order
 
 
@@ -25,6 +25,30 @@ class Parameter:
     unit: str = ""
     min: float = -math.inf
     max: float = math.inf
+
+    def __post_init__(self) -> None:
+        check_parameter_name(self.name)
+        check_label(self.unit, f"the unit of '{self.name}'")
+        if not is_number(self.initial):
+            raise InputError(f"the initial value of '{self.name}' must be a finite number; got {shown(self.initial)}.")
+        check_bounds(self.name, self.min, self.max)
+
+
+def check_parameter_name(name: Any) -> None:
+    """Raise InputError unless `name` is an identifier."""
+    if not is_identifier(name):
+        raise InputError(
+            f"{shown(name)} cannot name a parameter; use letters, digits and underscores, at most {LONGEST}, not "
+            "starting with a digit."
+        )
+
+
+def check_bounds(name: str, low: Any, high: Any) -> None:
+    """Raise InputError for bounds of a parameter that are no numbers, empty or reversed."""
+    if any(isinstance(b, bool) or not isinstance(b, int | float | np.number) for b in (low, high)):
+        raise InputError(f"the bounds of '{name}' must be numbers; got min = {shown(low)}, max = {shown(high)}.")
+    if not low < high:
+        raise InputError(f"the bounds of '{name}' are empty or reversed: min = {low:g}, max = {high:g}.")
 
 
 @dataclass(frozen=True)
@@ -69,17 +93,20 @@ class Baseline:
             InputError: an expression that is not arithmetic on lagged channels, or terms of one parameter
                 that disagree on its initial value, unit or being fixed.
         """
+        if not isinstance(terms, Sequence) or not all(isinstance(term, Term) for term in terms):
+            raise InputError(f"`terms` must be a list of Terms, such as [Term('a', 'y[k-1]')]; got {shown(terms)}.")
         if not terms:
             raise InputError("the baseline has no terms; give at least one, such as y[k-1].")
+        check_type(constants, Mapping | None, "constants", "numbers by name")
         constants = dict(constants or {})
         for name, value in constants.items():
             if not is_name(name):
                 raise InputError(
-                    f"'{name}' cannot name a constant; use letters, digits and underscores, not starting with a digit, "
-                    f"and no keyword; {', '.join(sorted(RESERVED))} are taken."
+                    f"{shown(name)} cannot name a constant; use letters, digits and underscores, not starting with a "
+                    f"digit, and no keyword; {', '.join(sorted(RESERVED))} are taken."
                 )
             if not is_number(value):
-                raise InputError(f"the constant '{name}' must be a finite number; got {value!r}.")
+                raise InputError(f"the constant '{name}' must be a finite number; got {shown(value)}.")
         terms = _agreed(terms)
         parameters = {t.parameter: _parameter(t) for t in terms if not t.fixed}
         baseline = cls(tuple(parameters.values()), tuple(terms), tuple(sorted(constants.items())))
@@ -89,6 +116,8 @@ class Baseline:
     @classmethod
     def from_function(cls, function: Callable[[Any], Any], parameters: Sequence[str | Parameter]) -> Baseline:
         """From a JAX function φ(x) of the regressor x (nx,) in `Lags` order, returning (ny, nθ)."""
+        if not callable(function) or isinstance(parameters, str) or not isinstance(parameters, Sequence):
+            raise InputError("`from_function` takes a function of the regressor and a list of parameter names.")
         entries = tuple(p if isinstance(p, Parameter) else Parameter(p) for p in parameters)
         check_unique((p.name for p in entries), "parameter")
         return cls(entries, function=function)
@@ -107,6 +136,15 @@ class Baseline:
     def initial(self) -> np.ndarray:
         """θ⁰, (nθ,)."""
         return np.array([p.initial for p in self.parameters], dtype=float)
+
+    def check_initial(self) -> None:
+        """Raise InputError for an initial value beyond its bounds; 0 is the default."""
+        for p in self.parameters:
+            if not p.min <= p.initial <= p.max:
+                raise InputError(
+                    f"the initial value of '{p.name}' is {p.initial:g}; its bounds are {p.min:g} and {p.max:g}. Give "
+                    "an `initial` between them."
+                )
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -199,16 +237,20 @@ def _agreed(terms: Sequence[Term]) -> list[Term]:
     """The terms; what one of them says about a parameter, all of its terms say."""
     said: dict[tuple[str, str], Any] = {}
     for term in terms:
-        if not term.parameter.strip() or not term.parameter.isprintable():
-            raise InputError(f"{term.parameter!r} cannot name a parameter; use visible characters on one line.")
+        check_parameter_name(term.parameter)
+        check_label("" if term.unit is None else term.unit, f"the unit of '{term.parameter}'")
+        check_type(term.fixed, bool, f"fixed of '{term.parameter}'", "true or false")
+        check_type(term.output, str | None, f"output of '{term.parameter}'", "the name of an output")
         for what, value in (("initial value", term.initial), ("lower bound", term.min), ("upper bound", term.max)):
             if value is not None and not is_number(value):
-                raise InputError(f"the {what} of '{term.parameter}' must be a finite number; got {value!r}.")
+                raise InputError(f"the {what} of '{term.parameter}' must be a finite number; got {shown(value)}.")
         for attribute in _SHARED:
             value = getattr(term, attribute)
             if value is not None and said.setdefault((term.parameter, attribute), value) != value:
                 first = said[term.parameter, attribute]
-                raise InputError(f"the terms of '{term.parameter}' disagree on `{attribute}`: {first!r} and {value!r}.")
+                raise InputError(
+                    f"the terms of '{term.parameter}' disagree on `{attribute}`: {shown(first)} and {shown(value)}."
+                )
     for term in terms:
         if term.fixed and (term.parameter, "initial") not in said:
             raise InputError(f"the term of '{term.parameter}' is fixed but gives no `initial`: its known coefficient.")
@@ -219,6 +261,4 @@ def _parameter(term: Term) -> Parameter:
     """The parameter of a term from `_agreed`."""
     low = -math.inf if term.min is None else float(term.min)
     high = math.inf if term.max is None else float(term.max)
-    if not low < high:
-        raise InputError(f"the bounds of '{term.parameter}' are empty or reversed: min = {low:g}, max = {high:g}.")
     return Parameter(term.parameter, float(term.initial or 0.0), term.unit or "", low, high)

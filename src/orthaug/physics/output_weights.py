@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector, check_choice
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, shown
 
 CHOICES = ("auto", "none", "std", "covariance")
 _SMALLEST, _LARGEST = 1e-12, 1e12  # of one weight against another: beyond, an output does not count at all
@@ -82,16 +82,19 @@ def check_output_weights(choice: Any, ny: int) -> None:
         check_choice(choice, CHOICES, "`output_weights`")
         return
     expected = f"expected one of {', '.join(CHOICES)}, or {ny} positive weights, one for each output"
-    if not isinstance(choice, Sequence | np.ndarray) or any(isinstance(w, bool | str) for w in choice):
-        raise InputError(f"`output_weights` is {choice!r}; {expected}.")
+    listed = isinstance(choice, Sequence) or (isinstance(choice, np.ndarray) and choice.ndim > 0)
+    if not listed or any(isinstance(w, bool | str) for w in choice):
+        raise InputError(f"`output_weights` is {shown(choice)}; {expected}.")
     try:
         values = np.asarray(choice, dtype=float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         values = np.zeros(0)
     if values.shape != (ny,) or not np.all(np.isfinite(values) & (values > 0)):
-        raise InputError(f"`output_weights` is {choice!r}; {expected}.")
+        raise InputError(f"`output_weights` is {shown(choice)}; {expected}.")
     if values.min() < _SMALLEST * values.max():
-        raise InputError(f"`output_weights` {choice!r} differ by more than {_LARGEST:g}; leave the output out instead.")
+        raise InputError(
+            f"`output_weights` {shown(choice)} differ by more than {_LARGEST:g}; leave the output out instead."
+        )
 
 
 def weigh_outputs(choice: str | Sequence[float], deviation: Vector) -> OutputWeights:

@@ -14,27 +14,36 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.checks import Matrix, Vector, check_unique, is_number, nearest
-from orthaug._base.errors import InputError
+from orthaug._base.checks import Matrix, Vector, check_label, check_unique, is_number, nearest
+from orthaug._base.errors import InputError, shown
 from orthaug.data.expressions import FUNCTIONS, RESERVED, Expression, is_name, parse
-from orthaug.physics.baseline import Baseline
+from orthaug.physics.baseline import Baseline, check_bounds
 from orthaug.physics.excitation import Excitation, excitation
 
 AGREEMENT = 1e-6  # relative difference up to which a term's `initial` is what the physics gives
 
+_STEP = 1e-100  # h relative to p: h² vanishes beside 1, and products with h are far from underflow
+
+
+def _complex_arctan2(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    slope = np.real(b) * np.imag(a) - np.real(a) * np.imag(b)
+    return np.arctan2(np.real(a), np.real(b)) + 1j * slope / (np.real(a) ** 2 + np.real(b) ** 2)
+
 
 # What `Expression.evaluate` asks of numpy, on p + ih: Im θ / h is dθ/dp by the complex step (Squire & Trapp 1998),
-# exact up to rounding whatever the scales of p are. The functions of numpy are analytic, these five are not. They take
+# exact up to rounding whatever the scales of p are. The functions of numpy are analytic, these seven are not. They take
 # the branch of the real part: at a kink that is the slope of one side.
 _COMPLEX = SimpleNamespace(
     asarray=lambda x, dtype=None: np.asarray(x, dtype=complex),
     abs=lambda x: np.where(np.real(x) < 0, -1.0, 1.0) * x,
     sign=lambda x: np.sign(np.real(x)),
+    floor=lambda x: np.floor(np.real(x)),
+    arctan=np.arctan,
+    arctan2=_complex_arctan2,
     minimum=lambda a, b: np.where(np.real(a) <= np.real(b), a, b),
     maximum=lambda a, b: np.where(np.real(a) >= np.real(b), a, b),
-    **{name: getattr(np, name) for name in FUNCTIONS if name not in ("abs", "sign", "min", "max")},
+    **{name: getattr(np, name) for name in ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh")},
 )
-_STEP = 1e-100  # h relative to p: h² vanishes beside 1, and products with h are far from underflow
 
 
 @dataclass(frozen=True)
@@ -191,16 +200,14 @@ def _check_parameters(parameters: Sequence[PhysicalParameter], constants: Mappin
             )
     for name, value in constants.items():
         if not is_number(value):
-            raise InputError(f"the constant '{name}' must be a finite number; got {value!r}.")
+            raise InputError(f"the constant '{name}' must be a finite number; got {shown(value)}.")
     for p in parameters:
         if p.name in constants:
             raise InputError(f"'{p.name}' is a physical parameter and a constant; give one of them another name.")
         if not is_number(p.initial):
-            raise InputError(f"the initial value of '{p.name}' must be a finite number; got {p.initial!r}.")
-        if any(isinstance(b, bool) or not isinstance(b, int | float | np.number) for b in (p.min, p.max)):
-            raise InputError(f"the bounds of '{p.name}' must be numbers; got min = {p.min!r}, max = {p.max!r}.")
-        if not p.min < p.max:
-            raise InputError(f"the bounds of '{p.name}' are empty or reversed: min = {p.min:g}, max = {p.max:g}.")
+            raise InputError(f"the initial value of '{p.name}' must be a finite number; got {shown(p.initial)}.")
+        check_label(p.unit, f"the unit of '{p.name}'")
+        check_bounds(p.name, p.min, p.max)
         if not p.min <= p.initial <= p.max:
             raise InputError(
                 f"the initial value of '{p.name}' is {p.initial:g}; its bounds are {p.min:g} and {p.max:g}."
@@ -211,7 +218,7 @@ def _parsed(name: str, text: str, known: Mapping[str, float], parameters: Sequen
     """The expression of one θ. Its names are checked first: `parse` would take an unknown name for a channel."""
     where = f"physics.theta '{name}'"
     if not isinstance(text, str):
-        raise InputError(f"{where} must be an expression in text such as 'Ts**2 / m'; got {text!r}.")
+        raise InputError(f"{where} must be an expression in text such as 'Ts**2 / m'; got {shown(text)}.")
     if "[" in text:
         raise InputError(f"{where} = {text}: a signal such as y[k-1] is no part of it; use parameters and constants.")
     for word in re.findall(r"\b[^\W\d]\w*", unicodedata.normalize("NFKC", text)):

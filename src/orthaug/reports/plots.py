@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
+from functools import wraps
 from pathlib import Path
+from typing import ParamSpec
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from orthaug.models.response import Response
 from orthaug.reports.findings import ResidualTestResult, SuspectResult
@@ -17,9 +21,24 @@ _BLACK, _GREY, _BLUE, _ORANGE, _GREEN = "#000000", "#B8B8B8", "#0072B2", "#E69F0
 _CYCLE = (_BLUE, _ORANGE, _GREEN, _BLACK)
 _KINDS = ("prediction", "simulation")
 _WINDOW = 250  # samples of a long record that are shown, so that single swings can be seen
+Drawn = ParamSpec("Drawn")
 _SIZE = (7.0, 2.4)  # inches per panel
 
 
+def _plain(draw: Callable[Drawn, Figure]) -> Callable[Drawn, Figure]:
+    """Figures whose text is shown as it is: a `$` in a unit or name begins no formula."""
+
+    @wraps(draw)
+    def drawn(*arguments: Drawn.args, **options: Drawn.kwargs) -> Figure:
+        figure = draw(*arguments, **options)
+        for text in figure.findobj(Text):
+            text.set_parse_math(False)  # type: ignore[attr-defined]
+        return figure
+
+    return drawn
+
+
+@_plain
 def output_figure(response: Response, title: str) -> Figure:
     """Measured output against the model, and below it their difference, from the first value on."""
     trajectory = response.trajectories[0]
@@ -40,6 +59,7 @@ def output_figure(response: Response, title: str) -> Figure:
     return figure
 
 
+@_plain
 def residual_figure(response: Response, title: str) -> Figure:
     """Measured minus model over the whole record, one panel per output."""
     trajectory = response.trajectories[0]
@@ -55,6 +75,7 @@ def residual_figure(response: Response, title: str) -> Figure:
     return figure
 
 
+@_plain
 def components_figure(response: Response, title: str) -> Figure:
     """The baseline's and the learner's part of the model's output, each on its own scale; two panels per output."""
     time, rows = _window(response)
@@ -63,8 +84,8 @@ def components_figure(response: Response, title: str) -> Figure:
     for i, channel in enumerate(response.outputs):
         unit = f" [{channel.unit}]" if channel.unit else ""
         for axis, values, color, part, formula in (
-            (axes[2 * i], trajectory.baseline, _BLUE, "baseline", r"$\varphi\,\theta$"),
-            (axes[2 * i + 1], trajectory.learner, _GREEN, "learner", r"$f - \varphi\,\theta_{\mathrm{aux}}$"),
+            (axes[2 * i], trajectory.baseline, _BLUE, "baseline", "φ θ"),
+            (axes[2 * i + 1], trajectory.learner, _GREEN, "learner", "f − φ θ_aux"),
         ):
             axis.plot(
                 time, values[rows, i], color=color, linewidth=1.1, label=f"{part} part of {channel.name}, {formula}"
@@ -76,6 +97,7 @@ def components_figure(response: Response, title: str) -> Figure:
     return figure
 
 
+@_plain
 def residual_analysis_figure(tests: Sequence[ResidualTestResult], title: str) -> Figure:
     """Of each residual: autocorrelation, correlation with the inputs, means over its most telling regressor."""
     figure = Figure(figsize=(_SIZE[0] * 1.3, 0.5 + 2.6 * len(tests)), layout="constrained")
@@ -115,6 +137,7 @@ def residual_analysis_figure(tests: Sequence[ResidualTestResult], title: str) ->
     return figure
 
 
+@_plain
 def bias_figure(suspects: Sequence[SuspectResult]) -> Figure:
     """Heat map of the bias of each parameter by each suspect, in per cent."""
     names, labels = list(suspects[0].percent), [suspect.name for suspect in suspects]
@@ -139,6 +162,7 @@ def bias_figure(suspects: Sequence[SuspectResult]) -> Figure:
     return figure
 
 
+@_plain
 def comparison_figure(rows: Sequence[RowResult]) -> Figure:
     """Scores and parameters of several ways of modelling, from the rows of a comparison.
 
@@ -192,7 +216,9 @@ def _floats(values: Sequence[float | None]) -> np.ndarray:
 
 def save(figure: Figure, path: Path) -> None:
     """Write a PNG that is sharp at column width."""
-    figure.savefig(path, dpi=160)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # such as a unit in letters that the font lacks
+        figure.savefig(path, dpi=160)
 
 
 def _panels(response: Response, title: str, heights: tuple[int, ...] = (1,)) -> tuple[Figure, list]:

@@ -1,0 +1,53 @@
+"""How much memory there is, and the refusal of what would not fit."""
+
+from __future__ import annotations
+
+import math
+import os
+
+from orthaug._base.errors import InputError
+
+
+def available() -> float:
+    """Bytes that this process may still take; infinite where the system does not say."""
+    return min(_unused(), _allowed())
+
+
+def check_memory(size: float, what: str) -> None:
+    """Raise InputError where `size` bytes are more than there are; `what` begins the sentence."""
+    there = available()
+    if size > there:
+        raise InputError(f"{what} would take {in_words(size)} of memory; {in_words(there)} are available.")
+
+
+def in_words(size: float) -> str:
+    """Bytes in the unit that suits them."""
+    step = max(0, min(int(math.log(max(size, 1), 1024)), 5))
+    return f"{size / 1024**step:.3g} {('bytes', 'KiB', 'MiB', 'GiB', 'TiB', 'PiB')[step]}"
+
+
+def _unused() -> float:
+    """Memory that no process uses."""
+    try:
+        with open("/proc/meminfo", encoding="ascii") as file:
+            lines = dict(line.split(":", 1) for line in file)
+        return 1024.0 * int(lines["MemAvailable"].split()[0])
+    except (OSError, KeyError, ValueError):
+        try:
+            return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+        except (AttributeError, OSError, ValueError):
+            return math.inf
+
+
+def _allowed() -> float:
+    """What limits on the process (`ulimit -v`) leave."""
+    try:
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit == resource.RLIM_INFINITY:
+            return math.inf
+        with open("/proc/self/statm", encoding="ascii") as file:
+            return max(0.0, limit - int(file.read().split()[0]) * resource.getpagesize())
+    except (ImportError, OSError, ValueError):
+        return math.inf
