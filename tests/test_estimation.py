@@ -12,7 +12,7 @@ from orthaug.data.record import Channel, Record
 from orthaug.data.regressors import Lags
 from orthaug.fitting.estimation import estimate, orthogonalize
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import Additive
+from orthaug.fitting.structures import Additive, Orthogonal
 from orthaug.models.learners import MLP, Function
 from orthaug.physics.baseline import Baseline, Parameter, Term
 
@@ -140,8 +140,8 @@ def test_numbers_from_numpy_are_taken(record):
 @pytest.mark.parametrize("structure", ["orthogonal", "additive"])
 def test_linear_learner_on_expressions_is_least_squares(record, structure):
     learner = MLP(hidden=(), inputs=("u[k]**2", "sin(3*u[k-1])"))
-    arguments = {"structure": Additive()} if structure == "additive" else {}
-    found = estimate(record, PHYSICS, learner=learner, **arguments)
+    chosen = {"additive": Additive(), "orthogonal": Orthogonal(shared="all")}[structure]
+    found = estimate(record, PHYSICS, learner=learner, structure=chosen)
     more = (lambda y, u, k: u[k] ** 2, lambda y, u, k: np.sin(3 * u[k - 1]), lambda y, u, k: 1.0)
     a = columns(record, 1, *PHI, *more)
     b = target(record, 1)
@@ -149,10 +149,12 @@ def test_linear_learner_on_expressions_is_least_squares(record, structure):
     np.testing.assert_allclose(found.model.predict(record).model[1:, 0], a @ least_squares(a, b), atol=1e-9)
     if structure == "orthogonal":
         np.testing.assert_allclose(found.theta, least_squares(a[:, :2], b), rtol=1e-12)
+        beside = estimate(record, PHYSICS, learner=learner).theta  # it cannot imitate the physics: a joint regression
+        np.testing.assert_allclose(beside, least_squares(a, b)[:2], rtol=1e-6)
 
 
 def test_learner_with_other_lags_than_the_baseline(record):
-    found = estimate(record, PHYSICS, lags=Lags(na=0, nb=2, nk=2), learner=LINEAR)
+    found = estimate(record, PHYSICS, lags=Lags(na=0, nb=2, nk=2), learner=LINEAR, structure=Orthogonal(shared="all"))
     a = columns(record, 3, *PHI, lambda y, u, k: u[k - 2], lambda y, u, k: u[k - 3], lambda y, u, k: 1.0)
     b = target(record, 3)
     assert (found.model.form.first_row, len(found.problem.rows)) == (3, 118)
@@ -163,7 +165,8 @@ def test_learner_with_other_lags_than_the_baseline(record):
 @pytest.mark.parametrize("learner", [None, MLP(hidden=(), inputs=("u[k]**2",))])
 def test_experiments_given_twice_weigh_twice(learner):
     one, other = record_of(1, 61), record_of(2, 61)
-    found = estimate(Record.join([one, other, one]), PHYSICS, learner=learner)
+    structure = Orthogonal(shared="all")
+    found = estimate(Record.join([one, other, one]), PHYSICS, learner=learner, structure=structure)
     functions = [*PHI] if learner is None else [*PHI, lambda y, u, k: u[k] ** 2, lambda y, u, k: 1.0]
     both = Record.join([one, other])
     a, b = columns(both, 1, *functions), target(both, 1)

@@ -77,16 +77,18 @@ FIXED = ({}, {1: 0.7}, {2: -0.3, 0: 1.2}, {0: 0.1, 1: 0.2, 2: 0.3})
 
 
 def elimination(rows=0, bounds=NO_BOUNDS, seed=0):
-    """Random coordinates, outputs and rows for three entries of θ."""
+    """Random coordinates, outputs and rows for three entries of θ; one direction of the learner is moved to θ."""
     rng = np.random.default_rng(seed)
     penalty = PenaltyRows(rng.normal(size=(rows, 3)), rng.normal(size=(rows, 3)), rng.normal(size=rows))
-    return Elimination(rng.normal(size=(3, 3)), 3 * rng.normal(size=3), penalty, *bounds)
+    coordinates, outputs, direction = rng.normal(size=(3, 3)), 3 * rng.normal(size=3), rng.normal(size=3)
+    taken = np.outer(direction, direction) / (direction @ direction)
+    return Elimination(coordinates, outputs, taken, penalty, *bounds)
 
 
 def stacked(given, f):
     """Matrix and right-hand side of the whole quadratic in θ, written out."""
     matrix = np.vstack([given.to_coordinates, given.rows.theta])
-    return matrix, np.concatenate([given.outputs - f, given.rows.target - given.rows.learner @ f])
+    return matrix, np.concatenate([given.outputs - f + given.taken @ f, given.rows.target - given.rows.learner @ f])
 
 
 def least(given, f, fixed):
@@ -120,7 +122,8 @@ def test_a_theta_that_can_follow_leaves_nothing():
 @pytest.mark.parametrize("structure", ALL, ids=lambda s: s.name)
 @pytest.mark.parametrize("f", [np.zeros(3), np.array([1.0, -2.0, 3.0])], ids=["f = 0", "f"])
 def test_hold_of_every_structure(structure, f):
-    given = Elimination(np.diag([3.0, 2.0, 1.0]), np.ones(3), structure.penalty(NAMES, INITIAL, 2.0), *NO_BOUNDS)
+    penalty = structure.penalty(NAMES, INITIAL, 2.0)
+    given = Elimination(np.diag([3.0, 2.0, 1.0]), np.ones(3), np.zeros((3, 3)), penalty, *NO_BOUNDS)
     matrix, target = given.hold({})
     apart = least(given, f, {})[0] - least(given, np.ones(3), {})[0]
     held = np.sum((target - matrix @ f) ** 2) - np.sum((target - matrix @ np.ones(3)) ** 2)
@@ -184,8 +187,9 @@ def test_columns_of_very_different_size():
     box = np.array([-0.1, -1.0, -2.0]) / size, np.array([0.1, 1.0, 0.05]) / size
     square, outputs = rng.normal(size=(3, 3)), rng.normal(size=3)
     rows = PenaltyRows(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-    given = Elimination(square * size, outputs, rows, *box)
-    plain = Elimination(square, outputs, rows, box[0] * size, box[1] * size)
+    nothing = np.zeros((3, 3))
+    given = Elimination(square * size, outputs, nothing, rows, *box)
+    plain = Elimination(square, outputs, nothing, rows, box[0] * size, box[1] * size)
     f = np.zeros(3)
     np.testing.assert_allclose(given.theta(f, given.active(f)) * size, enumerated(plain, f), rtol=1e-9)
 
