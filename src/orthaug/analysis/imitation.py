@@ -49,10 +49,7 @@ class Imitation:
         """In sentences."""
         sees = f"The learner sees {_listed(self.inputs)}"
         if self.everything:
-            return (
-                f"{sees} and could imitate all of the physics: θ is split off along every direction, which makes it "
-                "the least-squares estimate of the physics alone."
-            )
+            return f"{sees} and could imitate all of the physics: θ is split off along every direction."
         if not self.directions:
             return f"{sees} and could imitate nothing of the physics: the fit determines every parameter beside it."
         could = _listed([_combination(direction) for direction in self.directions])

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.fitting.elimination import Elimination, Fixed
-from orthaug.fitting.normal_equations import Blocks, Normal
+from orthaug.fitting.normal_equations import Blocks, Hold, Normal, collect
 from orthaug.models.learners import Bound
 from orthaug.models.rows import Chunk, Overlap, row_sum
 from orthaug.physics.problem import Problem
@@ -102,17 +102,14 @@ class JointOneStep:
         nt = len(physics.outputs)
         v, w = p[:nt], p[nt:]
         known = Overlap(before.jacobian[:, nt:], before.values)  # of QᵀJ and QᵀF, subtracted from the rows
-        blocks = Blocks(self.bound)
-        total = row_sum(lambda chunk: blocks(chunk, w, known), rows)
-        g_qr, g_qj = total[:nt, nt], total[:nt, nt + 1 :]
-        g_rr, g_jr, g_jj = total[nt, nt], total[nt + 1 :, nt], total[nt + 1 :, nt + 1 :]
-        share = Overlap(known.jacobian + g_qj, known.values - g_qr)
+        blocks, free = Blocks(self.bound), Hold(jnp.zeros((nt, nt)), jnp.zeros(nt))
+        rest = collect(row_sum(lambda chunk: blocks(chunk, w, known), rows), free, known)  # what is orthogonal to Q
+        share = rest.overlap
         miss = physics.outputs - physics.start - physics.basis @ v - share.values  # Qᵀ(Y − Φθ − F)
         slope = jnp.concatenate([physics.basis, share.jacobian], axis=1)  # Qᵀ of all columns
-        inner = jnp.pad(g_jj - g_qj.T @ g_qj, ((nt, 0), (nt, 0)))  # and what is orthogonal to Q
         return Normal(
-            hessian=inner + slope.T @ slope,
-            gradient=jnp.pad(g_jr - g_qj.T @ g_qr, (nt, 0)) + slope.T @ miss,
-            loss=jnp.maximum(g_rr - g_qr @ g_qr, 0.0) + miss @ miss,
+            hessian=jnp.pad(rest.hessian, ((nt, 0), (nt, 0))) + slope.T @ slope,
+            gradient=jnp.pad(rest.gradient, (nt, 0)) + slope.T @ miss,
+            loss=rest.loss + miss @ miss,
             overlap=Overlap(jnp.pad(share.jacobian, ((0, 0), (nt, 0))), share.values),
         )
