@@ -265,6 +265,13 @@ def test_a_bound_holds_beside_the_learner():
     bounded = Baseline.from_terms([Term("t1", "y[k-1]"), Term("t2", "y[k-2]"), Term("t3", "u[k-1]", max=3e-5)])
     fit = estimate(oscillator(), bounded, learner=VELOCITY, solver=LevenbergMarquardt(50))
     assert fit.theta[2] == 3e-5 and fit.at_bound == {"t3": 3e-5}
+    assert fit.std is None and "no_standard_errors" in [warning.code for warning in fit.warnings]
+
+
+def test_an_ensemble_says_that_it_has_no_standard_errors():
+    options = {"solver": LevenbergMarquardt(5), "restarts": 2, "ensemble": True}
+    fit = estimate(oscillator(), OSCILLATOR, learner=VELOCITY, **options)
+    assert fit.std is None and "no_standard_errors" in [warning.code for warning in fit.warnings]
 
 
 # --- in words

@@ -46,6 +46,10 @@ def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estim
     noise = errors.noise if ending.usable else None
     identified = structure.projects or (learned.bound is None and structure.identifies)
     known = noise is not None and identified and not learned.elsewhere
+    told = _warnings(problem, structure, learned, identified, noise, fixed)
+    if known and errors.covariance is None and learned.errors is None:
+        text = "no standard errors: beside a learner that sees only some features, an ensemble or a bound leaves none."
+        told.append(Warning("no_standard_errors", text))
     return Estimate(
         model=_model(problem, structure, learned, ThetaSplit(theta, theta_aux, fixed), errors, noise),
         status=Status(ending, learned.iterations, learned.seconds, errors.mean_square),
@@ -58,7 +62,7 @@ def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estim
         problem=problem,
         criterion=task.criterion,
         at_bound={problem.baseline.names[i]: value for i, value in fixed.items()},
-        warnings=tuple(_warnings(problem, structure, learned, identified, noise, fixed)),
+        warnings=tuple(told),
     )
 
 
