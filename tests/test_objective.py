@@ -11,7 +11,7 @@ import pytest
 from orthaug._base.jax import jax
 from orthaug.data.record import Record
 from orthaug.fitting.criteria import Simulation
-from orthaug.fitting.free_run import FreeRunTask
+from orthaug.fitting.flight_plan import FlightPlan
 from orthaug.fitting.initial_states import Start
 from orthaug.fitting.objective import FreeRunObjective
 from orthaug.fitting.one_step import OneStepTask
@@ -46,7 +46,7 @@ def objective(kind="orthogonal") -> FreeRunObjective:
         terms = [Term(t.parameter, t.regressor, t.initial, min=-5, max=5) for t in baseline.terms]
         baseline = Baseline.from_terms(terms)
     task = OneStepTask.of(pose(record, baseline), MLP(hidden=(3,)))
-    found = FreeRunTask.of(task, CRITERION).objective(KINDS[kind])
+    found = FlightPlan.of(task, CRITERION).objective(KINDS[kind])
     assert found.initial.free and found.follows == (kind == "bounds")
     return found
 

@@ -80,8 +80,11 @@ def test_another_validation_record_changes_the_choice_and_nothing_else(chosen):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"regularization": ("none", "evidence")}, "several regularizations need `validation` to choose between them"),
-        ({"regularization": [0.1, 1.0]}, "several regularizations need `validation`"),
+        (
+            {"regularization": ("none", "evidence"), "blocks": 0},
+            "several regularizations need `validation` or `blocks`",
+        ),
+        ({"blocks": 1}, "`blocks` must be 2 or more, or 0 for none; got 1"),
         (
             {"regularization": (), "validation": VALIDATION},
             "`regularization` is empty; give none, evidence or a number",
@@ -177,7 +180,10 @@ def test_skipped_samples_do_not_choose(project):
 
 
 REFUSED = [
-    (spec(NETWORK + 'regularization = ["none", 0.5]\n', "[data.channels.y]"), ["list; expected [data.validation]"]),
+    (
+        spec(NETWORK + 'regularization = ["none", 0.5]\n', "[validation]\nblocks = 0\n[data.channels.y]"),
+        ["list; expected [data.validation] or `validation.blocks`"],
+    ),
     (spec(NETWORK + "regularization = []\n"), ["'training.regularization': found []", "at least one entry"]),
     (spec(NETWORK + 'regularization = ["none", "ridge"]\n'), ["'training.regularization[1]'", '"ridge"', "evidence"]),
     (spec(NETWORK + 'solver = "adam-lbfgs"\nregularization = ["none", "evidence"]\n'), ["levenberg-marquardt"]),

@@ -13,7 +13,7 @@ from orthaug._base.errors import InputError
 from orthaug.analysis.validation import (
     Extrapolation,
     Trial,
-    blocked,
+    block_trials,
     cross_validate,
     dominance,
     extrapolation,
@@ -24,6 +24,7 @@ from orthaug.analysis.validation import (
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags, stack_rows
 from orthaug.fitting.estimation import estimate
+from orthaug.fitting.held_out import blocked
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import Ending
 from orthaug.models.learners import MLP
@@ -263,7 +264,7 @@ def validated(record, blocks=4, **options):
 
 
 def verdict(errors):
-    return judge([Trial(f"block {i + 1} of {len(errors)}", *pair, block=True) for i, pair in enumerate(errors)])
+    return judge(block_trials(errors, 1))
 
 
 def test_errors_are_those_of_fits_without_the_block():
@@ -273,7 +274,8 @@ def test_errors_are_those_of_fits_without_the_block():
     training, out = blocked(record, 3, 2)[1]
     unit = record.experiments[0].outputs.std(axis=0)
     expected = [free_run_error(fitted(training, **o).model, out, unit=unit) for o in ({}, SMALL)]
-    np.testing.assert_allclose(errors[1], expected, rtol=1e-6)
+    trial = block_trials(errors, 1)[1]
+    np.testing.assert_allclose([trial.alone, trial.model], expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -307,7 +309,8 @@ def test_a_fit_that_fails_counts_as_a_free_run_that_diverges():
         return replace(fit, status=replace(fit.status, ending=Ending.NON_FINITE))
 
     errors = cross_validate(system(0, 120), [fitted, refused, non_finite], blocks=2, start=2)
-    assert all(0 < alone < 1 and (first, second) == (INF, INF) for alone, first, second in errors)
+    for fit in (1, 2):
+        assert all(0 < trial.alone < 1 and trial.model == INF for trial in block_trials(errors, fit))
 
 
 def test_too_few_rows_are_refused_before_any_fit():

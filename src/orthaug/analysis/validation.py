@@ -1,15 +1,11 @@
-"""Does the learner earn its place? Free runs of the model and of physics alone on data that were not fitted.
-
-Blocked cross-validation leaves out one contiguous block after another, with gaps of the lag length, so that no sample
-is predicted from its own neighbours in the training data.
-"""
+"""Does the learner earn its place? Free runs of the model and of physics alone on data that were not fitted."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -17,26 +13,27 @@ from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError
 from orthaug._base.parallel import spread
 from orthaug._base.warning import Warning
-from orthaug.data.record import Experiment, Record
+from orthaug.data.record import Record
 from orthaug.data.regressors import Layout
-from orthaug.fitting.estimates import Estimate
+from orthaug.fitting.estimates import Estimate, HeldOut
+from orthaug.fitting.held_out import Pieces, Ratio, blocked, mean_square, squared_errors
 from orthaug.models.model import Model
 from orthaug.models.response import Response
 
-_WORTH = 0.02  # of the error: less than this is neither help nor harm
-_FEWEST = 20  # usable rows of a block
 
-
-class Trial(NamedTuple):
+@dataclass(frozen=True)
+class Trial:
     """Free-run errors on one piece of data that was not fitted, in standard deviations; inf where a run diverges.
 
-    `block` is true for a block of cross-validation, and false for a part of its own.
+    `block` is true for a block of cross-validation, and false for a part of its own. `pieces` holds the squared errors
+    along the runs, of physics alone and of the model, for the uncertainty of their ratio.
     """
 
     where: str
     alone: float
     model: float
     block: bool = False
+    pieces: tuple[Pieces, Pieces] | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True)
@@ -60,12 +57,16 @@ class Extrapolation:
 
 @dataclass(frozen=True)
 class Verdict:
-    """`code` is helps, no_help or hurts; `summary` says why. `trials` are the errors it rests on."""
+    """`code` is helps, no_help or hurts; `summary` says why. `trials` are the errors it rests on.
+
+    `ratio` is the error with the learner over that of physics alone where that decided; None without errors along runs.
+    """
 
     code: str
     summary: str
     trials: tuple[Trial, ...]
     extrapolation: tuple[Extrapolation, ...] = ()
+    ratio: Ratio | None = None
 
     @property
     def text(self) -> str:
@@ -110,61 +111,34 @@ def trial_on(
     response: Response | None = None,
 ) -> Trial:
     """Both models' free runs on a record that was not fitted; their responses, if they are there already."""
+    alone_response = alone.simulate(record) if alone_response is None else alone_response
+    response = model.simulate(record) if response is None else response
     error = free_run_error(alone, record, skip, response=alone_response)
-    return Trial(where, error, free_run_error(model, record, skip, response=response))
+    pieces = tuple(squared_errors(run, model.deviation, skip) for run in (alone_response, response))
+    own = free_run_error(model, record, skip, response=response)
+    return Trial(where, error, own, pieces=(pieces[0], pieces[1]))
 
 
-def blocked(record: Record, blocks: int, start: int) -> list[tuple[Record, Record]]:
-    """(training, held out) for each of `blocks` contiguous blocks of about equal length, `start` rows of gap around.
-
-    All training records have the same number of usable rows after the first `start` of each experiment.
-
-    Raises:
-        InputError: too few rows for so many blocks.
-    """
-    edges = np.linspace(0, len(record), blocks + 1).round().astype(int)
-    folds = []
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
-        held, kept, offset = [], [], 0
-        for experiment in record.experiments:
-            rows = len(experiment)
-            a, b = (int(np.clip(edge - offset, 0, rows)) for edge in (low, high))
-            inside = a < b
-            held += [experiment.rows(a, b)] if inside else []
-            before, after = (a - start, b + start) if inside else (rows, rows)
-            kept += [experiment.rows(0, before)] if before > start else []
-            kept += [experiment.rows(after, rows)] if rows - after > start else []
-            offset += rows
-        held = [e for e in held if len(e) > start]
-        if sum(len(e) - start for e in held) < _FEWEST or sum(len(e) - start for e in kept) < _FEWEST:
-            raise InputError(f"{len(record)} rows are too few for {blocks} blocks with gaps of {start} rows.")
-        folds.append((kept, held))
-    least = min(sum(len(e) - start for e in kept) for kept, _ in folds)
+def trials_of(held_out: HeldOut) -> list[Trial]:
+    """The errors by which a run was chosen, as trials: one for each piece that was held out."""
+    pairs = list(zip(held_out.alone, held_out.runs[held_out.chosen], strict=True))
+    root = lambda piece: math.sqrt(mean_square([piece]))  # noqa: E731
     return [
-        (replace(record, experiments=_cut(kept, least, start)), replace(record, experiments=tuple(held)))
-        for kept, held in folds
+        Trial(f"piece {i + 1} of {len(pairs)}", root(a), root(m), True, ([a], [m])) for i, (a, m) in enumerate(pairs)
     ]
-
-
-def _cut(experiments: list[Experiment], usable: int, start: int) -> tuple[Experiment, ...]:
-    """The experiments without the last rows of the longest ones, so that `usable` rows remain."""
-    cut = list(experiments)
-    while (surplus := sum(len(e) - start for e in cut) - usable) > 0:
-        longest = max(range(len(cut)), key=lambda i: len(cut[i]))
-        length = len(cut[longest])
-        shorter = max(length - surplus, max((len(e) for e in cut if len(e) < length), default=start + 1), start + 1)
-        cut[longest] = cut[longest].rows(0, min(shorter, length - 1))
-    return tuple(e for e in cut if len(e) > start)
 
 
 def cross_validate(
     record: Record, fits: Sequence[Callable[[Record], Estimate]], *, blocks: int, start: int
-) -> list[tuple[float, ...]]:
-    """Free-run errors of every way of fitting on every held-out block, (blocks, fits), in training deviations.
+) -> list[list[Pieces]]:
+    """Squared free-run errors of every way of fitting on every held-out block, in training deviations.
 
     Args:
-        fits: each fits a training record; a failed training counts as a run that diverges.
+        fits: each fits a training record; a failed training counts as runs that diverge.
         start: rows at the beginning of an experiment without a prediction.
+
+    Returns:
+        For every block the errors of every fit.
 
     Raises:
         InputError: too few rows for so many blocks.
@@ -172,45 +146,63 @@ def cross_validate(
     folds = blocked(record, blocks, start)
     unit = np.std(np.concatenate([e.outputs for e in record.experiments]), axis=0)
 
-    def one(pair: tuple[Record, Record], check: Callable[[], None]) -> tuple[float, ...]:
+    def one(pair: tuple[Record, Record], check: Callable[[], None]) -> list[Pieces]:
         training, held = pair
-        errors = []
+        errors: list[Pieces] = []
         for fit in fits:
             check()
             try:
                 trained = fit(training)
             except InputError:  # the block took away what the physics needs
-                errors.append(math.inf)
+                errors.append([None] * len(held.experiments))
                 continue
-            errors.append(free_run_error(trained.model, held, unit=unit) if trained.status.ok else math.inf)
-        return tuple(errors)
+            usable = trained.status.ok
+            found = squared_errors(trained.model.simulate(held), unit) if usable else [None] * len(held.experiments)
+            errors.append(found)
+        return errors
 
     return spread(one, folds)
+
+
+def block_trials(errors: Sequence[Sequence[Pieces]], fit: int) -> list[Trial]:
+    """Trials of one way of fitting against the first one, from `cross_validate`."""
+    return [
+        Trial(
+            f"block {i + 1} of {len(errors)}",
+            math.sqrt(mean_square(block[0])),
+            math.sqrt(mean_square(block[fit])),
+            block=True,
+            pieces=(block[0], block[fit]),
+        )
+        for i, block in enumerate(errors)
+    ]
 
 
 def judge(trials: Sequence[Trial], extrapolation: Sequence[Extrapolation] = ()) -> Verdict | None:
     """The verdict on trials of physics alone against the model; None without a trial.
 
-    It helps where the error over all blocks, and on every part of its own, is lower; it hurts where one of them is
-    higher by more than 2 %, or where the model runs away and physics alone does not.
+    All blocks together, and every part of its own, are judged by one rule (`Ratio.code`). The learner helps where each
+    of them says so; it hurts where one of them does, or where the model runs away and physics alone does not.
     """
     if not trials:
         return None
     blocks = [t for t in trials if t.block]
     groups = [("blocked cross-validation", blocks)] if blocks else []
     groups += [(t.where, [t]) for t in trials if not t.block]
-    sentences, codes = [], []
+    sentences, codes, ratios = [], [], []
     for where, group in groups:
         alone, model = (math.sqrt(sum(getattr(t, k) ** 2 for t in group) / len(group)) for k in ("alone", "model"))
         ran_away = any(math.isinf(t.model) and not math.isinf(t.alone) for t in group)
-        code = "hurts" if ran_away else _compare(alone, model)
-        told = _told(alone, model)
+        ratio = _ratio(group, alone, model)
+        sure = f" ({ratio})" if str(ratio) and ratio.low < ratio.high else ""
+        told = _told(alone, model) + sure
         if len(group) > 1:
             told = f"In {where} ({len(group)} blocks, {sum(t.model < t.alone for t in group)} of them better): {told}"
         else:
             told = f"On {where}: {told}"
         sentences.append(told)
-        codes.append(code)
+        codes.append("hurts" if ran_away else ratio.code)
+        ratios.append(ratio)
     worst = next(code for code in ("hurts", "no_help", "helps") if code in codes)
     hurt = {where for (where, _), code in zip(groups, codes, strict=True) if code == "hurts"}
     beyond = [e for e in extrapolation if e.part in hurt]
@@ -221,7 +213,16 @@ def judge(trials: Sequence[Trial], extrapolation: Sequence[Extrapolation] = ()) 
     }[worst]
     reasons = sentences if worst == "helps" else [s for s, c in zip(sentences, codes, strict=True) if c != "helps"]
     text = ". ".join([opening, *reasons]) + "."
-    return Verdict(worst, text, tuple(trials), tuple(extrapolation))
+    return Verdict(worst, text, tuple(trials), tuple(extrapolation), ratios[codes.index(worst)])
+
+
+def _ratio(group: Sequence[Trial], alone: float, model: float) -> Ratio:
+    """Of a group's errors, with its interval where errors along the runs are there."""
+    pieces = [t.pieces for t in group]
+    if any(piece is None for piece in pieces):
+        return Ratio.exactly(model, alone)
+    both = [piece for piece in pieces if piece is not None]
+    return Ratio.of([run for _, model in both for run in model], [run for alone, _ in both for run in alone])
 
 
 def _told(alone: float, model: float) -> str:
@@ -231,14 +232,6 @@ def _told(alone: float, model: float) -> str:
         return f"free-run NRMSE {model:.4g} with the learner, {alone:.4g} with physics alone"
     told = (f"diverges {who}" if math.isinf(e) else f"has an NRMSE of {e:.4g} {who}" for who, e in errors.items())
     return f"the free run {' and '.join(told)}"
-
-
-def _compare(alone: float, model: float) -> str:
-    if math.isinf(model):
-        return "no_help" if math.isinf(alone) else "hurts"
-    if model > (1 + _WORTH) * alone:
-        return "hurts"
-    return "helps" if model < (1 - _WORTH) * alone else "no_help"
 
 
 def extrapolation(part: str, x: Matrix, training: Matrix, layout: Layout) -> list[Extrapolation]:

@@ -13,7 +13,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
 from orthaug._base.progress import SILENT, Progress
 from orthaug.analysis.validation import Verdict, dominance
-from orthaug.commands.fit import DEFAULT_BLOCKS, Fitted, cross_validated, fit_variant, judge_fit, score_part
+from orthaug.commands.fit import Fitted, cross_validated, fit_variant, judge_fit, score_part, wanted_blocks
 from orthaug.commands.folder import is_result
 from orthaug.commands.job import ALONE, Job, Variant, structure_of
 from orthaug.data.record import same_step
@@ -43,7 +43,7 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -
     """Fit every structure as the spec trains, score each on every part, and put saved models beside them.
 
     A structure that the spec does not allow (a baseline penalty with an initial value of 0) is left out with
-    the reason. With a validation part the structure of the lowest one-step error there is marked as chosen.
+    the reason. With a validation part the row of the lowest error there is marked as chosen.
     """
     models = {str(path): _matching(path, job) for path in saved}
     kinds = (ALONE,) if job.spec.declared_learner() is None else compared()
@@ -65,7 +65,7 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -
         "spec": job.declaration,
         "data": job.data,
         "comparison": rows,
-        "chosen": _chosen(rows) if job.validation else None,
+        "chosen": _chosen(rows, job.spec.declared_criterion().simulates) if job.validation else None,
         "left_out": left_out,
         "warnings": job.warnings,
     }
@@ -78,9 +78,12 @@ def _verdicts(job: Job, fitted: dict[str, Fitted]) -> dict[str, Verdict]:
     kinds = [kind for kind, tried in fitted.items() if kind != ALONE and tried.fit.status.ok]
     if not kinds or not alone.status.ok:
         return {}
-    blocks = DEFAULT_BLOCKS if job.spec.validation.blocks is None else job.spec.validation.blocks
-    trials = cross_validated(job, blocks, [Variant(kind) for kind in kinds]) if blocks else [[] for _ in kinds]
-    verdicts = {k: judge_fit(fitted[k], tried, fitted[ALONE]) for k, tried in zip(kinds, trials, strict=True)}
+    blocks, flown = wanted_blocks(job), job.spec.declared_criterion().flown is not None
+    if flown or not blocks:  # free runs were chosen by the same trials
+        verdicts = {kind: judge_fit(fitted[kind], None, fitted[ALONE]) for kind in kinds}
+    else:
+        trials = cross_validated(job, blocks, [Variant(kind) for kind in kinds])
+        verdicts = {k: judge_fit(fitted[k], tried, fitted[ALONE]) for k, tried in zip(kinds, trials, strict=True)}
     return {kind: verdict for kind, verdict in verdicts.items() if verdict is not None}
 
 
@@ -157,11 +160,17 @@ def _saved_row(name: str, model: Model, job: Job) -> RowResult:
     )
 
 
-def _chosen(rows: Sequence[RowResult]) -> str | None:
-    """The name of the row with the lowest one-step error on the validation part."""
+def _chosen(rows: Sequence[RowResult], simulates: bool) -> str | None:
+    """The row of the lowest error on the validation part, of the free run or one step ahead as training looks at it.
+
+    Physics alone wins where the verdict is that the learner of that row does not help.
+    """
     errors = {}
     for row in rows:
-        nrmse = row.scores["validation"].prediction.nrmse if "validation" in row.scores else None
-        if nrmse is not None and None not in nrmse:
-            errors[row.name] = float(np.mean(np.square(np.array(nrmse, dtype=float))))
-    return min(errors, key=errors.__getitem__) if errors else None
+        scores = row.scores.get("validation")
+        score = None if scores is None else scores.simulation if simulates else scores.prediction
+        if score is not None and score.nrmse is not None and None not in score.nrmse:
+            errors[row.name] = float(np.mean(np.square(np.array(score.nrmse, dtype=float))))
+    best = min(errors, key=errors.__getitem__) if errors else None
+    verdict = next((row.validation for row in rows if row.name == best), None)
+    return ALONE if verdict is not None and verdict.verdict != "helps" and ALONE in errors else best

@@ -15,7 +15,7 @@ from orthaug._base.progress import SILENT, Progress
 from orthaug._base.warning import Warning
 from orthaug.commands.bias import bias_of
 from orthaug.commands.folder import is_result
-from orthaug.commands.job import ALONE, AS_DECLARED, Job, Variant, run_fit
+from orthaug.commands.job import ALONE, AS_DECLARED, DEFAULT_BLOCKS, Job, Variant, run_fit
 from orthaug.commands.parts import Part
 from orthaug.commands.shared import shared_of
 from orthaug.data.regressors import lag_rows
@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from orthaug.models.model import Model
     from orthaug.models.response import Response
 
-DEFAULT_BLOCKS = 4
-
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
@@ -54,7 +52,7 @@ def fit_job(job: Job, progress: Progress = SILENT) -> Fitted:
     """Train as the spec says, score every part, and ask whether the learner earns its place."""
     fitted = fit_variant(job, AS_DECLARED, progress)
     fit, warnings = fitted.fit, list(fitted.result.warnings)
-    if not fit.status.ok or fit.model.form.bound is None:
+    if not fit.status.ok or (fit.model.form.bound is None and fit.held_out is None):
         return fitted
     verdict = judge_fit(fitted)
     if verdict is None and job.spec.validation.blocks != 0:
@@ -63,7 +61,7 @@ def fit_job(job: Job, progress: Progress = SILENT) -> Fitted:
             "rows for cross-validation in so many blocks."
         )
         warnings.append(WarningResult(code="not_judged", text=told))
-    if verdict is not None:
+    if verdict is not None and fit.model.form.bound is not None:
         warnings += [WarningResult.model_validate(warning) for warning in verdict.warnings]
     result = FitResult.model_validate({**dict(fitted.result), "validation": verdict, "warnings": warnings})
     return replace(fitted, result=result)
@@ -161,18 +159,25 @@ def _analysed(fit: Estimate, one_step: Response, free_run: Response, warnings: l
 def judge_fit(fitted: Fitted, blocks: Sequence[Trial] | None = None, alone: Fitted | None = None) -> Verdict | None:
     """Whether the learner earns its place: free runs against physics alone on what was not fitted.
 
+    Where the fit fell back to physics alone, that is judged by which it did.
+
     Args:
-        blocks: trials of blocked cross-validation; None to make them where there is no validation or test part, or
-            where the spec asks for them.
+        blocks: trials of blocked cross-validation; None for those by which the fit was chosen, or to make them, where
+            there is no validation or test part or where the spec asks for them.
         alone: the physics alone; None to fit it.
     """
-    from orthaug.analysis.validation import extrapolation, judge, trial_on
+    from orthaug.analysis.validation import extrapolation, judge, trial_on, trials_of
 
-    job, model = fitted.job, fitted.fit.model
-    held_out, wanted = job.parts[1:], job.spec.validation.blocks
+    job, model, chosen_by = fitted.job, fitted.fit.model, fitted.fit.held_out
+    held_out = job.parts[1:]
+    if chosen_by is not None and model.form.bound is None:
+        return judge(trials_of(chosen_by))
     if blocks is None:
-        wanted = (0 if held_out else DEFAULT_BLOCKS) if wanted is None else wanted
-        blocks = cross_validated(job, wanted, [AS_DECLARED])[0] if wanted else ()
+        wanted = wanted_blocks(job)
+        if wanted and chosen_by is not None and job.validation is None:
+            blocks = trials_of(chosen_by)
+        else:
+            blocks = cross_validated(job, wanted, [AS_DECLARED])[0] if wanted else ()
     physics = run_fit(job, Variant(ALONE)).model if alone is None else alone.fit.model
     trials, beyond = list(blocks), []
     for part in held_out:
@@ -186,9 +191,15 @@ def judge_fit(fitted: Fitted, blocks: Sequence[Trial] | None = None, alone: Fitt
     return judge(trials, beyond)
 
 
+def wanted_blocks(job: Job) -> int:
+    """Blocks of cross-validation for a verdict: none where parts are held out, unless the spec asks for them."""
+    asked = job.spec.validation.blocks
+    return (0 if job.parts[1:] else DEFAULT_BLOCKS) if asked is None else asked
+
+
 def cross_validated(job: Job, blocks: int, variants: Sequence[Variant]) -> list[list[Trial]]:
     """Trials of every variant on every block; none where the record is too short for that."""
-    from orthaug.analysis.validation import Trial, cross_validate
+    from orthaug.analysis.validation import block_trials, cross_validate
 
     def fit_of(variant: Variant) -> Any:
         return lambda fold: run_fit(job, variant.on(fold))
@@ -198,10 +209,7 @@ def cross_validated(job: Job, blocks: int, variants: Sequence[Variant]) -> list[
         errors = cross_validate(job.train.record, fits, blocks=blocks, start=job.problem.rows.start)
     except InputError:
         return [[] for _ in variants]
-    return [
-        [Trial(f"block {i + 1} of {blocks}", fold[0], fold[1 + j], block=True) for i, fold in enumerate(errors)]
-        for j in range(len(variants))
-    ]
+    return [block_trials(errors, 1 + j) for j in range(len(variants))]
 
 
 def score_part(model: Model, part: Part, warnings: list[Any]) -> tuple[PartScores, tuple[Response, Response]]:

@@ -28,7 +28,7 @@ from orthaug.reports.result import DataResult
 if TYPE_CHECKING:
     from orthaug.fitting.estimates import Estimate
 
-FOLD_ITERATIONS = 60  # enough to tell whether a learner helps, on every block of cross-validation
+DEFAULT_BLOCKS = 4
 ALONE = "physics alone"
 
 
@@ -209,9 +209,16 @@ def _check_measure(weighed: Weighed, problem: Problem) -> None:
         raise InputError(f"under the {name} measure the physics cannot tell {groups} apart; widen or move it.")
 
 
+def _blocks(spec: Spec) -> int:
+    """Blocks of the training data by which free runs are chosen."""
+    asked = spec.validation.blocks
+    return DEFAULT_BLOCKS if asked is None else asked
+
+
 def run_fit(job: Job, variant: Variant = AS_DECLARED, progress: Progress = SILENT) -> Estimate:
     """Train as the spec says, or a variant of that."""
     from orthaug.fitting.estimation import fit
+    from orthaug.fitting.training import FOLD_ITERATIONS
 
     fold, spec, training = variant.fold, job.spec, job.spec.training
     learner = None if variant.alone else spec.declared_learner()
@@ -229,6 +236,8 @@ def run_fit(job: Job, variant: Variant = AS_DECLARED, progress: Progress = SILEN
         regularization=choices if fold is None or not isinstance(choices, tuple) else choices[0],
         restarts=training.restarts if fold is None else 1,
         seed=training.seed,
+        blocks=0 if fold is not None else _blocks(spec),
+        fallback=training.fallback,
         ensemble=training.ensemble and fold is None and learner is not None,
         validation=job.validation.scored(job.problem.rows.start) if validated and job.validation else None,
         progress=progress,

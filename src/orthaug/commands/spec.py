@@ -204,6 +204,7 @@ class TrainingSection(KindSection):
     focus: str = "prediction"
     restarts: Positive = 1
     ensemble: bool = False
+    fallback: bool = True
     seed: Annotated[int, Field(ge=0, lt=2**63, strict=True)] = 0
     regularization: Regularization | Annotated[list[Regularization], Field(min_length=1)] | None = None
     output_weights: str | list[float] = "auto"
@@ -223,7 +224,7 @@ class TrainingSection(KindSection):
 
 
 class ValidationSection(Section):
-    """Blocked cross-validation; absent: 4 blocks in `compare`, and in `fit` where no part is held out."""
+    """Blocked cross-validation; absent: 4 blocks, for a verdict only where no part is held out."""
 
     blocks: Annotated[int, Field(ge=0, strict=True)] | None = None
 
@@ -250,8 +251,11 @@ class Spec(Section):
 
     @model_validator(mode="after")
     def _choices_need_validation(self) -> Spec:
-        if isinstance(self.training.regularization, list) and self.data.validation is None:
-            raise ValueError("`training.regularization` is a list; expected [data.validation] to choose by")
+        several = isinstance(self.training.regularization, list)
+        if several and self.data.validation is None and self.validation.blocks == 0:
+            raise ValueError(
+                "`training.regularization` is a list; expected [data.validation] or `validation.blocks` to choose by"
+            )
         return self
 
     def channels(self, names: list[str]) -> tuple[Channel, ...]:

@@ -2,33 +2,32 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Vector, check_choice, check_count, check_type, finite_or_none, is_number
+from orthaug._base.checks import Vector, check_choice, check_count, check_type, is_number
 from orthaug._base.errors import InputError, shown
 from orthaug._base.jax import Array, jax, jnp
-from orthaug._base.parallel import spread
 from orthaug._base.progress import SILENT, Tell
 from orthaug.data.record import Record
 from orthaug.data.regressors import Features, Lags
 from orthaug.fitting.conclusion import conclude
 from orthaug.fitting.cost import check_cost
 from orthaug.fitting.criteria import Criterion, Prediction
-from orthaug.fitting.estimates import Estimate, Restart
+from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.free_run import FreeRunTask
-from orthaug.fitting.learned import Learned, Task
+from orthaug.fitting.learned import Learned
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.reweighting import reweighted
 from orthaug.fitting.rules import check_solver, check_starts
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Orthogonal, Structure
+from orthaug.fitting.training import Choice, PlannedRun, train
 from orthaug.inference.measures import Training
 from orthaug.models.learners import MLP, Bound, External, Function, Learner, Scaling
 from orthaug.models.model import Model
@@ -52,6 +51,8 @@ def estimate(
     restarts: int = 1,
     seed: int = 0,
     ensemble: bool = False,
+    blocks: int = 4,
+    fallback: bool = True,
     initial: Estimate | Model | None = None,
     validation: Record | None = None,
     output_weights: str | Sequence[float] = "auto",
@@ -73,10 +74,13 @@ def estimate(
         regularization: "none", "evidence" (MacKay; the weights' prior is estimated too), or a number: the
             ridge α on the weights, against squared errors in units of the baseline's RMS residual. Several may be
             given with `validation`, which then chooses.
-        restarts: runs from initial weights of seeds `seed … seed + restarts - 1`, spread over the cores. The run of the
-            lowest training loss is kept. With `validation` it is the lowest error of the criterion there.
+        restarts: runs from initial weights of seeds `seed … seed + restarts - 1`, spread over the cores. Kept is the
+            one of the lowest error of the criterion on `validation`; without that, of free runs and of several
+            regularizations, on `blocks` that are held out; else of the lowest training loss.
         seed: of the initial weights.
         ensemble: the median of all restarts as one model, instead of the best one.
+        blocks: parts into which the training data are cut for that, each held out once; 0 for none.
+        fallback: whether physics alone is the result where no free run of the learner is better than its there.
         initial: warm start from an earlier estimate or model. Its learner, features, scaling and weights replace
             `learner`, `restarts` and `seed`.
         validation: a record that chooses between restarts and regularizations; it is never fitted.
@@ -113,6 +117,8 @@ def estimate(
         restarts=restarts,
         seed=seed,
         ensemble=ensemble,
+        blocks=blocks,
+        fallback=fallback,
         initial=model,
         validation=validation,
         progress=progress,
@@ -130,6 +136,8 @@ def fit(
     restarts: int = 1,
     seed: int = 0,
     ensemble: bool = False,
+    blocks: int = 4,
+    fallback: bool = True,
     initial: Model | None = None,
     validation: Record | None = None,
     progress: Tell = SILENT,
@@ -147,7 +155,8 @@ def fit(
     """
     _check_choices(learner, structure, criterion, solver, initial, validation)
     _check_splittable(structure, problem.baseline, learner)
-    choices = _regularizations(regularization, validation)
+    blocks = _check_blocks(blocks)
+    choices = _regularizations(regularization, validation is not None or blocks > 0)
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
     check_starts(restarts if initial is None else 1, seed, ensemble=ensemble)
     check_solver(solver, criterion, () if learner is None else choices)
@@ -158,22 +167,23 @@ def fit(
     warm = None
     if initial is not None:
         task, weights, warm = _warm_start(problem, initial, engine)
-        starts = [_PlannedRun(0, weights, choice) for choice in choices]
+        starts = [PlannedRun(0, weights, choice) for choice in choices]
     else:
         task = OneStepTask.of(problem, learner, engine=engine)
-        seeds = range(seed, seed + restarts) if learner is not None else (seed,)
-        keyed = {s: np.zeros(0) if task.bound is None else task.bound.init(jax.random.key(s)) for s in seeds}
-        starts = [_PlannedRun(s, w, choice) for choice in choices for s, w in keyed.items()]
+        starts = _starts(task.bound, range(seed, seed + restarts), choices)
     solved = criterion.one_step and problem.baseline.linear
     ensemble = ensemble and task.bound is not None
     _check_ensemble(ensemble, problem)
     if task.bound is None and solved:
         estimate = conclude(task, structure, task.physics_learned())
+        status = replace(estimate.status, start_loss=estimate.status.loss)
+        estimate = replace(estimate, status=status)
     else:
-        if task.bound is None:
-            starts = [_PlannedRun(seed, np.zeros(0), "none")]
         trained = task if solved else FreeRunTask.of(task, criterion, warm)
-        estimate = _train(trained, task, starts, structure, solver, validation, progress, ensemble)
+        chosen = Choice(validation, blocks if initial is None else 0, fallback, ensemble)
+        estimate = train(trained, starts, structure, solver, chosen, progress)
+        if _splits(structure) and estimate.status.ok and estimate.model.form.bound is not None:
+            estimate = estimate.split(structure.measure)
     if problem.weight.choice != "covariance" or problem.weight.kind == "covariance" or not solved:
         return estimate
 
@@ -184,6 +194,26 @@ def fit(
         return fit(problem, structure=structure, criterion=criterion, solver=solver, progress=progress, **more)
 
     return reweighted(estimate, again)
+
+
+def _starts(bound: Bound | None, seeds: range, choices: Sequence[Regularization]) -> list[PlannedRun]:
+    """A run from every seed with every regularization; one without a learner."""
+    if bound is None:
+        return [PlannedRun(seeds.start, np.zeros(0), "none")]
+    keyed = {seed: bound.init(jax.random.key(seed)) for seed in seeds}
+    return [PlannedRun(seed, w, choice) for choice in choices for seed, w in keyed.items()]
+
+
+def _check_blocks(blocks: int) -> int:
+    """How many blocks are held out in turn.
+
+    Raises:
+        InputError: one, of which nothing would be left to train on.
+    """
+    blocks = check_count(blocks, "blocks", least=0)
+    if blocks == 1:
+        raise InputError("`blocks` must be 2 or more, or 0 for none; got 1.")
+    return blocks
 
 
 def _check_ensemble(ensemble: bool, problem: Problem) -> None:
@@ -256,86 +286,6 @@ def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStep
     return task, jnp.asarray(numbers.weights), model.theta - model.theta_aux
 
 
-@dataclass(frozen=True, eq=False)
-class _PlannedRun:
-    """One run to be made: its seed, initial weights and regularization."""
-
-    seed: int
-    weights: Any
-    regularization: Regularization
-
-
-def _train(
-    task: Task,
-    rows: OneStepTask,
-    starts: Sequence[_PlannedRun],
-    structure: Structure,
-    solver: Solver,
-    validation: Record | None,
-    progress: Tell,
-    ensemble: bool = False,
-) -> Estimate:
-    """Run from every start and conclude with the best, by training loss or by the criterion's validation error."""
-
-    def train(numbered: tuple[int, _PlannedRun], check: Callable[[], None]) -> Any:
-        i, start = numbered
-
-        def tell(iteration: int, loss: float) -> None:
-            check()
-            progress(i, iteration, loss)
-
-        return task.run(solver, start.weights, structure, start.regularization, tell)
-
-    def concluded(learned: Learned) -> Estimate:
-        return replace(conclude(rows, structure, learned), criterion=task.criterion)
-
-    runs = spread(train, list(enumerate(starts)))
-    losses, errors = [task.loss(run) for run in runs], [math.nan] * len(runs)
-    tried: dict[int, Estimate] = {}
-    if validation is not None:
-        tried = {i: concluded(task.learned(run)) for i, run in enumerate(runs)}
-        errors = [_validation_error(trained, validation) for trained in tried.values()]
-    ranking = np.array(losses if validation is None else errors)
-    best = int(np.nanargmin(ranking)) if np.isfinite(ranking).any() else 0
-    members = [best]
-    if ensemble:
-        members = [i for i in range(len(runs)) if starts[i].regularization == starts[best].regularization]
-        estimate = concluded(_median(task, rows, runs, members, best))
-    else:
-        estimate = tried[best] if validation is not None else concluded(task.learned(runs[best]))
-    restarts = tuple(
-        Restart(
-            seed=start.seed,
-            loss=finite_or_none(losses[i]),
-            iterations=run.iterations,
-            code=run.ending.code,
-            chosen=i in members,
-            regularization=start.regularization,
-            validation=finite_or_none(errors[i]),
-        )
-        for i, (start, run) in enumerate(zip(starts, runs, strict=True))
-    )
-    seconds = sum(run.seconds for run in runs)
-    estimate = replace(estimate, restarts=restarts, status=replace(estimate.status, seconds=seconds))
-    split_off = _splits(structure) and estimate.status.ok and task.bound is not None
-    return estimate.split(structure.measure) if split_off else estimate
-
-
-def _median(task: Task, rows: OneStepTask, runs: Sequence[Any], members: Sequence[int], best: int) -> Learned:
-    """The median of the members that have a value everywhere; the best one alone if it has none."""
-    learned = {i: task.learned(runs[i]) for i in members}
-    sound = [i for i, member in learned.items() if np.isfinite(rows.share(member).square)]
-    return task.median([learned[i] for i in sound], sound.index(best)) if best in sound else learned[best]
-
-
-def _validation_error(fit: Estimate, validation: Record) -> float:
-    """Mean squared error with each output in its training standard deviation; NaN without a model or a value."""
-    if not fit.status.ok:
-        return math.nan
-    rmse = fit.criterion.response(fit.model, validation).scores().rmse
-    return float(np.mean((rmse / fit.problem.deviation) ** 2))
-
-
 def _check_record(record: Any, baseline: Any, lags: Any, learner: Any, initial: Any) -> None:
     check_type(record, Record, "record", "a Record")
     check_type(baseline, Baseline, "baseline", "a Baseline")
@@ -353,11 +303,11 @@ def _check_choices(learner: Any, structure: Any, criterion: Any, solver: Any, in
     check_type(validation, Record | None, "validation", "a Record or None")
 
 
-def _regularizations(given: Any, validation: Record | None) -> tuple[Regularization, ...]:
+def _regularizations(given: Any, chosen: bool) -> tuple[Regularization, ...]:
     """The regularizations to try, each checked."""
     choices = tuple(given) if isinstance(given, list | tuple) else (given,)
-    if len(choices) > 1 and validation is None:
-        raise InputError("several regularizations need `validation` to choose between them.")
+    if len(choices) > 1 and not chosen:
+        raise InputError("several regularizations need `validation` or `blocks` to choose between them.")
     for choice in choices:
         if isinstance(choice, str):
             check_choice(choice, ("none", "evidence"), "`regularization`")

@@ -64,7 +64,11 @@ class InitialStates:
         missed = np.moveaxis(self.measured - values, -1, 1)
         inner = own[..., :n0] + prior
         across, right = own[..., n0:-1], own[..., -1] + missed @ prior
-        solved = np.linalg.solve(inner, np.concatenate([across, right[..., None]], axis=-1))
+        try:
+            solved = np.linalg.solve(inner, np.concatenate([across, right[..., None]], axis=-1))
+        except np.linalg.LinAlgError:  # states that no output shows: no normal equations, and the trial is rejected
+            nothing = np.full_like(shared[:-1, :-1], np.nan)
+            return nothing, nothing[0], None, None
         slope, offset = solved[..., :-1], solved[..., -1]
         hessian = shared[:-1, :-1] - np.tensordot(across, slope, axes=([0, 1, 2], [0, 1, 2]))
         gradient = shared[:-1, -1] - np.tensordot(across, offset, axes=([0, 1, 2], [0, 1, 2]))

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.progress import RunTell, quiet
+from orthaug.data.record import Record
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.elimination import Fixed
 from orthaug.fitting.status import Ending
@@ -68,6 +69,33 @@ class Task(Protocol):
 
     @property
     def criterion(self) -> Criterion: ...
+
+    @property
+    def start_loss(self) -> float | None:
+        """Loss of physics alone, in the units of `loss`; None where it cannot be computed."""
+        ...
+
+    @property
+    def seconds(self) -> float:
+        """What was spent before the first run."""
+        ...
+
+    @property
+    def rows_task(self) -> Any:
+        """The rows laid out for one step, to sum over (`OneStepTask`)."""
+        ...
+
+    def on(self, record: Record) -> Task:
+        """The same problem on another record."""
+        ...
+
+    def physics_alone(self) -> tuple[Any, Learned]:
+        """The rows without a learner, and what physics alone leaves on them."""
+        ...
+
+    def prepared(self, solver: Any, structure: Structure, progress: RunTell = quiet) -> Task:
+        """The same with physics alone trained: what all runs start from."""
+        ...
 
     def run(
         self,

@@ -55,8 +55,9 @@ class LinearisedFreeRun(NamedTuple):
 class FreeRunObjective:
     """`‖r‖²` of the free run and of the structure's rows.
 
-    `numbers` makes a model's numbers of (c, w). `weight` (ny, ny) multiplies the errors of a step. `colour` holds
-    longer segments, where the others are too short to show how long the errors remember.
+    `numbers` makes a model's numbers of (c, w). `weight` (ny, ny) multiplies the errors of a step; `rms` is their unit,
+    in whitened outputs. `colour` holds longer segments, where the others are too short to show how long the errors
+    remember.
     """
 
     dynamics: Dynamics
@@ -66,6 +67,7 @@ class FreeRunObjective:
     initial: InitialStates
     elimination: Elimination
     weight: Matrix
+    rms: float
     colour: Segments | None = None
 
     @property
@@ -115,7 +117,7 @@ class FreeRunObjective:
         rows = self.elimination.rows
         if len(rows.target):
             miss = rows.target - rows.theta @ theta - rows.learner @ self.task.share_of(w)
-            loss += float(miss @ miss) / self.task.rms**2
+            loss += float(miss @ miss) / self.rms**2
         return Flown(p, theta, c, w, states, errors, misfit, loss)
 
     def linearise(self, flown: Flown) -> LinearisedFreeRun:
@@ -126,7 +128,7 @@ class FreeRunObjective:
         information, gradient, offset, slope = self.initial.eliminate(slopes, flown.states, start_rows)
         start = Start(flown.states, flown.misfit, np.concatenate([flown.c, flown.w]), offset, slope)
         hessian = information
-        rows, rms = self.elimination.rows, self.task.rms
+        rows, rms = self.elimination.rows, self.rms
         if self.follows:
             change = self.change(flown.w)
             hessian, gradient = change.T @ hessian @ change, change.T @ gradient

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,11 +10,14 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
-from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.jax import jnp
 from orthaug._base.progress import RunTell, quiet
+from orthaug.data.record import Record
+from orthaug.data.regressors import Features
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.elimination import Elimination, Fixed, eliminate
 from orthaug.fitting.learned import Learned
+from orthaug.fitting.learner_sums import LearnerSums, ResidualGram, row_values
 from orthaug.fitting.normal_equations import Blocks, Hold, Normal, OneStep, Streamed, linearise
 from orthaug.fitting.paper_criterion import JointOneStep, PaperCriterion, Physics
 from orthaug.fitting.rules import ridge_of
@@ -26,7 +28,7 @@ from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.inference.covariance import mixing
 from orthaug.models.learners import Bound, Learner, Scaling
-from orthaug.models.rows import Chunk, Engine, InMemory, MixedGram, Overlap, from_chunks
+from orthaug.models.rows import Engine, InMemory, MixedGram, Overlap, from_chunks
 from orthaug.physics.problem import Problem
 
 OUTPUT_UNIT = 10.0
@@ -84,6 +86,39 @@ class OneStepTask:
         rows = engine.lay(scaling(z), problem.projection.q, e / rms, gain)
         return cls(problem, bound, scaling, unit, rms, engine, rows)
 
+    @property
+    def start_loss(self) -> float:
+        """Loss of least squares with physics alone, in the units of `loss`."""
+        return float(np.mean(self.problem.unexplained**2))
+
+    @property
+    def seconds(self) -> float:
+        """What physics alone took."""
+        return 0.0
+
+    @property
+    def rows_task(self) -> OneStepTask:
+        return self
+
+    @property
+    def alone(self) -> OneStepTask:
+        """The same rows without a learner."""
+        problem = replace(self.problem, features=Features(()))
+        return replace(self, problem=problem, bound=None, unit=np.zeros_like(self.unit))
+
+    def physics_alone(self) -> tuple[OneStepTask, Learned]:
+        """The rows without a learner, and least squares on them."""
+        return self.alone, self.alone.physics_learned()
+
+    def on(self, record: Record) -> OneStepTask:
+        """The same problem on another record."""
+        learner = None if self.bound is None else self.bound.learner
+        return OneStepTask.of(self.problem.on(record), learner, engine=self.engine)
+
+    def prepared(self, solver: Any, structure: Structure, progress: RunTell = quiet) -> OneStepTask:
+        """Itself: physics alone is solved already (F1)."""
+        return self
+
     def run(
         self,
         solver: Any,
@@ -98,11 +133,30 @@ class OneStepTask:
         bound are held there, and training goes on until the same entries stand there.
         """
         structure = Orthogonal() if structure is None else structure
+        elimination = eliminate(structure, self.problem)
+        run = self._run_inside(solver, w, structure, elimination, regularization, progress)
+        solved = solver.gauss_newton and elimination.decoupled and not structure.from_initial
+        if not (solved and run.ending.usable and self.bound and self.loss(run) > self.start_loss):
+            return run
+        silent = self.bound.silent(np.asarray(w))  # from there no step ends above physics alone
+        if silent is None:
+            return run
+        return self._run_inside(solver, jnp.asarray(silent), structure, elimination, regularization, progress)
+
+    def _run_inside(
+        self,
+        solver: Any,
+        w: Any,
+        structure: Structure,
+        elimination: Elimination,
+        regularization: str | float,
+        progress: RunTell,
+    ) -> compiled.TrainingRun:
+        """One run with θ inside its bounds."""
 
         def tell(iteration: int, loss: float) -> None:
             progress(iteration, self.mean_square(loss))
 
-        elimination = eliminate(structure, self.problem)
         fixed: Fixed = {}
         seconds = iterations = 0
         for _ in range(_ACTIVE_SETS):
@@ -184,8 +238,7 @@ class OneStepTask:
         first = objective.fly(np.asarray(w), first.normal.overlap)  # less what rounding left of J in the physics
         if np.isfinite(first.normal.hessian).all() and compiled.spanned(first.normal):
             return compiled.TrainingRun(w, first.normal, ridge, 0.0, 0, Ending.SPANNED, 0.0)
-        late: dict[str, Any] = {"evidence_at_start": False}  # as the compiled loop has it
-        end = solver.descend(objective, np.asarray(w), first.normal.overlap, damping=IDENTITY, **late, **options)
+        end = solver.descend(objective, np.asarray(w), first.normal.overlap, damping=IDENTITY, **options)
         normal: Normal = end.flown.normal
         weights = jnp.asarray(end.flown.p)
         return compiled.TrainingRun(weights, normal, end.ridge, end.effective, end.iterations, end.ending, end.seconds)
@@ -274,12 +327,12 @@ class OneStepTask:
         problem = self.problem
         physics = problem.target_coordinates - problem.projection.to_coordinates @ c
         total = self.engine.sum(
-            _ResidualGram(learned.bound), self.rows, *self._weights(learned), jnp.asarray(physics / self.rms)
+            ResidualGram(learned.bound), self.rows, *self._weights(learned), jnp.asarray(physics / self.rms)
         )
         return np.asarray(total) * self.rms**2
 
     def _sums(self, learned: Learned, shift: Vector) -> tuple[Vector, float]:
-        summed = _LearnerSums(learned.bound)
+        summed = LearnerSums(learned.bound)
         rest, square = self.engine.sum(summed, self.rows, *self._weights(learned), jnp.asarray(shift / self.rms))
         return np.asarray(rest) * self.rms, float(square) * self.rms**2
 
@@ -287,7 +340,7 @@ class OneStepTask:
         """f at the training rows, in the outputs' units; the rows are in memory."""
         if self.bound is None:
             return np.zeros_like(self.problem.target)
-        return from_chunks(_row_values(self.bound, w, self.rows.z), len(self.problem.rows)) * self.unit
+        return from_chunks(row_values(self.bound, w, self.rows.z), len(self.problem.rows)) * self.unit
 
     def share_of(self, w: Vector) -> Vector:
         """QᵀF (nθ,) of the learner with the weights w, in whitened outputs; the rows are in memory."""
@@ -337,46 +390,3 @@ class OneStepTask:
         """ΣqᵀΣ_eq (nθ, nθ) of the rows q of Q, for the noise covariance of whitened outputs."""
         mix = jnp.asarray(mixing(noise))
         return np.asarray(self.engine.sum(MixedGram(None), self.rows, jnp.zeros(0), mix))
-
-
-@partial(jax.jit, static_argnames="bound")
-def _row_values(bound: Bound, w: Float[Array, "nw"], z: Float[Array, "k nz m"]) -> Float[Array, "k ny m"]:
-    one_chunk = jax.vmap(lambda row: bound.values(w, row), in_axes=-1, out_axes=-1)
-    return jax.lax.map(one_chunk, z)
-
-
-def _values(bound: Bound | None, chunk: Chunk, w: Any, tilt: Any) -> Float[Array, "ny m"]:
-    """F of one chunk; of an ensemble the median of its members, each with the physics that it adds."""
-    if bound is None:
-        return jnp.zeros_like(chunk.e)
-
-    def member_values(w: Any) -> Any:
-        values = jax.vmap(lambda z: bound.values(w, z), in_axes=-1, out_axes=-1)(chunk.z)
-        return jnp.sum(chunk.gain * values, axis=1)
-
-    if tilt is None:
-        return member_values(w)
-    return jnp.median(jax.vmap(member_values)(w) + jnp.einsum("otm,it->iom", chunk.q, tilt), axis=0)
-
-
-@dataclass(frozen=True)
-class _LearnerSums:
-    """Qᵀ(F − Q shift) and ‖F‖² of one chunk."""
-
-    bound: Bound | None
-
-    def __call__(self, chunk: Chunk, w: Any, tilt: Any, shift: Any) -> tuple[Any, Any]:
-        values = _values(self.bound, chunk, w, tilt)
-        rest = values - jnp.einsum("otm,t->om", chunk.q, shift)
-        return jnp.einsum("otm,om->t", chunk.q, rest), jnp.sum(values**2)
-
-
-@dataclass(frozen=True)
-class _ResidualGram:
-    """Σ r rᵀ of one chunk, `r = P⊥Y − F + Q physics`."""
-
-    bound: Bound | None
-
-    def __call__(self, chunk: Chunk, w: Any, tilt: Any, physics: Any) -> Any:
-        residual = chunk.e - _values(self.bound, chunk, w, tilt) + jnp.einsum("otm,t->om", chunk.q, physics)
-        return residual @ residual.T

@@ -60,13 +60,15 @@ class Ending(IntEnum):
 class Status:
     """How training ended.
 
-    `loss` is the mean of squared errors with every output divided by its standard deviation.
+    `loss` is the mean of squared errors with every output divided by its standard deviation, `start_loss` that of
+    physics alone under the same criterion.
     """
 
     ending: Ending
     iterations: int
     seconds: float
     loss: float
+    start_loss: float | None = None
 
     @property
     def code(self) -> str:

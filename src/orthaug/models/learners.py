@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Annotated, Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -36,6 +36,7 @@ ACTIVATIONS: dict[str, Callable[[Any], Any]] = {
 }
 """By name. They call JAX only when they are called, so that a spec is read without it."""
 MOST_LAYERS = 10  # hidden ones; ten take half a minute to compile
+_PROBES = 16  # points at which a silenced learner is looked at
 _GAIN = {"tanh": 5 / 3, "relu": math.sqrt(2.0)}  # Xavier gains; 1 for the others
 
 
@@ -96,6 +97,10 @@ class MLP:
                 f"`hidden` has {len(self.hidden)} layers; at most {MOST_LAYERS} are taken: more compile for minutes."
             )
         check_fields(self)
+
+    def silent(self, tree: Tree) -> Tree:
+        """The same hidden layers with an output layer of zeros."""
+        return [*tree[:-1], tuple(np.zeros_like(part) for part in tree[-1])]
 
     def weights(self, nz: int, ny: int) -> int:
         """How many weights it has for `nz` features and `ny` outputs."""
@@ -285,6 +290,23 @@ class Bound:
         """Initial weights as one vector."""
         return self.ravel(jax.tree.leaves(self.learner.init(key, self.nz, self.ny)))
 
+    def silent(self, w: Float[Array | np.ndarray, "nw"]) -> np.ndarray | None:
+        """The same weights with the output silenced, so that f = 0 everywhere and training can go on from there.
+
+        A learner says how by a method `silent(tree)`; of others the last arrays are set to zero, as few as it takes.
+        None where that does not silence it.
+        """
+        leaves = self.leaves(np.asarray(w))
+        declared = getattr(self.learner, "silent", None)
+        if declared is not None:
+            return np.asarray(self.ravel(jax.tree.leaves(declared(jax.tree.unflatten(self._shape[0], leaves)))))
+        for count in range(1, len(leaves) + 1):
+            tried = np.asarray(self.ravel([*leaves[:-count], *(jnp.zeros_like(leaf) for leaf in leaves[-count:])]))
+            values, slopes = _probed(self, tried)
+            if not np.any(values) and np.any(slopes) and np.isfinite(slopes).all():
+                return tried
+        return None
+
     @staticmethod
     def ravel(leaves: list[Any]) -> Float[Array, "nw"]:
         if any(map(is_traced, leaves)):
@@ -328,3 +350,10 @@ class Bound:
         none = jnp.zeros((0, batch))  # a learner may have no weights
         columns = [jnp.concatenate([none, *(g.reshape(-1, batch) for g in grads)]) for grads in per_output]
         return values, jnp.stack(columns, axis=1) if len(columns) > 1 else columns[0][:, None, :]
+
+
+@partial(jax.jit, static_argnames="bound")
+def _probed(bound: Bound, w: Float[Array, "nw"]) -> tuple[Float[Array, "ny m"], Float[Array, "nw ny m"]]:
+    """f and ∂f/∂w at some points of the scaled box."""
+    z = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (bound.nz, _PROBES)))
+    return bound.jacobian(w, z, jnp.broadcast_to(jnp.eye(bound.ny)[..., None], (bound.ny, bound.ny, _PROBES)))

@@ -31,8 +31,8 @@ class Problem:
     """Usable rows of a record with everything that does not depend on the learner's weights.
 
     `weight` weighs the outputs, for criterion and measure alike: so F1 holds for several outputs too. Rows multiplied
-    by it are called whitened. `target` is the outputs without the fixed terms, `deviation` (ny,) their standard
-    deviation.
+    by it are called whitened. `target` is the outputs without the fixed terms, `deviation` (ny,) the standard
+    deviation of the outputs themselves.
     """
 
     record: Record
@@ -95,6 +95,10 @@ class Problem:
             return self
         return pose(self.record, self.baseline, output_weights=self.weight.choice)
 
+    def on(self, record: Record) -> Problem:
+        """The same physics and features on another record."""
+        return _posed(record, self.baseline, self.layout, self.features, self.weight.choice)
+
     def weighed(self, weight: OutputWeights) -> Problem:
         """The same problem with other output weights."""
         if weight is self.weight:
@@ -139,13 +143,27 @@ def pose(
     check_output_weights(output_weights, len(outputs))
     baseline.check_channels(outputs, inputs)
     layout, features = regressor_of(baseline, lags, learner_inputs, outputs, inputs)
+    return _posed(record, baseline, layout, features, output_weights, require_full_rank=require_full_rank)
+
+
+def _posed(
+    record: Record,
+    baseline: Baseline,
+    layout: Layout,
+    features: Features,
+    output_weights: str | Sequence[float],
+    *,
+    require_full_rank: bool = True,
+) -> Problem:
+    """Rows, physics matrix and factor of a record whose channels were checked."""
+    outputs = tuple(channel.name for channel in record.outputs)
     rows = stack_rows(record, layout)
     _check_moving(record, layout)
     with np.errstate(all="ignore"):
         phi = np.asarray(baseline.phi(rows.x, layout, outputs, np))
         known = np.asarray(baseline.known(rows.x, layout, outputs, np))
         target = rows.y - known
-        deviation = target.std(axis=0)
+        deviation = rows.y.std(axis=0)
     _check_physics(phi, known, baseline, rows, record)
     moves = np.ptp(target, axis=0) > 0
     if not np.all(np.isfinite(deviation)) or np.any(moves & ((deviation > _LARGEST) | (deviation < 1 / _LARGEST))):

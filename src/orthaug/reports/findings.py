@@ -224,6 +224,14 @@ class TrialResult(Content):
     model: Number
 
 
+class RatioResult(Content):
+    """Error with the learner over that of physics alone, with its 95 % interval."""
+
+    value: Number
+    low: Number
+    high: Number
+
+
 class ExtrapolationResult(Content):
     """How far a part leaves the training data."""
 
@@ -239,5 +247,6 @@ class ValidationResult(Content):
 
     verdict: str = Field(validation_alias="code")
     text: str
+    ratio: RatioResult | None = None
     trials: list[TrialResult]
     extrapolation: list[ExtrapolationResult]

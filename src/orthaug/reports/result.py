@@ -59,6 +59,7 @@ class StatusResult(Content):
     iterations: Whole
     seconds: Number
     loss: Number
+    start_loss: Number
 
 
 class RestartResult(Content):

@@ -91,7 +91,7 @@ def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
     """Two tables, parameters with standard errors and scores on every part; then the verdicts on each row."""
     lines = [*_table(_parameter_cells(result)), "", *_table(_score_cells(result.comparison))]
     if result.chosen:
-        lines += ["", "* lowest one-step error on the validation part"]
+        lines += ["", "* chosen on the validation part"]
     told = [f"{row.name}: {row.residuals.text}" for row in result.comparison if row.residuals is not None]
     lines += ["", *told] if told else []
     told = [f"{kind}: {verdict.summary}" for kind, verdict in verdicts.items()]

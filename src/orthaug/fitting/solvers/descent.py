@@ -22,6 +22,7 @@ from orthaug._base.progress import RunTell, quiet
 from orthaug.fitting.status import Ending
 
 _SETTLED = 0.1  # of the objective: a step that lowers it by less belongs to the end of a run
+_FIRST_STEPS = 5  # accepted ones, before evidence may find that the weights are too many
 _SMALLEST_CURVATURE = 1e-14  # of the largest: it damps a direction that does nothing
 
 
@@ -100,6 +101,8 @@ class Descent(NamedTuple):
     iterations: int
     ending: Ending
     seconds: float
+    path: tuple[Vector, ...] = ()
+    """p of every accepted trial, the start first."""
 
 
 class _Iterate(NamedTuple):
@@ -111,9 +114,14 @@ class _Iterate(NamedTuple):
     damping: float
     growth: float = 2.0
     small: int = 0
-    accepted: int = 0
+    path: tuple[Vector, ...] = ()
     coloured: bool = False
     """Whether the colour of the errors counts. It does once they no longer fall fast; before, misfit colours them."""
+
+    @property
+    def settled(self) -> bool:
+        """Whether the objective falls slowly, after a few steps."""
+        return self.coloured and len(self.path) > _FIRST_STEPS
 
 
 def descend(
@@ -126,7 +134,8 @@ def descend(
     damping: Damping,
     ridge: float = 0.0,
     evidence: bool = False,
-    evidence_at_start: bool = True,
+    evidence_settled: bool = False,
+    ceiling: float = np.inf,
     bounds: tuple[Vector, Vector] | None = None,
     progress: RunTell = quiet,
 ) -> Descent:
@@ -135,7 +144,9 @@ def descend(
     Args:
         start: handed to the first trial.
         ridge: α; with `evidence` where it starts.
-        evidence_at_start: whether α is re-estimated at p already, or first after an accepted step.
+        evidence_settled: whether α waits until the objective falls slowly; otherwise until the first accepted step.
+            From weights that do nothing yet, evidence would find that none are needed (w = 0 is its fixed point).
+        ceiling: a trial with a larger `‖r‖²` is rejected.
         bounds: of θ, each (physics,); the start is moved inside.
     """
     began = time.perf_counter()
@@ -148,19 +159,22 @@ def descend(
     if linear is None or not np.isfinite(linear.hessian).all():
         return Descent(flown, None, ridge, 0.0, 0, Ending.NON_FINITE, time.perf_counter() - began)
     largest = 1.0 if damping.diagonal else float(np.diag(linear.hessian).max(initial=1e-300))
-    iterate = _Iterate(flown, linear, ridge, damping.first * largest)
-    iterate = iterate._replace(ridge=_next_ridge(objective, iterate, evidence and evidence_at_start))
-    ending, done = Ending.RUNNING, 0
+    iterate = _Iterate(flown, linear, ridge, damping.first * largest, path=(flown.p,))
+    ending, done, taken = Ending.RUNNING, 0, 1
     while ending is Ending.RUNNING and done < iterations:
-        iterate, ending = _trial(objective, iterate, limits, tolerance, damping, evidence)
+        iterate, ending = _trial(objective, iterate, limits, tolerance, damping, ceiling)
+        if evidence and len(iterate.path) > taken and (iterate.settled or not evidence_settled):
+            iterate = iterate._replace(ridge=_next_ridge(objective, iterate))
+        taken = len(iterate.path)
         done += 1
         progress(done, iterate.flown.loss)
     effective = effective_weights(iterate.linear.hessian, iterate.ridge, objective.physics)
-    return Descent(iterate.flown, iterate.linear, iterate.ridge, effective, done, ending, time.perf_counter() - began)
+    seconds = time.perf_counter() - began
+    return Descent(iterate.flown, iterate.linear, iterate.ridge, effective, done, ending, seconds, iterate.path)
 
 
 def _trial(
-    objective: SquaredResiduals, iterate: _Iterate, limits: Any, tolerance: float, damping: Damping, evidence: bool
+    objective: SquaredResiduals, iterate: _Iterate, limits: Any, tolerance: float, damping: Damping, ceiling: float
 ) -> tuple[_Iterate, Ending]:
     """One damped step: accept it, or damp more."""
     flown, linear, ridge = iterate.flown, iterate.linear, iterate.ridge
@@ -172,7 +186,8 @@ def _trial(
     tried = objective.fly(p + step, linear.start) if moves else None
     before = flown.loss + ridge * float(penalty @ p**2)
     after = np.nan if tried is None else tried.loss + ridge * float(penalty @ (p + step) ** 2)
-    followed = objective.linearise(tried) if np.isfinite(after) and after < before else None
+    lower = tried is not None and tried.loss <= ceiling and np.isfinite(after) and after < before
+    followed = objective.linearise(tried) if lower else None
     if tried is not None and followed is not None and np.isfinite(followed.hessian).all():
         gain = (before - after) / expected if expected > 0 else 1.0
         iterate = _Iterate(
@@ -181,22 +196,19 @@ def _trial(
             ridge=ridge,
             damping=iterate.damping * max(1 / 3, 1 - (2 * gain - 1) ** 3),
             small=iterate.small + 1 if before - after < tolerance * before else 0,
-            accepted=iterate.accepted + 1,
+            path=(*iterate.path, tried.p),
             coloured=iterate.coloured or before - after < _SETTLED * before,
         )
-        iterate = iterate._replace(ridge=_next_ridge(objective, iterate, evidence))
         return iterate, Ending.CONVERGED if iterate.small >= 2 else Ending.RUNNING
     iterate = iterate._replace(damping=iterate.damping * iterate.growth, growth=2 * iterate.growth)
     largest = 1.0 if damping.diagonal else float(np.diag(linear.hessian).max(initial=1e-300))
     if iterate.damping > damping.largest * largest or not step.any():
         level = _level(linear.hessian, downhill, before, _held(p, downhill, *limits))
-        return iterate, Ending.CONVERGED if iterate.accepted or level else Ending.NO_DESCENT
+        return iterate, Ending.CONVERGED if len(iterate.path) > 1 or level else Ending.NO_DESCENT
     return iterate, Ending.RUNNING
 
 
-def _next_ridge(objective: SquaredResiduals, iterate: _Iterate, evidence: bool) -> float:
-    if not evidence:
-        return iterate.ridge
+def _next_ridge(objective: SquaredResiduals, iterate: _Iterate) -> float:
     flown, samples = iterate.flown, objective.samples(iterate.flown)
     physics, hessian = objective.physics, iterate.linear.hessian
     return _evidence(samples, flown.p, hessian, flown.loss, iterate.ridge, physics, iterate.coloured)

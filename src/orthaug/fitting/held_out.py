@@ -1,0 +1,154 @@
+"""Errors on rows that were not fitted, and the one rule by which two models are compared there.
+
+Starts, regularizations, the fallback to physics alone and every verdict rest on it. Blocked cross-validation leaves out
+one contiguous block after another, with gaps of the lag length, so that no sample is predicted from its own neighbours
+in the training data.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import Vector
+from orthaug._base.errors import InputError
+from orthaug.data.record import Experiment, Record
+from orthaug.models.response import Response
+
+WORTH = 0.02  # of the error: less than this is neither help nor harm
+_FEWEST = 20  # usable rows of a block
+_STRETCHES = 20  # pieces of a free run that the bootstrap draws from: longer than its errors remember
+_DRAWS = 999
+
+Pieces = Sequence[Vector | None]
+"""Squared errors along each held-out run, mean over the outputs; None for a run that diverged."""
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """RMS error of a model over that of another on the same rows, with a 95 % interval by the block bootstrap.
+
+    Where only one of them diverges it is 0 or infinite, and the interval with it; where both do there is none.
+    """
+
+    value: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, model: Pieces, other: Pieces) -> Ratio:
+        """The model against the other. Runs that diverge count first; then those that both survive."""
+        lost, other_lost = (sum(piece is None for piece in pieces) for pieces in (model, other))
+        if lost != other_lost:
+            certain = math.inf if lost > other_lost else 0.0
+            return cls(certain, certain, certain)
+        both = [(a, b) for a, b in zip(model, other, strict=True) if a is not None and b is not None]
+        if not both:
+            return cls(math.nan, math.nan, math.nan)
+        sums = np.concatenate([_stretches(a, b, sum(len(a) for a, _ in both)) for a, b in both])
+        drawn = np.random.default_rng(0).integers(len(sums), size=(_DRAWS, len(sums)))
+        with np.errstate(all="ignore"):
+            ratios = np.sqrt(sums[drawn, 0].sum(axis=1) / sums[drawn, 1].sum(axis=1))
+            value = float(np.sqrt(sums[:, 0].sum() / sums[:, 1].sum()))
+        if not np.isfinite(ratios).all():  # the other follows some rows exactly
+            return cls(value, value, value)
+        return cls(value, *(float(q) for q in np.quantile(ratios, (0.025, 0.975))))
+
+    @classmethod
+    def exactly(cls, model: float, other: float) -> Ratio:
+        """Of two errors that are all that is known."""
+        if math.isinf(model) and math.isinf(other):
+            value = math.nan
+        else:
+            value = model / other if other > 0 else math.inf if model > 0 else math.nan
+        return cls(value, value, value)
+
+    @property
+    def code(self) -> str:
+        """helps, hurts, or no_help where the interval holds 1 or the difference is below 2 %."""
+        if self.high < 1 and self.value < 1 - WORTH:
+            return "helps"
+        return "hurts" if self.low > 1 and self.value > 1 + WORTH else "no_help"
+
+    def __str__(self) -> str:
+        if not 0 < self.value < math.inf:
+            return ""
+        return f"ratio {self.value:.3g}, 95 % interval {self.low:.3g} to {self.high:.3g}"
+
+
+def _stretches(model: Vector, other: Vector, rows: int) -> np.ndarray:
+    """Sums of both over stretches of one run, (stretches, 2); `rows` of all runs together make `_STRETCHES`."""
+    count = max(1, min(round(_STRETCHES * len(model) / rows), len(model)))
+    edges = np.linspace(0, len(model), count + 1).astype(int)[:-1]
+    return np.stack([np.add.reduceat(errors, edges) for errors in (model, other)], axis=-1)
+
+
+def mean_square(pieces: Pieces) -> float:
+    """Over all rows of all runs; infinite where one diverged."""
+    if any(piece is None for piece in pieces):
+        return math.inf
+    return float(np.mean(np.concatenate([piece for piece in pieces if piece is not None])))
+
+
+def squared_errors(response: Response, unit: Any, skip: int | tuple[int, ...] = 0) -> list[Vector | None]:
+    """Squared errors of a response along each experiment, each output in its `unit`, mean over the outputs.
+
+    Args:
+        skip: leading samples of each experiment that do not count, as in `Response.scores`.
+    """
+    skips = (skip,) * len(response.trajectories) if isinstance(skip, int | np.integer) else skip
+    pieces: list[Vector | None] = []
+    for trajectory, first in zip(response.trajectories, skips, strict=True):
+        assert trajectory.measured is not None, "errors need measured outputs"
+        rows = slice(max(trajectory.start, first), None)
+        with np.errstate(all="ignore"):
+            squares = np.mean(((trajectory.measured[rows] - trajectory.model[rows]) / unit) ** 2, axis=1)
+        pieces.append(squares if trajectory.diverged is None and np.isfinite(squares).all() else None)
+    return pieces
+
+
+def blocked(record: Record, blocks: int, start: int) -> list[tuple[Record, Record]]:
+    """(training, held out) for each of `blocks` contiguous blocks of about equal length, `start` rows of gap around.
+
+    All training records have the same number of usable rows after the first `start` of each experiment.
+
+    Raises:
+        InputError: too few rows for so many blocks.
+    """
+    edges = np.linspace(0, len(record), blocks + 1).round().astype(int)
+    folds = []
+    for low, high in zip(edges[:-1], edges[1:], strict=True):
+        held, kept, offset = [], [], 0
+        for experiment in record.experiments:
+            rows = len(experiment)
+            a, b = (int(np.clip(edge - offset, 0, rows)) for edge in (low, high))
+            inside = a < b
+            held += [experiment.rows(a, b)] if inside else []
+            before, after = (a - start, b + start) if inside else (rows, rows)
+            kept += [experiment.rows(0, before)] if before > start else []
+            kept += [experiment.rows(after, rows)] if rows - after > start else []
+            offset += rows
+        held = [e for e in held if len(e) > start]
+        if sum(len(e) - start for e in held) < _FEWEST or sum(len(e) - start for e in kept) < _FEWEST:
+            raise InputError(f"{len(record)} rows are too few for {blocks} blocks with gaps of {start} rows.")
+        folds.append((kept, held))
+    least = min(sum(len(e) - start for e in kept) for kept, _ in folds)
+    return [
+        (replace(record, experiments=_cut(kept, least, start)), replace(record, experiments=tuple(held)))
+        for kept, held in folds
+    ]
+
+
+def _cut(experiments: list[Experiment], usable: int, start: int) -> tuple[Experiment, ...]:
+    """The experiments without the last rows of the longest ones, so that `usable` rows remain."""
+    cut = list(experiments)
+    while (surplus := sum(len(e) - start for e in cut) - usable) > 0:
+        longest = max(range(len(cut)), key=lambda i: len(cut[i]))
+        length = len(cut[longest])
+        shorter = max(length - surplus, max((len(e) for e in cut if len(e) < length), default=start + 1), start + 1)
+        cut[longest] = cut[longest].rows(0, min(shorter, length - 1))
+    return tuple(e for e in cut if len(e) > start)

@@ -1,0 +1,216 @@
+"""Runs from every start, the choice between them, and the fallback to physics alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from orthaug._base.checks import finite_or_none
+from orthaug._base.errors import InputError
+from orthaug._base.jax import jax
+from orthaug._base.parallel import one_blas_thread, spread
+from orthaug._base.progress import Tell
+from orthaug._base.warning import Warning
+from orthaug.data.record import Record
+from orthaug.fitting.conclusion import conclude
+from orthaug.fitting.estimates import Estimate, HeldOut, Restart
+from orthaug.fitting.held_out import Pieces, blocked, mean_square, squared_errors
+from orthaug.fitting.learned import Learned, Task
+from orthaug.fitting.one_step import OneStepTask
+from orthaug.fitting.solvers.solver import Solver
+from orthaug.fitting.structures import Structure
+
+FOLD_ITERATIONS = 60  # enough to tell whether a learner helps, on every block of cross-validation
+
+
+class PlannedRun(NamedTuple):
+    """One run to be made: its seed, initial weights and regularization."""
+
+    seed: int
+    weights: Any
+    regularization: str | float
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """How one run is chosen: on `validation`, on held-out `blocks` of the training data, or by the lowest loss.
+
+    With `fallback` physics alone is handed over where no free run is better there. An `ensemble` takes them all.
+    """
+
+    validation: Record | None = None
+    blocks: int = 0
+    fallback: bool = True
+    ensemble: bool = False
+
+    def compares(self, task: Task, starts: Sequence[PlannedRun]) -> bool:
+        """Whether there is something to choose by held-out errors: runs that fly, or several regularizations."""
+        several = len({start.regularization for start in starts}) > 1
+        return task.bound is not None and (task.criterion.flown is not None or several)
+
+
+def train(
+    task: Task,
+    starts: Sequence[PlannedRun],
+    structure: Structure,
+    solver: Solver,
+    choice: Choice,
+    progress: Tell,
+) -> Estimate:
+    """Run from every start and conclude with the best."""
+    with one_blas_thread():
+        task = task.prepared(solver, structure, partial(progress, 0))
+    starts, runs = _run(task, starts, structure, solver, progress)
+    losses = [task.loss(run) for run in runs]
+    held_out = _held_out(task, starts, runs, structure, solver, choice)
+    errors = [math.nan] * len(runs) if held_out is None else [mean_square(run) for run in held_out.runs]
+    ranking = np.array(errors if np.isfinite(errors).any() else losses)
+    usable = np.array([run.ending.usable for run in runs]) & np.isfinite(ranking)
+    best = int(np.argmin(np.where(usable, ranking, np.inf)))
+    told = []
+    if held_out is not None:
+        held_out = replace(held_out, chosen=best)
+        if choice.fallback and task.criterion.flown is not None and held_out.ratio.code != "helps":
+            told, best = [_fell_back(held_out)], -1
+    members = [best]
+    if best < 0:
+        estimate = _alone(task, structure)
+    elif choice.ensemble:
+        members = [i for i, start in enumerate(starts) if start.regularization == starts[best].regularization]
+        estimate = _concluded(task, structure, _median(task, runs, members, best))
+    else:
+        estimate = _concluded(task, structure, task.learned(runs[best]))
+    restarts = tuple(
+        Restart(
+            seed=start.seed,
+            loss=finite_or_none(losses[i]),
+            iterations=run.iterations,
+            code=run.ending.code,
+            chosen=i in members,
+            regularization=start.regularization,
+            validation=finite_or_none(errors[i]),
+        )
+        for i, (start, run) in enumerate(zip(starts, runs, strict=True))
+    )
+    status = replace(
+        estimate.status, seconds=task.seconds + sum(run.seconds for run in runs), start_loss=task.start_loss
+    )
+    warnings = (*estimate.warnings, *_replaced(starts, runs), *told)
+    return replace(estimate, restarts=restarts, status=status, held_out=held_out, warnings=warnings)
+
+
+def _run(
+    task: Task, starts: Sequence[PlannedRun], structure: Structure, solver: Solver, progress: Tell
+) -> tuple[list[PlannedRun], list[Any]]:
+    """Every planned run; one that fails is made again from the seeds that follow."""
+
+    def one(numbered: tuple[int, PlannedRun], check: Callable[[], None]) -> Any:
+        i, start = numbered
+
+        def tell(iteration: int, loss: float) -> None:
+            check()
+            progress(i, iteration, loss)
+
+        return task.run(solver, start.weights, structure, start.regularization, tell)
+
+    made = list(starts)
+    runs = spread(one, list(enumerate(made)))
+    failed = [start for start, run in zip(made, runs, strict=True) if not run.ending.usable]
+    if task.bound is None or not failed or len(failed) == len(made):  # where all fail the data or the learner are bad
+        return made, runs
+    following = max(start.seed for start in made) + 1
+    bound = task.bound
+    again = [
+        start._replace(seed=seed, weights=bound.init(jax.random.key(seed)))
+        for seed, start in enumerate(failed, following)
+    ]
+    return made + again, runs + spread(one, list(enumerate(again, len(made))))
+
+
+def _replaced(starts: Sequence[PlannedRun], runs: Sequence[Any]) -> list[Warning]:
+    failed = [str(start.seed) for start, run in zip(starts, runs, strict=True) if not run.ending.usable]
+    if not failed or len(failed) == len(runs):
+        return []
+    text = f"training failed from seed {', '.join(failed)} and was made again from the seeds after the last one."
+    return [Warning("start_replaced", text)]
+
+
+def _held_out(
+    task: Task,
+    starts: Sequence[PlannedRun],
+    runs: Sequence[Any],
+    structure: Structure,
+    solver: Solver,
+    choice: Choice,
+) -> HeldOut | None:
+    """Errors where nothing was fitted: of the runs on the validation record, or of runs on folds on their blocks."""
+    if choice.validation is not None:
+        record, unit = choice.validation, task.problem.deviation
+        fits = [_concluded(task, structure, task.learned(run)) for run in runs]
+        alone = _errors(_alone(task, structure), record, unit)
+        return HeldOut("the validation part", alone, tuple(_errors(fit, record, unit) for fit in fits))
+    if not choice.blocks or not choice.compares(task, starts):
+        return None
+    try:
+        folds = blocked(task.problem.record, choice.blocks, task.problem.rows.start)
+    except InputError:  # too few rows to leave some out
+        return None
+    shorter, unit = solver.at_most(FOLD_ITERATIONS), task.problem.deviation
+
+    def one(fold: tuple[Record, Record], check: Callable[[], None]) -> list[Pieces]:
+        training, held = fold
+        failed: Pieces = [None] * len(held.experiments)
+        try:
+            own = task.on(training).prepared(shorter, structure)
+            fits = [_alone(own, structure)]
+            for start in starts:
+                check()
+                run = own.run(shorter, start.weights, structure, start.regularization)
+                fits.append(_concluded(own, structure, own.learned(run)))
+        except InputError:  # the block took away what the physics needs
+            return [failed] * (1 + len(starts))
+        return [_errors(fit, held, unit) for fit in fits]
+
+    pieces = [[p for block in column for p in block] for column in zip(*spread(one, folds), strict=True)]
+    return HeldOut(f"blocked cross-validation ({choice.blocks} blocks)", pieces[0], tuple(pieces[1:]))
+
+
+def _errors(fit: Estimate, record: Record, unit: Any) -> Pieces:
+    """Of the criterion's own response; None for a run without a model or a value."""
+    if not fit.status.ok:
+        return [None] * len(record.experiments)
+    return squared_errors(fit.criterion.response(fit.model, record), unit)
+
+
+def _fell_back(held_out: HeldOut) -> Warning:
+    model, alone = (math.sqrt(mean_square(p)) for p in (held_out.runs[held_out.chosen], held_out.alone))
+    errors = f"its error is {model:.4g} deviations of the output, that of physics alone {alone:.4g}"
+    if math.isinf(model):
+        errors = "every one of its starts runs away there"
+    text = (
+        f"in {held_out.where} the learner is not better than physics alone ({errors}), so the result is physics alone; "
+        "`fallback = false` keeps the learner."
+    )
+    return Warning("physics_alone", text)
+
+
+def _alone(task: Task, structure: Structure) -> Estimate:
+    rows, learned = task.physics_alone()
+    return replace(conclude(rows, structure, learned), criterion=task.criterion)
+
+
+def _concluded(task: Task, structure: Structure, learned: Learned) -> Estimate:
+    return replace(conclude(task.rows_task, structure, learned), criterion=task.criterion)
+
+
+def _median(task: Task, runs: Sequence[Any], members: Sequence[int], best: int) -> Learned:
+    """The median of the members that have a value everywhere; the best one alone if it has none."""
+    rows: OneStepTask = task.rows_task
+    learned = {i: task.learned(runs[i]) for i in members}
+    sound = [i for i, member in learned.items() if np.isfinite(rows.share(member).square)]
+    return task.median([learned[i] for i in sound], sound.index(best)) if best in sound else learned[best]
