@@ -14,6 +14,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.progress import RunTell, quiet
+from orthaug._base.warning import Warning
 from orthaug.data.record import Record
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.flight_plan import Flight, FlightPlan
@@ -94,6 +95,19 @@ class FreeRunTask:
     def on(self, record: Record) -> FreeRunTask:
         """The same problem on another record."""
         return FreeRunTask.of(self.task.on(record), self.criterion)
+
+    @property
+    def warnings(self) -> tuple[Warning, ...]:
+        """One where runs cannot be compared over whole experiments."""
+        if self.physics is None or self.plan.whole is not self.plan.segments:
+            return ()
+        if not self.criterion.simulates or not self.plan.flown.segment:
+            return ()
+        text = (
+            "the free run of physics alone diverges over whole experiments of the training data, so `loss` counts its "
+            "segments; bound what makes it run away, or trust predictions a segment ahead only."
+        )
+        return (Warning("free_run_diverges", text),)
 
     def prepared(self, solver: LevenbergMarquardt, structure: Structure, progress: RunTell = quiet) -> FreeRunTask:
         """The same with physics alone trained.

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.progress import RunTell, quiet
+from orthaug._base.warning import Warning
 from orthaug.data.record import Record
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.elimination import Fixed
@@ -78,6 +79,11 @@ class Task(Protocol):
     @property
     def seconds(self) -> float:
         """What was spent before the first run."""
+        ...
+
+    @property
+    def warnings(self) -> tuple[Warning, ...]:
+        """What physics alone gave reason to tell."""
         ...
 
     @property

@@ -12,6 +12,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jnp
 from orthaug._base.progress import RunTell, quiet
+from orthaug._base.warning import Warning
 from orthaug.data.record import Record
 from orthaug.data.regressors import Features
 from orthaug.fitting.criteria import Criterion, Prediction
@@ -95,6 +96,11 @@ class OneStepTask:
     def seconds(self) -> float:
         """What physics alone took."""
         return 0.0
+
+    @property
+    def warnings(self) -> tuple[Warning, ...]:
+        """None: least squares has nothing to tell here."""
+        return ()
 
     @property
     def rows_task(self) -> OneStepTask:

@@ -75,7 +75,8 @@ def train(
     told = []
     if held_out is not None:
         held_out = replace(held_out, chosen=best)
-        if choice.fallback and task.criterion.flown is not None and held_out.ratio.code != "helps":
+        flies = task.criterion.flown is not None and task.start_loss is not None
+        if choice.fallback and flies and held_out.ratio.code != "helps":
             told, best = [_fell_back(held_out)], -1
     members = [best]
     if best < 0:
@@ -100,7 +101,7 @@ def train(
     status = replace(
         estimate.status, seconds=task.seconds + sum(run.seconds for run in runs), start_loss=task.start_loss
     )
-    warnings = (*estimate.warnings, *_replaced(starts, runs), *told)
+    warnings = (*estimate.warnings, *task.warnings, *_replaced(starts, runs), *told)
     return replace(estimate, restarts=restarts, status=status, held_out=held_out, warnings=warnings)
 
 
