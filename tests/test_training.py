@@ -1,0 +1,147 @@
+"""Which run is kept: starts from physics alone, held-out free runs that choose, and the fallback to physics alone."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import equinox as eqx
+import numpy as np
+import pytest
+from test_free_run import FREE, LM, NETWORK, PHYSICS, record
+
+from orthaug._base.jax import jax, jnp
+from orthaug.data.record import Record
+from orthaug.fitting.estimation import estimate
+from orthaug.fitting.free_run import FreeRunTask
+from orthaug.fitting.held_out import Ratio, mean_square
+from orthaug.fitting.status import Ending
+from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
+from orthaug.models.learners import MLP, Bound, EquinoxModule, Function
+
+OPTIONS = {"learner": NETWORK, "criterion": FREE, "solver": LM}
+
+
+def linear(seed=0, rows=300):
+    """Nothing for a learner to find."""
+    rng = np.random.default_rng(seed)
+    u, y = rng.normal(size=rows), np.zeros(rows)
+    for k in range(2, rows):
+        y[k] = 0.9 * y[k - 1] - 0.3 * y[k - 2] + 0.5 * u[k - 1]
+    return Record.from_arrays(u, y + 0.2 * rng.normal(size=rows))
+
+
+@cache
+def chosen():
+    return estimate(record(), PHYSICS, restarts=3, **OPTIONS)
+
+
+def test_the_lowest_error_on_held_out_blocks_is_chosen():
+    found = chosen()
+    errors = [mean_square(run) for run in found.held_out.runs]
+    assert [run.validation for run in found.restarts] == errors and len(errors) == 3
+    assert [run.chosen for run in found.restarts] == [error == min(errors) for error in errors]
+    assert found.held_out.ratio.code == "helps" and found.held_out.ratio.high < 1
+    assert found.model.form.bound is not None
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_where_no_learner_is_better_the_result_is_physics_alone(seed):
+    found = estimate(linear(seed), PHYSICS, **OPTIONS)
+    alone = estimate(linear(seed), PHYSICS, **{**OPTIONS, "learner": None})
+    assert found.model.form.bound is None and "physics_alone" in [w.code for w in found.warnings]
+    np.testing.assert_allclose(found.theta, alone.theta, rtol=1e-9)
+    np.testing.assert_allclose(found.std, alone.std, rtol=1e-6)
+    assert found.status.loss == found.status.start_loss and not any(run.chosen for run in found.restarts)
+
+
+def test_the_fallback_can_be_declined():
+    found = estimate(linear(), PHYSICS, fallback=False, **OPTIONS)
+    assert found.model.form.bound is not None and found.held_out.ratio.code != "helps"
+    assert found.status.loss <= found.status.start_loss and found.restarts[0].chosen
+
+
+@pytest.mark.parametrize("structure", [Orthogonal(), Additive(), OrthogonalPenalty(1.0), BaselinePenalty(1.0)])
+def test_no_start_ends_above_physics_alone(structure):
+    """Not even where iterations are few."""
+    options = {**OPTIONS, "solver": type(LM)(4), "structure": structure, "restarts": 4, "blocks": 0}
+    found = estimate(record(), PHYSICS, **options)
+    alone = estimate(record(), PHYSICS, **{**options, "learner": None})
+    assert found.status.start_loss == pytest.approx(alone.status.loss, rel=1e-9)
+    assert all(run.loss <= found.status.start_loss for run in found.restarts)
+
+
+def test_one_step_does_not_end_above_physics_alone_either():
+    found = estimate(linear(), PHYSICS, learner=NETWORK, solver=type(LM)(1), restarts=4)
+    assert all(run.loss <= found.status.start_loss for run in found.restarts)
+
+
+def test_a_start_that_fails_is_told_and_replaced(monkeypatch):
+    run = FreeRunTask.run
+
+    def failing(self, solver, w, *rest):
+        flight = run(self, solver, w, *rest)
+        first = np.array_equal(np.asarray(w), np.asarray(self.bound.init(jax.random.key(1))))
+        return flight._replace(end=flight.end._replace(ending=Ending.NON_FINITE)) if first else flight
+
+    monkeypatch.setattr(FreeRunTask, "run", failing)
+    found = estimate(record(), PHYSICS, restarts=2, seed=1, blocks=0, **OPTIONS)
+    assert [(r.seed, r.code == "non_finite") for r in found.restarts] == [(1, True), (2, False), (3, False)]
+    assert "start_replaced" in [w.code for w in found.warnings] and found.status.ok
+
+
+# --- silent learners
+
+SILENCED = {
+    "mlp": MLP((4, 3)),
+    "function": Function(
+        lambda w, z: w["out"] @ jnp.tanh(w["in"] @ z),
+        lambda key: {"in": jax.random.normal(key, (3, 2)), "out": jnp.ones((1, 3))},
+    ),
+    "module": EquinoxModule(lambda key: eqx.nn.MLP(2, 1, 4, 1, key=key)),
+}
+
+
+@pytest.mark.parametrize("kind", SILENCED)
+def test_a_silenced_learner_is_zero_and_can_be_trained(kind):
+    bound = Bound(SILENCED[kind], 2, 1)
+    w = np.asarray(bound.init(jax.random.key(0)))
+    silent = bound.silent(w)
+    z = jnp.asarray(np.random.default_rng(1).normal(size=(2, 9)))
+    values, slopes = bound.jacobian(jnp.asarray(silent), z, jnp.ones((1, 1, 9)))
+    assert not np.any(values) and np.any(slopes) and np.any(silent)
+    kept = silent != 0
+    np.testing.assert_array_equal(silent[kept], w[kept])
+
+
+def test_what_cannot_be_silenced_is_said_so():
+    bound = Bound(Function(lambda w, z: jnp.exp(w * z[:1]), lambda key: jnp.ones(1)), 2, 1)
+    assert bound.silent(np.ones(1)) is None
+
+
+# --- the one rule
+
+
+def coloured(rng, rows=400):
+    e = np.zeros(rows)
+    for k in range(1, rows):
+        e[k] = 0.8 * e[k - 1] + rng.normal()
+    return e**2
+
+
+def test_the_ratio_of_errors():
+    errors = coloured(np.random.default_rng(0))
+    assert Ratio.of([errors], [errors]) == Ratio(1.0, 1.0, 1.0)
+    half = Ratio.of([errors / 4], [errors])
+    assert (half.value, half.low, half.high) == pytest.approx((0.5, 0.5, 0.5)) and half.code == "helps"
+    assert Ratio.of([errors * 1.01], [errors]).code == "no_help"
+    assert Ratio.of([None, errors], [errors, errors]).code == "hurts"
+    assert Ratio.of([errors], [None]).code == "helps"
+    assert Ratio.of([None], [None]).code == "no_help"
+    assert Ratio.of([errors], [0 * errors]).code == "hurts" and Ratio.of([0 * errors], [0 * errors]).code == "no_help"
+
+
+def test_equal_models_are_rarely_told_apart():
+    """Coloured errors of equal size: the 95 % interval holds 1 in at least 90 % of the draws."""
+    rng = np.random.default_rng(3)
+    codes = [Ratio.of([coloured(rng)], [coloured(rng)]).code for _ in range(200)]
+    assert codes.count("no_help") >= 180
