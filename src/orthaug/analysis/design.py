@@ -118,7 +118,8 @@ def design_input(
     if baseline.function is not None or not baseline.names:
         raise InputError("a design needs physics that is made of terms, with one parameter or more.")
     theta = _numbers(baseline.initial if theta is None else theta, (len(baseline.names),), "theta")
-    plant = Plant(baseline, (tuple(outputs), tuple(inputs)), suspects, theta, channel)
+    known = [suspect.sampled(sampling_time) for suspect in suspects]
+    plant = Plant(baseline.sampled(sampling_time), (tuple(outputs), tuple(inputs)), known, theta, channel)
     samples = check_count(samples, "samples", plant.start + 4 * len(theta) + 16)
     if samples > MOST_SAMPLES:
         raise InputError(f"`samples` is {shown(samples)}; at most {MOST_SAMPLES} are simulated.")
