@@ -589,18 +589,21 @@ def test_design_writes_an_input_within_its_limits(project):
 
 
 def test_design_as_json(project):
-    project.write_text(MACHINE + DESIGN + COULOMB)
+    project.write_text(MACHINE + DESIGN.replace("amplitude = 50", "minimum = 0\nmaximum = 50") + COULOMB)
     found = finite_json(run("design", project, "--out", "u.csv", "--json").out)
     assert found["samples"] == 400 and set(found["bias"]) == set(found["std"]) == {"theta1", "theta2", "theta3"}
     costs = [row["cost"] for row in found["candidates"]]
     assert costs[0] == min(cost for cost in costs if cost is not None) == pytest.approx(found["cost"])
-    assert pd.read_csv("u.csv")["force"].abs().max() <= 50
+    force = pd.read_csv("u.csv")["force"]
+    assert 0 <= force.min() < 10 and 40 < force.max() <= 50
 
 
 BAD_DESIGNS = [
-    ("", "the section [design] is missing; it needs `samples` and `amplitude`"),
+    ("", "the section [design] is missing; it needs `samples` and limits, such as `amplitude`"),
     (DESIGN + COULOMB.replace("coefficient = -3.8e-5", ""), "has no `coefficient`; a design needs a guess of its size"),
-    ("[design]\nsamples = 400\n", "the key 'design.amplitude' is missing"),
+    ("[design]\nsamples = 400\n", "'design': give `amplitude`, or `minimum` and `maximum`; got none of them"),
+    (DESIGN + "minimum = 0\n", "'design': give `amplitude`, or `minimum` and `maximum`; got amplitude and minimum"),
+    (DESIGN.replace("amplitude = 50", "minimum = 3\nmaximum = 3"), "'design': `minimum` must be less than `maximum`"),
     (DESIGN.replace("400", "-1"), "'design.samples': found -1"),
     (DESIGN.replace("400", "10"), "`samples` must be a whole number, 30 or more; got 10"),
     (DESIGN.replace("50", "0"), "'design.amplitude': found 0; expected greater than 0"),

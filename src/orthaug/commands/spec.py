@@ -161,12 +161,21 @@ class DesignSection(Section):
     """An input to design, within limits."""
 
     samples: Positive
-    amplitude: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+    amplitude: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    minimum: Finite | None = None
+    maximum: Finite | None = None
     input: str | None = None
     rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
     noise: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
     condition: Annotated[float, Field(gt=1, allow_inf_nan=False)] = 1e3
     seed: Count = 0
+
+    @model_validator(mode="after")
+    def _check_limits(self) -> DesignSection:
+        from orthaug.analysis.design import input_limits  # most specs have no design
+
+        input_limits(self.amplitude, self.minimum, self.maximum)
+        return self
 
 
 class LearnerSection(KindSection):
