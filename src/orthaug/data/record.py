@@ -34,7 +34,8 @@ class Channel:
         if not is_name(self.name):
             raise InputError(
                 f"{_quoted(self.name)} cannot name a channel; use letters, digits and underscores, at most {LONGEST}, "
-                f"not starting with a digit, and none of {', '.join(sorted(RESERVED))}."
+                f"not starting with a digit, and none of {', '.join(sorted(RESERVED))}. A column of another name is "
+                "its `column`."
             )
         check_label(self.unit, f"the unit of '{self.name}'")
         check_type(self.column, str, f"column of '{self.name}'", "a column's name")
