@@ -111,6 +111,10 @@ class Experiment:
     def __len__(self) -> int:
         return len(self.inputs)
 
+    def __repr__(self) -> str:
+        shapes = f"inputs {np.shape(self.inputs)}, outputs {np.shape(self.outputs)}"
+        return f"Experiment({visible(self.source) + ': ' if self.source else ''}{shapes})"
+
     def check(self, inputs: int, outputs: int) -> None:
         """Raise InputError unless there are as many columns, and as many rows of both."""
         wanted = (len(self), inputs), (len(self), outputs)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -88,6 +89,8 @@ class Baseline:
 
     Examples:
         >>> spring = Baseline.from_terms([Term("a", "y[k-1]", initial=0.9), Term("b", "u[k-1]")])
+        >>> spring
+        Baseline(a*y[k-1] + b*u[k-1])
         >>> spring.names
         ('a', 'b')
     """
@@ -96,6 +99,17 @@ class Baseline:
     terms: tuple[Term, ...] = ()
     constants: tuple[tuple[str, float], ...] = ()
     function: Callable[[Any], Any] | None = field(default=None, repr=False)
+
+    def __repr__(self) -> str:
+        if self.function is not None:
+            return f"Baseline(a function of the regressor, θ: {', '.join(self.names)})"
+        sums: dict[str, list[str]] = {}
+        for term in self.terms:
+            factor = f"{term.initial:g}" if term.fixed else term.parameter
+            alone = re.fullmatch(r"\w+\[[^][]*\]", term.regressor)
+            regressor = term.regressor if alone else f"({term.regressor})"
+            sums.setdefault(term.output or "", []).append(f"{factor}*{regressor}")
+        return f"Baseline({'; '.join(f'{name} = ' * bool(name) + ' + '.join(terms) for name, terms in sums.items())})"
 
     @classmethod
     def from_terms(cls, terms: Sequence[Term], constants: Mapping[str, float] | None = None) -> Baseline:

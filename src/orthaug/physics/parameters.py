@@ -72,6 +72,10 @@ class PhysicsMap:
     expressions: tuple[Expression, ...]
     constants: tuple[tuple[str, float], ...] = ()
 
+    def __repr__(self) -> str:
+        given = zip(self.theta_names, self.expressions, strict=True)
+        return f"PhysicsMap({'; '.join(f'{name} = {text}' for name, text in given)}; p: {', '.join(self.names)})"
+
     @classmethod
     def of(
         cls,

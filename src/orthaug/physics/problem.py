@@ -46,6 +46,10 @@ class Problem:
     projection: Projection
     excitation: Excitation
 
+    def __repr__(self) -> str:
+        lags = ", ".join(str(lag) for lag in self.layout)
+        return f"Problem({len(self.rows)} rows of {', '.join(self.outputs)}, x: {lags}, {self.baseline!r})"
+
     @property
     def outputs(self) -> tuple[str, ...]:
         return tuple(channel.name for channel in self.record.outputs)
