@@ -75,6 +75,10 @@ class Job:
     physics: PhysicsMap | None
     warnings: tuple[Warning, ...]
 
+    def __repr__(self) -> str:
+        parts = ", ".join(f"{part.name} {len(part.record)} rows" for part in self.parts)
+        return f"Job({self.path.name}: {parts}; {self.problem.baseline!r})"
+
     @property
     def run_count(self) -> int:
         """How many runs a fit makes: restarts times regularizations."""
