@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 from test_cli import MLP, SPEC, finite_json, make_project, one_line, run, write_csv
 
+from orthaug import load_spec
 from orthaug.inference.covariance import interval
 from orthaug.models.storage import load
 from orthaug.studies.synthetic import MassSpringDamper
@@ -573,6 +574,26 @@ def test_a_parameter_at_its_bound_is_not_split_off(inside, tmp_path):
 
 DESIGN = "[design]\nsamples = 400\namplitude = 50\nnoise = 2e-6\n"
 COULOMB = suspects(f'kind = "coulomb"\non = "{VELOCITY}"\ncoefficient = -3.8e-5')
+
+
+def test_the_sampling_time_need_not_be_declared(project):
+    """It is that of the data, from the spec or a time column, with `every` rows kept."""
+    declared = load_spec(project)
+    text = MACHINE.replace("[baseline.constants]\nTs = 0.01\n", "")
+    project.write_text(text + COULOMB)
+    np.testing.assert_array_equal(load_spec(project).problem.baseline.initial, declared.problem.baseline.initial)
+    table = pd.read_csv("run.csv")
+    table.insert(0, "t", 5 + 0.01 * np.arange(len(table)))
+    table.to_csv("run.csv", index=False)
+    project.write_text(text.replace("sampling_time = 0.01", 'time = "t"'))
+    timed = load_spec(project).problem.baseline
+    np.testing.assert_allclose(timed.initial, declared.problem.baseline.initial, rtol=1e-9)
+    thinned = text.replace('["run.csv"]', '["run.csv"], every = 2')
+    project.write_text(thinned)
+    assert load_spec(project).physics.constants == (("Ts", 0.02),)
+    project.write_text(thinned + "[baseline.constants]\nTs = 0.01\n")
+    done = run("check", project)
+    assert done.code == 2 and one_line(done.err, "machine.toml: the constant 'Ts' is 0.01", "sampled every 0.02 s")
 
 
 def test_design_writes_an_input_within_its_limits(project):

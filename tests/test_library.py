@@ -47,8 +47,8 @@ def test_structures_are_compared(job, fitted):
     alone = oa.estimate(job.train.record, job.problem.baseline, learner=None)
     theirs = found.verdicts["orthogonal"]
     for record in (job.tests[0].record, reordered(job)):
-        verdict = oa.verdict(fitted.fit, alone, {"tests.steps": record})
-        assert verdict.code == theirs.code == oa.verdict(fitted.fit, alone, record).code
+        verdict = oa.verdict(fitted.fit, alone, {"tests.steps": record}, skip=job.tests[0].skip)
+        assert verdict.code == theirs.code
         assert verdict.trials[0][1:3] == pytest.approx(theirs.trials[0][1:3], rel=1e-9)
     for arguments, message in (
         ((1, alone, job.tests[0].record), "`fit` must be an Estimate; got 1"),

@@ -152,13 +152,16 @@ def input_limits(amplitude: Any, minimum: Any, maximum: Any) -> tuple[float, flo
         if not 1 / LARGEST <= amplitude <= LARGEST:
             raise InputError(f"`amplitude` must lie between {1 / LARGEST:g} and {LARGEST:g}; got {amplitude:g}.")
         return -amplitude, amplitude
-    for name, value in (("minimum", minimum), ("maximum", maximum)):
-        if not is_number(value) or abs(value) > LARGEST:
-            raise InputError(f"`{name}` must be a number between {-LARGEST:g} and {LARGEST:g}; got {shown(value)}.")
-    low, high = float(minimum), float(maximum)
+    low, high = (_limit(name, value) for name, value in (("minimum", minimum), ("maximum", maximum)))
     if not high - low >= max(1 / LARGEST, 1e-9 * max(abs(low), abs(high))):
         raise InputError(f"`minimum` must be less than `maximum`; got {low:g} and {high:g}.")
     return low, high
+
+
+def _limit(name: str, value: Any) -> float:
+    if not is_number(value) or abs(value) > LARGEST:
+        raise InputError(f"`{name}` must be a number between {-LARGEST:g} and {LARGEST:g}; got {shown(value)}.")
+    return float(value)
 
 
 def _numbers(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray:

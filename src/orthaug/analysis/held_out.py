@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from orthaug._base.checks import check_type
+from orthaug._base.checks import check_count, check_type
 from orthaug._base.errors import InputError
 from orthaug.analysis.validation import Verdict, extrapolation, judge, trial_on
 from orthaug.data.record import Record
@@ -12,13 +12,14 @@ from orthaug.data.regressors import lag_rows
 from orthaug.fitting.estimates import Estimate
 
 
-def verdict(fit: Estimate, alone: Estimate, tests: Record | Mapping[str, Record]) -> Verdict:
+def verdict(fit: Estimate, alone: Estimate, tests: Record | Mapping[str, Record], *, skip: int = 0) -> Verdict:
     """Whether the learner helps: free runs of a fit and of physics alone on records that neither was fitted to.
 
     Args:
         fit: with a learner.
         alone: the same physics without, `estimate(…, learner=None)`, trained on the same record.
         tests: a record, or several by name. A free run starts from the measured outputs before its first row.
+        skip: leading samples of each experiment that are not scored.
 
     Returns:
         `code` is helps, no_help or hurts; `text` says why, with the errors of both and where the training range is
@@ -35,11 +36,12 @@ def verdict(fit: Estimate, alone: Estimate, tests: Record | Mapping[str, Record]
     records = {"the test record": tests} if isinstance(tests, Record) else dict(tests)
     if not records:
         raise InputError("`tests` is empty; give a record that was not fitted.")
+    skip = check_count(skip, "skip", least=0)
     trials, beyond = [], []
     for name, record in records.items():
         check_type(record, Record, f"tests[{name!r}]", "a Record")
         ordered = fit.model.fitting(record, need_outputs=True)
-        skips = (0,) * len(ordered.experiments)
+        skips = (skip,) * len(ordered.experiments)
         trials.append(trial_on(str(name), ordered, skips, alone.model, fit.model))
         problem = fit.problem
         beyond += extrapolation(str(name), lag_rows(ordered, problem.layout), problem.rows.x, problem.layout)
