@@ -251,7 +251,7 @@ def _uniform_step(table: Table, time: str, start: int, stop: int) -> float:
         )
     if np.abs(instants).max() > _LATEST:
         raise InputError(
-            f"{table.path}: column '{time}': instants of {np.abs(instants).max():.3g} are no seconds, but perhaps milli- "
-            "or nanoseconds since 1970; write seconds."
+            f"{table.path}: column '{time}': instants of {np.abs(instants).max():.3g} are no seconds; perhaps they "
+            "are milli- or nanoseconds since 1970. Write seconds."
         )
     return mean
