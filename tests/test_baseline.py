@@ -66,6 +66,16 @@ def test_fixed_terms_are_known_and_not_estimated():
     np.testing.assert_array_equal(without.known(X, LAYOUT, ("y",), np), np.zeros((5, 1)))
 
 
+def test_repr():
+    terms = [
+        Term("a", "y[k-1]", output="y"),
+        Term("b", "u[k-1]**2", output="y"),
+        Term("g", "1", 9.81, output="z", fixed=True),
+    ]
+    assert repr(Baseline.from_terms(terms)) == "Baseline(y = a*y[k-1] + b*(u[k-1]**2); z = 9.81*(1))"
+    assert repr(Baseline.from_function(abs, ["a", "b"])) == "Baseline(a function of the regressor, θ: a, b)"
+
+
 def test_all_terms_fixed():
     baseline = Baseline.from_terms([Term("a", "u[k-1]", initial=3.0, fixed=True)])
     assert baseline.names == ()

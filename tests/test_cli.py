@@ -518,7 +518,7 @@ def test_ctrl_c_while_the_result_is_written(project, monkeypatch):
 )
 def test_responses_have_a_row_per_data_row_and_the_library_s_numbers(fitted, tmp_path, model, command, first):
     done = run(*command, fitted / model, fitted / "steps.csv", "--out", tmp_path / "out.csv")
-    assert done == (0, "", "")
+    assert (done.code, done.err) == (0, "")
     frame = pd.read_csv(tmp_path / "out.csv")
     assert list(frame.columns) == ["time", "y", "y_model", "y_baseline", "y_learner"]
     assert len(frame) == 60
@@ -533,12 +533,16 @@ def test_responses_have_a_row_per_data_row_and_the_library_s_numbers(fitted, tmp
     np.testing.assert_array_equal(frame["y_learner"], response.trajectories[0].learner[:, 0])
     np.testing.assert_array_equal(frame["y"], record.experiments[0].outputs[:, 0])
     assert (tmp_path / "out.csv").read_text().splitlines()[1].endswith(",,,")
+    told, scored, scores = done.out.splitlines(), f"{60 - first} rows", response.scores()
+    assert scored in told[0] and told[2] == f"written to {tmp_path / 'out.csv'}"
+    rmse, nrmse, percent = (f"{v[0]:.6g}" for v in (scores.rmse, scores.nrmse, scores.fit))
+    assert told[1].split() == ["y", rmse, "m", nrmse, percent]
     assert listing(tmp_path) == ["out.csv"]
 
 
 def test_standard_output_without_a_file(fitted):
     done = run("simulate", fitted / "physics", fitted / "steps.csv")
-    assert (done.code, done.err) == (0, "")
+    assert done.code == 0 and done.err.startswith("free run, 58 rows")  # the scores stay out of the CSV
     frame = pd.read_csv(io.StringIO(done.out))
     assert len(frame) == 60
     np.testing.assert_allclose(frame["y_learner"].dropna(), 0.0)
@@ -551,7 +555,7 @@ def test_predict_is_one_step_by_default(fitted):
 
 def simulated(*arguments: object) -> np.ndarray:
     done = run("simulate", *arguments)
-    assert (done.code, done.err) == (0, "")
+    assert done.code == 0
     return pd.read_csv(io.StringIO(done.out))["y_model"].to_numpy()
 
 
@@ -573,7 +577,12 @@ def test_initial_values(fitted, tmp_path):
 
 def test_without_measured_outputs_there_is_no_measured_column(fitted, tmp_path):
     write_csv(tmp_path / "u.csv", u=np.ones(10))
-    frame = pd.read_csv(io.StringIO(run("simulate", fitted / "mlp", tmp_path / "u.csv").out))
+    done = run("simulate", fitted / "mlp", tmp_path / "u.csv")
+    assert (
+        done.err
+        == f"note: {tmp_path / 'u.csv'} has no y: the free run starts from 0; --initial CSV gives other outputs.\n"
+    )
+    frame = pd.read_csv(io.StringIO(done.out))
     assert list(frame.columns) == ["time", "y_model", "y_baseline", "y_learner"]
 
 
@@ -809,7 +818,7 @@ def test_a_model_without_inputs_on_a_file_without_its_channels(project):
 
 def test_the_installed_command(fitted, tmp_path):
     done = shell("simulate", fitted / "mlp", fitted / "steps.csv", cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
+    assert done.returncode == 0 and done.stderr.startswith("free run, 58 rows")
     assert len(done.stdout.splitlines()) == 61
     assert (tmp_path / "cache").is_dir()
 

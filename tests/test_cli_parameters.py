@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 from test_cli import MLP, SPEC, finite_json, make_project, one_line, run, write_csv
 
+from orthaug import load_spec
 from orthaug.inference.covariance import interval
 from orthaug.models.storage import load
 from orthaug.studies.synthetic import MassSpringDamper
@@ -575,6 +576,26 @@ DESIGN = "[design]\nsamples = 400\namplitude = 50\nnoise = 2e-6\n"
 COULOMB = suspects(f'kind = "coulomb"\non = "{VELOCITY}"\ncoefficient = -3.8e-5')
 
 
+def test_the_sampling_time_need_not_be_declared(project):
+    """It is that of the data, from the spec or a time column, with `every` rows kept."""
+    declared = load_spec(project)
+    text = MACHINE.replace("[baseline.constants]\nTs = 0.01\n", "")
+    project.write_text(text + COULOMB)
+    np.testing.assert_array_equal(load_spec(project).problem.baseline.initial, declared.problem.baseline.initial)
+    table = pd.read_csv("run.csv")
+    table.insert(0, "t", 5 + 0.01 * np.arange(len(table)))
+    table.to_csv("run.csv", index=False)
+    project.write_text(text.replace("sampling_time = 0.01", 'time = "t"'))
+    timed = load_spec(project).problem.baseline
+    np.testing.assert_allclose(timed.initial, declared.problem.baseline.initial, rtol=1e-9)
+    thinned = text.replace('["run.csv"]', '["run.csv"], every = 2')
+    project.write_text(thinned)
+    assert load_spec(project).physics.constants == (("Ts", 0.02),)
+    project.write_text(thinned + "[baseline.constants]\nTs = 0.01\n")
+    done = run("check", project)
+    assert done.code == 2 and one_line(done.err, "machine.toml: the constant 'Ts' is 0.01", "sampled every 0.02 s")
+
+
 def test_design_writes_an_input_within_its_limits(project):
     project.write_text(MACHINE + DESIGN + "rate = 1000\n" + COULOMB)
     done = run("design", project, "--out", "u.csv")
@@ -589,18 +610,21 @@ def test_design_writes_an_input_within_its_limits(project):
 
 
 def test_design_as_json(project):
-    project.write_text(MACHINE + DESIGN + COULOMB)
+    project.write_text(MACHINE + DESIGN.replace("amplitude = 50", "minimum = 0\nmaximum = 50") + COULOMB)
     found = finite_json(run("design", project, "--out", "u.csv", "--json").out)
     assert found["samples"] == 400 and set(found["bias"]) == set(found["std"]) == {"theta1", "theta2", "theta3"}
     costs = [row["cost"] for row in found["candidates"]]
     assert costs[0] == min(cost for cost in costs if cost is not None) == pytest.approx(found["cost"])
-    assert pd.read_csv("u.csv")["force"].abs().max() <= 50
+    force = pd.read_csv("u.csv")["force"]
+    assert 0 <= force.min() < 10 and 40 < force.max() <= 50
 
 
 BAD_DESIGNS = [
-    ("", "the section [design] is missing; it needs `samples` and `amplitude`"),
+    ("", "the section [design] is missing; it needs `samples` and limits, such as `amplitude`"),
     (DESIGN + COULOMB.replace("coefficient = -3.8e-5", ""), "has no `coefficient`; a design needs a guess of its size"),
-    ("[design]\nsamples = 400\n", "the key 'design.amplitude' is missing"),
+    ("[design]\nsamples = 400\n", "'design': give `amplitude`, or `minimum` and `maximum`; got none of them"),
+    (DESIGN + "minimum = 0\n", "'design': give `amplitude`, or `minimum` and `maximum`; got amplitude and minimum"),
+    (DESIGN.replace("amplitude = 50", "minimum = 3\nmaximum = 3"), "'design': `minimum` must be less than `maximum`"),
     (DESIGN.replace("400", "-1"), "'design.samples': found -1"),
     (DESIGN.replace("400", "10"), "`samples` must be a whole number, 30 or more; got 10"),
     (DESIGN.replace("50", "0"), "'design.amplitude': found 0; expected greater than 0"),

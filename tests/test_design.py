@@ -122,6 +122,16 @@ def test_limits_hold_to_the_last_bit(rate: float) -> None:
     assert np.abs(np.diff(found)).max() >= 0.99 * rate * 0.01
 
 
+def test_limits_may_be_apart() -> None:
+    """A propeller's command is not negative; ±A is the same as A."""
+    found = machine(samples=1000, amplitude=None, minimum=20, maximum=90, rate=5000.0, iterations=0).signal
+    assert found.min() >= 20 and found.max() <= 90 and np.ptp(found) > 60
+    assert np.abs(np.diff(found, prepend=20.0)).max() <= 50
+    one = machine(samples=300, iterations=0)
+    other = machine(samples=300, iterations=0, amplitude=None, minimum=-AMPLITUDE, maximum=AMPLITUDE)
+    assert np.array_equal(one.signal, other.signal) and one.cost == other.cost
+
+
 def test_the_cap_on_the_condition_number_is_kept() -> None:
     free, capped = machine(samples=2000, iterations=5), machine(samples=2000, iterations=5, condition=2.0)
     assert capped.condition <= 2 < free.condition
@@ -222,6 +232,14 @@ AWAY = r"^the simulated output runs away under every input; give a `theta` that 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"amplitude": None}, r"^give `amplitude`, or `minimum` and `maximum`; got none of them\.$"),
+        ({"minimum": 0.0, "maximum": 1.0}, r"got amplitude and minimum and maximum\.$"),
+        ({"amplitude": None, "maximum": 1.0}, r"^give `amplitude`, or `minimum` and `maximum`; got maximum\.$"),
+        (
+            {"amplitude": None, "minimum": 2.0, "maximum": 1.0},
+            r"^`minimum` must be less than `maximum`; got 2 and 1\.$",
+        ),
+        ({"amplitude": None, "minimum": np.nan, "maximum": 1}, r"^`minimum` must be a number between -1e\+100 and"),
         ({"amplitude": 0}, r"^`amplitude` must be a positive number; got 0\.$"),
         ({"amplitude": -1.0}, r"^`amplitude` must be a positive number; got -1\.0\.$"),
         ({"rate": 0.0}, r"^`rate` must be a positive number; got 0\.0\.$"),

@@ -60,7 +60,7 @@ def posed(ny, lower=None):
         if ny == 2:
             y[k, 1] = 3 * y[k - 1, 0] + 0.5 * y[k - 1, 1] - 2 * u[k - 1] ** 2
     y = y + rng.normal(size=y.shape) * ([0.05, 0.2][:ny])
-    terms = [Term("a", "y1[k-1]", 0.4, output="y1", min=lower), Term("g", "u[k-1]", 0.8, output="y1")]
+    terms = [Term("a", "y1[k-1]", lower or 0.4, output="y1", min=lower), Term("g", "u[k-1]", 0.8, output="y1")]
     terms += [Term("h", "y1[k-1]", 2.0, output="y2"), Term("a", "y2[k-1]", output="y2")] if ny == 2 else []
     record = Record.from_arrays(u, y, outputs=["y1", "y2"][:ny])
     return pose(record, Baseline.from_terms(terms), Lags(na=1, nb=2, nk=0))

@@ -130,6 +130,14 @@ def test_equal_by_text_and_the_constants_used():
     assert str(parse("y[k-1]  *  2")) == "y[k-1] * 2"
 
 
+def test_the_sampling_time_may_be_given_later():
+    text, declared = "(y[k-1] - y[k-2])/Ts", parse("(y[k-1] - y[k-2])/Ts", CONSTANTS)
+    assert parse(text).unsampled and not declared.unsampled and not parse("Ts[k-1] + 1").unsampled
+    assert parse(text).sampled(0.01) == declared and declared.sampled(7.0) == declared
+    with pytest.raises(InputError, match="Ts has no value here; give it as a constant"):
+        parse(text).evaluate(POINT, np)
+
+
 REFUSED = [
     ("", "empty; write for example"),
     (" \n\t ", "empty"),
@@ -196,21 +204,26 @@ REFUSED = [
     ("y[1]", r"the index of 'y\[1\]' must be k or k-1"),
     ("y[-1]", "must be k or k-1"),
     ("y[1-k]", "must be k or k-1"),
-    ("y[t-1]", "must be k or k-1"),
+    ("y[t-1]", r"the index k; write y\[k-1\]"),
     ("y[k-1, 0]", "must be k or k-1"),
     ("y[k:]", "must be k or k-1"),
     ("y[u[k]]", "must be k or k-1"),
     ("y[k-1][k]", "is not a channel at a lag such as"),
     ("(y + 1)[k]", "is not a channel at a lag such as"),
     ("2[k]", "is not a channel at a lag such as"),
-    ("y", r"unknown constant 'y'; a channel needs its lag, y\[k-1\]"),
+    ("y", r"unknown constant 'y'; declare it with its value, or, for a channel, give its lag, y\[k-1\]"),
     ("2*stifness", "unknown constant 'stifness', did you mean 'stiffness'"),
     ("k", "k is the time index and cannot stand alone"),
     ("k*y[k-1]", "k is the time index"),
     ("sin", r"sin is a function; write sin\(…\)"),
-    ("y[k-1]^2", r"'\^' is not a power here; write \*\*, as in y\[k-1\]\*\*2"),
-    ("2*v(k-1)", r"a channel at a lag has square brackets; write v\[k-1\]"),
-    ("v(k)", r"square brackets; write v\[k\]"),
+    ("y[k-1]^2", r"here a power is \*\*; write y\[k-1\]\*\*2\."),
+    ("y[k-1]^(u[k] +", r"is not an expression"),
+    ("2*v(k-1)", r"here a channel at a lag has square brackets and the index k; write 2\*v\[k-1\]\."),
+    ("v(k)", r"square brackets and the index k; write v\[k\]"),
+    ("sin(y(t - 1)).^2 ./ u[t]", r"write sin\(y\[k-1\]\)\*\*2 / u\[k\]\."),
+    ("y[k-1].*u[k]", r"here products and quotients are \* and /; write y\[k-1\]\*u\[k\]\."),
+    ("y[k-1] && u[k]", "there is no logic in an expression; sign, min and max can switch"),
+    ("ln(y[k-1])", "unknown function 'ln', did you mean 'log'"),
     ("atan2(y[k-1])", "atan2 takes two arguments, got 1"),
     ("floor(y[k-1], 1)", "floor takes one argument, got 2"),
     ("1e400", "number too large for double precision"),

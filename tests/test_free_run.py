@@ -184,10 +184,12 @@ BOX = {"a": (0.0, 0.9), "g": (0.0, 5.0)}
 
 
 def bounded_physics(box=BOX):
-    return Baseline.from_terms(
-        [Term(t.parameter, t.regressor, t.initial, min=box.get(t.parameter, (None, None))[0],
-              max=box.get(t.parameter, (None, None))[1]) for t in TERMS]
-    )  # fmt: skip
+    terms = []
+    for term in TERMS:
+        low, high = box.get(term.parameter, (None, None))
+        initial = term.initial if low is None else float(np.clip(term.initial, low, high))
+        terms.append(Term(term.parameter, term.regressor, initial, min=low, max=high))
+    return Baseline.from_terms(terms)
 
 
 @cache

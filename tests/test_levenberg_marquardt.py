@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 from helpers import linear_columns, problem
 
-from orthaug._base.jax import jax, jnp
+from orthaug._base.jax import jax, jnp, training_clock
 from orthaug.fitting.normal_equations import Normal
 from orthaug.fitting.solvers import compiled
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
@@ -202,3 +204,25 @@ def test_pauses_change_nothing(monkeypatch, seconds):
     )
     assert told[-1] == (run.iterations, float(run.normal.loss))
     assert len(told) == (run.iterations if seconds == 0 else 4)
+
+
+def test_the_training_clock_stands_still_while_programs_are_made():
+    """Tracing sleeps here, in a program and in one that it calls, so that what is nested would count twice."""
+
+    @jax.jit
+    def inner(x):
+        time.sleep(0.1)
+        return 2 * x
+
+    @jax.jit
+    def outer(x):
+        time.sleep(0.1)
+        return jax.lax.fori_loop(0, 3, lambda i, s: s + inner(s), x)
+
+    began, wall = training_clock(), time.perf_counter()
+    jax.block_until_ready(outer(jnp.asarray(1.0)))
+    trained, spent = training_clock() - began, time.perf_counter() - wall
+    assert 0 <= trained < spent - 0.2
+    began, wall = training_clock(), time.perf_counter()
+    time.sleep(0.02)
+    assert training_clock() - began == pytest.approx(time.perf_counter() - wall, abs=0.005)

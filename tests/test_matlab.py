@@ -32,6 +32,27 @@ def test_every_kind_of_number(tmp_path, kind, compressed):
             read_variables(tmp_path / "run.mat", (name,))
 
 
+def test_paths_into_structs_and_cells(tmp_path):
+    """An exported iddata has its signals in cells of one matrix, several runs are an array of structs."""
+    u, path = np.arange(6.0), tmp_path / "run.mat"
+    one, two = np.empty((1, 1), object), np.empty((1, 2), object)
+    one[0, 0], two[0, 0], two[0, 1] = np.stack([u, 2 * u], 1), u[None], 3 * u
+    runs = np.array([(u, {"y": 4 * u}), (5 * u, {"y": 6 * u})], dtype=[("u", object), ("deep", object)])
+    scipy.io.savemat(path, {"z": {"InputData": one}, "c": two, "runs": runs})
+    wanted = {"z.InputData[1]": 2, "z/InputData[0]": 1, "c[0]": 1, "c[1]": 3, "runs[1].u": 5, "runs[1].deep.y": 6}
+    for name, values in read_variables(path, tuple(wanted)).items():
+        np.testing.assert_array_equal(values, wanted[name] * u, err_msg=name)
+    for name, words in (
+        ("z.InputData", 'no vector; write a column of a matrix as "z.InputData\\[0\\]"'),
+        ("c{2}", 'elements are counted from 0 here, "c\\[1\\]"'),
+        ("runs(1).u", 'counted from 0 here, "runs\\[0\\].u"'),
+        ("z.InputData(:, 2)", '"z.InputData\\[1\\]"'),
+        ("runs.u", "no variable 'runs.u', did you mean 'runs\\[1\\].u'"),
+    ):
+        with pytest.raises(InputError, match=words):
+            read_variables(path, (name,))
+
+
 def big_endian(values: np.ndarray) -> bytes:
     """A file of one vector as a machine of the other byte order writes it."""
 

@@ -262,8 +262,10 @@ def test_to_frame(pair):
 def test_repr(pair):
     model, record = pair
     assert repr(model).startswith("Model(orthogonal, θ: a, b, c, learner: MLP(hidden=(3,)")
-    assert repr(model.simulate(record)) == "Response(simulation, 1 experiment(s), 30 samples)"
-    assert repr(model.predict(record, 3)) == "Response(3-step prediction, 1 experiment(s), 30 samples)"
+    assert repr(model.simulate(record)) == "Response(simulation of y1, y2, 1 experiment, 30 samples)"
+    assert repr(model.simulate(record).trajectories[0]) == "Trajectory(30 samples of 2 outputs)"
+    assert repr(model.simulate(record).scores()).startswith("Scores(rmse = ")
+    assert repr(model.predict(record, 3)) == "Response(3-step prediction of y1, y2, 1 experiment, 30 samples)"
     none = CASES["physics alone"]
     fit = estimate(none[0](np.random.default_rng(0), 30), none[1], learner=None)
     assert repr(fit.model) == "Model(orthogonal, θ: a, b, learner: none)"

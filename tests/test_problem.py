@@ -119,6 +119,29 @@ def test_refused(record, baseline, options, message):
         pose(record, baseline, **options)
 
 
+def test_the_sampling_time_is_a_name():
+    record = Record.from_arrays(U, Y, sampling_time=0.5)
+    texts, constants = ("u[k]*Ts", "y[k-1]/Ts"), {"Ts": 0.5}
+    found = pose(record, physics(*texts), learner_inputs=("(y[k-1] - y[k-2])/Ts",))
+    declared = Baseline.from_terms(physics(*texts).terms, constants)
+    wanted = pose(record, declared, learner_inputs=("(y[k-1] - y[k-2])/Ts",))
+    np.testing.assert_array_equal(found.projection.phi, wanted.projection.phi)
+    np.testing.assert_array_equal(found.feature_rows(), wanted.feature_rows())
+    assert dict(found.baseline.constants) == constants  # as a saved model needs it
+    with pytest.raises(InputError, match="the constant 'Ts' is 0.5, but the data are sampled every 0.25 s. Ts is the"):
+        pose(Record.from_arrays(U, Y, sampling_time=0.25), declared)
+    with pytest.raises(InputError, match="'Ts' is a constant and a channel"):
+        pose(Record.from_arrays(U, Y, inputs=["Ts"]), physics("Ts[k]", "Ts*y[k-1]"))
+
+
+@pytest.mark.parametrize("initial", [None, 0.5])
+def test_initial_values_are_within_their_bounds(initial):
+    with pytest.raises(
+        InputError, match="the initial value of 't0' is .*; its bounds are 1 and inf. Give an `initial`"
+    ):
+        pose(RECORD, physics("u[k]", min=1.0, initial=initial))
+
+
 @pytest.mark.parametrize(
     ("u", "y", "name"), [(np.full(20, 3.0), Y, "'u' is constant .3."), (U, np.zeros(20), "'y' is constant .0.")]
 )

@@ -54,6 +54,23 @@ def test_rows_and_split():
     first, rest = record.split(0.5)
     assert (len(first), len(rest)) == (3, 3)
     assert rest.experiments[0].first_row == 3
+    timed = Record.from_arrays(y=STEPS, sampling_time=0.1).split(0.5)[1].rows(1)
+    assert timed.experiments[0].start_time == pytest.approx(0.4)
+
+
+def test_several_experiments_are_split_each_or_as_a_whole():
+    joined = Record.join(Record.from_arrays(y=np.arange(n), source=str(n)) for n in (10, 20, 5))
+    first, rest = joined.split(0.8)
+    assert [len(e) for e in first.experiments] == [8, 16, 4] and [len(e) for e in rest.experiments] == [2, 4, 1]
+    np.testing.assert_array_equal(rest.experiments[1].outputs[:, 0], [16, 17, 18, 19])
+    first, rest = joined.split(2 / 3, by="experiments")
+    assert [e.source for e in first.experiments] == ["10", "20"] and [e.source for e in rest.experiments] == ["5"]
+    with pytest.raises(InputError, match="the split at 0.09 would be empty: an experiment has 5 rows"):
+        joined.split(0.09)
+    with pytest.raises(InputError, match="would be empty: there are 3 experiments"):
+        joined.split(0.1, by="experiments")
+    with pytest.raises(InputError, match="`by` must be one of rows, experiments; got 'files'"):
+        joined.split(0.5, by="files")
 
 
 def test_join_keeps_experiments_apart():
@@ -63,8 +80,6 @@ def test_join_keeps_experiments_apart():
     assert repr(record).startswith("Record(3 experiments, 18 samples, Ts = 0.1 s")
     with pytest.raises(InputError, match="`rows` needs a record of one experiment; this one has 3"):
         record.rows(0, 1)
-    with pytest.raises(InputError, match="`split` needs a record of one experiment"):
-        record.split(0.5)
 
 
 def test_join_refuses_what_does_not_fit():

@@ -22,9 +22,9 @@ MESSAGES = {
         "Try another seed or another activation"
     ),
     "non_finite": (
-        "the loss is not finite at the start: (a) a learner input grows without bound, "
-        "(b) the learner returns NaN, or (c) channels differ by many orders of magnitude. "
-        "Rescale the channels or choose other learner inputs"
+        "the loss is not finite: (a) a learner input grows without bound, (b) the learner returns NaN, "
+        "(c) channels differ by many orders of magnitude, or (d) `learning_rate` is too large. "
+        "Rescale the channels, choose other learner inputs, or lower the rate"
     ),
 }
 """What each code has always said."""

@@ -128,10 +128,12 @@ def test_arguments_of_lags_and_learners():
 def test_a_simulation_says_what_it_wants():
     record = oa.Record.from_arrays(np.arange(12.0) % 5, np.arange(12.0) % 7, sampling_time=0.5)
     model = oa.estimate(record, oa.Baseline.from_terms([oa.Term("a", "u[k]")]), learner=None).model
-    wanted = r"`record` must be a Record, such as Record.from_arrays\(u=u, sampling_time=0.5\); got array"
-    for call in (model.simulate, model.predict, model.components):
-        with pytest.raises(InputError, match=wanted):
+    for call, y in ((model.simulate, ("", "")), (model.predict, ("y=y, ", "outputs=['y'], "))):
+        wanted = f"a Record, such as Record.from_arrays(u=u, {y[0]}inputs=['u'], {y[1]}sampling_time=0.5)"
+        with pytest.raises(InputError) as refusal:
             call(np.ones(12))
+        assert str(refusal.value) == f"`record` must be {wanted}; got an array of shape (12,)."
+    for call in (model.simulate, model.predict, model.components):
         assert tried(call) == len(WRONG)
     assert tried(lambda value: model.predict(record, horizon=value)) >= 20
     assert tried(lambda value: model.simulate(record, initial=value)) >= 10

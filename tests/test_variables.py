@@ -387,6 +387,15 @@ def test_text_in_hdf5(tmp_path):
     refused(tmp_path, SPEC.format(file=path.name, u="u", y="y"), "run.h5", "'u'", "no numbers", "y (1×20)")
 
 
+def test_paths_with_points_or_slashes(tmp_path):
+    path = put_hdf5(tmp_path / "run.h5", **{"run/deep/u": U, "y": Y})
+    matlab = put_v73(tmp_path / "run.mat", run={"deep": {"u": U}, "cell": [np.stack([np.ravel(U), np.ravel(Y)])]})
+    for file in (path, matlab):
+        for name in ("run.deep.u", "run/deep/u", "/run/deep/u"):
+            np.testing.assert_array_equal(read_variables(file, (name,))[name], np.ravel(U))
+    np.testing.assert_array_equal(read_variables(matlab, ("run.cell[1]",))["run.cell[1]"], np.ravel(Y))
+
+
 def test_a_group_of_hdf5(tmp_path):
     path = put_hdf5(tmp_path / "run.h5", **{"run/u": U, "y": Y})
     refused(tmp_path, SPEC.format(file=path.name, u="run", y="y"), "run.h5", "'run' is a group", "run/u (1×20)")

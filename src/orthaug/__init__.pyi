@@ -2,7 +2,13 @@ from ._base import InputError as InputError
 from ._base import RankError as RankError
 from ._base import TrainingError as TrainingError
 from .analysis import Suspect as Suspect
+from .analysis import design_input as design_input
 from .analysis import diagnose as diagnose
+from .analysis import stability as stability
+from .analysis import verdict as verdict
+from .commands import fit_spec as fit_spec
+from .commands import load_spec as load_spec
+from .commands.library import compare as compare
 from .data import Channel as Channel
 from .data import Experiment as Experiment
 from .data import Lags as Lags
@@ -42,6 +48,7 @@ from .physics import PhysicalParameter as PhysicalParameter
 from .physics import PhysicsMap as PhysicsMap
 from .physics import Term as Term
 from .physics import identifiability as identifiability
+from .reports import plot as plot
 from .studies import synthetic as synthetic
 
 __version__: str

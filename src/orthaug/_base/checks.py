@@ -29,7 +29,7 @@ def as_signal(values: Any, name: str) -> Matrix:
             raise InputError(f"`{name}` is complex; expected real numbers.")
         array = np.array(array, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"`{name}` is not an array of numbers: {error}.") from None
+        raise InputError(f"`{name}` is not an array of numbers: {str(error).rstrip('.')}.") from None
     if array.ndim == 1:
         array = array[:, None]
     if array.ndim != 2:

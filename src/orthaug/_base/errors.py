@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Any
 
 LONGEST = 60  # characters of a name or value in a message
+_FEW = 4  # entries of an array that is shown
 _MOST, _HEAD = 1200, 900  # characters of a message, and of its beginning where the middle is left out
 _SEARCHED = 6 * _MOST  # characters that are looked at for names and values
 _QUOTED = re.compile(r"""(?<!\w)(['"`])(?!\1)(.*?)\1(?!\w)""")
@@ -21,6 +23,8 @@ def visible(text: str) -> str:
 def shown(value: Any) -> str:
     """A value as Python writes it, on one line, cut where it is long."""
     try:
+        if math.prod(getattr(value, "shape", ())) > _FEW:
+            return f"an array of shape {tuple(value.shape)}"
         return cut(visible(" ".join(repr(value)[:_MOST].split())))
     except Exception:  # a foreign `__repr__` may do anything, and one of a huge whole number fails
         return f"a {type(value).__name__} that cannot be written"

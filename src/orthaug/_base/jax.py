@@ -10,6 +10,7 @@ import functools
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -81,6 +82,36 @@ def is_traced(value: Any) -> bool:
     from jax.core import Tracer
 
     return isinstance(value, Tracer)
+
+
+class _Compiling(threading.local):
+    """When this thread traced and compiled, as disjoint spans of time [s] in order."""
+
+    def __init__(self) -> None:
+        self.spans: list[tuple[float, float]] = []
+        self.total = 0.0
+
+    def note(self, event: str, duration: float, **_: Any) -> None:
+        if not event.startswith("/jax/core/compile/"):
+            return
+        end = time.perf_counter()
+        while self.spans and self.spans[-1][1] > end - duration:  # what a program calls is traced within it
+            begin, last = self.spans.pop()
+            self.total -= last - begin
+            duration = max(duration, end - begin)
+        self.spans.append((end - duration, end))
+        self.total += duration
+
+
+_compiling: list[_Compiling] = []
+
+
+def training_clock() -> float:
+    """A clock of this thread [s] that stands still while JAX compiles: its differences are what computing took."""
+    if not _compiling:
+        _compiling.append(_Compiling())
+        _real_jax().monitoring.register_event_duration_secs_listener(_compiling[0].note)
+    return time.perf_counter() - _compiling[0].total
 
 
 def padded_length(rows: int) -> int:

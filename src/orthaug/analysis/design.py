@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Matrix, Vector, check_choice, check_count, check_number
+from orthaug._base.checks import Matrix, Vector, check_choice, check_count, check_number, is_number
 from orthaug._base.errors import InputError, shown
 from orthaug._base.memory import check_memory
 from orthaug.analysis.candidates import Pattern, families, starting_patterns
@@ -74,7 +74,9 @@ def design_input(
     inputs: Sequence[str],
     sampling_time: float,
     samples: int,
-    amplitude: float,
+    amplitude: float | None = None,
+    minimum: float | None = None,
+    maximum: float | None = None,
     rate: float | None = None,
     suspects: Sequence[Suspect] = (),
     noise: float | Sequence[float] = 0.0,
@@ -87,13 +89,14 @@ def design_input(
     initial_outputs: Any = 0.0,
     iterations: int = 30,
 ) -> Design:
-    """The input of least predicted error of θ within |u| ≤ amplitude and |u_k − u_{k−1}| ≤ rate · Ts.
+    """The input of least predicted error of θ within minimum ≤ u ≤ maximum and |u_k − u_{k−1}| ≤ rate · Ts.
 
     Args:
         baseline: made of terms; of channels with the names `outputs` and `inputs`.
         sampling_time: Ts, s.
         samples: N.
-        amplitude: in the channel's unit; `rate` in that unit per second, counted from 0 before the first sample.
+        amplitude: the limits are ±amplitude, in the channel's unit; or `minimum` and `maximum` instead.
+        rate: in the channel's unit per second, counted from 0, or from the limit next to it, before the first sample.
         suspects: with their coefficients; without any the design has least variance (A-optimal for W θ).
         noise: standard deviation of the equation noise in the output's unit, or one for each; 0 counts the bias alone.
             Without suspects 0 means 1, and `std` is per unit of noise.
@@ -109,16 +112,15 @@ def design_input(
         InputError: numbers out of range, unknown channels, a suspect without coefficient, θ of 0 without `weights`,
             a simulated output that runs away, no candidate within the cap on the condition number.
     """
-    amplitude = check_number(amplitude, "amplitude", positive=True)
-    if not 1 / LARGEST <= amplitude <= LARGEST:
-        raise InputError(f"`amplitude` must lie between {1 / LARGEST:g} and {LARGEST:g}; got {amplitude:g}.")
+    low, high = input_limits(amplitude, minimum, maximum)
     sampling_time = check_number(sampling_time, "sampling_time", positive=True)
     step = math.inf if rate is None else check_number(rate, "rate", positive=True) * sampling_time
     iterations, seed, suspects = check_count(iterations, "iterations", 0), check_count(seed, "seed", 0), tuple(suspects)
     if baseline.function is not None or not baseline.names:
         raise InputError("a design needs physics that is made of terms, with one parameter or more.")
     theta = _numbers(baseline.initial if theta is None else theta, (len(baseline.names),), "theta")
-    plant = Plant(baseline, (tuple(outputs), tuple(inputs)), suspects, theta, channel)
+    known = [suspect.sampled(sampling_time) for suspect in suspects]
+    plant = Plant(baseline.sampled(sampling_time), (tuple(outputs), tuple(inputs)), known, theta, channel)
     samples = check_count(samples, "samples", plant.start + 4 * len(theta) + 16)
     if samples > MOST_SAMPLES:
         raise InputError(f"`samples` is {shown(samples)}; at most {MOST_SAMPLES} are simulated.")
@@ -129,14 +131,37 @@ def design_input(
     plant.before = _numbers(initial_outputs, (plant.start, len(outputs)), "initial_outputs")
     sigma = np.array([check_number(value, "noise") for value in _numbers(noise, (len(outputs),), "noise")])
     sigma = (sigma if suspects or sigma.any() else np.ones(len(outputs))) / math.sqrt(samples - plant.start)
-    limits = amplitude, step, check_number(condition, "condition", positive=True), samples
+    limits = low, high, step, check_number(condition, "condition", positive=True), samples
     try:
         with np.errstate(all="ignore"):
             return _Search(plant, _weights(weights, plant), sigma, *limits).run(seed, iterations)
     except np.linalg.LinAlgError:
         raise InputError(
-            "the simulated rows are too large or too small for double precision; change `amplitude` or the units."
+            "the simulated rows are too large or too small for double precision; change the limits or the units."
         ) from None
+
+
+def input_limits(amplitude: Any, minimum: Any, maximum: Any) -> tuple[float, float]:
+    """Lower and upper limit of the input."""
+    if (amplitude is None) == (minimum is None and maximum is None) or (minimum is None) != (maximum is None):
+        given = {"amplitude": amplitude, "minimum": minimum, "maximum": maximum}
+        named = " and ".join(name for name, value in given.items() if value is not None) or "none of them"
+        raise InputError(f"give `amplitude`, or `minimum` and `maximum`; got {named}.")
+    if amplitude is not None:
+        amplitude = check_number(amplitude, "amplitude", positive=True)
+        if not 1 / LARGEST <= amplitude <= LARGEST:
+            raise InputError(f"`amplitude` must lie between {1 / LARGEST:g} and {LARGEST:g}; got {amplitude:g}.")
+        return -amplitude, amplitude
+    low, high = (_limit(name, value) for name, value in (("minimum", minimum), ("maximum", maximum)))
+    if not high - low >= max(1 / LARGEST, 1e-9 * max(abs(low), abs(high))):
+        raise InputError(f"`minimum` must be less than `maximum`; got {low:g} and {high:g}.")
+    return low, high
+
+
+def _limit(name: str, value: Any) -> float:
+    if not is_number(value) or abs(value) > LARGEST:
+        raise InputError(f"`{name}` must be a number between {-LARGEST:g} and {LARGEST:g}; got {shown(value)}.")
+    return float(value)
 
 
 def _numbers(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
@@ -186,7 +211,8 @@ class _Search:
     plant: Plant
     weights: Matrix
     sigma: Vector  # of the noise, over the square root of the number of rows
-    amplitude: float
+    low: float
+    high: float
     step: float
     cap: float
     samples: int
@@ -217,7 +243,7 @@ class _Search:
         """The limited signals (N, M) of waves of amplitude 1, and their factors per row; of whole periods if given."""
         signals, factors, size = [], [], max(1, BATCH // len(waves))
         for first in range(0, waves.shape[1], size):
-            u = self.limited(waves[:, first : first + size] * self.amplitude)
+            u = self.limited(waves[:, first : first + size])
             rows, weight = self.plant.rows(u)
             counted = np.full(len(rows), rows.shape[1])
             if period is not None:  # a quarter is left to the transient
@@ -232,15 +258,17 @@ class _Search:
             factors.append(np.stack([r, s], axis=1) / np.sqrt(counted)[:, None, None, None])
         return np.hstack(signals), np.concatenate(factors)
 
-    def limited(self, u: Matrix) -> Matrix:
-        """Within the limits to the last bit: steps are shortened by what rounding could add."""
-        u = np.clip(u, -self.amplitude, self.amplitude)
-        if self.step >= 2 * self.amplitude:
+    def limited(self, waves: Matrix) -> Matrix:
+        """Signals within the limits to the last bit: steps are shortened by what rounding could add."""
+        low, high = self.low, self.high
+        u = np.clip((low + high) / 2 + (high - low) / 2 * waves, low, high)
+        if self.step >= high - low:
             return u
         from orthaug.analysis.signals import limit_rate  # after scipy.signal, which is slow to import
 
-        step = max(self.step - 4 * np.spacing(self.amplitude), self.step / 2)
-        return np.stack([limit_rate(column, step, 0.0) for column in u.T], axis=1)
+        step = max(self.step - 4 * np.spacing(max(-low, high)), self.step / 2)
+        before = min(max(0.0, low), high)
+        return np.stack([limit_rate(column, step, before) for column in u.T], axis=1)
 
     def scores(self, factors: Factors) -> _Scores:
         """Bias, variance and cost over all N samples."""

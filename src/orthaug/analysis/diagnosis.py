@@ -54,6 +54,9 @@ class Diagnosis:
     noise_in_lags: float | None
     warnings: tuple[Warning, ...]
 
+    def __repr__(self) -> str:
+        return f"Diagnosis({self.verdict}: {self.text})"
+
 
 def diagnose(fit: Estimate, *, one_step: Response | None = None, free_run: Response | None = None) -> Diagnosis | None:
     """Analyse the residuals of a fit on its training data; None where they cannot be tested.

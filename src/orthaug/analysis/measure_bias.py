@@ -37,7 +37,7 @@ def bias_under(
         learned: f at the measure's points (M, ny) after a fit, to tell how much of it a suspect explains.
     """
     named, x = bool(suspects), weighed.points.x
-    suspects = suspects or usual_suspects(problem)
+    suspects = [suspect.sampled(problem.record.sampling_time) for suspect in suspects or usual_suspects(problem)]
     with np.errstate(all="ignore"):
         deltas = suspect_columns(suspects, x, problem.layout, problem.outputs)
     kept = [i for i in range(len(suspects)) if named or np.any(deltas[i])]

@@ -7,7 +7,7 @@ leaves out by intention, known in form though not in size.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, check_number, check_unique, is_number, nearest
 from orthaug._base.errors import InputError
-from orthaug.data.expressions import Expression, Lag, is_name, parse
+from orthaug.data.expressions import SAMPLING_TIME, Expression, Lag, is_name, parse
 from orthaug.data.regressors import Layout
 from orthaug.physics.problem import Problem
 
@@ -55,8 +55,8 @@ class Suspect:
     """A suspected term `coefficient * expression` of one output; make one of a known kind with `of`.
 
     `expression` is in the language of `orthaug.data.expressions` and may use the names in `constants` (kept as sorted
-    pairs). `coefficient` is a guess of its size, in the output's unit per unit of the expression, None where
-    there is none. `output` may be left out where there is only one.
+    pairs), and `Ts` for the sampling time. `coefficient` is a guess of its size, in the output's unit per unit of the
+    expression, None where there is none. `output` may be left out where there is only one.
 
     Raises:
         InputError: an expression that is not arithmetic on lagged channels, a name or a number that is none.
@@ -152,6 +152,12 @@ class Suspect:
             return parse(self.expression, dict(self.constants))
         except InputError as error:
             raise InputError(f"suspect '{self.name}': {error}") from None
+
+    def sampled(self, sampling_time: float) -> Suspect:
+        """The suspect with this value [s] of `Ts`, where its expression reads that without declaring it."""
+        if not self.parsed.unsampled:
+            return self
+        return replace(self, constants=(*dict(self.constants).items(), (SAMPLING_TIME, float(sampling_time))))
 
     @property
     def lags(self) -> tuple[Lag, ...]:

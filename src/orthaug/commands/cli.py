@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -201,7 +202,7 @@ def simulate(
     start = run.read_initial(initial, opened)
     check_file(out, data, Path(initial or data))
     _prepare_jax()
-    _write_response(opened.model.simulate(opened.record, initial=start), out)
+    _write_response(opened.model.simulate(opened.record, initial=start), out, run.notes(opened, initial))
 
 
 @app.command()
@@ -318,12 +319,19 @@ def _fail(message: str, code: int) -> None:
     sys.exit(code)
 
 
-def _write_response(response: Response, out: Path | None) -> None:
+def _write_response(response: Response, out: Path | None, notes: Sequence[str] = ()) -> None:
+    """The CSV and what is to say about it: scores go where the CSV does not."""
     from orthaug.commands import run
+    from orthaug.reports.text import response_text
 
-    for warning in run.warnings(response):
-        sys.stderr.write(f"warning: {warning.text}\n")
+    for line in (*notes, *(f"warning: {warning.text}" for warning in run.warnings(response))):
+        typer.echo(line, err=True)
     run.write_csv(response, out)
+    told = response_text(response)
+    if told:
+        typer.echo(told, err=out is None)
+    if out is not None:
+        typer.echo(f"written to {out}")
 
 
 def _json(content: Any) -> str:

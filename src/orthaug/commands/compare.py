@@ -33,6 +33,16 @@ class Comparison:
     verdicts: dict[str, Verdict]
     result: CompareResult
 
+    def __repr__(self) -> str:
+        codes = {kind: self.verdicts[kind].code if kind in self.verdicts else "–" for kind in self.fitted}
+        return f"Comparison({', '.join(f'{kind}: {code}' for kind, code in codes.items())})"
+
+    def summary(self) -> str:
+        """What `orthaug compare` prints."""
+        from orthaug.reports.text import compare_text
+
+        return compare_text(self.result, self.verdicts)
+
 
 def compared() -> tuple[str, ...]:
     """What is fitted: physics alone, and every structure that is registered."""

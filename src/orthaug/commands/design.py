@@ -25,7 +25,9 @@ def design_for(job: Job) -> Design:
     """
     section, problem = job.spec.design, job.problem
     if section is None:
-        raise InputError(f"{job.path}: the section [design] is missing; it needs `samples` and `amplitude`.")
+        raise InputError(
+            f"{job.path}: the section [design] is missing; it needs `samples` and limits, such as `amplitude`."
+        )
     theta = problem.projection.solve(problem.whitened_target)
     residual = problem.weight.outputs(problem.whitened_target - problem.projection.phi @ theta)
     given = problem.baseline.initial
@@ -37,6 +39,8 @@ def design_for(job: Job) -> Design:
             sampling_time=problem.record.sampling_time,
             samples=section.samples,
             amplitude=section.amplitude,
+            minimum=section.minimum,
+            maximum=section.maximum,
             rate=section.rate,
             suspects=declared(job.spec.suspects, problem),
             noise=tuple(residual.std(axis=0)) if section.noise is None else section.noise,

@@ -47,6 +47,15 @@ class Fitted:
     responses: Mapping[str, tuple[Response, Response]]
     """One-step prediction and free run of every part, by its name; none where training failed."""
 
+    def __repr__(self) -> str:
+        return f"Fitted({self.job.path.name}: {self.fit!r})"
+
+    def summary(self) -> str:
+        """What `orthaug fit` prints."""
+        from orthaug.reports.text import fit_text
+
+        return fit_text(self.fit, self.result) or self.fit.status.message
+
 
 def fit_job(job: Job, progress: Progress = SILENT) -> Fitted:
     """Train as the spec says, score every part, and ask whether the learner earns its place."""

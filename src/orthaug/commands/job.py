@@ -75,6 +75,10 @@ class Job:
     physics: PhysicsMap | None
     warnings: tuple[Warning, ...]
 
+    def __repr__(self) -> str:
+        parts = ", ".join(f"{part.name} {len(part.record)} rows" for part in self.parts)
+        return f"Job({self.path.name}: {parts}; {self.problem.baseline!r})"
+
     @property
     def run_count(self) -> int:
         """How many runs a fit makes: restarts times regularizations."""
@@ -138,8 +142,13 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
         InputError: anything wrong with spec, files or physics; one line that names it.
     """
     spec = load_spec(path)
+    parts, step = None, spec.data.step
+    if step is None:
+        parts = load_parts(path, spec)
+        step = parts[0].record.sampling_time
     try:
-        baseline, learner_inputs, physics = spec.declared_baseline(), spec.learner_inputs(), spec.physics_map()
+        baseline, learner_inputs = spec.declared_baseline(), spec.learner_inputs()
+        physics = spec.physics_map(step)
         if physics is not None:
             baseline = with_initial(physics, baseline)
         baseline.check_initial()
@@ -148,7 +157,7 @@ def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
         baseline.check_channels(spec.data.outputs, spec.data.inputs)
     except InputError as error:
         raise type(error)(f"{path}: {error}") from None
-    train, validation, tests = load_parts(path, spec)
+    train, validation, tests = parts or load_parts(path, spec)
     lags = spec.lag_orders() if spec.declared_learner() is not None else None
     try:
         layout, _ = regressor_of(baseline, lags, learner_inputs, tuple(spec.data.outputs), tuple(spec.data.inputs))

@@ -69,6 +69,14 @@ def read_initial(initial: str | None, opened: ModelOnData) -> str | Any:
     return record.experiments[0].outputs
 
 
+def notes(opened: ModelOnData, initial: str | None) -> list[str]:
+    """What a user may not expect of a free run: where it starts when nothing says so."""
+    if initial is not None or opened.record.outputs or not opened.model.form.states:
+        return []
+    names = ", ".join(channel.name for channel in opened.model.outputs)
+    return [f"note: {opened.source} has no {names}: the free run starts from 0; --initial CSV gives other outputs."]
+
+
 def with_initial(opened: ModelOnData, initial: str | Any) -> Record:
     """The record with the outputs of its first rows replaced, for predictions that start from others."""
     if isinstance(initial, str) and initial == "measured":

@@ -20,6 +20,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.registry import resolve
 from orthaug.commands.sections import KindSection, Section, with_kinds
 from orthaug.commands.spec_errors import first_message
+from orthaug.data.expressions import SAMPLING_TIME
 from orthaug.data.record import Channel
 from orthaug.data.regressors import Lags
 from orthaug.data.tables import check_readable
@@ -79,6 +80,11 @@ class Data(Section):
     validation: PartSection | None = None
     tests: dict[str, PartSection] = {}
     channels: dict[str, ChannelSection] = {}
+
+    @property
+    def step(self) -> float | None:
+        """Seconds between the rows that are kept of the training data; None where a time column tells."""
+        return None if self.time else (self.sampling_time or 1.0) * self.train.every
 
     @model_validator(mode="after")
     def _one_time(self) -> Data:
@@ -155,12 +161,21 @@ class DesignSection(Section):
     """An input to design, within limits."""
 
     samples: Positive
-    amplitude: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+    amplitude: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    minimum: Finite | None = None
+    maximum: Finite | None = None
     input: str | None = None
     rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
     noise: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
     condition: Annotated[float, Field(gt=1, allow_inf_nan=False)] = 1e3
     seed: Count = 0
+
+    @model_validator(mode="after")
+    def _check_limits(self) -> DesignSection:
+        from orthaug.analysis.design import input_limits  # most specs have no design
+
+        input_limits(self.amplitude, self.minimum, self.maximum)
+        return self
 
 
 class LearnerSection(KindSection):
@@ -277,8 +292,8 @@ class Spec(Section):
         ]
         return Baseline.from_terms(terms, self.baseline.constants)
 
-    def physics_map(self) -> PhysicsMap | None:
-        """The physical parameters and their map to θ, if the spec has one."""
+    def physics_map(self, sampling_time: float) -> PhysicsMap | None:
+        """The physical parameters and their map to θ, if the spec has one; `Ts` in it is the sampling time [s]."""
         if self.physics is None:
             return None
         limits = {"min": -math.inf, "max": math.inf}
@@ -288,7 +303,8 @@ class Spec(Section):
             )
             for name, p in self.physics.parameters.items()
         ]
-        return PhysicsMap.of(parameters, self.physics.theta, self.baseline.constants)
+        known = {} if SAMPLING_TIME in self.physics.parameters else {SAMPLING_TIME: sampling_time}
+        return PhysicsMap.of(parameters, self.physics.theta, known | self.baseline.constants)
 
     def declared_learner(self) -> Learner | None:
         """The learner; None for physics alone."""

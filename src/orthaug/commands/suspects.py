@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from orthaug.analysis.suspects import WIDTHS, Suspect, data_width, suspect_columns
 from orthaug.commands.spec import SuspectSection
+from orthaug.data.expressions import SAMPLING_TIME
 from orthaug.physics.problem import Problem
 
 
@@ -15,7 +16,7 @@ def declared(sections: Sequence[SuspectSection], problem: Problem) -> tuple[Susp
     Raises:
         InputError: an unknown kind, channel or lag, an expression that cannot be read.
     """
-    constants = dict(problem.baseline.constants)
+    constants = {SAMPLING_TIME: problem.record.sampling_time} | dict(problem.baseline.constants)
     suspects = []
     for section in sections:
         width = section.width

@@ -10,10 +10,11 @@ from __future__ import annotations
 import ast
 import keyword
 import math
+import re
 import unicodedata
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -36,6 +37,7 @@ _OF_MANY = ("min", "max")
 FUNCTIONS = (*_OF_ONE, "atan2", *_OF_MANY)
 _ELSEWHERE = {"atan": "arctan", "atan2": "arctan2"}  # as NumPy and JAX call them, where that is another name
 RESERVED = frozenset((*FUNCTIONS, "k"))
+SAMPLING_TIME = "Ts"  # a name that need not be declared: it is the record's sampling time
 LARGEST_LAG = 100_000  # more is a mistake, and would fill the memory
 _MAX_LENGTH = 500  # characters; a longer expression is a mistake, and messages stay readable
 _BINARY = {
@@ -46,6 +48,8 @@ _BINARY = {
     ast.Pow: lambda a, b: a**b,
 }
 _ALLOWED = "channels at a lag such as y[k-1], numbers, constants, + - * / ** ( ) and " + ", ".join(FUNCTIONS)
+_POWER, _ELEMENTWISE = re.compile(r"\.?\^"), re.compile(r"\.([*/])")
+_LAGGED = re.compile(r"\b([^\W\d]\w*)\s*[({]\s*[kt]\s*([-+]\s*\d+)?\s*[)}]|\b([^\W\d]\w*)\[\s*t\s*([-+]\s*\d+)?\s*\]")
 
 
 @dataclass(frozen=True)
@@ -78,8 +82,26 @@ class Expression:
         nodes.sort(key=lambda node: node.col_offset)  # `walk` goes level by level
         return tuple(dict.fromkeys(_lag(node, self.text) for node in nodes))
 
+    @cached_property
+    def unsampled(self) -> bool:
+        """Whether it reads `Ts`, and has no value for that yet."""
+        named = any(isinstance(node, ast.Name) and node.id == SAMPLING_TIME for node in _free_names(self._tree))
+        return named and SAMPLING_TIME not in dict(self.constants)
+
+    def sampled(self, sampling_time: float) -> Expression:
+        """The expression with this value [s] of `Ts`; the same one where it does not wait for it."""
+        if not self.unsampled:
+            return self
+        return replace(self, constants=tuple(sorted((*self.constants, (SAMPLING_TIME, float(sampling_time))))))
+
     def evaluate(self, columns: Mapping[Lag, Any], xp: Any) -> Any:
-        """Value for `columns[lag]` (scalars or arrays of one shape), computed by `xp` (numpy or jax.numpy)."""
+        """Value for `columns[lag]` (scalars or arrays of one shape), computed by `xp` (numpy or jax.numpy).
+
+        Raises:
+            InputError: the sampling time is asked for and not known here.
+        """
+        if self.unsampled:
+            raise InputError(f"'{self.text}': {SAMPLING_TIME} has no value here; give it as a constant.")
         return _evaluate(self._tree, columns, dict(self.constants), xp, self.text)
 
 
@@ -101,6 +123,8 @@ def is_identifier(name: Any) -> bool:
 def parse(text: str, constants: Mapping[str, float] | None = None) -> Expression:
     """Read `text`. Besides channels and functions it may use the names in `constants`.
 
+    It may also use `Ts`, the sampling time of the record that it will be read on (`Expression.sampled`).
+
     Raises:
         InputError: anything that is not arithmetic on lagged channels, with the offending piece named.
     """
@@ -115,19 +139,50 @@ def parse(text: str, constants: Mapping[str, float] | None = None) -> Expression
     if len(text) > _MAX_LENGTH:
         raise InputError(f"An expression has {len(text)} characters; at most {_MAX_LENGTH} are read.")
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Python's own remarks about text that is refused below
-            tree = ast.parse(text, mode="eval").body
-        used: set[str] = set()
-        _check(tree, text, constants, used)
+        return _read(text, constants)
     except (SyntaxError, ValueError) as error:
+        _suggest(text, constants)
         if isinstance(error, InputError):
             raise
+        if any(mark in text for mark in ("&&", "||", "~=", "==")):
+            raise InputError(f"'{text}': there is no logic in an expression; sign, min and max can switch.") from None
         reason = getattr(error, "msg", str(error))
         raise InputError(f"'{text}' is not an expression ({reason}); allowed are {_ALLOWED}.") from None
     except (RecursionError, MemoryError):
         raise InputError(f"'{text[:40]}…' is nested too deeply; write it in simpler terms.") from None
+
+
+def _read(text: str, constants: Mapping[str, float]) -> Expression:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Python's own remarks about text that is refused below
+        tree = ast.parse(text, mode="eval").body
+    used: set[str] = set()
+    _check(tree, text, constants, used)
     return Expression(text, tuple((name, float(constants[name])) for name in sorted(used)))
+
+
+def _suggest(text: str, constants: Mapping[str, float]) -> None:
+    """Raise InputError with the text as it is written here, where it is one in the habits of MATLAB."""
+
+    def lagged(found: re.Match[str]) -> str:
+        name, lag = found[1] or found[3], found[2] or found[4] or ""
+        return found[0] if name in FUNCTIONS else f"{name}[k{lag.replace(' ', '')}]"
+
+    said, ours = [], text
+    for pattern, written, sentence in (
+        (_POWER, "**", "a power is **"),
+        (_ELEMENTWISE, r"\1", "products and quotients are * and /"),
+        (_LAGGED, lagged, "a channel at a lag has square brackets and the index k"),
+    ):
+        changed = pattern.sub(written, ours)
+        said, ours = ([*said, sentence] if changed != ours else said), changed
+    if not said:
+        return
+    try:
+        _read(ours, constants)
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        return
+    raise InputError(f"'{text}': here {', '.join(said)}; write {ours}.")
 
 
 def _check(node: ast.AST, text: str, constants: Mapping[str, float], used: set[str]) -> None:
@@ -142,9 +197,10 @@ def _check(node: ast.AST, text: str, constants: Mapping[str, float], used: set[s
         if not finite:
             raise InputError(f"'{text}' holds a number too large for double precision.")
     elif isinstance(node, ast.Name):
-        if node.id not in constants:
+        if node.id in constants:
+            used.add(node.id)
+        elif node.id != SAMPLING_TIME:
             raise InputError(_unknown_name(node.id, text, constants))
-        used.add(node.id)
     elif isinstance(node, ast.Subscript):
         _lag(node, text)
     elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.UAdd | ast.USub):
@@ -159,6 +215,11 @@ def _check(node: ast.AST, text: str, constants: Mapping[str, float], used: set[s
     else:
         if isinstance(node, ast.BinOp) and isinstance(node.op, ast.BitXor):
             raise InputError(f"'{text}': '^' is not a power here; write **, as in y[k-1]**2.")
+        if isinstance(node, ast.Compare | ast.BoolOp | ast.IfExp):
+            raise InputError(
+                f"'{text}': '{ast.unparse(node)}' is not allowed in an expression, which has no logic; sign, min and "
+                "max can switch."
+            )
         what = ast.unparse(node) if isinstance(node, ast.expr) else type(node).__name__
         raise InputError(f"'{text}': '{what}' is not allowed in an expression; allowed are {_ALLOWED}.")
 
@@ -168,19 +229,24 @@ def _check_call(node: ast.Call, text: str) -> None:
     if name is None or node.keywords or any(isinstance(a, ast.Starred) for a in node.args):
         raise InputError(f"'{text}': '{ast.unparse(node)}' is not allowed; functions are {', '.join(FUNCTIONS)}.")
     if name not in FUNCTIONS:
-        inner = list(ast.walk(node.args[0])) if len(node.args) == 1 else []
-        if {n.id for n in inner if isinstance(n, ast.Name)} == {"k"} and not any(
-            isinstance(n, ast.Subscript) for n in inner
-        ):
-            lag = f"{name}[{ast.unparse(node.args[0]).replace(' ', '')}]"
-            raise InputError(f"'{text}': a channel at a lag has square brackets; write {lag}.")
-        raise InputError(
-            f"'{text}': unknown function '{name}'{nearest(name, FUNCTIONS)}; known are {', '.join(FUNCTIONS)}."
-        )
+        hint = ", did you mean 'log'?" if name == "ln" else nearest(name, FUNCTIONS)
+        raise InputError(f"'{text}': unknown function '{name}'{hint}; known are {', '.join(FUNCTIONS)}.")
     many, exact = name in _OF_MANY, 1 if name in _OF_ONE else 2
     wanted = "two or more arguments" if many else "two arguments" if exact == 2 else "one argument"
     if (len(node.args) < 2) if many else (len(node.args) != exact):
         raise InputError(f"'{text}': {name} takes {wanted}, got {len(node.args)}.")
+
+
+def _free_names(node: ast.AST) -> Iterator[ast.Name]:
+    """The names that stand for numbers: neither channels nor functions."""
+    if isinstance(node, ast.Name):
+        yield node
+    elif isinstance(node, ast.Call):
+        for argument in node.args:
+            yield from _free_names(argument)
+    elif not isinstance(node, ast.Subscript):
+        for child in ast.iter_child_nodes(node):
+            yield from _free_names(child)
 
 
 def _lag(node: ast.Subscript, text: str) -> Lag:
@@ -239,5 +305,5 @@ def _unknown_name(name: str, text: str, constants: Mapping[str, float]) -> str:
         return f"'{text}': k is the time index and cannot stand alone; write a channel at a lag, y[k-1]."
     if name in FUNCTIONS:
         return f"'{text}': {name} is a function; write {name}(…)."
-    hint = nearest(name, constants) or f"; a channel needs its lag, {name}[k-1]"
+    hint = nearest(name, constants) or f"; declare it with its value, or, for a channel, give its lag, {name}[k-1]"
     return f"'{text}': unknown constant '{name}'{hint}."

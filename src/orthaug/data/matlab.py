@@ -14,8 +14,9 @@ from orthaug._base.memory import check_memory
 
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _INT32, _UINT32, _MATRIX, _COMPRESSED = 5, 6, 14, 15
-_STRUCT, _OBJECT = 2, 3
-_NO_NUMBERS = {1: "a cell", _STRUCT: "a struct", _OBJECT: "an object", 4: "text", 5: "a sparse matrix",
+_CELL, _STRUCT, _OBJECT = 1, 2, 3
+_MOST_ELEMENTS = 1000  # of an array of structs or a cell that is looked into
+_NO_NUMBERS = {_CELL: "a cell", _STRUCT: "a struct", _OBJECT: "an object", 4: "text", 5: "a sparse matrix",
                16: "a function", 17: "an opaque object"}  # fmt: skip
 _COMPLEX_FLAG = 0x0800
 _HEADER, _PREFIX = 128, 4096  # bytes of the file's header; of a compressed variable that hold its name and shape
@@ -48,25 +49,33 @@ class Variable:
             raise ValueError(f"'{self.name}' has {len(values)} numbers; declared are {math.prod(self.shape)}")
         return values.reshape(self.shape, order="F")
 
-    def fields(self) -> Iterator[Variable]:
-        """The fields of a single struct or object; none of anything else."""
-        if self._flags & 0xFF not in (_STRUCT, _OBJECT) or math.prod(self.shape) != 1:
+    def parts(self) -> Iterator[Variable]:
+        """What is in a struct, an object or a cell, by its path; nothing of anything else.
+
+        Elements of arrays are counted from 0: `runs[1].u`, `c[0]`. The only element of a cell has the cell's own name.
+        """
+        kind, count = self._flags & 0xFF, math.prod(self.shape)
+        if kind not in (_CELL, _STRUCT, _OBJECT) or not 0 < count <= _MOST_ELEMENTS:
             return
-        body, at = self._body(), self._begin
-        if self._flags & 0xFF == _OBJECT:
+        body, at, names = self._body(), self._begin, [""]
+        if kind == _OBJECT:
             at = _element(body, at, self._order)[2]  # the name of its class
-        _, length, at = _element(body, at, self._order)
-        _, packed, at = _element(body, at, self._order)
-        (size,) = struct.unpack(self._order + "i", length)
-        if size < 1:
-            raise ValueError("field names have no length")
-        for begin in range(0, len(packed), size):
-            kind, data, at = _element(body, at, self._order)
-            if kind != _MATRIX:
-                raise ValueError("a field is no matrix")
-            if data:
-                field = bytes(packed[begin : begin + size]).split(b"\0")[0].decode("latin-1")
-                yield _variable(data, self._order, lambda data=data: data, f"{self.name}.{field}")
+        if kind != _CELL:
+            _, length, at = _element(body, at, self._order)
+            _, packed, at = _element(body, at, self._order)
+            (size,) = struct.unpack(self._order + "i", length)
+            if size < 1:
+                raise ValueError("field names have no length")
+            fields = (bytes(packed[begin : begin + size]) for begin in range(0, len(packed), size))
+            names = ["." + field.split(b"\0")[0].decode("latin-1") for field in fields]
+        for i in range(count):
+            for name in names:
+                type_, data, at = _element(body, at, self._order)
+                if type_ != _MATRIX:
+                    raise ValueError("what is in a struct or cell is no matrix")
+                if data:
+                    path = f"{self.name}{f'[{i}]' if count > 1 else ''}{name}"
+                    yield _variable(data, self._order, lambda data=data: data, path)
 
 
 def read_mat5(content: bytes, path: object) -> dict[str, Variable]:

@@ -22,6 +22,7 @@ RowRange = tuple[int, int] | list[int]
 _JITTER = 0.45  # largest deviation of a step from the usual one, relative: one lost sample is a deviation of 1 or ½
 _DRIFT = 0.02  # largest change of the mean step over the record, relative; it must also displace half a sample
 _RESOLUTION = 1e-6  # what rounding of the instants may change the mean step by, relative
+_LATEST = 1e11  # s; later than the year 5000
 _MISSING = ("", "nan", "na", "n/a", "#n/a", "null", "none")  # how files write a sample that is not there
 
 
@@ -247,5 +248,10 @@ def _uniform_step(table: Table, time: str, start: int, stop: int) -> float:
         raise InputError(
             f"{table.path}: column '{time}': instants of {np.abs(instants).max():.3g} s are too large for steps of "
             f"{mean:g} s in double precision; subtract the first instant, and write seconds."
+        )
+    if np.abs(instants).max() > _LATEST:
+        raise InputError(
+            f"{table.path}: column '{time}': instants of {np.abs(instants).max():.3g} are no seconds; perhaps they "
+            "are milli- or nanoseconds since 1970. Write seconds."
         )
     return mean

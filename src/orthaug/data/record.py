@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.checks import Matrix, as_signal, check_label, check_type, check_unique, is_number
+from orthaug._base.checks import Matrix, as_signal, check_choice, check_label, check_type, check_unique, is_number
 from orthaug._base.errors import LONGEST, InputError, shown, visible
 from orthaug.data.expressions import RESERVED, is_name
 
@@ -34,7 +34,8 @@ class Channel:
         if not is_name(self.name):
             raise InputError(
                 f"{_quoted(self.name)} cannot name a channel; use letters, digits and underscores, at most {LONGEST}, "
-                f"not starting with a digit, and none of {', '.join(sorted(RESERVED))}."
+                f"not starting with a digit, and none of {', '.join(sorted(RESERVED))}. A column of another name is "
+                "its `column`."
             )
         check_label(self.unit, f"the unit of '{self.name}'")
         check_type(self.column, str, f"column of '{self.name}'", "a column's name")
@@ -109,6 +110,10 @@ class Experiment:
 
     def __len__(self) -> int:
         return len(self.inputs)
+
+    def __repr__(self) -> str:
+        shapes = f"inputs {np.shape(self.inputs)}, outputs {np.shape(self.outputs)}"
+        return f"Experiment({visible(self.source) + ': ' if self.source else ''}{shapes})"
 
     def check(self, inputs: int, outputs: int) -> None:
         """Raise InputError unless there are as many columns, and as many rows of both."""
@@ -250,22 +255,55 @@ class Record:
         return self.outputs + self.inputs
 
     def rows(self, start: int | None = None, stop: int | None = None) -> Record:
-        """The half-open range of rows `[start, stop)` of a single experiment."""
+        """The half-open range of rows `[start, stop)` of a single experiment; negative ones count from its end."""
         for name, value in (("start", start), ("stop", stop)):
             check_type(value, int | np.integer | None, name, "a whole number or None")
-        return replace(self, experiments=(self._only("rows").rows(start, stop),))
+        if len(self.experiments) != 1:
+            raise InputError(f"`rows` needs a record of one experiment; this one has {len(self.experiments)}.")
+        return replace(self, experiments=(self._piece(self.experiments[0], start, stop),))
 
-    def split(self, fraction: float) -> tuple[Record, Record]:
-        """The first `fraction` of the rows of a single experiment, and the rest."""
+    def split(self, fraction: float, by: str = "rows") -> tuple[Record, Record]:
+        """Two records: the first `fraction` and the rest.
+
+        Args:
+            fraction: between 0 and 1, rounded to whole rows or experiments.
+            by: "rows" cuts every experiment, the first `fraction` of its rows into the first record; "experiments"
+                leaves each whole, and puts the first `fraction` of them into the first record.
+
+        Raises:
+            InputError: a part that would be empty.
+
+        Examples:
+            >>> import numpy as np
+            >>> both = Record.join([Record.from_arrays(y=np.ones(10)), Record.from_arrays(y=np.ones(20))])
+            >>> both.split(0.8)[1]
+            Record(2 experiments, 6 samples, Ts = 1 s, inputs: none; outputs: y)
+            >>> both.split(0.5, by="experiments")[1]
+            Record(1 experiment, 20 samples, Ts = 1 s, inputs: none; outputs: y)
+        """
         if not is_number(fraction) or not 0 < fraction < 1:
             raise InputError(f"`fraction` must lie between 0 and 1; got {shown(fraction)}.")
-        cut = round(fraction * len(self._only("split")))
-        return self.rows(None, cut), self.rows(cut, None)
+        check_choice(by, ("rows", "experiments"), "`by`")
+        pieces = self.experiments if by == "rows" else (self.experiments,)
+        cuts = [round(fraction * len(piece)) for piece in pieces]
+        for piece, cut in zip(pieces, cuts, strict=True):
+            if not 0 < cut < len(piece):
+                held = f"an experiment has {len(piece)} rows" if by == "rows" else f"there are {len(piece)} experiments"
+                raise InputError(
+                    f"a part of the split at {fraction:g} would be empty: {held}. Take another `fraction`."
+                )
+        if by == "experiments":
+            first, second = self.experiments[: cuts[0]], self.experiments[cuts[0] :]
+        else:
+            places = tuple(zip(self.experiments, cuts, strict=True))
+            first = tuple(self._piece(experiment, None, place) for experiment, place in places)
+            second = tuple(self._piece(experiment, place, None) for experiment, place in places)
+        return replace(self, experiments=first), replace(self, experiments=second)
 
-    def _only(self, verb: str) -> Experiment:
-        if len(self.experiments) != 1:
-            raise InputError(f"`{verb}` needs a record of one experiment; this one has {len(self.experiments)}.")
-        return self.experiments[0]
+    def _piece(self, experiment: Experiment, start: int | None, stop: int | None) -> Experiment:
+        """Rows of an experiment, with the instant of their first."""
+        first = range(len(experiment))[start:stop].start
+        return replace(experiment.rows(start, stop), start_time=experiment.start_time + first * self.sampling_time)
 
 
 def _channels(given: Sequence[str | Channel] | None, default: str, count: int) -> tuple[Channel, ...]:

@@ -149,6 +149,10 @@ class Features:
         """The raw lags that the features read."""
         return tuple(dict.fromkeys(lag for entry in self.entries for lag in entry.lags))
 
+    def sampled(self, sampling_time: float) -> Features:
+        """The features with this value [s] of `Ts`, where they read it."""
+        return Features(tuple(entry.sampled(sampling_time) for entry in self.entries))
+
     def evaluate(self, x: Any, layout: Layout, xp: Any) -> Any:
         """Features (…, nz) of regressors (…, nx), by `xp` (numpy or jax.numpy)."""
         if not self.entries:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,6 +22,8 @@ from orthaug.data.matlab import Variable, read_mat5
 _NAMED = 30  # variables that a message lists
 _HDF5, _USERBLOCK = b"\x89HDF\r\n", 4096  # how such a file begins, and before which byte it does
 _DIGITS = 10  # of an index at most
+_ROOT = re.compile(r"[./\[]")  # what follows the name of a variable in a path
+_ELEMENT = re.compile(r"[({]\s*(?::\s*,\s*)?([1-9]\d{0,8})\s*(,\s*:\s*)?[)}]")  # as MATLAB writes it
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,7 @@ class Held:
 def read_variables(path: Path, names: Sequence[str]) -> dict[str, Vector]:
     """The named channels: a vector (1×N or N×1), or a line of a matrix, counted from 0.
 
-    A column is written `"U[2]"`, a row `"U[2,:]"`, a field of a MATLAB struct `"data.u"`.
+    A column is written `"U[2]"`, a row `"U[2,:]"`; what is in MATLAB's structs or in groups of HDF5 `"data.u"`.
 
     Raises:
         InputError: a missing variable, a struct, text, complex numbers, a corrupt file; the message lists
@@ -98,20 +101,20 @@ def _from_mat(path: Path, names: Sequence[str]) -> dict[str, Vector]:
     if _HDF5 in content[:_USERBLOCK] or content[124:126] in (b"\x00\x02", b"\x02\x00"):  # v7.3
         return _from_hdf5(path, names)
     variables = read_mat5(content, path)
-    structs = {name.partition(".")[0] for name in names if name not in variables}
+    roots = {_ROOT.split(name.lstrip("/"))[0] for name in names}
     held: dict[str, Held] = {}
     for name, variable in variables.items():
-        held |= _held(path, variable, deep=name in structs)
+        held |= _held(path, variable, deep=name in roots)
     return {name: _pick(path, name, held) for name in names}
 
 
 def _held(path: Path, variable: Variable, *, deep: bool) -> dict[str, Held]:
-    """A variable, with the fields in it if wanted, by their paths."""
+    """A variable, with what is in it if wanted, by their paths."""
     if not variable.what:
         return {variable.name: _lazy(path, variable.shape, 8, variable.numbers)}
     held = {variable.name: Held(variable.what, None)}
-    for field in variable.fields() if deep else ():
-        held |= _held(path, field, deep=True)
+    for part in variable.parts() if deep else ():
+        held |= _held(path, part, deep=True)
     return held
 
 
@@ -132,7 +135,9 @@ def _from_hdf5(path: Path, names: Sequence[str]) -> dict[str, Vector]:
                 held[key] = Held("a sparse matrix" if sparse else "a struct" if matlab else "a group", None)
         elif not name.startswith("#") and "MATLAB_sparse" not in item.parent.attrs:
             kind = item.attrs.get("MATLAB_class", b"")
-            if kind in (b"char", b"cell", "char", "cell"):
+            if kind in (b"cell", "cell") and item.shape is not None and math.prod(item.shape) == 1:
+                note(name, file[item[()].flat[0]])
+            elif kind in (b"char", b"cell", "char", "cell"):
                 held[key] = Held("text" if kind in (b"char", "char") else "a cell", None)
             elif item.shape is None:
                 held[key] = Held("empty", None)
@@ -147,9 +152,6 @@ def _from_hdf5(path: Path, names: Sequence[str]) -> dict[str, Vector]:
     with h5py.File(path, "r") as file:
         _ = [name in file for name in names]  # complains of broken tables on which a visit never ends
         file.visititems(note)
-        if matlab:
-            names_in = {name: name.replace("/", ".") for name in names}
-            return {name: _pick(path, key, held) for name, key in names_in.items()}
         return {name: _pick(path, name, held) for name in names}
 
 
@@ -177,12 +179,15 @@ def _lazy(path: Path, shape: Sequence[int], itemsize: int, read: Callable[[], An
 
 
 def _pick(path: Path, name: str, held: Mapping[str, Held]) -> Vector:
+    name = _known_as(name, held)
     variable, axis, index = (name, 0, 0) if name in held else _line(path, name)
     listing = ", ".join(f"{key} ({value.what})" for key, value in list(held.items())[:_NAMED]) or "nothing"
     listing += f" and {len(held) - _NAMED} more" if len(held) > _NAMED else ""
     if variable not in held:
+        ours = _ELEMENT.sub(lambda m: f"[{int(m[1]) - 1}{',:' if m[2] else ''}]", name)
+        hint = f'; elements are counted from 0 here, "{ours}"' if ours != name else ""
         raise MissingColumnError(
-            f"{path}: no variable '{variable}'{nearest(variable, held)}; the file holds {listing}."
+            f"{path}: no variable '{variable}'{hint or nearest(variable, held)}; the file holds {listing}."
         )
     read = held[variable].read
     if read is None:
@@ -204,6 +209,15 @@ def _pick(path: Path, name: str, held: Mapping[str, Held]) -> Vector:
             f'"{variable}[0,:]". The file holds {listing}.'
         )
     return np.asarray(array, dtype=float)
+
+
+def _known_as(name: str, held: Mapping[str, Held]) -> str:
+    """The name as the file has it: paths may be written with points or slashes."""
+    bare = name.lstrip("/")
+    for one in (name, bare, bare.replace("/", "."), bare.replace(".", "/")):
+        if one in held or (one.endswith("]") and one.rpartition("[")[0] in held):
+            return one
+    return name
 
 
 def _line(path: Path, name: str) -> tuple[str, int, int]:

@@ -21,6 +21,7 @@ from orthaug.inference.measures import Measure, Support, Training
 from orthaug.inference.physical import PhysicalEstimate, profile, solve
 from orthaug.inference.splitting import MeasureSplit, split_under
 from orthaug.models.model import Model
+from orthaug.physics.baseline import check_sampling_constant
 from orthaug.physics.excitation import Excitation
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import Problem
@@ -203,6 +204,7 @@ class Estimate:
         return profile(physics, self.theta[order], covariance, name, freedom=max(self.freedom, 1.0))
 
     def _in_order_of(self, physics: PhysicsMap) -> tuple[list[int], Matrix | None]:
+        check_sampling_constant(physics.constants, self.problem.record.sampling_time)
         names = self.problem.baseline.names
         missing = [name for name in physics.theta_names if name not in names]
         if missing:

@@ -83,7 +83,7 @@ class Ratio:
 
 
 def _tail(count: int) -> float:
-    """Level of the percentiles of `count` stretches: 2.5 %, expanded because they are few (Hesterberg 2015, sect. 5)."""
+    """Level of the percentiles of `count` stretches: 2.5 %, expanded as they are few (Hesterberg 2015, sect. 5)."""
     if count < 2:
         return 0.0
     return float(special.ndtr(np.sqrt(count / (count - 1)) * special.stdtrit(count - 1, 0.025)))

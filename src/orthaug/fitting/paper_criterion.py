@@ -38,8 +38,7 @@ class Physics(NamedTuple):
         Where θ is `solved` (F1), it stands at its end and has no columns: the learner's path does not depend on it.
         """
         to_rows = elimination.to_coordinates / rms
-        initial = np.clip(problem.baseline.initial, elimination.lower, elimination.upper)
-        initial = np.array([fixed.get(i, value) for i, value in enumerate(initial)])
+        initial = np.array([fixed.get(i, value) for i, value in enumerate(problem.baseline.initial)])
         free = np.array([float(i not in fixed) for i in range(len(initial))])
         nt = len(initial)
         scale = free * np.sqrt(len(problem.rows)) / np.linalg.norm(to_rows, axis=0) if nt else free

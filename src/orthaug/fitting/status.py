@@ -34,9 +34,9 @@ class Ending(IntEnum):
     NON_FINITE = (
         3,
         "non_finite",
-        "the loss is not finite at the start: (a) a learner input grows without bound, "
-        "(b) the learner returns NaN, or (c) channels differ by many orders of magnitude",
-        "Rescale the channels or choose other learner inputs",
+        "the loss is not finite: (a) a learner input grows without bound, (b) the learner returns NaN, "
+        "(c) channels differ by many orders of magnitude, or (d) `learning_rate` is too large",
+        "Rescale the channels, choose other learner inputs, or lower the rate",
     )
     SPANNED = 4, "converged"
     """P⊥J = 0: the learner has nothing to learn beside the physics."""
@@ -67,8 +67,12 @@ class Status:
     ending: Ending
     iterations: int
     seconds: float
+    """Of training, without compiling its programs."""
     loss: float
     start_loss: float | None = None
+
+    def __repr__(self) -> str:
+        return f"Status({self.code}, {self.iterations} iterations, {self.seconds:.2f} s, loss {self.loss:.6g})"
 
     @property
     def code(self) -> str:

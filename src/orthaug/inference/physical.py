@@ -57,6 +57,11 @@ class PhysicalEstimate:
     """∂ln p̂ / ∂ln θ̂ (np, nθ): 10 says that 1 % in θ moves p by 10 %. NaN for p̂ = 0, 0 for one at a bound."""
     warnings: tuple[Warning, ...] = ()
 
+    def __repr__(self) -> str:
+        rows = zip(self.names, self.value, self.std, self.units, strict=True)
+        told = (f"{n} = {v:.6g}{'' if s is None else f' ± {s:.2g}'} {unit}".rstrip() for n, v, s, unit in rows)
+        return f"PhysicalEstimate({', '.join(told)})"
+
 
 @dataclass(frozen=True, eq=False)
 class _Fit:

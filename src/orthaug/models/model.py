@@ -204,14 +204,24 @@ class Model:
             name = experiment.source or "the record"
             raise InputError(f"{name} has {len(experiment)} rows, too few: the first value is at row {shown(first)}.")
 
+    def _wanted(self, with_outputs: bool) -> str:
+        """A record of the model's channels, in the words of Python."""
+        given = {
+            "u": ("inputs", self.inputs),
+            "y": ("outputs", self.outputs if with_outputs or not self.inputs else ()),
+        }
+        arrays = [f"{name}={name}" for name, (_, channels) in given.items() if channels]
+        names = [f"{kind}={[c.name for c in channels]}" for kind, channels in given.values() if channels]
+        arguments = ", ".join([*arrays, *names, f"sampling_time={self.sampling_time:g}"])
+        return f"a Record, such as Record.from_arrays({arguments})"
+
     def fitting(self, record: Record, *, need_outputs: bool) -> Record:
         """The record's channels in the model's order, by name.
 
         Raises:
             InputError: a channel is missing, or the sampling time differs by more than 0.1 %.
         """
-        wanted = f"a Record, such as Record.from_arrays(u=u, sampling_time={self.sampling_time:g})"
-        check_type(record, Record, "record", wanted)
+        check_type(record, Record, "record", self._wanted(need_outputs))
         if not same_step(record.sampling_time, self.sampling_time):
             raise InputError(
                 f"the record is sampled every {record.sampling_time:g} s, the model every {self.sampling_time:g} s; "

@@ -30,6 +30,11 @@ class Scores:
     fit: Vector
     samples: int
 
+    def __repr__(self) -> str:
+        kinds = ((name, [f"{value:.6g}" for value in getattr(self, name)]) for name in ("rmse", "nrmse", "fit"))
+        told = ", ".join(f"{name} = {' | '.join(values)}" for name, values in kinds)
+        return f"Scores({told} %, {self.samples} samples)"
+
 
 def scores(measured: Matrix, model: Matrix) -> Scores:
     """RMSE, NRMSE (population standard deviation of the scored samples) and FIT of each column, (N, ny)."""
@@ -58,6 +63,12 @@ class Trajectory:
     start_time: float = 0.0
     diverged: tuple[int, str] | None = None
 
+    def __repr__(self) -> str:
+        samples, outputs = self.baseline.shape
+        measured = "" if self.measured is not None else ", not measured"
+        ended = "" if self.diverged is None else f", diverged in {self.diverged[1]} at row {self.diverged[0]}"
+        return f"Trajectory({samples} samples of {outputs} output{'s' * (outputs > 1)}{measured}{ended})"
+
     @property
     def model(self) -> Matrix:
         return self.baseline + self.learner
@@ -84,7 +95,8 @@ class Response:
 
     def __repr__(self) -> str:
         kind = "simulation" if self.horizon is None else f"{self.horizon}-step prediction"
-        return f"Response({kind}, {len(self.trajectories)} experiment(s), {len(self.model)} samples)"
+        count, names = len(self.trajectories), ", ".join(channel.name for channel in self.outputs)
+        return f"Response({kind} of {names}, {count} experiment{'s' * (count > 1)}, {len(self.model)} samples)"
 
     def scores(self, skip: int | tuple[int, ...] = 0) -> Scores:
         """Scores over all experiments, without the first `skip` samples of each; a tuple has one number per experiment.

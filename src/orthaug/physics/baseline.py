@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -12,7 +13,8 @@ import numpy as np
 
 from orthaug._base.checks import check_label, check_type, check_unique, is_number
 from orthaug._base.errors import LONGEST, InputError, shown
-from orthaug.data.expressions import RESERVED, Expression, Lag, is_identifier, is_name, parse
+from orthaug.data.expressions import RESERVED, SAMPLING_TIME, Expression, Lag, is_identifier, is_name, parse
+from orthaug.data.record import same_step
 from orthaug.data.regressors import Layout, in_order
 
 
@@ -40,6 +42,17 @@ def check_parameter_name(name: Any) -> None:
         raise InputError(
             f"{shown(name)} cannot name a parameter; use letters, digits and underscores, at most {LONGEST}, not "
             "starting with a digit."
+        )
+
+
+def check_sampling_constant(constants: Sequence[tuple[str, float]], sampling_time: float) -> None:
+    """Raise InputError where a constant `Ts` is not the sampling time."""
+    declared = dict(constants).get(SAMPLING_TIME, sampling_time)
+    if not same_step(declared, sampling_time):
+        raise InputError(
+            f"the constant '{SAMPLING_TIME}' is {declared:g}, but the data are sampled every {sampling_time:g} s. "
+            f"{SAMPLING_TIME} is the sampling time without being declared: leave it out, or rename it if it is another "
+            "quantity."
         )
 
 
@@ -76,6 +89,8 @@ class Baseline:
 
     Examples:
         >>> spring = Baseline.from_terms([Term("a", "y[k-1]", initial=0.9), Term("b", "u[k-1]")])
+        >>> spring
+        Baseline(a*y[k-1] + b*u[k-1])
         >>> spring.names
         ('a', 'b')
     """
@@ -85,9 +100,20 @@ class Baseline:
     constants: tuple[tuple[str, float], ...] = ()
     function: Callable[[Any], Any] | None = field(default=None, repr=False)
 
+    def __repr__(self) -> str:
+        if self.function is not None:
+            return f"Baseline(a function of the regressor, θ: {', '.join(self.names)})"
+        sums: dict[str, list[str]] = {}
+        for term in self.terms:
+            factor = f"{term.initial:g}" if term.fixed else term.parameter
+            alone = re.fullmatch(r"\w+\[[^][]*\]", term.regressor)
+            regressor = term.regressor if alone else f"({term.regressor})"
+            sums.setdefault(term.output or "", []).append(f"{factor}*{regressor}")
+        return f"Baseline({'; '.join(f'{name} = ' * bool(name) + ' + '.join(terms) for name, terms in sums.items())})"
+
     @classmethod
     def from_terms(cls, terms: Sequence[Term], constants: Mapping[str, float] | None = None) -> Baseline:
-        """One term per summand; expressions may use the names in `constants`.
+        """One term per summand; expressions may use the names in `constants`, and `Ts` for the sampling time.
 
         Raises:
             InputError: an expression that is not arithmetic on lagged channels, or terms of one parameter
@@ -166,6 +192,17 @@ class Baseline:
     def lags(self) -> tuple[Lag, ...]:
         """The raw lags that the expressions read (none known for a function)."""
         return tuple(dict.fromkeys(lag for expression in self.expressions for lag in expression.lags))
+
+    def sampled(self, sampling_time: float) -> Baseline:
+        """The baseline with this value [s] of `Ts`, where its expressions read that without declaring it.
+
+        Raises:
+            InputError: a constant `Ts` of another value.
+        """
+        check_sampling_constant(self.constants, sampling_time)
+        if not any(expression.unsampled for expression in self.expressions):
+            return self
+        return replace(self, constants=tuple(sorted((*self.constants, (SAMPLING_TIME, float(sampling_time))))))
 
     def check_channels(self, outputs: Sequence[str], inputs: Sequence[str]) -> None:
         """Raise InputError for a term that uses an unknown channel, an output at lag 0 or an unknown output."""

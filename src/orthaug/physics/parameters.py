@@ -16,7 +16,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_label, check_unique, is_number, nearest
 from orthaug._base.errors import InputError, shown
-from orthaug.data.expressions import FUNCTIONS, RESERVED, Expression, is_name, parse
+from orthaug.data.expressions import FUNCTIONS, RESERVED, SAMPLING_TIME, Expression, is_name, parse
 from orthaug.physics.baseline import Baseline, check_bounds
 from orthaug.physics.excitation import Excitation, excitation
 
@@ -71,6 +71,10 @@ class PhysicsMap:
     theta_names: tuple[str, ...]
     expressions: tuple[Expression, ...]
     constants: tuple[tuple[str, float], ...] = ()
+
+    def __repr__(self) -> str:
+        given = zip(self.theta_names, self.expressions, strict=True)
+        return f"PhysicsMap({'; '.join(f'{name} = {text}' for name, text in given)}; p: {', '.join(self.names)})"
 
     @classmethod
     def of(
@@ -224,6 +228,7 @@ def _parsed(name: str, text: str, known: Mapping[str, float], parameters: Sequen
     for word in re.findall(r"\b[^\W\d]\w*", unicodedata.normalize("NFKC", text)):
         if word not in known and word not in FUNCTIONS and not keyword.iskeyword(word):
             hint = nearest(word, known) or f"; known are {', '.join(known)}"
+            hint = "; give it in `constants`, {'Ts': record.sampling_time}" if word == SAMPLING_TIME else hint
             raise InputError(f"{where} = {text}: unknown name '{word}'{hint}.")
     try:
         expression = parse(text, known)

@@ -46,6 +46,10 @@ class Problem:
     projection: Projection
     excitation: Excitation
 
+    def __repr__(self) -> str:
+        lags = ", ".join(str(lag) for lag in self.layout)
+        return f"Problem({len(self.rows)} rows of {', '.join(self.outputs)}, x: {lags}, {self.baseline!r})"
+
     @property
     def outputs(self) -> tuple[str, ...]:
         return tuple(channel.name for channel in self.record.outputs)
@@ -135,14 +139,18 @@ def pose(
 
     Raises:
         InputError: unknown channels, outputs at lag 0, constant channels, values that are not finite,
-            too few rows; RankError for linearly dependent physics.
+            too few rows, initial values beyond their bounds, a constant `Ts` that is not the sampling time;
+            RankError for linearly dependent physics.
     """
     outputs, inputs = (tuple(c.name for c in group) for group in (record.outputs, record.inputs))
     if not outputs:
         raise InputError("the record has no outputs; there is nothing to fit.")
     check_output_weights(output_weights, len(outputs))
+    baseline.check_initial()
+    baseline = baseline.sampled(record.sampling_time)
     baseline.check_channels(outputs, inputs)
     layout, features = regressor_of(baseline, lags, learner_inputs, outputs, inputs)
+    features = features.sampled(record.sampling_time)
     return _posed(record, baseline, layout, features, output_weights, require_full_rank=require_full_rank)
 
 

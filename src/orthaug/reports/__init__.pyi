@@ -1,3 +1,4 @@
+from .figures import plot as plot
 from .result import CheckResult as CheckResult
 from .result import CompareResult as CompareResult
 from .result import DesignResult as DesignResult

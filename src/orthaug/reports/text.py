@@ -23,6 +23,7 @@ from orthaug.reports.result import (
 if TYPE_CHECKING:
     from orthaug.analysis.validation import Verdict
     from orthaug.fitting.estimates import Estimate
+    from orthaug.models.response import Response
 
 SHOWN = 8  # signals of a design that are listed
 WIDTH = 100  # of wrapped sentences
@@ -199,6 +200,19 @@ def _score_lines(fit: Estimate, result: FitResult) -> list[str]:
                 rmse, nrmse, percent = ("–" if c is None else f"{c:.6g}" for c in cells)
                 rows.append([part, kind, channel.name, f"{rmse} {channel.unit}".strip(), nrmse, percent])
     return _table(rows) if len(rows) > 1 else []
+
+
+def response_text(response: Response) -> str:
+    """Scores of a response where its outputs were measured and it has a value on every row; otherwise nothing."""
+    if any(t.measured is None or t.diverged for t in response.trajectories):
+        return ""
+    kind = "free run" if response.horizon is None else f"{response.horizon} step{'s' * (response.horizon > 1)} ahead"
+    scored = response.scores()
+    rows = [[f"{kind}, {scored.samples} rows", "RMSE", "NRMSE", "FIT %"]]
+    for channel, *numbers in zip(response.outputs, scored.rmse, scored.nrmse, scored.fit, strict=True):
+        rmse, nrmse, percent = ("–" if np.isnan(number) else f"{number:.6g}" for number in numbers)
+        rows.append([channel.name, f"{rmse} {channel.unit}".strip(), nrmse, percent])
+    return "\n".join(_table(rows))
 
 
 def _parameter_cells(result: CompareResult) -> list[list[str]]:

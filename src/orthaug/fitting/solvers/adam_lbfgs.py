@@ -6,7 +6,6 @@ loop. SciPy's L-BFGS-B, called back from Python, took 3 to 6 times longer on bot
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, NamedTuple
@@ -14,7 +13,7 @@ from typing import Annotated, Any, NamedTuple
 from annotated_types import Ge, Gt
 from jaxtyping import Float
 
-from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.jax import Array, jax, jnp, training_clock
 from orthaug._base.progress import RunTell, quiet
 from orthaug._base.registry import check_fields
 from orthaug.fitting.paper_criterion import PaperCriterion, Physics
@@ -84,7 +83,7 @@ class AdamLBFGS:
         """Minimise the joint criterion from θ⁰ and `w`; the loss told to `progress` is a mean square."""
         import optax
 
-        began = time.perf_counter()
+        began = training_clock()
         unknowns = (jnp.zeros_like(physics.start), w)
         loss = _value(criterion, unknowns, chunks, physics)
         done, state = 0, _GradientState(unknowns, None, loss, jnp.asarray(0), jnp.asarray(0))
@@ -98,17 +97,17 @@ class AdamLBFGS:
             )
             burst, second = 1, optimizer is phases[1][1]
             while int(state.iteration) < limit and bool(_going(state)):
-                tick = time.perf_counter()
+                tick = training_clock()
                 stop = jnp.asarray(min(int(state.iteration) + burst, limit))
                 advance = _lbfgs if second else _adam
                 state = jax.block_until_ready(advance(criterion, state, chunks, physics, self.learning_rate, stop))
-                burst = burst_length(burst, time.perf_counter() - tick)
+                burst = burst_length(burst, training_clock() - tick)
                 progress(done + int(state.iteration), float(state.loss) * float(physics.samples))
             done += int(state.iteration)
         finite = bool(jnp.isfinite(state.loss))
         ending = Ending.NON_FINITE if not finite else Ending.CONVERGED if int(state.small) >= 5 else Ending.RUNNING
         v, w = state.unknowns
-        return GradientRun(v, w, done, ending, time.perf_counter() - began)
+        return GradientRun(v, w, done, ending, training_clock() - began)
 
 
 def _going(state: _GradientState) -> Any:

@@ -7,7 +7,6 @@ and this pass is also the linearisation for the next step.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -15,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.jax import Array, jax, jnp, training_clock
 from orthaug._base.progress import RunTell, quiet
 from orthaug.fitting.normal_equations import Normal, linearise
 from orthaug.fitting.solvers.descent import IDENTITY
@@ -88,15 +87,15 @@ def minimise(
         samples: residuals less the physics' own parameters, for the noise variance.
         iterations, tolerance: as of `LevenbergMarquardt`.
     """
-    began = time.perf_counter()
+    began = training_clock()
     options = Options(jnp.asarray(tolerance), jnp.asarray(evidence), jnp.asarray(float(samples)))
     state = _start(criterion, w, arguments, overlap, jnp.asarray(ridge), options)
     burst = 1
     while int(state.code) == Ending.RUNNING and int(state.iteration) < iterations:
-        tick = time.perf_counter()
+        tick = training_clock()
         stop = min(int(state.iteration) + burst, iterations)
         state = jax.block_until_ready(_advance(criterion, state, arguments, options, jnp.asarray(stop)))
-        spent = time.perf_counter() - tick
+        spent = training_clock() - tick
         burst = burst_length(burst, spent)
         progress(int(state.iteration), float(state.normal.loss))
     return TrainingRun(
@@ -106,7 +105,7 @@ def minimise(
         float(effective_weights(state.normal, state.ridge)),
         int(state.iteration),
         Ending(int(state.code)),
-        time.perf_counter() - began,
+        training_clock() - began,
     )
 
 

@@ -10,7 +10,6 @@ Where the rows of a one-step criterion are in memory, the loop is compiled whole
 
 from __future__ import annotations
 
-import time
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -18,6 +17,7 @@ import scipy.linalg
 from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.jax import training_clock
 from orthaug._base.progress import RunTell, quiet
 from orthaug.fitting.status import Ending
 
@@ -149,7 +149,7 @@ def descend(
         ceiling: a trial with a larger `‖r‖²` is rejected.
         bounds: of θ, each (physics,); the start is moved inside.
     """
-    began = time.perf_counter()
+    began = training_clock()
     limits = tuple(np.full(len(p), side) for side in (-np.inf, np.inf))
     if bounds is not None:
         for limit, side in zip(limits, bounds, strict=True):
@@ -157,7 +157,7 @@ def descend(
     flown = objective.fly(np.clip(p, *limits), start)
     linear = objective.linearise(flown) if np.isfinite(flown.loss) else None
     if linear is None or not np.isfinite(linear.hessian).all():
-        return Descent(flown, None, ridge, 0.0, 0, Ending.NON_FINITE, time.perf_counter() - began)
+        return Descent(flown, None, ridge, 0.0, 0, Ending.NON_FINITE, training_clock() - began)
     largest = 1.0 if damping.diagonal else float(np.diag(linear.hessian).max(initial=1e-300))
     iterate = _Iterate(flown, linear, ridge, damping.first * largest, path=(flown.p,))
     ending, done, taken = Ending.RUNNING, 0, 1
@@ -169,7 +169,7 @@ def descend(
         done += 1
         progress(done, iterate.flown.loss)
     effective = effective_weights(iterate.linear.hessian, iterate.ridge, objective.physics)
-    seconds = time.perf_counter() - began
+    seconds = training_clock() - began
     return Descent(iterate.flown, iterate.linear, iterate.ridge, effective, done, ending, seconds, iterate.path)
 
 

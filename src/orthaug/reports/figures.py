@@ -1,0 +1,71 @@
+"""Figures from Python: of responses, of suspects and of comparisons, as the result folders have them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from orthaug._base.checks import check_choice, check_type
+from orthaug._base.errors import InputError
+from orthaug.models.response import Response
+from orthaug.reports.result import CheckResult, CompareResult, FitResult
+
+if TYPE_CHECKING:
+    from orthaug.reports.plots import Figure
+
+_OF_RESPONSES = ("output", "residual", "components")
+
+
+def plot(
+    what: Response | FitResult | CheckResult | CompareResult,
+    kind: str = "output",
+    *,
+    title: str | None = None,
+    path: str | os.PathLike | None = None,
+) -> Figure:
+    """A matplotlib figure; also written as a PNG where there is a `path`.
+
+    Args:
+        what: a response, of `model.simulate` or `model.predict`; or the `result` of `fit_spec` or `compare`.
+        kind: of a response "output" (measured and model), "residual" or "components" (physics and learner). A result
+            has one figure: the biases by suspected terms of a fit, or the comparison.
+        title: of a response's figure; by default what kind of response it is.
+        path: PNG file to write; a file of that name is replaced.
+
+    Raises:
+        InputError: nothing that has a figure, an unknown kind, outputs that were not measured, a path that cannot be
+            written.
+    """
+    wanted = "a Response, such as model.simulate(record), or the `result` of fit_spec or compare"
+    check_type(what, Response | FitResult | CheckResult | CompareResult, "what", wanted)
+    check_choice(kind, _OF_RESPONSES, "`kind`")
+    check_type(title, str | None, "title", "text")
+    check_type(path, str | os.PathLike | None, "path", "a file's name")
+    if path is not None and Path(path).suffix.lower() != ".png":
+        raise InputError(f"{path}: figures are written as PNG; give a name that ends in .png.")
+    figure = _drawn(what, kind, title)
+    if path is not None:
+        from orthaug.reports import plots
+
+        try:
+            plots.save(figure, Path(path))
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written ({error.strerror}).") from None
+    return figure
+
+
+def _drawn(what: Any, kind: str, title: str | None) -> Figure:
+    from orthaug.reports import plots
+
+    if isinstance(what, CompareResult):
+        return plots.comparison_figure(what.comparison)
+    if not isinstance(what, Response):
+        if not what.bias:
+            raise InputError("this result has no suspects, so that there is no figure of their biases.")
+        return plots.bias_figure(what.bias)
+    if kind == "residual" and any(trajectory.measured is None for trajectory in what.trajectories):
+        raise InputError("the outputs of this response were not measured; it has no residual.")
+    horizon = "free run" if what.horizon is None else f"{what.horizon}-step prediction"
+    draw = {"output": plots.output_figure, "residual": plots.residual_figure, "components": plots.components_figure}
+    return draw[kind](what, horizon if title is None else title)
