@@ -47,7 +47,7 @@ def main(repeats: int = 7) -> None:
         commands |= {"import all three": [f"import {', '.join(IMPORTS)}"], "help": [COMMAND, "--help"]}
         for name, spec in write_cases(Path(folder)).items():
             commands[f"fit, {name}"] = [COMMAND, "fit", str(spec), "--out", str(spec.parent / "out")]
-        times = in_turn(commands, repeats, {**os.environ, "JAX_COMPILATION_CACHE_DIR": f"{folder}/cache"})
+        times = in_turn(commands, repeats, environment(folder))
     wall, processor = times["import all three"]
     print("| process | wall | ratio | processor | ratio |\n|---|---|---|---|---|")
     for name, (seconds, busy) in times.items():
@@ -99,6 +99,12 @@ def many_terms() -> tuple[str, Record, Record]:
     )
     inputs = str(names).replace("'", '"')
     return STATIC.format(inputs=inputs, terms=terms), record(4000, 0.01), record(1000, 0.0)
+
+
+def environment(folder: str) -> dict[str, str]:
+    """That of this process, with caches of bytecode and programs that only these processes fill."""
+    kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    return kept | {"PYTHONPYCACHEPREFIX": f"{folder}/bytecode", "JAX_COMPILATION_CACHE_DIR": f"{folder}/programs"}
 
 
 def in_turn(commands: dict[str, list[str]], repeats: int, environment: dict[str, str]) -> dict[str, np.ndarray]:
