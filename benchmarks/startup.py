@@ -1,7 +1,7 @@
 """`orthaug fit` with all its files, its programs compiled before, against a bare import of what it is made of.
 
-The bare import is `import jax, matplotlib.pyplot, pandas`. All run in turn, each a process of its own, timed by the clock
-and by the processor time of all threads; the ratio of the latter holds beside other work, too.
+The bare import is `import jax, matplotlib.pyplot, pandas`. All run in turn, each a process of its own, timed by the
+clock and by the processor time of all threads; the ratio of the latter holds beside other work, too.
 
 Run: python benchmarks/startup.py [REPEATS]
 """
@@ -108,7 +108,7 @@ def environment(folder: str) -> dict[str, str]:
 
 
 def in_turn(commands: dict[str, list[str]], repeats: int, environment: dict[str, str]) -> dict[str, np.ndarray]:
-    """Median seconds of each process, by the clock and of processor time; the first round, which compiles, is left out."""
+    """Median seconds of each process, by the clock and of processor time; the first round compiles and is left out."""
     rounds = [[measured(code, environment) for code in commands.values()] for _ in range(repeats + 1)]
     return dict(zip(commands, np.median(rounds[1:], axis=0), strict=True))
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 def bias_of(job: Job, fit: Estimate | None = None) -> list[dict[str, Any]]:
     """The table of suspects under the spec's measure; after a fit with its θ and what its learner explains.
 
-    Whether a measure can remove a suspect's bias is a question before a fit: then it is asked of the usual suspects, too.
+    Whether a measure can remove a bias is asked before a fit: then it is answered for the usual suspects, too.
     """
     problem, weighed = job.problem, job.weighed
     if fit is not None and fit.problem.weight.kind != problem.weight.kind:  # weighed by the errors that the fit left
