@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Vector, check_choice, check_count, check_type, finite_or_none, is_number
 from orthaug._base.errors import InputError, shown
-from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.jax import Array, jax
 from orthaug._base.parallel import spread
 from orthaug._base.progress import SILENT, Tell
 from orthaug.data.record import Record
@@ -253,7 +253,7 @@ def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStep
         raise InputError(f"`initial` has {bound.ny} outputs, the record {len(problem.outputs)}; fit anew.")
     scaling = Scaling(np.asarray(numbers.centre), np.asarray(numbers.halfwidth))
     task = OneStepTask.of(problem, bound.learner, scaling, np.asarray(numbers.gain), engine)
-    return task, jnp.asarray(numbers.weights), model.theta - model.theta_aux
+    return task, np.asarray(numbers.weights), model.theta - model.theta_aux
 
 
 @dataclass(frozen=True, eq=False)

@@ -126,7 +126,7 @@ class Streamed:
 
     def fly(self, p: Vector, start: Overlap) -> Passed:
         """The normal equations at w = p; `start` is the overlap from the previous pass."""
-        total = self.engine.sum(Blocks(self.bound), self.rows, jnp.asarray(p), start)
+        total = self.engine.sum(Blocks(self.bound), self.rows, p, start)
         normal = _collect(total, self.hold, start)
         return Passed(np.asarray(p), float(normal.loss), normal)
 

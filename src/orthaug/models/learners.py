@@ -290,7 +290,7 @@ class Bound:
         if any(map(is_traced, leaves)):
             return jnp.concatenate([jnp.ravel(leaf) for leaf in leaves])
         flat = [np.ravel(np.asarray(leaf, dtype=float)) for leaf in leaves]  # nothing to compile
-        return jnp.asarray(np.concatenate([np.zeros(0), *flat]))
+        return jax.device_put(np.concatenate([np.zeros(0), *flat]))
 
     def leaves(self, w: Float[Array | np.ndarray, "nw"]) -> list[Float[Array, "..."]]:
         """The weight arrays that the vector holds, in the tree's order."""

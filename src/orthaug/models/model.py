@@ -157,7 +157,7 @@ class Model:
         steps = len(inputs)
         padded = np.zeros((padded_length(steps), inputs.shape[1]))
         padded[:steps] = inputs
-        parts = _free_run(self.form, self.numbers, jnp.asarray(state), jnp.asarray(padded))
+        parts = _free_run(self.form, self.numbers, state, padded)
         return Parts(*(np.asarray(part)[:steps] for part in parts))
 
     def _predict_rows(self, x: Matrix) -> Parts:
@@ -242,7 +242,7 @@ def _in_batches(function: Callable[..., Parts], rows: tuple[np.ndarray, ...], la
         batch = [array[begin : begin + size] for array in rows]
         padding = size - len(batch[0])
         padded = [np.concatenate([b, np.repeat(b[-1:], padding, axis=0)]) if padding else b for b in batch]
-        parts = function(*(jnp.asarray(b) for b in padded))
+        parts = function(*padded)
         pieces.append([np.asarray(part)[: size - padding] for part in parts])
     return Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True)))
 

@@ -74,7 +74,7 @@ class InMemory:
     def lay(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Chunk:
         shape = chunk_shape(len(z), self.limit)
         padded = in_chunks(z, shape, repeat=True)  # zeros may be where the learner has no value
-        return Chunk(*map(jnp.asarray, (padded, *(in_chunks(piece, shape) for piece in (q, e, gain)))))
+        return Chunk(*map(jax.device_put, (padded, *(in_chunks(piece, shape) for piece in (q, e, gain)))))
 
     def sum(self, function: Callable[..., Any], rows: Chunk, *arguments: Any) -> Any:
         return _compiled_sum(function, rows, arguments)

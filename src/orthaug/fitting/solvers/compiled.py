@@ -89,13 +89,13 @@ def minimise(
         iterations, tolerance: as of `LevenbergMarquardt`.
     """
     began = time.perf_counter()
-    options = Options(jnp.asarray(tolerance), jnp.asarray(evidence), jnp.asarray(float(samples)))
-    state = _start(criterion, w, arguments, overlap, jnp.asarray(ridge), options)
+    options = Options(np.float64(tolerance), np.bool_(evidence), np.float64(samples))
+    state = _start(criterion, w, arguments, overlap, np.float64(ridge), options)
     burst = 1
     while int(state.code) == Ending.RUNNING and int(state.iteration) < iterations:
         tick = time.perf_counter()
         stop = min(int(state.iteration) + burst, iterations)
-        state = jax.block_until_ready(_advance(criterion, state, arguments, options, jnp.asarray(stop)))
+        state = jax.block_until_ready(_advance(criterion, state, arguments, options, np.int64(stop)))
         spent = time.perf_counter() - tick
         burst = burst_length(burst, spent)
         progress(int(state.iteration), float(state.normal.loss))
