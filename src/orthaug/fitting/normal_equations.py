@@ -88,12 +88,20 @@ class OneStep:
 
 
 @partial(jax.jit, static_argnames="criterion")
+def one_pass(
+    criterion: Callable[..., Normal], w: Float[Array, "nw"], arguments: tuple[Any, ...], overlap: Overlap
+) -> Normal:
+    """The criterion at w. The programs around it trace it once, together."""
+    return criterion(w, *arguments, overlap)
+
+
+@partial(jax.jit, static_argnames="criterion")
 def linearise(
     criterion: Callable[..., Normal], w: Float[Array, "nw"], arguments: tuple[Any, ...], overlap: Overlap
 ) -> Normal:
     """The criterion at w, in two passes: the second subtracts the overlap of the first."""
-    first = criterion(w, *arguments, overlap)
-    return criterion(w, *arguments, first.overlap)
+    first = one_pass(criterion, w, arguments, overlap)
+    return one_pass(criterion, w, arguments, first.overlap)
 
 
 class Passed(NamedTuple):

@@ -87,7 +87,8 @@ def _compiled_sum(function: Callable[..., Any], rows: Chunk, arguments: tuple[An
 
 def row_sum(function: Callable[[Any], Any], rows: Any) -> Any:
     """Σ function(chunk) over the leading axis of every array in `rows`; any pytree in, any pytree out."""
-    first = jax.tree.map(lambda a: a[0], rows)
+    function = jax.jit(function)  # traced once for its shape and the sum
+    first = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), rows)
     zero = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(function, first))
     total, _ = jax.lax.scan(lambda acc, chunk: (jax.tree.map(jnp.add, acc, function(chunk)), None), zero, rows)
     return total

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 
 from orthaug._base.jax import Array, jax, jnp
 from orthaug._base.progress import RunTell, quiet
-from orthaug.fitting.normal_equations import Normal, linearise
+from orthaug.fitting.normal_equations import Normal, linearise, one_pass
 from orthaug.fitting.solvers.descent import IDENTITY
 from orthaug.fitting.status import Ending
 from orthaug.models.rows import Overlap
@@ -148,7 +148,7 @@ def _trial(criterion: Any, state: State, arguments: tuple[Any, ...], options: Op
     downhill = normal.gradient - alpha * w
     shifted = normal.hessian + (alpha + state.damping) * jnp.eye(w.shape[0])
     step = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(shifted), downhill)
-    trial = criterion(w + step, *arguments, normal.overlap)
+    trial = one_pass(criterion, w + step, arguments, normal.overlap)
 
     before = normal.loss + alpha * (w @ w)
     after = trial.loss + alpha * ((w + step) @ (w + step))
