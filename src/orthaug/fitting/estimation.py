@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from orthaug._base.checks import Vector, check_choice, check_count, check_type, finite_or_none, is_number
 from orthaug._base.errors import InputError, shown
-from orthaug._base.jax import Array, jax
+from orthaug._base.jax import jax
 from orthaug._base.parallel import spread
 from orthaug._base.progress import SILENT, Tell
 from orthaug.data.record import Record
@@ -242,7 +241,7 @@ _GIVEN = Function(lambda w, z: z, lambda key: ())
 """The learner whose values are its features."""
 
 
-def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStepTask, Float[Array, "nw"], Vector]:
+def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStepTask, Vector, Vector]:
     """The task of going on from an earlier model's weights, in its scaling; and the model's c."""
     bound, numbers = model.form.bound, model.numbers
     if numbers.tilt is not None:

@@ -23,8 +23,8 @@ from orthaug.models.rows import Chunk, Engine, Overlap, gram, row_sum
 class Hold(NamedTuple):
     """`‖target − matrix QᵀF‖²`: the structure's hold on the learner's share in the span of the physics."""
 
-    matrix: Float[Array, "nt nt"]
-    target: Float[Array, "nt"]
+    matrix: Float[Array | np.ndarray, "nt nt"]
+    target: Float[Array | np.ndarray, "nt"]
 
 
 class Normal(NamedTuple):

@@ -40,9 +40,9 @@ class Chunk(NamedTuple):
 class Overlap(NamedTuple):
     """The learner's share in the span of the physics, as an earlier pass gave it."""
 
-    jacobian: Float[Array, "nt nw"]
+    jacobian: Float[Array | np.ndarray, "nt nw"]
     """QᵀJ."""
-    values: Float[Array, "nt"]
+    values: Float[Array | np.ndarray, "nt"]
     """QᵀF."""
 
 

@@ -268,7 +268,7 @@ def _headline(figure: Figure, title: str) -> None:
 
 def _label(axis: Axes, *, x: str | None = None, y: str | None = None, title: str | None = None) -> None:
     """Labels at a fixed distance from the panel."""
-    figure = axis.get_figure()
+    figure = axis.get_figure(root=True)
     assert figure is not None
     wide, high = axis.get_position().size * figure.get_size_inches()
     if x is not None:

@@ -43,15 +43,15 @@ class State(NamedTuple):
 class Options(NamedTuple):
     """Numbers of a run that the compiled program takes as arguments."""
 
-    tolerance: Float[Array, ""]
+    tolerance: Float[Array | np.ndarray, ""]
     evidence: Any
-    samples: Float[Array, ""]
+    samples: Float[Array | np.ndarray, ""]
 
 
 class TrainingRun(NamedTuple):
     """The end of one run from one start."""
 
-    w: Float[Array, "nw"]
+    w: Float[Array | np.ndarray, "nw"]
     normal: Normal
     ridge: float
     effective: float
@@ -89,7 +89,7 @@ def minimise(
         iterations, tolerance: as of `LevenbergMarquardt`.
     """
     began = time.perf_counter()
-    options = Options(np.float64(tolerance), np.bool_(evidence), np.float64(samples))
+    options = Options(np.asarray(tolerance), np.asarray(evidence), np.asarray(float(samples)))
     state = _start(criterion, w, arguments, overlap, np.float64(ridge), options)
     burst = 1
     while int(state.code) == Ending.RUNNING and int(state.iteration) < iterations:
