@@ -272,6 +272,19 @@ def test_the_import_and_the_help_page_load_nothing_heavy() -> None:
     assert report["code"] in (0, None)
 
 
+def test_what_a_fit_seldom_needs_is_not_loaded_for_it(tmp_path: Path) -> None:
+    (tmp_path / "run.csv").write_text("u,y\n1,2\n3,4\n", encoding="utf-8")
+    report = loaded_by(
+        "from pathlib import Path\n"
+        "import orthaug.commands.fit, orthaug.fitting.estimation, orthaug.analysis.diagnosis\n"
+        "import orthaug.analysis.free_run_stability, orthaug.analysis.validation\n"
+        "from orthaug.data.tables import read_table\n"
+        f"report['rows'] = len(read_table(Path({str(tmp_path / 'run.csv')!r}), ('u', 'y')).columns['u'])\n"
+        "report['loaded'] = [n for n in ('pandas', 'optax', 'scipy.optimize', 'scipy.stats') if n in sys.modules]"
+    )
+    assert report == {"rows": 2, "loaded": []}
+
+
 def test_reading_a_spec_and_its_data_does_not_load_jax() -> None:
     names = [n for n in FILES if room_of(n) in ("data", "physics")] + ["commands.job", "commands.run"]
     report = loaded_by(

@@ -297,6 +297,7 @@ def test_result_of_physics_alone(fitted):
     assert result["status"]["code"] == "exact"
     assert result["status"]["iterations"] == 0
     assert result["validation"] is None and result["bias"] and result["residuals"]["verdict"]
+    assert [entry["certificate"] for entry in result["bias"]] == [None] * len(result["bias"])  # of none that is named
     assert result["orthogonality_defect"] is None
     assert result["excitation"]["rank"] == 3
     assert [(p["name"], p["unit"], p["initial"]) for p in result["parameters"]] == [

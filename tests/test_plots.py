@@ -116,6 +116,31 @@ def test_residual_shows_the_whole_record():
     assert axis.get_ylabel() == "residual of position [m]"
 
 
+def test_a_long_residual_is_drawn_by_its_outline():
+    """In every column of pixels the least and the largest value stand, gaps aside."""
+    long = response(rows=20_000)
+    (axis,) = plots.residual_figure(long, "").axes
+    trajectory = long.trajectories[0]
+    residual = (trajectory.measured - trajectory.model)[:, 0]
+    time, values = (np.asarray(v) for v in axis.lines[0].get_data())
+    assert len(values) < len(residual) / 5 and np.all(np.diff(time) >= 0)
+    assert (np.nanmin(values), np.nanmax(values)) == (np.nanmin(residual), np.nanmax(residual))
+    begin, end = np.searchsorted(0.1 * np.arange(20_000), time[[1000, 1002]] - 0.05)
+    assert values[1000:1002].tolist() == [residual[begin:end].min(), residual[begin:end].max()]
+
+
+def test_a_large_heat_map_has_no_numbers(tmp_path):
+    def suspect(count: int) -> SuspectResult:
+        unknown = dict.fromkeys(("relative_physical_bias", "expected_physical_bias"))
+        shares = {f"c{i}": 0.01 * i for i in range(count)}
+        return SuspectResult.model_construct(name="drag", relative_bias=shares, coefficient=1.0, size=1.0, **unknown)
+
+    for count, numbers in ((5, 5), (300, 0)):
+        figure = plots.bias_figure([suspect(count)])
+        assert len(figure.axes[0].texts) == numbers and len(figure.axes[0].get_xticks()) == count
+    assert drawn(figure, tmp_path / "figure.png")
+
+
 def drawn(figure: Figure, path) -> bool:
     """Whether a figure becomes a picture that is not blank."""
     plots.save(figure, path)

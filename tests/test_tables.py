@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from orthaug._base.errors import InputError
+from orthaug.data import tables
 from orthaug.data.tables import check_readable, has_column, read_table
 
 
@@ -60,6 +61,20 @@ AS_FOUND = {
 @pytest.mark.parametrize("content", AS_FOUND.values(), ids=AS_FOUND.keys())
 def test_csv_as_it_is_found(tmp_path, content):
     assert values(put(tmp_path, "run.csv", content), "u", "y") == [[1.0, 3.0], [2.0, 4.0]]
+
+
+def test_numpy_and_pandas_read_the_same_numbers(tmp_path, monkeypatch):
+    rng = np.random.default_rng(0)
+    numbers = rng.normal(size=(300, 2)) * 10.0 ** rng.integers(-300, 300, (300, 2))
+    cells = "\n".join(f"{u!r},{y:.12e}" for u, y in numbers.tolist())
+    path = put(tmp_path, "run.csv", f"u,y\n{cells}\n")
+    small = read_table(path, ("y", "u"))
+    monkeypatch.setattr(tables, "_SMALL", 0)
+    large = read_table(path, ("y", "u"))
+    assert [small.filled, small.where(2), small.cell("u", 2)] == [large.filled, large.where(2), large.cell("u", 2)]
+    for name in ("u", "y"):
+        np.testing.assert_array_equal(small.columns[name], large.columns[name])
+    np.testing.assert_array_equal(small.columns["u"], numbers[:, 0])
 
 
 HEADERS = [

@@ -2,5 +2,5 @@ from . import signals as signals
 from .design import design_input as design_input
 from .diagnosis import diagnose as diagnose
 from .free_run_stability import stability as stability
-from .verdict_on_parts import verdict as verdict
 from .suspects import Suspect as Suspect
+from .verdict_on_parts import verdict as verdict

@@ -13,7 +13,6 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import linprog
 
 from orthaug._base.checks import Matrix, Vector, check_unique
 from orthaug._base.errors import InputError
@@ -219,6 +218,8 @@ def find_certificate(projection: Projection, delta: Float[np.ndarray, "N ny"]) -
         projection: of the weighted rows of φ.
         delta: δ weighted alike, (N, ny).
     """
+    from scipy.optimize import linprog  # slow to import
+
     size = np.abs(delta).max(initial=0.0)
     delta = delta / size if size > 0 else delta  # squares of the smallest numbers would be lost
     products = np.einsum("kon,ko->kn", projection.q, delta)

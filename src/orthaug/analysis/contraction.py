@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy import linalg, optimize
+from scipy import linalg
 
 from orthaug._base.checks import Matrix, Vector, check_count
 from orthaug._base.parallel import one_blas_thread
@@ -126,6 +126,8 @@ def _lyapunov(mean: Matrix) -> Iterator[Matrix]:
 
 def _descend(a: Float[np.ndarray, "m n n"], sharpness: float) -> Matrix:
     """Y that lowers `log Σ σ^sharpness / sharpness`, over all singular values σ of all Y A Y⁻¹, from Y = I."""
+    from scipy import optimize  # slow to import
+
     n = a.shape[1]
 
     def value(flat: Vector) -> tuple[float, Vector]:

@@ -82,10 +82,14 @@ def lipschitz(model: Model, record: Record, *, x: Matrix | None = None) -> Lipsc
     with np.errstate(all="ignore"):
         phi = np.asarray(form.baseline.phi(x, form.layout, form.outputs, np))
         rms = np.sqrt(np.mean(np.sum((phi / y_scale[:, None]) ** 2, axis=1), axis=0))
-        for of_phi, scale in ((False, y_scale), (True, np.outer(y_scale, positive(rms)).ravel())):
-            batches = (g.reshape(len(g), len(scale), len(x_scale)) for g in _gradients(form, model.numbers, x, of_phi))
-            norms = [(size(g), size(g * x_scale / scale[:, None])) for g in batches]
-            plain, scaled = (np.concatenate(column) for column in zip(*norms, strict=True))
+        scales = (y_scale, np.outer(y_scale, positive(rms)).ravel())
+        sizes = []
+        for batch in _gradients(form, model.numbers, x):
+            slopes = [g.reshape(len(g), len(scale), -1) for g, scale in zip(batch, scales, strict=True)]
+            scaled = [g * x_scale / scale[:, None] for g, scale in zip(slopes, scales, strict=True)]
+            sizes.append([*map(size, slopes), *map(size, scaled)])
+        of_g, of_phi, scaled_g, scaled_phi = (np.concatenate(column) for column in zip(*sizes, strict=True))
+        for plain, scaled in ((of_g, scaled_g), (of_phi, scaled_phi)):
             largest += [where.worst(record, plain, entries)[0], *where.worst(record, scaled, entries)]
     fewer, plain, scaled = _weight_sizes(form, model.numbers, x, x_scale, y_scale)
     of_weights, there = where.take(fewer), lambda i: entries(int(fewer[i]))
@@ -105,17 +109,17 @@ def _measured(model: Model, record: Record, x: Matrix | None) -> tuple[Matrix, W
     return x, Where.of(lengths, form.first_row), positive(outputs.std(axis=0))
 
 
-def _gradients(form: Lagged, numbers: Numbers, x: Matrix, of_phi: bool) -> Iterator[Any]:
-    """∂g/∂x, or ∂φ/∂x, at regressors (m, nx), in batches that are computed at one shape."""
+def _gradients(form: Lagged, numbers: Numbers, x: Matrix) -> Iterator[list[Any]]:
+    """∂g/∂x and ∂φ/∂x at regressors (m, nx), in batches that are computed at one shape."""
     width = difference_width(x)
     for begin in range(0, len(x), _BATCH):
         rows = np.minimum(np.arange(begin, begin + _BATCH), len(x) - 1)  # the last one again
-        yield np.asarray(_gradient_rows(form, numbers, x[rows], width, of_phi))[: len(x) - begin]
+        yield [np.asarray(g)[: len(x) - begin] for g in _gradient_rows(form, numbers, x[rows], width)]
 
 
-@partial(jax.jit, static_argnames=("form", "of_phi"))
-def _gradient_rows(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"], width: Any, of_phi: bool) -> Array:
-    """∂g/∂x (m, ny, nx), by differences of `width` (nx,) where a learner has no derivative; or ∂φ/∂x."""
+@partial(jax.jit, static_argnames="form")
+def _gradient_rows(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"], width: Any) -> tuple[Array, Array]:
+    """∂g/∂x (m, ny, nx), by differences of `width` (nx,) where a learner has no derivative, and ∂φ/∂x."""
 
     def g(row: Any) -> Any:
         return form.at(numbers, row).total
@@ -124,7 +128,7 @@ def _gradient_rows(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"], widt
         return form.baseline.phi(row, form.layout, form.outputs, jnp)
 
     slope = jax.jacrev(g) if form.differentiable else partial(by_differences, g, width=width)
-    return jax.vmap(jax.jacfwd(phi) if of_phi else slope)(x)
+    return jax.vmap(slope)(x), jax.vmap(jax.jacfwd(phi))(x)
 
 
 def _weight_sizes(

@@ -14,7 +14,10 @@ if TYPE_CHECKING:
 
 
 def bias_of(job: Job, fit: Estimate | None = None) -> list[dict[str, Any]]:
-    """The table of suspects under the spec's measure; after a fit with its θ and what its learner explains."""
+    """The table of suspects under the spec's measure; after a fit with its θ and what its learner explains.
+
+    Whether a measure can remove a bias is asked before a fit: then it is answered for the usual suspects, too.
+    """
     problem, weighed = job.problem, job.weighed
     if fit is not None and fit.problem.weight.kind != problem.weight.kind:  # weighed by the errors that the fit left
         problem, weighed = fit.problem, weigh_problem(job.measure, fit.problem)
@@ -24,4 +27,5 @@ def bias_of(job: Job, fit: Estimate | None = None) -> list[dict[str, Any]]:
     learned = None
     if fit is not None and fit.model.form.bound is not None:
         learned = fit.model.learner_at(weighed.points.x)
-    return bias_under(weighed, problem, suspects, physics=job.physics, theta=theta, learned=learned)
+    options: dict[str, Any] = {"physics": job.physics, "theta": theta, "learned": learned}
+    return bias_under(weighed, problem, suspects, **options, certify_usual=fit is None)

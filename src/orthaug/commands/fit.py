@@ -11,6 +11,7 @@ import numpy as np
 
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
+from orthaug._base.parallel import one_blas_thread
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.warning import Warning
 from orthaug.commands.bias import bias_of
@@ -57,6 +58,7 @@ class Fitted:
         return fit_text(self.fit, self.result) or self.fit.status.message
 
 
+@one_blas_thread()
 def fit_job(job: Job, progress: Progress = SILENT) -> Fitted:
     """Train as the spec says, score every part, and ask whether the learner earns its place."""
     fitted = fit_variant(job, AS_DECLARED, progress)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -12,12 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.checks import Vector, nearest
+from orthaug._base.checks import Matrix, Vector, nearest
 from orthaug._base.errors import InputError, MissingColumnError
 from orthaug._base.memory import check_memory
 from orthaug.data.spreadsheets import as_number, read_sheet, text_number
 from orthaug.data.variables import ENDINGS, foreign, read_variables, short
 
+_SMALL = 4_000_000  # bytes of a text file that NumPy reads sooner than pandas is imported
 _NAMED = 30  # columns that a message lists
 _DECIMAL_COMMA = re.compile(r'(?:^|;)[ \t]*"?[ \t]*[+-]?(?:\d[\d.]*)?,\d+', re.MULTILINE)
 
@@ -119,6 +121,10 @@ def _read_text(path: Path, columns: Sequence[str]) -> Table:
 
 def _cells(path: Path, skipped: int, count: int, separator: str, used: list[str], commas: bool) -> tuple[Any, Any, Any]:
     """The used of `count` columns as numbers, as text (None where all are numbers or empty), and what is not empty."""
+    plain = None if commas else _plain_numbers(path, skipped, count, separator)
+    if plain is not None:
+        numbers = {str(i): column for i, column in enumerate(plain)}
+        return numbers, None, {name: np.full(plain.shape[1], name in numbers) for name in used}
     import pandas as pd
 
     def read(**options: Any) -> pd.DataFrame:
@@ -147,6 +153,28 @@ def _cells(path: Path, skipped: int, count: int, separator: str, used: list[str]
             raise InputError(f"{path}: there are no data rows below the header.") from None
         raise InputError(f"{path}: not a readable table ({short(error)}).") from None
     return texts.apply(lambda column: column.map(_comma_number if commas else text_number)), texts, texts != ""
+
+
+def _plain_numbers(path: Path, skipped: int, count: int, separator: str) -> Matrix | None:
+    """The columns (count, rows) of a small file with a finite number in every cell of every line; None for all others.
+
+    NumPy reads it before pandas would be imported.
+    """
+    if path.stat().st_size > _SMALL:
+        return None
+    text = path.read_bytes()
+    lines = text.count(b"\n") + (not text.endswith(b"\n"))
+    if b'"' in text or lines == skipped:
+        return None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # as where all lines are blank
+            options: dict[str, Any] = {"delimiter": separator, "skiprows": skipped, "comments": None}
+            numbers = np.loadtxt(path, **options, encoding="utf-8-sig", ndmin=2)
+    except (ValueError, UserWarning):
+        return None
+    plain = numbers.shape == (lines - skipped, count) and np.isfinite(numbers).all()
+    return np.ascontiguousarray(numbers.T) if plain else None
 
 
 def _check_no_nul(path: Path) -> None:

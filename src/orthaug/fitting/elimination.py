@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import scipy.optimize
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug.fitting.structures import PenaltyRows, Structure
@@ -92,9 +91,11 @@ class Elimination:
         """Which entries of θ stand at which bound, for the learner's coordinates f."""
         if not self.bounded:
             return {}
+        from scipy.optimize import lsq_linear  # slow to import
+
         matrix, right = self._theta, self._target - self._learner @ f
         scale = np.linalg.norm(matrix, axis=0)
-        solution = scipy.optimize.lsq_linear(
+        solution = lsq_linear(
             matrix / scale, right, bounds=(self.lower * scale, self.upper * scale), method="bvls", tol=1e-14
         )
         return {

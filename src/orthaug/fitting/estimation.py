@@ -7,11 +7,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from orthaug._base.checks import Vector, check_choice, check_count, check_type, is_number
 from orthaug._base.errors import InputError, shown
-from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.jax import jax
 from orthaug._base.progress import SILENT, Tell
 from orthaug.data.record import Record
 from orthaug.data.regressors import Features, Lags
@@ -272,7 +271,7 @@ _GIVEN = Function(lambda w, z: z, lambda key: ())
 """The learner whose values are its features."""
 
 
-def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStepTask, Float[Array, "nw"], Vector]:
+def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStepTask, Vector, Vector]:
     """The task of going on from an earlier model's weights, in its scaling; and the model's c."""
     bound, numbers = model.form.bound, model.numbers
     if numbers.tilt is not None:
@@ -283,7 +282,7 @@ def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStep
         raise InputError(f"`initial` has {bound.ny} outputs, the record {len(problem.outputs)}; fit anew.")
     scaling = Scaling(np.asarray(numbers.centre), np.asarray(numbers.halfwidth))
     task = OneStepTask.of(problem, bound.learner, scaling, np.asarray(numbers.gain), engine)
-    return task, jnp.asarray(numbers.weights), model.theta - model.theta_aux
+    return task, np.asarray(numbers.weights), model.theta - model.theta_aux
 
 
 def _check_record(record: Any, baseline: Any, lags: Any, learner: Any, initial: Any) -> None:

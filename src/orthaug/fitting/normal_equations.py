@@ -23,8 +23,8 @@ from orthaug.models.rows import Chunk, Engine, Overlap, gram, row_sum
 class Hold(NamedTuple):
     """`‖target − matrix QᵀF‖²`: the structure's hold on the learner's share in the span of the physics."""
 
-    matrix: Float[Array, "nt nt"]
-    target: Float[Array, "nt"]
+    matrix: Float[Array | np.ndarray, "nt nt"]
+    target: Float[Array | np.ndarray, "nt"]
 
 
 class Normal(NamedTuple):
@@ -88,12 +88,20 @@ class OneStep:
 
 
 @partial(jax.jit, static_argnames="criterion")
+def one_pass(
+    criterion: Callable[..., Normal], w: Float[Array, "nw"], arguments: tuple[Any, ...], overlap: Overlap
+) -> Normal:
+    """The criterion at w. The programs around it trace it once, together."""
+    return criterion(w, *arguments, overlap)
+
+
+@partial(jax.jit, static_argnames="criterion")
 def linearise(
     criterion: Callable[..., Normal], w: Float[Array, "nw"], arguments: tuple[Any, ...], overlap: Overlap
 ) -> Normal:
     """The criterion at w, in two passes: the second subtracts the overlap of the first."""
-    first = criterion(w, *arguments, overlap)
-    return criterion(w, *arguments, first.overlap)
+    first = one_pass(criterion, w, arguments, overlap)
+    return one_pass(criterion, w, arguments, first.overlap)
 
 
 class Passed(NamedTuple):
@@ -126,7 +134,7 @@ class Streamed:
 
     def fly(self, p: Vector, start: Overlap) -> Passed:
         """The normal equations at w = p; `start` is the overlap from the previous pass."""
-        total = self.engine.sum(Blocks(self.bound), self.rows, jnp.asarray(p), start)
+        total = self.engine.sum(Blocks(self.bound), self.rows, p, start)
         normal = _collect(total, self.hold, start)
         return Passed(np.asarray(p), float(normal.loss), normal)
 

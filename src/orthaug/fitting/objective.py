@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import jnp
 from orthaug.fitting.colour import independent_share
 from orthaug.fitting.elimination import Elimination
 from orthaug.fitting.initial_states import InitialStates, Start
@@ -122,8 +121,8 @@ class FreeRunObjective:
 
     def linearise(self, flown: Flown) -> LinearisedFreeRun:
         """Normal equations about a trial, with its states at their best."""
-        numbers, states = self.numbers(flown.c, flown.w), jnp.asarray(flown.states)
-        slopes = sensitivity(self.dynamics, numbers, self.segments, states, jnp.asarray(self.weight))
+        numbers, states = self.numbers(flown.c, flown.w), flown.states
+        slopes = sensitivity(self.dynamics, numbers, self.segments, states, self.weight)
         start_rows = self.dynamics.start_rows(self.weight)
         information, gradient, offset, slope = self.initial.eliminate(slopes, flown.states, start_rows)
         start = Start(flown.states, flown.misfit, np.concatenate([flown.c, flown.w]), offset, slope)
@@ -176,6 +175,6 @@ class FreeRunObjective:
 
 def errors_of(dynamics: Dynamics, numbers: Numbers, states: Any, segments: Segments) -> Float[np.ndarray, "k T ny m"]:
     """Errors of every segment from its state, in the outputs' units; 0 where they are not scored."""
-    run = np.asarray(respond(dynamics, numbers, segments, jnp.asarray(states)))
+    run = np.asarray(respond(dynamics, numbers, segments, states))
     with np.errstate(all="ignore"):
         return np.where(np.asarray(segments.scored)[:, :, None], np.asarray(segments.target) - run, 0.0)

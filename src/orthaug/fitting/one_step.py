@@ -191,7 +191,7 @@ class OneStepTask:
     ) -> compiled.TrainingRun:
         assert self.bound is not None, "physics alone is not trained one step ahead"
         matrix, target = elimination.hold(fixed)
-        hold = Hold(jnp.asarray(matrix), jnp.asarray(target / self.rms))
+        hold = Hold(matrix, target / self.rms)
         ridge, evidence = ridge_of(regularization)
         if solver.gauss_newton and not structure.from_initial:
             return self._least_squares(solver, w, hold, ridge, evidence, progress)
@@ -205,7 +205,7 @@ class OneStepTask:
         normal = linearise(OneStep(self.bound), end.w, (self.rows, hold), self._nothing)
         coordinates = np.asarray(physics.start + physics.basis @ end.v) * self.rms
         coefficients = None if structure.projects else self.problem.projection.from_coordinates(coordinates)
-        effective = float(compiled.effective_weights(normal, jnp.asarray(ridge)))
+        effective = float(compiled.effective_weights(normal, ridge))
         return compiled.TrainingRun(
             end.w, normal, ridge, effective, end.iterations, end.ending, end.seconds, coefficients
         )
@@ -223,8 +223,8 @@ class OneStepTask:
         """Levenberg-Marquardt over θ, from θ⁰, and the weights together."""
         assert self.bound is not None
         nt = len(physics.outputs)
-        nothing = Overlap(jnp.zeros((nt, nt + self.bound.size)), jnp.zeros(nt))
-        unknowns = jnp.concatenate([jnp.zeros(nt), w])
+        nothing = Overlap(np.zeros((nt, nt + self.bound.size)), np.zeros(nt))
+        unknowns = np.concatenate([np.zeros(nt), w])
         options: dict[str, Any] = {"samples": self.problem.target.size, "progress": progress}
         end = solver.minimise(JointOneStep(self.bound), unknowns, (self.rows, physics), nothing, **options)
         return GradientRun(end.w[:nt], end.w[nt:], end.iterations, end.ending, end.seconds)
@@ -246,14 +246,14 @@ class OneStepTask:
             return compiled.TrainingRun(w, first.normal, ridge, 0.0, 0, Ending.SPANNED, 0.0)
         end = solver.descend(objective, np.asarray(w), first.normal.overlap, damping=IDENTITY, **options)
         normal: Normal = end.flown.normal
-        weights = jnp.asarray(end.flown.p)
+        weights = np.asarray(end.flown.p)
         return compiled.TrainingRun(weights, normal, end.ridge, end.effective, end.iterations, end.ending, end.seconds)
 
     @property
     def _nothing(self) -> Overlap:
         """No overlap known yet."""
         nt, size = len(self.problem.baseline.names), self.bound.size if self.bound else 0
-        return Overlap(jnp.zeros((nt, size)), jnp.zeros(nt))
+        return Overlap(np.zeros((nt, size)), np.zeros(nt))
 
     def loss(self, run: compiled.TrainingRun) -> float:
         """Mean of squared errors of a run, with each output in its standard deviation."""
@@ -332,14 +332,12 @@ class OneStepTask:
         """Σ r rᵀ (ny, ny) of the residual r = Y − F − Φc, in whitened outputs."""
         problem = self.problem
         physics = problem.target_coordinates - problem.projection.to_coordinates @ c
-        total = self.engine.sum(
-            ResidualGram(learned.bound), self.rows, *self._weights(learned), jnp.asarray(physics / self.rms)
-        )
+        total = self.engine.sum(ResidualGram(learned.bound), self.rows, *self._weights(learned), physics / self.rms)
         return np.asarray(total) * self.rms**2
 
     def _sums(self, learned: Learned, shift: Vector) -> tuple[Vector, float]:
         summed = LearnerSums(learned.bound)
-        rest, square = self.engine.sum(summed, self.rows, *self._weights(learned), jnp.asarray(shift / self.rms))
+        rest, square = self.engine.sum(summed, self.rows, *self._weights(learned), shift / self.rms)
         return np.asarray(rest) * self.rms, float(square) * self.rms**2
 
     def values(self, w: Any) -> Float[np.ndarray, "N ny"]:
@@ -357,23 +355,21 @@ class OneStepTask:
         nt = len(self.problem.baseline.names)
         if self.bound is None:
             return np.zeros((nt, 0))
-        total = self.engine.sum(Blocks(self.bound), self.rows, jnp.asarray(w), self._nothing)
+        total = self.engine.sum(Blocks(self.bound), self.rows, w, self._nothing)
         return np.asarray(total[:nt, nt + 1 :]) * self.rms
 
     def _weights(self, learned: Learned) -> tuple[Any, Any]:
         """Weights and tilt of a learned function, the tilt in the coordinates of the rows."""
         if learned.tilt is None:
-            return jnp.asarray(learned.weights), None
-        return jnp.asarray(learned.weights), jnp.asarray(
-            learned.tilt @ self.problem.projection.to_coordinates.T / self.rms
-        )
+            return learned.weights, None
+        return learned.weights, learned.tilt @ self.problem.projection.to_coordinates.T / self.rms
 
     def gram(self, run: compiled.TrainingRun) -> Matrix:
         """Gram matrix of `[Φ J]` in whitened outputs, from the run's last pass; of a held run without the hold."""
         normal = run.normal
         if run.held:
             nt = len(normal.overlap.values)
-            free = Hold(jnp.zeros((nt, nt)), jnp.zeros(nt))
+            free = Hold(np.zeros((nt, nt)), np.zeros(nt))
             assert self.bound is not None
             normal = Streamed(self.engine, self.bound, self.rows, free, 0).fly(np.asarray(run.w), normal.overlap).normal
         overlap = np.asarray(normal.overlap.jacobian) * self.rms
@@ -384,8 +380,8 @@ class OneStepTask:
 
     def middle(self, w: Any, noise: Matrix) -> Matrix:
         """ΣψᵀΣ_eψ of `[Φ J]` for the noise covariance of whitened outputs; one pass over the rows."""
-        mix = jnp.asarray(mixing(noise))
-        total = np.asarray(self.engine.sum(MixedGram(self.bound), self.rows, jnp.asarray(w), mix))
+        mix = mixing(noise)
+        total = np.asarray(self.engine.sum(MixedGram(self.bound), self.rows, w, mix))
         to_phi = self.problem.projection.to_coordinates
         nt = len(to_phi)
         change = np.eye(len(total)) * self.rms
@@ -394,5 +390,5 @@ class OneStepTask:
 
     def physics_middle(self, noise: Matrix) -> Matrix:
         """ΣqᵀΣ_eq (nθ, nθ) of the rows q of Q, for the noise covariance of whitened outputs."""
-        mix = jnp.asarray(mixing(noise))
-        return np.asarray(self.engine.sum(MixedGram(None), self.rows, jnp.zeros(0), mix))
+        mix = mixing(noise)
+        return np.asarray(self.engine.sum(MixedGram(None), self.rows, np.zeros(0), mix))

@@ -62,7 +62,7 @@ def lay_segments(record: Record, dynamics: Dynamics, segment: int, washout: int)
     pieces += [nothing] * (chunks * width - count)
     stacked = (np.stack(part, axis=-1) for part in zip(*pieces, strict=True))
     cut = (np.moveaxis(part.reshape(*part.shape[:-1], chunks, width), -2, 0) for part in stacked)
-    return Segments(*(jnp.asarray(part) for part in cut))
+    return Segments(*map(jax.device_put, cut))
 
 
 def _segment(experiment: Experiment, inputs: Any, begin: int, steps: int, washout: int, dynamics: Dynamics) -> Segments:

@@ -53,8 +53,8 @@ def joint_covariance(problem: Problem, model: Model, convention: str = "calibrat
     engine = InMemory()
     rows = learner_rows(engine, model.form, model.numbers, problem.rows.x, problem.projection.q, problem.weight.matrix)
     whitened = problem.weight.whitened(noise)
-    bound, w = model.form.bound, jnp.asarray(model.numbers.weights)
-    outer, middle = (projected_gram(engine, bound, w, rows, jnp.asarray(m)) for m in (np.eye(ny), mixing(whitened)))
+    bound, w = model.form.bound, np.asarray(model.numbers.weights)
+    outer, middle = (projected_gram(engine, bound, w, rows, m) for m in (np.eye(ny), mixing(whitened)))
     change = np.eye(len(outer))
     change[:nt, :nt] = projection.r / projection.scale
     outer, middle = (change.T @ gram @ change for gram in (outer, middle))
@@ -76,13 +76,13 @@ def prediction_std(model: Model, record: Record) -> list[Matrix]:
         raise InputError(
             "the model has no statistics to take standard errors from (an ensemble, or trained elsewhere)."
         )
-    root = jnp.asarray(joint.root())
+    root = joint.root()
     record = model.fitting(record, need_outputs=True)
     deviations = []
     for experiment in record.experiments:
         x = model.form.regressors(experiment, record)
         shape = chunk_shape(len(x))
-        chunks = jnp.asarray(in_chunks(x, shape, repeat=True))
+        chunks = in_chunks(x, shape, repeat=True)
         variance = np.asarray(_variances(model.form, model.numbers, chunks, root))
         values = np.full((len(experiment), len(model.outputs)), np.nan)
         values[model.form.first_row :] = np.sqrt(np.maximum(from_chunks(variance, len(x)), 0.0))

@@ -13,7 +13,6 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-import scipy.optimize
 import scipy.special
 from jaxtyping import Bool
 
@@ -100,6 +99,8 @@ class _Fit:
 
         Every step solves its linear problem within the bounds exactly: p ends on a bound or away from it.
         """
+        from scipy.optimize import lsq_linear  # slow to import
+
         free = list(self.free)
         low, high = (bound[free] for bound in self.physics.bounds)
         residual, jacobian = self.at(p)
@@ -110,7 +111,7 @@ class _Fit:
             rows = np.vstack([columns, np.diag(np.sqrt(damping) * np.linalg.norm(columns, axis=0))])
             right = np.concatenate([-residual, np.zeros(len(free))])
             limits = ((low - p[free]) / scale, (high - p[free]) / scale)
-            step = scipy.optimize.lsq_linear(rows, right, limits, method="bvls")
+            step = lsq_linear(rows, right, limits, method="bvls")
             new = p.copy()
             moved = np.clip(p[free] + scale * step.x, low, high)
             new[free] = np.where(step.active_mask < 0, low, np.where(step.active_mask > 0, high, moved))
@@ -333,12 +334,14 @@ def profile(
 
 def _crossing(excess: Callable[[float], float], start: float, step: float, bound: float) -> float:
     """Where `excess`, negative at `start`, changes its sign on the way to `bound`; `bound` where it does not."""
+    from scipy.optimize import brentq
+
     inner = start
     for doubling in range(60):  # 10¹⁸ standard deviations
         outer = start + step * 2.0**doubling
         outer = min(outer, bound) if step > 0 else max(outer, bound)
         if excess(outer) > 0:
-            return scipy.optimize.brentq(excess, inner, outer, xtol=1e-10 * abs(step))  # pyright: ignore[reportReturnType]
+            return brentq(excess, inner, outer, xtol=1e-10 * abs(step))  # pyright: ignore[reportReturnType]
         if outer == bound:
             return float(bound)
         inner = outer

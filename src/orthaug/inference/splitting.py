@@ -12,7 +12,6 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
-from orthaug._base.jax import jnp
 from orthaug._base.warning import Warning
 from orthaug.inference.measures import Measure, Points, Support
 from orthaug.inference.weighed import weigh
@@ -98,5 +97,5 @@ def learner_slope(model: Model, points: Points, projection: Projection, unit: np
         return np.zeros((nt, 0))
     engine = InMemory()
     rows = learner_rows(engine, model.form, numbers, points.x, projection.q, unit)
-    overlap = engine.sum(Overlaps(bound), rows, jnp.asarray(numbers.weights))
+    overlap = engine.sum(Overlaps(bound), rows, np.asarray(numbers.weights))
     return projection.from_coordinates(projection.along(model.shared) @ np.asarray(overlap.jacobian))

@@ -17,7 +17,7 @@ import numpy as np
 from annotated_types import Ge
 from jaxtyping import Float
 
-from orthaug._base.checks import Matrix
+from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, shown
 from orthaug._base.jax import Array, is_traced, jax, jnp
 from orthaug._base.registry import OneOf, check_fields
@@ -109,13 +109,14 @@ class MLP:
 
     def init(self, key: Array, nz: int, ny: int) -> Tree:
         sizes = (nz, *self.hidden, ny)
-        keys = jax.random.split(key, len(sizes) - 1)
-        layers = []
-        for i, (fan_in, fan_out) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
-            gain = _GAIN.get(self.activation, 1.0) if i < len(self.hidden) else 1.0
-            a = gain * math.sqrt(6.0 / (fan_in + fan_out))
-            layers.append((_uniform(keys[i], (fan_out, fan_in), a), np.zeros(fan_out)))
-        return layers
+        shapes = list(zip(sizes[1:], sizes[:-1], strict=True))
+        gains = [_GAIN.get(self.activation, 1.0)] * len(self.hidden) + [1.0]
+        reach = np.array([gain * math.sqrt(6.0 / sum(shape)) for gain, shape in zip(gains, shapes, strict=True)])
+        drawn = _uniform(key, reach, max(map(math.prod, shapes)))
+        return [
+            (values[: math.prod(shape)].reshape(shape), np.zeros(shape[0]))
+            for values, shape in zip(drawn, shapes, strict=True)
+        ]
 
     def apply(self, tree: Tree, z: Float[Array, "nz"]) -> Float[Array, "ny"]:
         activation = ACTIVATIONS[self.activation]
@@ -125,15 +126,20 @@ class MLP:
         return weight @ z + bias
 
 
-def _uniform(key: Array, shape: tuple[int, int], a: float) -> Any:
-    """Uniform on [−a, a], drawn in a multiple of 1024: one compiled program for layers of all sizes.
+def _uniform(key: Array, reach: Vector, count: int) -> Any:
+    """Rows of `count` numbers or more, uniform on [−a, a] for each a of `reach`.
 
-    JAX makes each number from its place alone, so they are those that would be drawn at the layer's own size.
+    They are drawn in multiples of 1024: one compiled program for layers of all sizes. JAX makes each number from its
+    place alone, so they are those that would be drawn at the layer's own size.
     """
-    count = math.prod(shape)
-    drawn = jax.random.uniform(key, (-(-count // 1024) * 1024,), minval=-a, maxval=a, dtype=float)
-    drawn = drawn if is_traced(drawn) else np.asarray(drawn)
-    return drawn[:count].reshape(shape)
+    drawn = _drawn(key, reach, -(-count // 1024) * 1024)
+    return drawn if is_traced(drawn) else np.asarray(drawn)
+
+
+@partial(jax.jit, static_argnames="count")
+def _drawn(key: Array, reach: Float[Array, "r"], count: int) -> Float[Array, "r count"]:
+    one = partial(jax.random.uniform, shape=(count,), dtype=float)
+    return jax.vmap(lambda key, a: one(key, minval=-a, maxval=a))(jax.random.split(key, len(reach)), reach)
 
 
 @dataclass(frozen=True)
@@ -260,7 +266,7 @@ class Bound:
     _shape: tuple[Any, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        tree = jax.eval_shape(lambda key: self.learner.init(key, self.nz, self.ny), jax.random.key(0))
+        tree = jax.eval_shape(lambda: self.learner.init(jax.random.key(0), self.nz, self.ny))
         leaves, treedef = jax.tree.flatten(tree)
         if any(not jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves):
             raise InputError(
@@ -312,7 +318,7 @@ class Bound:
         if any(map(is_traced, leaves)):
             return jnp.concatenate([jnp.ravel(leaf) for leaf in leaves])
         flat = [np.ravel(np.asarray(leaf, dtype=float)) for leaf in leaves]  # nothing to compile
-        return jnp.asarray(np.concatenate([np.zeros(0), *flat]))
+        return jax.device_put(np.concatenate([np.zeros(0), *flat]))
 
     def leaves(self, w: Float[Array | np.ndarray, "nw"]) -> list[Float[Array, "..."]]:
         """The weight arrays that the vector holds, in the tree's order."""

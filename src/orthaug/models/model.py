@@ -20,7 +20,7 @@ from orthaug.models.response import Response, Trajectory
 from orthaug.models.statistics import Statistics
 
 RUNAWAY = 1e6  # times the largest training output: a free run beyond this has diverged
-_BATCH = 4096  # rows per compiled call; records of any length share the program
+_BATCH = 1024  # rows per compiled call: longer records share the program, of a free run too
 _WINDOW_CELLS = 8_000_000  # input cells of a batch of multi-step predictions
 
 
@@ -30,9 +30,11 @@ def _predict_rows(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"]) -> Pa
 
 
 @partial(jax.jit, static_argnames="form")
-def _free_run(form: Dynamics, numbers: Numbers, state: Float[Array, "n0"], inputs: Float[Array, "T nu"]) -> Parts:
-    """One scan over the rows, from the state at the first one."""
-    return jax.lax.scan(lambda state, row: form.step(numbers, state, row), state, inputs)[1]
+def _free_run(
+    form: Dynamics, numbers: Numbers, state: Float[Array, "n0"], inputs: Float[Array, "T nu"]
+) -> tuple[Float[Array, "n0"], Parts]:
+    """One scan over the rows, from the state at the first one; with the state after the last."""
+    return jax.lax.scan(lambda state, row: form.step(numbers, state, row), state, inputs)
 
 
 @partial(jax.jit, static_argnames="form")
@@ -154,11 +156,14 @@ class Model:
         if not self.form.states:
             return self._predict_rows(self.form.regressors(experiment, record))
         inputs = self.form.inputs(experiment, record)
-        steps = len(inputs)
-        padded = np.zeros((padded_length(steps), inputs.shape[1]))
-        padded[:steps] = inputs
-        parts = _free_run(self.form, self.numbers, jnp.asarray(state), jnp.asarray(padded))
-        return Parts(*(np.asarray(part)[:steps] for part in parts))
+        size, pieces = min(_BATCH, padded_length(len(inputs))), []
+        for begin in range(0, len(inputs), size):
+            steps = min(size, len(inputs) - begin)
+            padded = np.zeros((size, inputs.shape[1]))
+            padded[:steps] = inputs[begin : begin + steps]
+            state, parts = _free_run(self.form, self.numbers, state, padded)
+            pieces.append([np.asarray(part)[:steps] for part in parts])
+        return Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True)))
 
     def _predict_rows(self, x: Matrix) -> Parts:
         return _in_batches(lambda rows: _predict_rows(self.form, self.numbers, rows), (x,))
@@ -252,7 +257,7 @@ def _in_batches(function: Callable[..., Parts], rows: tuple[np.ndarray, ...], la
         batch = [array[begin : begin + size] for array in rows]
         padding = size - len(batch[0])
         padded = [np.concatenate([b, np.repeat(b[-1:], padding, axis=0)]) if padding else b for b in batch]
-        parts = function(*(jnp.asarray(b) for b in padded))
+        parts = function(*padded)
         pieces.append([np.asarray(part)[: size - padding] for part in parts])
     return Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True)))
 

@@ -40,9 +40,9 @@ class Chunk(NamedTuple):
 class Overlap(NamedTuple):
     """The learner's share in the span of the physics, as an earlier pass gave it."""
 
-    jacobian: Float[Array, "nt nw"]
+    jacobian: Float[Array | np.ndarray, "nt nw"]
     """QᵀJ."""
-    values: Float[Array, "nt"]
+    values: Float[Array | np.ndarray, "nt"]
     """QᵀF."""
 
 
@@ -74,7 +74,7 @@ class InMemory:
     def lay(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Chunk:
         shape = chunk_shape(len(z), self.limit)
         padded = in_chunks(z, shape, repeat=True)  # zeros may be where the learner has no value
-        return Chunk(*map(jnp.asarray, (padded, *(in_chunks(piece, shape) for piece in (q, e, gain)))))
+        return Chunk(*map(jax.device_put, (padded, *(in_chunks(piece, shape) for piece in (q, e, gain)))))
 
     def sum(self, function: Callable[..., Any], rows: Chunk, *arguments: Any) -> Any:
         return _compiled_sum(function, rows, arguments)
@@ -87,7 +87,8 @@ def _compiled_sum(function: Callable[..., Any], rows: Chunk, arguments: tuple[An
 
 def row_sum(function: Callable[[Any], Any], rows: Any) -> Any:
     """Σ function(chunk) over the leading axis of every array in `rows`; any pytree in, any pytree out."""
-    first = jax.tree.map(lambda a: a[0], rows)
+    function = jax.jit(function)  # traced once for its shape and the sum
+    first = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), rows)
     zero = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(function, first))
     total, _ = jax.lax.scan(lambda acc, chunk: (jax.tree.map(jnp.add, acc, function(chunk)), None), zero, rows)
     return total

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
+from orthaug._base.parallel import one_blas_thread
 from orthaug.data.expressions import Lag, parse
 from orthaug.data.record import Record
 from orthaug.data.regressors import Features, Lags, Layout, UsableRows, in_order, lag_matrix, stack_rows
@@ -120,6 +121,7 @@ class Problem:
         return _feature_rows(self.features, self.rows, self.layout, self.record)
 
 
+@one_blas_thread()
 def pose(
     record: Record,
     baseline: Baseline,

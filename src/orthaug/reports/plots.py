@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from functools import wraps
 from pathlib import Path
-from typing import ParamSpec
+from typing import Any, ParamSpec
 
 import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.text import Text
 
 from orthaug.models.response import Response
 from orthaug.reports.findings import ResidualTestResult, SuspectResult
@@ -20,20 +23,28 @@ from orthaug.reports.result import RowResult
 _BLACK, _GREY, _BLUE, _ORANGE, _GREEN = "#000000", "#B8B8B8", "#0072B2", "#E69F00", "#009E73"
 _CYCLE = (_BLUE, _ORANGE, _GREEN, _BLACK)
 _KINDS = ("prediction", "simulation")
+_MOST_NUMBERS = 200  # in a heat map: of more the colours alone are shown
 _WINDOW = 250  # samples of a long record that are shown, so that single swings can be seen
 Drawn = ParamSpec("Drawn")
 _SIZE = (7.0, 2.4)  # inches per panel
+_LEFT, _RIGHT, _TOP, _BOTTOM, _GAP = 0.95, 0.15, 0.6, 0.5, 0.32  # inches around panels and between them
+_TITLE, _YLABEL, _XLABEL = 0.1, 0.72, 0.26  # inches from the figure's edge or the panel's
+_SHARPNESS = 160  # pixels per inch
+_COLUMNS = round(_SIZE[0] * _SHARPNESS)  # more points than these cannot be told apart
+
+
+def _own_style() -> AbstractContextManager[None]:
+    """Text is shown as it is: a `$` in a unit or name begins no formula."""
+    return rc_context({"text.parse_math": False})
 
 
 def _plain(draw: Callable[Drawn, Figure]) -> Callable[Drawn, Figure]:
-    """Figures whose text is shown as it is: a `$` in a unit or name begins no formula."""
+    """Figures in our own style."""
 
     @wraps(draw)
     def drawn(*arguments: Drawn.args, **options: Drawn.kwargs) -> Figure:
-        figure = draw(*arguments, **options)
-        for text in figure.findobj(Text):
-            text.set_parse_math(False)  # type: ignore[attr-defined]
-        return figure
+        with _own_style():
+            return draw(*arguments, **options)
 
     return drawn
 
@@ -51,11 +62,10 @@ def output_figure(response: Response, title: str) -> Figure:
             error = trajectory.measured[rows, i] - trajectory.model[rows, i]
             lower.plot(time, error, color=_BLUE, linewidth=0.9)
         upper.plot(time, trajectory.model[rows, i], color=_BLACK, linewidth=0.9, label="model")
-        upper.set_ylabel(channel.label)
-        lower.set_ylabel("difference" + (f" [{channel.unit}]" if channel.unit else ""))
+        _label(upper, y=channel.label)
+        _label(lower, y="difference" + (f" [{channel.unit}]" if channel.unit else ""))
         _legend(upper)
-    axes[-1].set_xlabel("time [s]")
-    figure.align_ylabels()
+    _label(axes[-1], x="time [s]")
     return figure
 
 
@@ -68,10 +78,10 @@ def residual_figure(response: Response, title: str) -> Figure:
     time = np.arange(len(trajectory.model)) * response.sampling_time
     for i, (axis, channel) in enumerate(zip(axes, response.outputs, strict=True)):
         residual = trajectory.measured[:, i] - trajectory.model[:, i]
-        axis.plot(time, residual, color=_BLUE, linewidth=0.6, rasterized=len(time) > 5000)
+        axis.plot(*_outline(time, residual), color=_BLUE, linewidth=0.6)
         axis.axhline(0.0, color=_BLACK, linewidth=0.6)
-        axis.set_ylabel(f"residual of {channel.label}")
-    axes[-1].set_xlabel("time [s]")
+        _label(axis, y=f"residual of {channel.label}")
+    _label(axes[-1], x="time [s]")
     return figure
 
 
@@ -90,26 +100,23 @@ def components_figure(response: Response, title: str) -> Figure:
             axis.plot(
                 time, values[rows, i], color=color, linewidth=1.1, label=f"{part} part of {channel.name}, {formula}"
             )
-            axis.set_ylabel(part + unit)
+            _label(axis, y=part + unit)
             _legend(axis)
-    axes[-1].set_xlabel("time [s]")
-    figure.align_ylabels()
+    _label(axes[-1], x="time [s]")
     return figure
 
 
 @_plain
 def residual_analysis_figure(tests: Sequence[ResidualTestResult], title: str) -> Figure:
     """Of each residual: autocorrelation, correlation with the inputs, means over its most telling regressor."""
-    figure = Figure(figsize=(_SIZE[0] * 1.3, 0.5 + 2.6 * len(tests)), layout="constrained")
-    axes = figure.subplots(len(tests), 3, squeeze=False)
-    figure.suptitle(f"{title}: 99 % bands", fontsize=10)
+    figure = Figure(figsize=(_SIZE[0] * 1.3, _TOP + 2.6 * len(tests)))
+    axes = _grid(figure, len(tests), 3, gap=(_BOTTOM + 0.3, 0.7))
+    _headline(figure, f"{title}: 99 % bands")
     for row, test in zip(axes, tests, strict=True):
         if test.acf is not None and test.acf_band is not None:
             row[0].bar(np.arange(1, len(test.acf)), _floats(test.acf[1:]), color=_BLUE, width=0.6)
             row[0].axhspan(-test.acf_band, test.acf_band, color=_GREY, alpha=0.5)
-        row[0].set_ylabel(f"residual of {test.name}")
-        row[0].set_xlabel("lag")
-        row[0].set_title("autocorrelation", fontsize=9)
+        _label(row[0], x="lag", y=f"residual of {test.name}", title="autocorrelation")
         shown = [(name, cross) for name, cross in test.cross.items() if cross is not None]
         for (name, cross), color in zip(shown, _CYCLE, strict=False):
             reach = len(cross.values) // 2
@@ -120,8 +127,7 @@ def residual_analysis_figure(tests: Sequence[ResidualTestResult], title: str) ->
             band = max(cross.band or 0.0 for _, cross in shown)
             row[1].axhspan(-band, band, color=_GREY, alpha=0.5)
             row[1].legend(fontsize=8, frameon=False)
-        row[1].set_xlabel("lag behind the input")
-        row[1].set_title("correlation with the inputs", fontsize=9)
+        _label(row[1], x="lag behind the input", title="correlation with the inputs")
         curves = {name: (curve.share or 0.0, curve) for name, curve in test.regressors.items() if curve is not None}
         if curves:
             name = max(curves, key=lambda key: curves[key][0])
@@ -129,11 +135,7 @@ def residual_analysis_figure(tests: Sequence[ResidualTestResult], title: str) ->
             centres, means, errors = (_floats(values) for values in (curve.centres, curve.means, curve.errors))
             row[2].errorbar(centres, means, 2.576 * errors, fmt="o", color=_GREEN, markersize=3)
             row[2].axhline(0.0, color=_BLACK, linewidth=0.6)
-            row[2].set_xlabel(name)
-            row[2].set_title(f"mean over {name}, {100 * share:.2g} % explained", fontsize=9)
-        for axis in row:
-            axis.grid(alpha=0.25)
-            axis.spines[["top", "right"]].set_visible(False)
+            _label(row[2], x=name, title=f"mean over {name}, {100 * share:.2g} % explained")
     return figure
 
 
@@ -142,23 +144,25 @@ def bias_figure(suspects: Sequence[SuspectResult]) -> Figure:
     """Heat map of the bias of each parameter by each suspect, in per cent."""
     names, labels = list(suspects[0].percent), [suspect.name for suspect in suspects]
     shares = np.array([_floats([suspect.percent[name] for name in names]) for suspect in suspects])
-    width, height = 2.6 + 0.8 * len(names) + 0.05 * max(map(len, labels)), 1.2 + 0.28 * len(suspects)
-    figure = Figure(figsize=(max(width, _SIZE[0]), height), layout="constrained")
-    axis = figure.subplots()
+    written = shares.size <= _MOST_NUMBERS
+    left, bottom = 0.3 + 0.075 * max(map(len, labels)), _BOTTOM if written else 0.3 + 0.09 * max(map(len, names))
+    width, height = left + (0.8 if written else 0.18) * len(names), _TOP + bottom + 0.28 * len(suspects)
+    figure = Figure(figsize=(max(width + _RIGHT, _SIZE[0]), height))
+    ((axis,),) = _grid(figure, 1, 1, left=left, bottom=bottom)
     signed = np.sign(shares) * np.log10(1 + np.abs(shares))  # biases of 0.1 % and of 100 % both show
     reach = max(float(np.nanmax(np.abs(signed), initial=0.0)), 1e-12)
     axis.imshow(signed, cmap="PuOr", vmin=-reach, vmax=reach, aspect="auto")
-    for i, j in np.ndindex(*shares.shape):
+    for i, j in np.ndindex(*shares.shape) if written else ():
         if np.isfinite(shares[i, j]):
             dark = abs(signed[i, j]) > 0.6 * reach
             color = "white" if dark else _BLACK
             axis.text(j, i, f"{shares[i, j]:+.2g}", ha="center", va="center", fontsize=7, color=color)
-    axis.set_xticks(range(len(names)), names)
+    axis.set_xticks(range(len(names)), names, rotation=0 if written else 90)
     axis.set_yticks(range(len(suspects)), labels, fontsize=8)
     axis.tick_params(length=0)
+    axis.grid(visible=False)
     axis.spines[:].set_visible(False)
-    title = "bias of each parameter [%] by terms that may be missing (without a guess: of 1 % of the output)"
-    figure.suptitle(title, fontsize=10)
+    _headline(figure, "bias of each parameter [%] by terms that may be missing (without a guess: of 1 % of the output)")
     return figure
 
 
@@ -216,21 +220,74 @@ def _floats(values: Sequence[float | None]) -> np.ndarray:
 
 def save(figure: Figure, path: Path) -> None:
     """Write a PNG that is sharp at column width."""
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), _own_style():
         warnings.simplefilter("ignore")  # such as a unit in letters that the font lacks
-        figure.savefig(path, dpi=160)
+        figure.set_dpi(_SHARPNESS)
+        FigureCanvasAgg(figure).print_png(path, pil_kwargs={"compress_level": 2})  # `savefig` would draw it twice
 
 
 def _panels(response: Response, title: str, heights: tuple[int, ...] = (1,)) -> tuple[Figure, list]:
     """Stacked axes, `len(heights)` per output."""
     ratios = heights * len(response.outputs)
-    figure = Figure(figsize=(_SIZE[0], 0.5 + _SIZE[1] * sum(ratios) / max(heights)), layout="constrained")
-    axes = list(figure.subplots(len(ratios), 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0])
-    for axis in axes:
+    figure = Figure(figsize=(_SIZE[0], _TOP + _SIZE[1] * sum(ratios) / max(heights)))
+    axes = _grid(figure, len(ratios), 1, sharex=True, height_ratios=ratios)[:, 0]
+    _headline(figure, title)
+    return figure, list(axes)
+
+
+def _grid(
+    figure: Figure,
+    rows: int,
+    columns: int,
+    *,
+    gap: tuple[float, float] = (_GAP, _GAP),
+    left: float = _LEFT,
+    bottom: float = _BOTTOM,
+    **options: Any,
+) -> np.ndarray:
+    """Panels (rows, columns) at fixed places; a layout found from the sizes of all texts takes longer than drawing.
+
+    Args:
+        gap: inches between rows and columns; `left` and `bottom` those beside and below them.
+    """
+    width, height = figure.get_size_inches()
+    high, wide = height - _TOP - bottom, width - left - _RIGHT
+    place = {"left": left / width, "right": 1 - _RIGHT / width, "bottom": bottom / height, "top": 1 - _TOP / height}
+    place["hspace"] = gap[0] * rows / max(high - gap[0] * (rows - 1), 0.1)
+    place["wspace"] = gap[1] * columns / max(wide - gap[1] * (columns - 1), 0.1)
+    axes = figure.subplots(rows, columns, squeeze=False, gridspec_kw=place, **options)
+    for axis in axes.flat:
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)
-    figure.suptitle(title, fontsize=10)
-    return figure, axes
+    return axes
+
+
+def _headline(figure: Figure, title: str) -> None:
+    figure.suptitle(title, fontsize=10, y=1 - _TITLE / figure.get_size_inches()[1], va="top")
+
+
+def _label(axis: Axes, *, x: str | None = None, y: str | None = None, title: str | None = None) -> None:
+    """Labels at a fixed distance from the panel."""
+    figure = axis.get_figure(root=True)
+    assert figure is not None
+    wide, high = axis.get_position().size * figure.get_size_inches()
+    if x is not None:
+        axis.set_xlabel(x)
+        axis.xaxis.set_label_coords(0.5, -_XLABEL / high)
+    if y is not None:
+        axis.set_ylabel(y)
+        axis.yaxis.set_label_coords(-_YLABEL / wide, 0.5)
+    if title is not None:
+        axis.set_title(title, fontsize=9, y=1.0)
+
+
+def _outline(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A curve to draw: of a long one the least and the largest value in every column of pixels."""
+    if len(values) <= 4 * _COLUMNS:
+        return time, values
+    starts = np.linspace(0, len(values), _COLUMNS, endpoint=False).astype(int)
+    ends = np.stack([ufunc.reduceat(values, starts) for ufunc in (np.fmin, np.fmax)], axis=1)
+    return np.repeat(time[starts], 2), ends.ravel()
 
 
 def _extent(response: Response, rows: slice) -> str:
@@ -246,5 +303,5 @@ def _window(response: Response) -> tuple[np.ndarray, slice]:
     return np.arange(rows.start, rows.stop) * response.sampling_time, rows
 
 
-def _legend(axis) -> None:  # noqa: ANN001  (a matplotlib Axes)
+def _legend(axis: Axes) -> None:
     axis.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, fontsize=8, frameon=False, ncols=2)

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 
 from orthaug._base.jax import Array, jax, jnp, training_clock
 from orthaug._base.progress import RunTell, quiet
-from orthaug.fitting.normal_equations import Normal, linearise
+from orthaug.fitting.normal_equations import Normal, linearise, one_pass
 from orthaug.fitting.solvers.descent import IDENTITY
 from orthaug.fitting.status import Ending
 from orthaug.models.rows import Overlap
@@ -42,15 +42,15 @@ class State(NamedTuple):
 class Options(NamedTuple):
     """Numbers of a run that the compiled program takes as arguments."""
 
-    tolerance: Float[Array, ""]
+    tolerance: Float[Array | np.ndarray, ""]
     evidence: Any
-    samples: Float[Array, ""]
+    samples: Float[Array | np.ndarray, ""]
 
 
 class TrainingRun(NamedTuple):
     """The end of one run from one start."""
 
-    w: Float[Array, "nw"]
+    w: Float[Array | np.ndarray, "nw"]
     normal: Normal
     ridge: float
     effective: float
@@ -88,13 +88,13 @@ def minimise(
         iterations, tolerance: as of `LevenbergMarquardt`.
     """
     began = training_clock()
-    options = Options(jnp.asarray(tolerance), jnp.asarray(evidence), jnp.asarray(float(samples)))
-    state = _start(criterion, w, arguments, overlap, jnp.asarray(ridge), options)
+    options = Options(np.asarray(tolerance), np.asarray(evidence), np.asarray(float(samples)))
+    state = _start(criterion, w, arguments, overlap, np.float64(ridge), options)
     burst = 1
     while int(state.code) == Ending.RUNNING and int(state.iteration) < iterations:
         tick = training_clock()
         stop = min(int(state.iteration) + burst, iterations)
-        state = jax.block_until_ready(_advance(criterion, state, arguments, options, jnp.asarray(stop)))
+        state = jax.block_until_ready(_advance(criterion, state, arguments, options, np.int64(stop)))
         spent = training_clock() - tick
         burst = burst_length(burst, spent)
         progress(int(state.iteration), float(state.normal.loss))
@@ -147,7 +147,7 @@ def _trial(criterion: Any, state: State, arguments: tuple[Any, ...], options: Op
     downhill = normal.gradient - alpha * w
     shifted = normal.hessian + (alpha + state.damping) * jnp.eye(w.shape[0])
     step = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(shifted), downhill)
-    trial = criterion(w + step, *arguments, normal.overlap)
+    trial = one_pass(criterion, w + step, arguments, normal.overlap)
 
     before = normal.loss + alpha * (w @ w)
     after = trial.loss + alpha * ((w + step) @ (w + step))
