@@ -37,20 +37,23 @@ FORMAT = 2
 _DECLARATION, _ARRAYS = "model.json", "arrays.safetensors"
 
 
-def is_model(folder: Path) -> bool:
-    """Whether a folder holds a saved model and nothing else."""
-    return {p.name for p in folder.iterdir()} <= {_DECLARATION, _ARRAYS}
+def not_a_model(folder: Path) -> str | None:
+    """A file in a folder without manifest that is no part of a model; None where an older version saved one."""
+    return next((p.name for p in sorted(folder.iterdir()) if p.name not in (_DECLARATION, _ARRAYS)), None)
 
 
-def save(model: Model, folder: str | Path) -> None:
-    """Write a model to a folder of its own, whole or not at all.
+def save(model: Model, folder: str | Path, *, force: bool = False) -> None:
+    """Write a model to a folder of its own, whole or not at all. A model that `save` wrote there before is replaced.
+
+    Args:
+        force: replace the folder whatever it holds.
 
     A baseline or learner that is a Python callable cannot be written. Its numbers can; `load` asks for the callable.
 
     Raises:
         InputError: the folder cannot be written, or holds something else.
     """
-    with whole_folder(Path(folder), is_model) as partial:
+    with whole_folder(Path(folder), not_a_model, force=force) as partial:
         write(model, partial)
 
 

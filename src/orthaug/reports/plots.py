@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from functools import wraps
 from pathlib import Path
 from typing import ParamSpec
 
 import numpy as np
+from matplotlib import rc_context, rcParamsDefault
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
@@ -25,12 +27,18 @@ Drawn = ParamSpec("Drawn")
 _SIZE = (7.0, 2.4)  # inches per panel
 
 
+def _own_style() -> AbstractContextManager[None]:
+    """Figures look the same whatever the user's own settings of matplotlib are."""
+    return rc_context({key: value for key, value in rcParamsDefault.items() if not key.startswith("backend")})
+
+
 def _plain(draw: Callable[Drawn, Figure]) -> Callable[Drawn, Figure]:
     """Figures whose text is shown as it is: a `$` in a unit or name begins no formula."""
 
     @wraps(draw)
     def drawn(*arguments: Drawn.args, **options: Drawn.kwargs) -> Figure:
-        figure = draw(*arguments, **options)
+        with _own_style():
+            figure = draw(*arguments, **options)
         for text in figure.findobj(Text):
             text.set_parse_math(False)  # type: ignore[attr-defined]
         return figure
@@ -214,11 +222,11 @@ def _floats(values: Sequence[float | None]) -> np.ndarray:
     return np.array(values, dtype=float)
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a PNG that is sharp at column width."""
-    with warnings.catch_warnings():
+def save(figure: Figure, path: Path, kind: str = "png") -> None:
+    """Write a figure that is sharp at column width; `kind` is also pdf or svg."""
+    with warnings.catch_warnings(), _own_style():
         warnings.simplefilter("ignore")  # such as a unit in letters that the font lacks
-        figure.savefig(path, dpi=160)
+        figure.savefig(path, dpi=160, format=kind)
 
 
 def _panels(response: Response, title: str, heights: tuple[int, ...] = (1,)) -> tuple[Figure, list]:
