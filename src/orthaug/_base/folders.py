@@ -130,10 +130,10 @@ def check_new_file(path: Path, *, force: bool = False) -> None:
         os.stat(target.parent / target.name)
     except FileNotFoundError:
         return
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}).") from None
-    except ValueError:
-        raise InputError(f"{path}: cannot be written (no name of a file).") from None
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:  # such as a NUL byte in the name
+        raise InputError(f"{path}: cannot be written ({getattr(error, 'strerror', None) or error}).") from None
 
 
 @contextmanager
@@ -145,12 +145,12 @@ def whole_file(path: Path, *, force: bool = False) -> Iterator[Path]:
     Raises:
         InputError: the file cannot be written, or exists already and holds something else.
     """
-    check_new_file(path, force=force)
+    check_new_file(path, force=True)  # whether it may be replaced is asked at the end: others write the same
     target = Path(os.path.realpath(path))
     partial = None
     try:
-        if target.exists() and not target.is_file():
-            yield target
+        if path.exists() and not path.is_file():
+            yield path
             return
         partial = PARTIALS.file(target.parent)
         yield partial
@@ -158,7 +158,7 @@ def whole_file(path: Path, *, force: bool = False) -> Iterator[Path]:
             _place_file(partial, target, force)
             PARTIALS.stands(partial, path)
     except FileExistsError:
-        told = f"{path}: exists now, written by someone else meanwhile; give another name, or replace it with --force."
+        told = f"{path}: exists and holds something else; give another name, or replace it with --force."
         raise InputError(told) from None
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or error}).") from None

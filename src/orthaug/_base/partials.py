@@ -24,6 +24,7 @@ class Partials:
         self.lock = threading.RLock()
         self.placed: list[Path] = []
         self._open: dict[Path, Sequence[Path]] = {}
+        self._swept: set[Path] = set()
 
     def folder(self, parent: Path, made: Sequence[Path] = ()) -> Path:
         """A new folder in `parent`; `made` are the parents that vanish with it."""
@@ -73,7 +74,9 @@ class Partials:
             self.discard(partial)
 
     def _named(self, parent: Path, made: Sequence[Path]) -> Path:
-        remove_stale(parent, self._open)
+        if parent not in self._swept:
+            remove_stale(parent, self._open)
+            self._swept.add(parent)
         partial = parent / _name(_PARTIAL)
         self._open[partial] = made
         return partial

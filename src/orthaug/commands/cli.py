@@ -97,7 +97,7 @@ def _complaint(error: Exception) -> str | None:
 
 def _version(show: bool) -> None:
     if show:
-        typer.echo(f"orthaug {__version__}")
+        streams.echo(f"orthaug {__version__}")
         raise typer.Exit
 
 
@@ -122,8 +122,8 @@ def demo(out: OutFolder = None, force: Force = False) -> None:
 
     with training_bar(2 * demonstration.RESTARTS, demonstration.ITERATIONS) as progress:
         text = demonstration.run(folder, progress, force=force)
-    typer.echo(text)
-    typer.echo(f"\nwritten to {folder}")
+    streams.echo(text)
+    streams.echo(f"\nwritten to {folder}")
 
 
 @app.command()
@@ -143,7 +143,7 @@ def check(
     job = open_job(spec, require_full_rank=False)
     check_figure(figure, *job.files, force=force)
     result = check_job(job)
-    typer.echo(result.to_json() if as_json else check_text(result))
+    streams.echo(result.to_json() if as_json else check_text(result))
     if figure is not None and result.bias:
         write_figure(result.bias, figure, force=force)
     try:
@@ -169,10 +169,10 @@ def fit(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force: F
         fitted = fit_job(job, progress)
     write_result(fitted, folder, force=force)
     if as_json:
-        typer.echo(fitted.result.to_json())
+        streams.echo(fitted.result.to_json())
     else:
-        typer.echo(fit_text(fitted.fit, fitted.result))
-        typer.echo(f"\nwritten to {folder}")
+        streams.echo(fit_text(fitted.fit, fitted.result))
+        streams.echo(f"\nwritten to {folder}")
     if not fitted.fit.status.ok:
         raise TrainingError(f"{fitted.fit.status.message}. The account is in {folder / 'result.json'}.")
 
@@ -203,7 +203,7 @@ def compare(
         comparison = comparing.compare(job, model or (), progress)
     comparing.write(comparison, folder, force=force)
     text = compare_text(comparison.result, comparison.verdicts)
-    typer.echo(comparison.result.to_json() if as_json else f"{text}\n\nwritten to {folder}")
+    streams.echo(comparison.result.to_json() if as_json else f"{text}\n\nwritten to {folder}")
 
 
 @app.command()
@@ -272,7 +272,7 @@ def split(
     chosen = read_measure(measure, given, split_place(opened.model, opened.record))
     _prepare_jax()
     result = splitting.split_model(opened, chosen)
-    typer.echo(result.to_json() if as_json else split_text(result))
+    streams.echo(result.to_json() if as_json else split_text(result))
 
 
 @app.command()
@@ -294,7 +294,7 @@ def design(
     designed = designing.design_for(job)
     designing.write(job, designed, out, force=force)
     result = DesignResult.of(designed)
-    typer.echo(result.to_json() if as_json else f"{design_text(result)}\n\nwritten to {out}")
+    streams.echo(result.to_json() if as_json else f"{design_text(result)}\n\nwritten to {out}")
 
 
 @app.command()
@@ -304,7 +304,7 @@ def schema(
     """The JSON schema of what a command writes."""
     from orthaug.reports.result import RESULTS, schema_of
 
-    typer.echo(_json(schema_of(check_choice(command, RESULTS, "COMMAND"))))
+    streams.echo(_json(schema_of(check_choice(command, RESULTS, "COMMAND"))))
 
 
 @app.command()
@@ -328,7 +328,7 @@ def reproduce(
     with study_bars() as progress:
         reproduced = reproduction.reproduce(entries, pipeline=pipeline, small=small, progress=progress)
     reproduction.write(reproduced, folder, pipeline, force=force)
-    typer.echo(f"{reproduction.text(reproduced)}\n\nwritten to {folder}/index.html")
+    streams.echo(f"{reproduction.text(reproduced)}\n\nwritten to {folder}/index.html")
 
 
 def _prepare_jax() -> None:

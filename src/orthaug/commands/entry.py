@@ -11,19 +11,20 @@ import sys
 from orthaug.commands.signals import WATCH
 
 _OF_JAX = ("JAX_PLATFORMS", "JAX_ENABLE_X64", "JAX_COMPILATION_CACHE_DIR", "JAX_DISABLE_JIT")  # the others are dropped
+_LEAST_MEMORY, _MEMORY_PER_CORE = 3.0 * 2**30, 0.15 * 2**30  # bytes of addresses that JAX and BLAS take for themselves
 
 
 def main() -> None:
     """Entry point of the program."""
+    _open_streams()
     WATCH.start()
     from orthaug.commands import streams
 
     streams.prepare()
     _settle()
-    try:
-        os.getcwd()
-    except OSError:
-        streams.say("error: the working folder is gone; change to one that exists.")
+    complaint = _complaint()
+    if complaint is not None:
+        streams.say(f"error: {complaint}")
         sys.exit(2)
     from orthaug.commands import cli
 
@@ -31,6 +32,32 @@ def main() -> None:
         cli.main()
     finally:
         WATCH.hold()
+
+
+def _open_streams() -> None:
+    """Open standard streams that are closed, so that no file takes their number. Writing to a closed output fails."""
+    for number, way in ((0, os.O_RDONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, way)  # takes the lowest number that is free
+
+
+def _complaint() -> str | None:
+    """What keeps every command from running, in words."""
+    from orthaug._base.memory import in_words, limit
+
+    try:
+        os.getcwd()
+    except OSError:
+        return "the working folder is gone; change to one that exists."
+    needed = _LEAST_MEMORY + _MEMORY_PER_CORE * (os.cpu_count() or 1)
+    if limit() < needed and not {"--help", "--version"} & set(sys.argv):
+        return (
+            f"the limit on memory (ulimit -v) is {in_words(limit())}; with its libraries orthaug takes "
+            f"{in_words(needed)} of addresses on this machine. Raise the limit."
+        )
+    return None
 
 
 def _settle() -> None:
@@ -41,7 +68,7 @@ def _settle() -> None:
     for name in list(os.environ):
         if name.startswith("JAX_") and name not in _OF_JAX:
             del os.environ[name]
-    os.environ["MPLBACKEND"] = "agg"
+    os.environ |= {"MPLBACKEND": "agg", "MATPLOTLIBRC": os.devnull}
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     warnings.resetwarnings()
     warnings.simplefilter("ignore")

@@ -38,7 +38,8 @@ def check_inputs_kept(job: Job, folder: Path, models: Iterable[Path] = ()) -> No
     """Raise InputError where the result would take the place of a file or model that the job reads."""
     for file in (*job.files, *models):
         if file.resolve().is_relative_to(folder.resolve()):
-            raise InputError(f"{folder}: holds {file.name}, which this fit reads; give another folder.")
+            what = file.name if file in job.files else f"the model {file}"
+            raise InputError(f"{folder}: holds {what}, which this fit reads; give another folder.")
 
 
 def check_file(out: Path | None, *read: Path, force: bool = False) -> None:

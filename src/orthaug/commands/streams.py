@@ -17,15 +17,7 @@ _PLAIN = {
 
 
 def prepare() -> None:
-    """Open what is closed, so that no file takes its number, and let every letter be written."""
-    for number, way in ((0, os.O_RDONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):  # writing to a closed one must fail
-        try:
-            os.fstat(number)
-        except OSError:
-            opened = os.open(os.devnull, way)
-            if opened != number:
-                os.dup2(opened, number)
-                os.close(opened)
+    """Let every letter be written, and a stream that was closed be written to."""
     codecs.register_error("orthaug.plain", plain)
     for name, number in (("stdout", 1), ("stderr", 2)):
         if getattr(sys, name) is None:
@@ -59,6 +51,12 @@ def _escaped(letter: str) -> str:
     """As JSON writes it: two escapes for a letter beyond 16 bits."""
     units = letter.encode("utf-16-be", "surrogatepass")
     return "".join(f"\\u{units[i]:02x}{units[i + 1]:02x}" for i in range(0, len(units), 2))
+
+
+def echo(text: str) -> None:
+    """A result on standard output."""
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
 
 
 def say(line: str) -> None:

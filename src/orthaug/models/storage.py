@@ -45,10 +45,12 @@ def not_a_model(folder: Path) -> str | None:
 def save(model: Model, folder: str | Path, *, force: bool = False) -> None:
     """Write a model to a folder of its own, whole or not at all. A model that `save` wrote there before is replaced.
 
-    Args:
-        force: replace the folder whatever it holds.
-
     A baseline or learner that is a Python callable cannot be written. Its numbers can; `load` asks for the callable.
+
+    Args:
+        model: what to write.
+        folder: a new one, or one that holds a saved model.
+        force: replace the folder whatever it holds.
 
     Raises:
         InputError: the folder cannot be written, or holds something else.

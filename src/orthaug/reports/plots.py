@@ -10,13 +10,18 @@ from pathlib import Path
 from typing import ParamSpec
 
 import numpy as np
-from matplotlib import rc_context, rcParamsDefault
-from matplotlib.figure import Figure
-from matplotlib.text import Text
 
+from orthaug._base.errors import InputError
 from orthaug.models.response import Response
 from orthaug.reports.findings import ResidualTestResult, SuspectResult
 from orthaug.reports.result import RowResult
+
+try:
+    from matplotlib import rc_context, rcParamsDefault
+    from matplotlib.figure import Figure
+    from matplotlib.text import Text
+except UnicodeDecodeError:
+    raise InputError("matplotlibrc: found letters that are not UTF-8; mend that file, or remove it.") from None
 
 # Okabe-Ito: told apart by every reader
 _BLACK, _GREY, _BLUE, _ORANGE, _GREEN = "#000000", "#B8B8B8", "#0072B2", "#E69F00", "#009E73"
