@@ -1,7 +1,7 @@
 """Surroundings in which the program must hold: places it may not write, signals, streams, settings, altered stores.
 
-Each trial is a shell script of its own. A fault is a traceback, a raw warning, a wrong exit code, more than one line for
-an error, anything partial that is left, or a sentence that is missing. `python benchmarks/surroundings.py [WORD…]` runs
+Each trial is a shell script of its own. A fault is a traceback, a raw warning, a wrong exit code, more than one line
+for an error, anything partial that is left, or a sentence that is missing. `python benchmarks/surroundings.py [WORD…]` runs
 all trials, or those whose name holds a word.
 """
 
@@ -45,7 +45,12 @@ amplitude = 1.0
 [learner]
 """
 RAW = re.compile(r"Traceback|Exception ignored|Warning|^\w*Error\b|Bad key|terminate called|core dumped", re.MULTILINE)
-PRELUDE = 'set -u; O() { "$PYTHON" -c "$MAIN" "$@"; }; '
+PRELUDE = r"""set -u
+O() { "$PYTHON" -c "$MAIN" "$@"; }
+four() { for i in 1 2 3 4; do O "$@" >/dev/null & p="${p-} $!"; done; for i in $p; do wait $i || return; done; }
+ended() { "$PYTHON" -c "$MAIN" fit long.toml --out deep/out & p=$!; sleep $2; kill -$1 $p; wait $p; }
+cached() { JAX_COMPILATION_CACHE_DIR=$PWD/c O fit net.toml --out out; }
+"""
 
 
 class Trial(NamedTuple):
@@ -109,18 +114,18 @@ TRIALS = [
     Trial("figure with dollars", "O check plant.toml --figure x.png && test -s x.png"),
     Trial(
         "four at once",
-        'for i in 1 2 3 4; do O simulate fit run.csv --out s & p="${p-} $!"; done; for i in $p; do wait $i || exit; done',
+        "four simulate fit run.csv --out s",
     ),
     Trial(
         "four fits at once",
-        'for i in 1 2 3 4; do O fit plant.toml --out out >/dev/null & p="${p-} $!"; done; for i in $p; do wait $i || exit; done; test -d out/model',
+        "four fit plant.toml --out out && test -d out/model",
     ),
-    Trial("what a dead process left", f"mkdir .orthaug-partial-$HOST-999999999-0; O fit plant.toml --out out"),
+    Trial("what a dead process left", "mkdir .orthaug-partial-$HOST-999999999-0; O fit plant.toml --out out"),
     # signals
     *(
         Trial(
             f"{name} after {after} s",
-            f'"$PYTHON" -c "$MAIN" fit long.toml --out deep/out & p=$!; sleep {after}; kill -{name} $p; wait $p; c=$?; test ! -e deep && exit $c',
+            f"ended {name} {after}; c=$?; test ! -e deep && exit $c",
             code,
             "nothing was written",
         )
@@ -190,17 +195,21 @@ TRIALS = [
     # stores
     Trial(
         "cache of swapped programs",
-        'cp -r cache c; "$PYTHON" swap.py c; JAX_COMPILATION_CACHE_DIR=$PWD/c O fit net.toml --out out && cmp out/result.json net/result.json || test $? = 1',
+        'cp -r cache c; "$PYTHON" swap.py c; cached && "$PYTHON" same.py out net',
     ),
     Trial(
         "cache of rubbish",
-        "cp -r cache c; for f in c/*-cache; do echo rubbish >$f; done; JAX_COMPILATION_CACHE_DIR=$PWD/c O fit net.toml --out out",
+        "cp -r cache c; for f in c/*-cache; do echo rubbish >$f; done; cached",
     ),
     Trial(
         "cache of empty files",
-        "cp -r cache c; for f in c/*-cache; do : >$f; done; JAX_COMPILATION_CACHE_DIR=$PWD/c O fit net.toml --out out",
+        "cp -r cache c; for f in c/*-cache; do : >$f; done; cached",
     ),
 ]
+SAME = """import json, sys
+first, second = (json.load(open(f"{name}/result.json"))["parameters"] for name in sys.argv[1:])
+assert first == second
+"""
 SWAP = """import pathlib, sys
 files = sorted(pathlib.Path(sys.argv[1]).glob("*-cache"))
 contents = [file.read_bytes() for file in files]
@@ -224,6 +233,7 @@ def make_project(folder: Path) -> None:
     for name, text in texts.items():
         (folder / f"{name}.toml").write_text(text, encoding="utf-8")
     (folder / "swap.py").write_text(SWAP)
+    (folder / "same.py").write_text(SAME)
 
 
 def settings(base: Path) -> dict[str, str]:

@@ -8,14 +8,15 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from orthaug import __version__
 
 MANIFEST = "manifest.json"
-Foreign = Callable[[Path], str | None]
-"""Of a folder without manifest, as older versions wrote them: a file in it that is not theirs, None where all are."""
+Foreign = Callable[[Path, Sequence[str]], str | None]
+"""Of a folder without manifest, as older versions wrote them, and the names of all files in it: one that is not theirs,
+None where all are."""
 
 _OF_THE_SYSTEM = {".DS_Store", "Thumbs.db", "desktop.ini"}  # file managers write these into every folder
 
@@ -31,7 +32,8 @@ def not_ours(folder: Path, foreign: Foreign) -> str | None:
     """A file of a folder that orthaug did not write or that was changed, in words; None where all may be replaced."""
     listed = _read(folder / MANIFEST)
     if listed is None:
-        name = foreign(folder) if any(_names(folder)) else None
+        names = list(_names(folder))
+        name = foreign(folder, names) if names else None
         return None if name is None else f"{name}, which is not known to be orthaug's"
     names = [name for name in _names(folder) if name != MANIFEST]
     for name in names:

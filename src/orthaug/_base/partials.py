@@ -1,4 +1,4 @@
-"""What a process is writing before it stands in its place: named after the process, and removed when that ends early."""
+"""What is written before it stands in its place: named after the process, and removed when that ends early."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from orthaug._base.errors import InputError
@@ -17,9 +17,8 @@ _KNOWN = re.compile(
 )
 
 
-def not_a_result(folder: Path) -> str | None:
+def not_a_result(folder: Path, names: Sequence[str]) -> str | None:
     """A file in a folder without manifest that is no part of a result; None where an older version wrote all."""
-    names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
     strange = [name for name in names if not _KNOWN.fullmatch(name)]
     try:
         content = json.loads((folder / "result.json").read_text(encoding="utf-8"))

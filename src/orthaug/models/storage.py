@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
@@ -37,9 +38,9 @@ FORMAT = 2
 _DECLARATION, _ARRAYS = "model.json", "arrays.safetensors"
 
 
-def not_a_model(folder: Path) -> str | None:
+def not_a_model(folder: Path, names: Sequence[str]) -> str | None:
     """A file in a folder without manifest that is no part of a model; None where an older version saved one."""
-    return next((p.name for p in sorted(folder.iterdir()) if p.name not in (_DECLARATION, _ARRAYS)), None)
+    return next((name for name in names if name not in (_DECLARATION, _ARRAYS)), None)
 
 
 def save(model: Model, folder: str | Path, *, force: bool = False) -> None:

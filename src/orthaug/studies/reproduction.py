@@ -95,9 +95,8 @@ def reproduce(
     return reproduced
 
 
-def not_a_reproduction(folder: Path) -> str | None:
+def not_a_reproduction(folder: Path, names: Sequence[str]) -> str | None:
     """A file in a folder without manifest that is no part of a reproduction; None where an older version wrote all."""
-    names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
     strange = [name for name in names if not _KNOWN.fullmatch(name)]
     return (strange or [None if MARK in names else names[0]])[0]
 
