@@ -107,7 +107,7 @@ def test_a_rename_that_fails_keeps_what_was_there(tmp_path, monkeypatch):
 def test_something_else_is_refused_and_kept(tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.txt").write_text("mine")
-    message = "out: holds thesis.txt, which is not known to be orthaug's; give another folder, or .* with --force"
+    message = "out: holds thesis.txt and is not an orthaug result; give another folder, or .* with --force"
     with pytest.raises(InputError, match=message):
         check_replaceable(tmp_path / "out", foreign)
     with pytest.raises(InputError, match=message):
@@ -176,7 +176,7 @@ def exchange(folder: Path) -> None:
         (add_note, "note.txt, which orthaug did not write"),
         (change, "ours, which was changed since orthaug wrote it"),
         (link, "deep, which orthaug did not write"),
-        (exchange, "manifest.json, which is not known to be orthaug's"),
+        (exchange, "manifest.json and is not an orthaug result"),
     ],
 )
 def test_a_result_with_something_else_is_kept_unless_forced(tmp_path, alter, words):

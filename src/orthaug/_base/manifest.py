@@ -34,7 +34,7 @@ def not_ours(folder: Path, foreign: Foreign) -> str | None:
     if listed is None:
         names = list(_names(folder))
         name = foreign(folder, names) if names else None
-        return None if name is None else f"{name}, which is not known to be orthaug's"
+        return None if name is None else f"{name} and is not an orthaug result"
     names = [name for name in _names(folder) if name != MANIFEST]
     for name in names:
         if name not in listed:
