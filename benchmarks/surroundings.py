@@ -1,7 +1,7 @@
 """Surroundings in which the program must hold: places it may not write, signals, streams, settings, altered stores.
 
 Each trial is a shell script of its own. A fault is a traceback, a raw warning, a wrong exit code, more than one line
-for an error, anything partial that is left, or a sentence that is missing. `python benchmarks/surroundings.py [WORD…]` runs
+for an error, anything partial that is left, or a missing sentence. `python benchmarks/surroundings.py [WORD…]` runs
 all trials, or those whose name holds a word.
 """
 
