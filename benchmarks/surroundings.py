@@ -322,7 +322,7 @@ def main() -> None:
             if found:
                 print(f"{trial.name}: " + "; ".join(found), flush=True)
         if not wanted or "Ctrl-C" in wanted:
-            waits = [0.06 + 0.02 * i for i in range(20)] + [0.5 + 0.4 * i for i in range(20)]
+            waits = [0.2 + 0.1 * i for i in range(10)] + [1.5 + 1.0 * i for i in range(10)]
             found, longest = interrupts(base, environment, waits)
             print("\n".join(found))
             print(f"longest time from Ctrl-C to the end: {longest:.2f} s")

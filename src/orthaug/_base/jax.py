@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 else:
     Array = Any  # in annotations; at run time jaxtyping checks shape and type of whatever is an array
 
-__all__ = ["Array", "is_traced", "jax", "jnp", "padded_length", "use_compilation_cache"]
+__all__ = ["Array", "is_traced", "jax", "jnp", "padded_length", "starts", "use_compilation_cache"]
 
 
 def _real_jax() -> Any:
@@ -74,6 +74,14 @@ def _late_jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any
         return made[0](*args, **kwargs)
 
     return call
+
+
+def starts() -> bool:
+    """Whether JAX finds a device to compute on; what it raises where it does not depends on the platform asked for."""
+    try:
+        return bool(_real_jax().devices())
+    except Exception:
+        return False
 
 
 def is_traced(value: Any) -> bool:

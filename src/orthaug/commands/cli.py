@@ -84,14 +84,17 @@ def main() -> None:
 
 def _complaint(error: Exception) -> str | None:
     """What to tell of an error that is not ours; None of one that should not be."""
+    from orthaug._base.jax import starts
+
     complaint = getattr(error, "format_message", None)  # typer's own, about arguments
     if complaint is not None:
         return complaint()
     text = str(error)
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in text:
         return "there is not enough memory; take fewer rows, a smaller learner, or every n-th row."
-    if isinstance(error, RuntimeError) and "Unable to initialize backend" in text:
-        return f"JAX cannot start with JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS', '')}; unset it, or set it to cpu."
+    platforms = os.environ.get("JAX_PLATFORMS", "")
+    if platforms not in ("", "cpu") and not starts():
+        return f"JAX cannot start with JAX_PLATFORMS={platforms}; unset it, or set it to cpu."
     return None
 
 
