@@ -367,7 +367,9 @@ def test_a_result_is_replaced_whole(project):
     assert run("fit", project, "--out", "out").code == 0
     Path("out/stale.txt").write_text("from the run before")
     project.write_text(SPEC.replace('parameter = "c"', 'parameter = "gain"'))
-    assert run("fit", project, "--out", "out").code == 0
+    done = run("fit", project, "--out", "out")
+    assert done.code == 2 and one_line(done.err, "error: out: holds stale.txt", "--force")
+    assert run("fit", project, "--out", "out", "--force").code == 0
     assert not Path("out/stale.txt").exists()
     assert "gain" in Path("out/result.json").read_text()
     assert listing(project.parent)[:2] == ["out", "out/figures"]
@@ -459,7 +461,7 @@ def test_training_that_fails_leaves_an_account_without_a_model(project, monkeypa
     done = run("fit", project, "--out", "out", *(["--json"] if as_json else []))
     assert done.code == 1
     assert one_line(done.err, "training failed", "not finite", "Rescale the channels", "result.json")
-    assert listing(Path("out")) == ["result.json"]
+    assert listing(Path("out")) == ["manifest.json", "result.json"]
     result = finite_json(Path("out/result.json").read_text(encoding="utf-8"))
     assert result["status"]["code"] == "non_finite"
     assert result["status"]["message"]

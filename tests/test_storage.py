@@ -21,7 +21,7 @@ from orthaug.models.storage import load, save
 from orthaug.physics.baseline import Baseline, Term
 
 SOLVER = LevenbergMarquardt(3)
-FILES = ["arrays.safetensors", "model.json"]
+FILES = ["arrays.safetensors", "model.json"]  # beside the manifest
 FIRST = Path(__file__).parent / "fixtures" / "model_format1"
 
 
@@ -118,7 +118,7 @@ def same(a: Model, b: Model, record: Record) -> None:
 def test_what_is_read_is_what_was_written(models, tmp_path, name, record):
     model = models[name]
     save(model, tmp_path / "model")
-    assert sorted(p.name for p in (tmp_path / "model").iterdir()) == FILES
+    assert sorted(p.name for p in (tmp_path / "model").iterdir()) == [*FILES[:1], "manifest.json", FILES[1]]
     again = load(tmp_path / "model")
     same(model, again, record)
     assert again.form == model.form
@@ -266,7 +266,7 @@ def test_saving_twice_replaces(models, saved):
 def test_a_folder_of_something_else_is_refused_and_kept(models, tmp_path):
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match="model: holds something"):
+    with pytest.raises(InputError, match="model: holds notes.txt and is not an orthaug result"):
         save(models["physics"], tmp_path / "model")
     assert [p.name for p in (tmp_path / "model").iterdir()] == ["notes.txt"]
     with pytest.raises(InputError, match="notes.txt: not a folder"):

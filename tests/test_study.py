@@ -125,7 +125,16 @@ def test_another_version_runs_all(tmp_path):
 
 @pytest.mark.parametrize(
     "content",
-    ["", '{"value": 0.', "[1, 2]", "\x00\x00", "null", '{"value": 0.1}', '{"made": "", "seconds": 1, "result": 3}'],
+    [
+        "",
+        '{"value": 0.',
+        "[1, 2]",
+        "\x00\x00",
+        "null",
+        "[" * 100_000,
+        '{"value": 0.1}',
+        '{"made": "", "seconds": 1, "result": 3}',
+    ],
 )
 def test_cut_files_are_as_good_as_none(tmp_path, content):
     calls = []
@@ -133,6 +142,29 @@ def test_cut_files_are_as_good_as_none(tmp_path, content):
     first = run(study, store=tmp_path)
     for path in (tmp_path / "s").glob("*.json"):
         path.write_text(content, encoding="utf-8")
+    pd.testing.assert_frame_equal(run(study, store=tmp_path), first)
+    assert len(calls) == 12
+
+
+@pytest.mark.parametrize(
+    "alter",
+    [
+        lambda content: content["result"].update(value=1 + content["result"]["value"]),
+        lambda content: content["result"].clear(),
+        lambda content: content["result"].update(value=None),
+        lambda content: content.update(seconds="long"),
+        lambda content: content.pop("sha256"),
+        lambda content: content.update(made=[[["deep"]]]),
+    ],
+)
+def test_altered_records_are_made_again(tmp_path, alter):
+    calls = []
+    study = Study("s", counted(calls), GRID)
+    first = run(study, store=tmp_path)
+    for path in (tmp_path / "s").glob("*.json"):
+        content = json.loads(path.read_text())
+        alter(content)
+        path.write_text(json.dumps(content))
     pd.testing.assert_frame_equal(run(study, store=tmp_path), first)
     assert len(calls) == 12
 

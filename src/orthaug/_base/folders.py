@@ -1,29 +1,41 @@
-"""Folders and files that appear whole or not at all: written beside their place, then renamed."""
+"""Folders and files that appear whole or not at all: written beside their place, then renamed.
+
+What stands in the place is replaced only where orthaug wrote it and nobody changed it, or by force.
+"""
 
 from __future__ import annotations
 
-import shutil
+import os
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from orthaug._base.errors import InputError
+from orthaug._base.manifest import Foreign, not_ours, write_manifest
+from orthaug._base.partials import PARTIALS
 
 
-def check_replaceable(folder: Path, is_ours: Callable[[Path], bool]) -> None:
-    """Raise InputError unless `folder` is absent, empty or ours, and stands where one may write."""
+def check_replaceable(folder: Path, foreign: Foreign, *, force: bool = False) -> None:
+    """Raise InputError unless `folder` is absent, empty or unchanged orthaug's, and stands where one may write.
+
+    Args:
+        foreign: judges a folder without manifest.
+        force: whatever the folder holds may be lost.
+    """
     try:
         there = folder.exists() or folder.is_symlink()
+        if there and not folder.is_dir():
+            raise InputError(f"{folder}: not a folder; give another name.")
+        mine = not_ours(folder, foreign) if there and not force else None
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror}).") from None
+    if mine is not None:
+        raise InputError(f"{folder}: holds {mine}; give another folder, or replace all of it with --force.")
     if there:
-        if not folder.is_dir():
-            raise InputError(f"{folder}: not a folder; give another name.")
-        if any(folder.iterdir()) and not is_ours(folder):
-            raise InputError(
-                f"{folder}: holds something that is not an orthaug result; give another folder, or empty it."
-            )
+        _check_parts_writable(folder)
+    if there and force:
+        _check_no_one_lives_there(folder)
     ancestor = _nearest_ancestor(folder)
     if not ancestor.is_dir():
         raise InputError(f"{folder}: cannot be written; {ancestor} is not a folder.")
@@ -33,59 +45,142 @@ def check_replaceable(folder: Path, is_ours: Callable[[Path], bool]) -> None:
         raise InputError(f"{folder}: cannot be written ({error.strerror} in {ancestor}).") from None
 
 
+def _check_parts_writable(folder: Path) -> None:
+    """Raise InputError where a folder below could not be removed."""
+    for place, _, _ in os.walk(folder):
+        if not os.access(place, os.W_OK | os.X_OK):
+            raise InputError(f"{folder}: cannot be written (Permission denied in {place}).")
+
+
+def _check_no_one_lives_there(folder: Path) -> None:
+    """Even by force neither the home nor the working folder is replaced, nor a folder above them."""
+    place = os.path.realpath(folder)
+    for taken, what in ((os.getcwd(), "working folder"), (os.path.expanduser("~"), "home folder")):
+        if Path(os.path.realpath(taken)).is_relative_to(place):
+            raise InputError(f"{folder}: is or holds the {what}; give another folder.")
+
+
 @contextmanager
-def whole_folder(folder: Path, is_ours: Callable[[Path], bool]) -> Iterator[Path]:
-    """A temporary folder that takes the place of `folder` at the end, and vanishes on any exception."""
-    check_replaceable(folder, is_ours)
-    folder = folder.absolute()
-    created = [p for p in folder.parents if not p.exists()]
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}-partial-", dir=folder.parent))
+def whole_folder(folder: Path, foreign: Foreign, *, force: bool = False) -> Iterator[Path]:
+    """A temporary folder that takes the place of `folder` at the end, and vanishes on any exception.
+
+    A manifest is added. A link is followed: its target is replaced.
+
+    Raises:
+        InputError: the folder cannot be written, or holds what is not orthaug's.
+    """
+    check_replaceable(folder, foreign, force=force)
+    place = Path(os.path.realpath(folder))
+    made = [p for p in place.parents if not p.exists()]
+    partial = None
     try:
-        partial.chmod(0o755)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        partial = PARTIALS.folder(place.parent, made)
         yield partial
-        _put_in_place(partial, folder)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        for parent in created:
-            if parent.is_dir() and not any(parent.iterdir()):
-                parent.rmdir()
-        raise
+        write_manifest(partial)
+        with PARTIALS.lock:
+            check_replaceable(folder, foreign, force=force)
+            _put_in_place(partial, place)
+            PARTIALS.stands(partial, folder)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror or error}).") from None
+    finally:
+        if partial is not None and os.path.lexists(partial):
+            PARTIALS.discard(partial)
 
 
-def _put_in_place(partial: Path, folder: Path) -> None:
+def _put_in_place(partial: Path, place: Path) -> None:
     """Rename. The folder that was there is kept until the new one stands."""
-    if not folder.exists():
-        partial.rename(folder)
+    if not place.exists():
+        partial.rename(place)
         return
-    shelter = Path(tempfile.mkdtemp(prefix=f".{folder.name}-old-", dir=folder.parent))
-    old = folder.rename(shelter / folder.name)
+    shelter = PARTIALS.shelter(place.parent)
+    old = None
     try:
-        partial.rename(folder)
+        old = place.rename(shelter / place.name)
+        partial.rename(place)
     except BaseException:
-        old.rename(folder)
+        if old is not None:
+            old.rename(place)
         raise
     finally:
-        shutil.rmtree(shelter, ignore_errors=True)
+        PARTIALS.discard(shelter)
 
 
 def _nearest_ancestor(folder: Path) -> Path:
-    return next(parent for parent in folder.absolute().parents if parent.exists())
+    return next(parent for parent in Path(os.path.realpath(folder)).parents if parent.exists())
+
+
+def check_new_file(path: Path, *, force: bool = False) -> None:
+    """Raise InputError where a file could not be written, or would replace another without force."""
+    try:
+        if path.is_dir() or not path.name:
+            raise InputError(f"{path}: is a folder; expected the name of a file.")
+        if path.is_file() and not force:
+            raise InputError(f"{path}: exists; give another name, or replace it with --force.")
+        if path.exists():
+            return
+        target = Path(os.path.realpath(path))
+        if target.is_symlink():
+            raise InputError(f"{path}: is a link to itself; give another name.")
+        if not target.parent.is_dir():
+            raise InputError(f"{path}: cannot be written; there is no folder {path.parent}.")
+        if not os.access(target.parent, os.W_OK | os.X_OK):
+            raise InputError(f"{path}: cannot be written (Permission denied in {path.parent}).")
+        os.stat(target.parent / target.name)
+    except FileNotFoundError:
+        return
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:  # such as a NUL byte in the name
+        raise InputError(f"{path}: cannot be written ({getattr(error, 'strerror', None) or error}).") from None
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
+def whole_file(path: Path, *, force: bool = False) -> Iterator[Path]:
     """A file beside `path` that takes its place at the end, and vanishes on any exception.
 
+    A link is followed: its target is written. What is no regular file, such as a pipe, is written into.
+
     Raises:
-        InputError: the file cannot be written.
+        InputError: the file cannot be written, or exists already and holds something else.
     """
-    partial = path.with_name(f".{path.name}.partial")
+    check_new_file(path, force=True)  # whether it may be replaced is asked at the end: others write the same
+    target = Path(os.path.realpath(path))
+    partial = None
     try:
+        if path.exists() and not path.is_file():
+            yield path
+            return
+        partial = PARTIALS.file(target.parent)
         yield partial
-        partial.replace(path)
+        with PARTIALS.lock:
+            _place_file(partial, target, force)
+            PARTIALS.stands(partial, path)
+    except FileExistsError:
+        told = f"{path}: exists and holds something else; give another name, or replace it with --force."
+        raise InputError(told) from None
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or error}).") from None
     finally:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
+        if partial is not None and os.path.lexists(partial):
+            PARTIALS.discard(partial)
+
+
+def _place_file(partial: Path, target: Path, force: bool) -> None:
+    """Rename; without force only where nothing else has appeared. Whoever wrote the same bytes is no one else."""
+    if not force:
+        try:
+            os.link(partial, target)
+        except FileExistsError:
+            if target.read_bytes() != partial.read_bytes():
+                raise
+        except OSError:  # a file system without links
+            if target.exists():
+                raise FileExistsError from None
+        else:
+            partial.unlink()
+            return
+    with suppress(FileNotFoundError):
+        partial.chmod(target.stat().st_mode & 0o777)
+    partial.replace(target)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 else:
     Array = Any  # in annotations; at run time jaxtyping checks shape and type of whatever is an array
 
-__all__ = ["Array", "is_traced", "jax", "jnp", "padded_length", "use_compilation_cache"]
+__all__ = ["Array", "is_traced", "jax", "jnp", "padded_length", "starts", "use_compilation_cache"]
 
 
 def _real_jax() -> Any:
@@ -33,7 +33,7 @@ def _real_jax() -> Any:
         PrecisionError: the environment forbids double precision.
     """
     asked = os.environ.get("JAX_ENABLE_X64", "")
-    if asked.strip().lower() in {"0", "false", "f", "no", "n", "off"}:
+    if asked.strip().lower() not in {"", "1", "true", "t", "yes", "y", "on"}:
         raise PrecisionError(
             "orthaug computes in double precision, but the environment has "
             f"JAX_ENABLE_X64={asked}. Unset it, or set it to 1."
@@ -75,6 +75,14 @@ def _late_jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any
         return made[0](*args, **kwargs)
 
     return call
+
+
+def starts() -> bool:
+    """Whether JAX finds a device to compute on; what it raises where it does not depends on the platform asked for."""
+    try:
+        return bool(_real_jax().devices())
+    except Exception:
+        return False
 
 
 def is_traced(value: Any) -> bool:
@@ -129,7 +137,10 @@ def use_compilation_cache() -> None:
     """Keep compiled programs between processes (the command line does; the library never on its own)."""
     import platformdirs
 
+    from orthaug._base.programs import check_cached_programs
+
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or platformdirs.user_cache_dir("orthaug")
     jax.config.update("jax_compilation_cache_dir", folder)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    check_cached_programs()

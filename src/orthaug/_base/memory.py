@@ -13,6 +13,23 @@ def available() -> float:
     return min(_unused(), _allowed())
 
 
+def limit() -> float:
+    """Bytes of addresses that this process may take at most (`ulimit -v`); infinite where nothing says so."""
+    try:
+        import resource
+    except ImportError:
+        return math.inf
+    size = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return math.inf if size == resource.RLIM_INFINITY else float(size)
+
+
+def check_limit(size: float, what: str) -> None:
+    """Raise InputError where a limit on the process, which ends it without a word, leaves less than `size` bytes."""
+    there = _allowed()
+    if size > there:
+        raise InputError(f"{what} takes {in_words(size)} of memory; the limit (ulimit -v) leaves {in_words(there)}.")
+
+
 def check_memory(size: float, what: str) -> None:
     """Raise InputError where `size` bytes are more than there are; `what` begins the sentence."""
     there = available()
@@ -41,13 +58,11 @@ def _unused() -> float:
 
 def _allowed() -> float:
     """What limits on the process (`ulimit -v`) leave."""
+    most = limit()
+    if math.isinf(most):
+        return most
     try:
-        import resource
-
-        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-        if limit == resource.RLIM_INFINITY:
-            return math.inf
         with open("/proc/self/statm", encoding="ascii") as file:
-            return max(0.0, limit - int(file.read().split()[0]) * resource.getpagesize())
-    except (ImportError, OSError, ValueError):
+            return max(0.0, most - int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE"))
+    except (OSError, ValueError):
         return math.inf

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from orthaug._base.progress import SILENT, Progress
+from orthaug.commands.signals import WATCH
 
 
 @contextmanager
@@ -27,6 +28,7 @@ def training_bar(runs: int, iterations: int, wanted: bool = True) -> Iterator[Pr
     with (
         _deferred_interrupt() as interrupted,
         Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar,
+        WATCH.telling(lambda: reached, bar.stop),
     ):
         task = bar.add_task("compiling", total=runs * iterations)
         done: dict[int, int] = {}
@@ -56,26 +58,36 @@ def study_bars() -> Iterator[Callable[[str, int, int], None]]:
 
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    reached = "the start of the studies"
     with (
         _deferred_interrupt() as interrupted,
         Bar(*columns, console=console, disable=not console.is_terminal) as bar,
+        WATCH.telling(lambda: reached, bar.stop),
     ):
         tasks: dict[str, Any] = {}
 
         def tell(title: str, done: int, total: int) -> None:
+            nonlocal reached
+            reached = f"'{title}', {done} of {total} runs done and kept for the next time"
             if title not in tasks:
                 tasks[title] = bar.add_task(title, total=total)
             bar.update(tasks[title], completed=done)
             if interrupted.is_set():
-                raise KeyboardInterrupt(f"'{title}', {done} of {total} runs done and kept for the next time")
+                raise KeyboardInterrupt(reached)
 
         yield tell
 
 
 @contextmanager
 def _deferred_interrupt() -> Iterator[threading.Event]:
-    """Ctrl-C sets the event, so that it never lands inside compiled code; a second one interrupts at once."""
+    """Ctrl-C sets the event, so that it never lands inside compiled code; a second one interrupts at once.
+
+    Where a thread watches for signals, it ends the program itself.
+    """
     event = threading.Event()
+    if WATCH.active:
+        yield event
+        return
 
     def note(signum: int, frame: object) -> None:
         if event.is_set():

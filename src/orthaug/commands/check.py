@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
+
+from orthaug._base.folders import whole_file
 from orthaug.commands.bias import bias_of
 from orthaug.commands.job import Job
 from orthaug.commands.shared import shared_of
 from orthaug.physics.excitation import identifiability
+from orthaug.reports.findings import SuspectResult
 from orthaug.reports.result import CheckResult
 
 
@@ -25,3 +30,11 @@ def check_job(job: Job) -> CheckResult:
             "warnings": job.warnings,
         }
     )
+
+
+def write_figure(bias: Sequence[SuspectResult], out: Path, *, force: bool = False) -> None:
+    """The heat map of the biases, whole or not at all."""
+    from orthaug.reports import plots
+
+    with whole_file(out, force=force) as partial:
+        plots.save(plots.bias_figure(bias), partial, kind=out.suffix[1:].lower())

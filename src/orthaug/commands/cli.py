@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import gc
 import json
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +15,9 @@ import typer.core
 from orthaug import __version__
 from orthaug._base.checks import check_choice
 from orthaug._base.errors import InputError, TrainingError
+from orthaug.commands import streams
 from orthaug.commands.bars import study_bars, training_bar
+from orthaug.commands.signals import WATCH
 
 if TYPE_CHECKING:
     from orthaug.models.response import Response
@@ -51,14 +53,15 @@ Initial = Annotated[
     str | None,
     typer.Option("--initial", metavar="measured|zero|INIT", help="Outputs before the first step; INIT is a CSV."),
 ]
+Force = Annotated[bool, typer.Option("--force", help="Replace what is there, whoever wrote it.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the summary.")]
 
 
 def main() -> None:
     """Entry point: runs the command and turns errors into one line and an exit code."""
-    gc.set_threshold(100_000, 50, 100)  # what imports and traces leave is no garbage: looking for it costs a tenth
     try:
         code = app(standalone_mode=False)
+        sys.stdout.flush()
     except InputError as error:
         _fail(f"error: {error}", 2)
     except TrainingError as error:
@@ -66,21 +69,39 @@ def main() -> None:
     except (Interrupted, KeyboardInterrupt) as interrupt:
         _fail(f"interrupted{''.join(f' during {text}' for text in interrupt.args)}; nothing was written", 130)
     except BrokenPipeError:
-        sys.stderr.close()
+        streams.silence(sys.stdout)
         sys.exit(0)
+    except OSError as error:
+        streams.silence(sys.stdout)
+        what = error.filename or "standard output"
+        _fail(f"error: {InputError(f'{what}: cannot be read or written ({error.strerror or error}).')}", 2)
     except Exception as error:
-        complaint = getattr(error, "format_message", None)  # typer's own, about arguments
-        if complaint is None:
+        text = _complaint(error)
+        if text is None:
             raise
-        text = complaint()
-        line = text if text.startswith("Usage") else f"error: {' '.join(text.split())}"
-        _fail(line, getattr(error, "exit_code", 2))
+        _fail(text if text.startswith("Usage") else f"error: {' '.join(text.split())}", getattr(error, "exit_code", 2))
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _complaint(error: Exception) -> str | None:
+    """What to tell of an error that is not ours; None of one that should not be."""
+    from orthaug._base.jax import starts
+
+    complaint = getattr(error, "format_message", None)  # typer's own, about arguments
+    if complaint is not None:
+        return complaint()
+    text = str(error)
+    if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in text:
+        return "there is not enough memory; take fewer rows, a smaller learner, or every n-th row."
+    platforms = os.environ.get("JAX_PLATFORMS", "")
+    if platforms not in ("", "cpu") and not starts():
+        return f"JAX cannot start with JAX_PLATFORMS={platforms}; unset it, or set it to cpu."
+    return None
 
 
 def _version(show: bool) -> None:
     if show:
-        typer.echo(f"orthaug {__version__}")
+        streams.echo(f"orthaug {__version__}")
         raise typer.Exit
 
 
@@ -94,19 +115,19 @@ def _options(
 
 
 @app.command()
-def demo(out: OutFolder = None) -> None:
+def demo(out: OutFolder = None, force: Force = False) -> None:
     """Fit the paper's example and compare with the truth."""
     from orthaug.commands.folder import check_folder
 
     folder = out or Path("orthaug-out/demo")
-    check_folder(folder)
+    check_folder(folder, force=force)
     _prepare_jax()
     from orthaug.commands import demo as demonstration
 
     with training_bar(2 * demonstration.RESTARTS, demonstration.ITERATIONS) as progress:
-        text = demonstration.run(folder, progress)
-    typer.echo(text)
-    typer.echo(f"\nwritten to {folder}")
+        text = demonstration.run(folder, progress, force=force)
+    streams.echo(text)
+    streams.echo(f"\nwritten to {folder}")
 
 
 @app.command()
@@ -114,22 +135,21 @@ def check(
     spec: SpecPath,
     as_json: AsJson = False,
     figure: Annotated[Path | None, typer.Option("--figure", metavar="PNG", help="Heat map of the biases.")] = None,
+    force: Force = False,
 ) -> None:
     """Report excitation and identifiability; trains nothing."""
-    from orthaug.commands.check import check_job
-    from orthaug.commands.folder import check_file
+    from orthaug.commands.check import check_job, write_figure
+    from orthaug.commands.folder import check_figure
     from orthaug.commands.job import open_job
     from orthaug.physics.excitation import require_rank
     from orthaug.reports.text import check_text
 
     job = open_job(spec, require_full_rank=False)
+    check_figure(figure, *job.files, force=force)
     result = check_job(job)
-    typer.echo(result.to_json() if as_json else check_text(result))
+    streams.echo(result.to_json() if as_json else check_text(result))
     if figure is not None and result.bias:
-        from orthaug.reports import plots
-
-        check_file(figure, *job.files)
-        plots.save(plots.bias_figure(result.bias), figure)
+        write_figure(result.bias, figure, force=force)
     try:
         require_rank(job.problem.excitation, job.problem.rows.y.size)
     except InputError as error:
@@ -137,7 +157,7 @@ def check(
 
 
 @app.command()
-def fit(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False) -> None:
+def fit(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force: Force = False) -> None:
     """Fit a spec, print a summary and write the result folder."""
     from orthaug.commands.fit import fit_job, write_result
     from orthaug.commands.folder import check_folder, check_inputs_kept
@@ -145,18 +165,18 @@ def fit(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False) -> None:
     from orthaug.reports.text import fit_text
 
     folder = out or Path("orthaug-out") / spec.stem
-    check_folder(folder)
+    check_folder(folder, force=force)
     job = open_job(spec)
     check_inputs_kept(job, folder)
     _prepare_jax()
     with training_bar(job.run_count, job.iterations, job.spec.declared_learner() is not None) as progress:
         fitted = fit_job(job, progress)
-    write_result(fitted, folder)
+    write_result(fitted, folder, force=force)
     if as_json:
-        typer.echo(fitted.result.to_json())
+        streams.echo(fitted.result.to_json())
     else:
-        typer.echo(fit_text(fitted.fit, fitted.result))
-        typer.echo(f"\nwritten to {folder}")
+        streams.echo(fit_text(fitted.fit, fitted.result))
+        streams.echo(f"\nwritten to {folder}")
     if not fitted.fit.status.ok:
         raise TrainingError(f"{fitted.fit.status.message}. The account is in {folder / 'result.json'}.")
 
@@ -169,6 +189,7 @@ def compare(
         list[Path] | None, typer.Option("--model", metavar="MODEL", help="A saved model to put beside; any number.")
     ] = None,
     as_json: AsJson = False,
+    force: Force = False,
 ) -> None:
     """Physics alone and every structure, one table."""
     from orthaug.commands.folder import check_folder, check_inputs_kept
@@ -176,17 +197,17 @@ def compare(
     from orthaug.reports.text import compare_text
 
     folder = out or Path("orthaug-out") / spec.stem
-    check_folder(folder)
+    check_folder(folder, force=force)
     job = open_job(spec)
-    check_inputs_kept(job, folder)
+    check_inputs_kept(job, folder, model or ())
     _prepare_jax()
     from orthaug.commands import compare as comparing
 
     with training_bar(job.run_count * len(comparing.compared()), job.iterations) as progress:
         comparison = comparing.compare(job, model or (), progress)
-    comparing.write(comparison, folder)
+    comparing.write(comparison, folder, force=force)
     text = compare_text(comparison.result, comparison.verdicts)
-    typer.echo(comparison.result.to_json() if as_json else f"{text}\n\nwritten to {folder}")
+    streams.echo(comparison.result.to_json() if as_json else f"{text}\n\nwritten to {folder}")
 
 
 @app.command()
@@ -195,6 +216,7 @@ def simulate(
     data: DataPath,
     out: OutFile = None,
     initial: Initial = None,
+    force: Force = False,
 ) -> None:
     """Free run of a saved model on a data file."""
     from orthaug.commands import run
@@ -202,9 +224,9 @@ def simulate(
 
     opened = run.open_run(model, data)
     start = run.read_initial(initial, opened)
-    check_file(out, data, Path(initial or data))
+    check_file(out, model, data, Path(initial or data), force=force)
     _prepare_jax()
-    _write_response(opened.model.simulate(opened.record, initial=start), out, run.notes(opened, initial))
+    _write_response(opened.model.simulate(opened.record, initial=start), out, force, run.notes(opened, initial))
 
 
 @app.command()
@@ -214,6 +236,7 @@ def predict(
     horizon: Annotated[int, typer.Option("--horizon", metavar="H", help="Steps ahead.")] = 1,
     out: OutFile = None,
     initial: Initial = None,
+    force: Force = False,
 ) -> None:
     """H-step-ahead prediction of a saved model."""
     from orthaug.commands import run
@@ -221,9 +244,9 @@ def predict(
 
     opened = run.open_run(model, data, need_outputs=True)
     record = run.with_initial(opened, run.read_initial(initial, opened))
-    check_file(out, data, Path(initial or data))
+    check_file(out, model, data, Path(initial or data), force=force)
     _prepare_jax()
-    _write_response(opened.model.predict(record, horizon=horizon), out)
+    _write_response(opened.model.predict(record, horizon=horizon), out, force)
 
 
 @app.command()
@@ -253,7 +276,7 @@ def split(
     chosen = read_measure(measure, given, split_place(opened.model, opened.record))
     _prepare_jax()
     result = splitting.split_model(opened, chosen)
-    typer.echo(result.to_json() if as_json else split_text(result))
+    streams.echo(result.to_json() if as_json else split_text(result))
 
 
 @app.command()
@@ -261,6 +284,7 @@ def design(
     spec: SpecPath,
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="CSV file for the input.")],
     as_json: AsJson = False,
+    force: Force = False,
 ) -> None:
     """An input within limits under which suspected terms and noise disturb the parameters least."""
     from orthaug.commands import design as designing
@@ -270,11 +294,11 @@ def design(
     from orthaug.reports.text import design_text
 
     job = open_job(spec, require_full_rank=False)
-    check_file(out, *job.files)
+    check_file(out, *job.files, force=force)
     designed = designing.design_for(job)
-    designing.write(job, designed, out)
+    designing.write(job, designed, out, force=force)
     result = DesignResult.of(designed)
-    typer.echo(result.to_json() if as_json else f"{design_text(result)}\n\nwritten to {out}")
+    streams.echo(result.to_json() if as_json else f"{design_text(result)}\n\nwritten to {out}")
 
 
 @app.command()
@@ -284,7 +308,7 @@ def schema(
     """The JSON schema of what a command writes."""
     from orthaug.reports.result import RESULTS, schema_of
 
-    typer.echo(_json(schema_of(check_choice(command, RESULTS, "COMMAND"))))
+    streams.echo(_json(schema_of(check_choice(command, RESULTS, "COMMAND"))))
 
 
 @app.command()
@@ -295,19 +319,20 @@ def reproduce(
         str, typer.Option("--pipeline", metavar="ours|paper|scripts", help="Who trains; scripts: as published.")
     ] = "ours",
     small: Annotated[bool, typer.Option("--small", help="The reduced size that the tests run.")] = False,
+    force: Force = False,
 ) -> None:
     """The paper's figures and tables, each number beside the published one; goes on where it was interrupted."""
     from orthaug.studies import reproduction
 
     folder = out or Path("orthaug-out/reproduction")
-    reproduction.check_output(folder)
+    reproduction.check_output(folder, force=force)
     entries = reproduction.chosen(name)
     check_choice(pipeline, reproduction.PIPELINES, "--pipeline")
     _prepare_jax()
     with study_bars() as progress:
         reproduced = reproduction.reproduce(entries, pipeline=pipeline, small=small, progress=progress)
-    reproduction.write(reproduced, folder, pipeline)
-    typer.echo(f"{reproduction.text(reproduced)}\n\nwritten to {folder}/index.html")
+    reproduction.write(reproduced, folder, pipeline, force=force)
+    streams.echo(f"{reproduction.text(reproduced)}\n\nwritten to {folder}/index.html")
 
 
 def _prepare_jax() -> None:
@@ -317,23 +342,24 @@ def _prepare_jax() -> None:
 
 
 def _fail(message: str, code: int) -> None:
-    sys.stderr.write(message + "\n")
+    WATCH.hold()
+    streams.say(message)
     sys.exit(code)
 
 
-def _write_response(response: Response, out: Path | None, notes: Sequence[str] = ()) -> None:
+def _write_response(response: Response, out: Path | None, force: bool, notes: Sequence[str] = ()) -> None:
     """The CSV and what is to say about it: scores go where the CSV does not."""
     from orthaug.commands import run
     from orthaug.reports.text import response_text
 
     for line in (*notes, *(f"warning: {warning.text}" for warning in run.warnings(response))):
-        typer.echo(line, err=True)
-    run.write_csv(response, out)
+        streams.say(line)
+    run.write_csv(response, out, force=force)
     told = response_text(response)
     if told:
-        typer.echo(told, err=out is None)
+        (streams.say if out is None else streams.echo)(told)
     if out is not None:
-        typer.echo(f"written to {out}")
+        streams.echo(f"written to {out}")
 
 
 def _json(content: Any) -> str:

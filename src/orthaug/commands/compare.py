@@ -14,7 +14,7 @@ from orthaug._base.folders import whole_folder
 from orthaug._base.progress import SILENT, Progress
 from orthaug.analysis.validation import Verdict, dominance
 from orthaug.commands.fit import Fitted, cross_validated, fit_variant, judge_fit, score_part, wanted_blocks
-from orthaug.commands.folder import is_result
+from orthaug.commands.folder import not_a_result
 from orthaug.commands.job import ALONE, Job, Variant, structure_of
 from orthaug.data.record import same_step
 from orthaug.fitting.kinds import STRUCTURES
@@ -97,9 +97,9 @@ def _verdicts(job: Job, fitted: dict[str, Fitted]) -> dict[str, Verdict]:
     return {kind: verdict for kind, verdict in verdicts.items() if verdict is not None}
 
 
-def write(comparison: Comparison, folder: Path) -> None:
+def write(comparison: Comparison, folder: Path, *, force: bool = False) -> None:
     """result.json, models/ and figures/, whole or not at all."""
-    with whole_folder(folder, is_result) as partial:
+    with whole_folder(folder, not_a_result, force=force) as partial:
         (partial / "result.json").write_text(comparison.result.to_json() + "\n", encoding="utf-8")
         for kind, fitted in comparison.fitted.items():
             if fitted.fit.status.ok:

@@ -57,7 +57,7 @@ def _input(name: str | None, known: list[str]) -> str | None:
     return None if name is None else check_choice(name, known, "`input`")
 
 
-def write(job: Job, design: Design, out: Path) -> None:
+def write(job: Job, design: Design, out: Path, *, force: bool = False) -> None:
     """The signal as CSV, `time` and every input, whole or not at all."""
     assert job.spec.design is not None
     names = [channel.name for channel in job.problem.record.inputs]
@@ -65,5 +65,5 @@ def write(job: Job, design: Design, out: Path) -> None:
     time = np.arange(len(design.signal)) * job.problem.record.sampling_time
     columns = {"time": time} | {name: design.signal if name == chosen else 0.0 * design.signal for name in names}
     table = np.column_stack(list(columns.values()))
-    with whole_file(out) as partial:
+    with whole_file(out, force=force) as partial:
         np.savetxt(partial, table, fmt="%.17g", delimiter=",", header=",".join(columns), comments="")

@@ -15,7 +15,7 @@ from orthaug._base.parallel import one_blas_thread
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.warning import Warning
 from orthaug.commands.bias import bias_of
-from orthaug.commands.folder import is_result
+from orthaug.commands.folder import not_a_result
 from orthaug.commands.job import ALONE, AS_DECLARED, DEFAULT_BLOCKS, Job, Variant, run_fit
 from orthaug.commands.parts import Part
 from orthaug.commands.shared import shared_of
@@ -243,9 +243,9 @@ def score_part(model: Model, part: Part, warnings: list[Any]) -> tuple[PartScore
     return PartScores.model_validate(scores), responses
 
 
-def write_result(fitted: Fitted, folder: Path) -> None:
+def write_result(fitted: Fitted, folder: Path, *, force: bool = False) -> None:
     """result.json, model/ and figures/, whole or not at all; without a model where training failed."""
-    with whole_folder(folder, is_result) as partial:
+    with whole_folder(folder, not_a_result, force=force) as partial:
         fill_result(fitted, partial)
 
 

@@ -3,44 +3,60 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from orthaug._base.errors import InputError
-from orthaug._base.folders import check_replaceable
+from orthaug._base.folders import check_new_file, check_replaceable
 from orthaug.commands.job import Job
 
+_MODEL = r"(model\.json|arrays\.safetensors)"
+_KNOWN = re.compile(
+    rf"result\.json|report\.html|spec\.toml|(train|test)\.csv|figures/[a-z_]+\.png|model/{_MODEL}|models/[a-z-]+/{_MODEL}"
+)
 
-def is_result(folder: Path) -> bool:
-    """Whether a folder holds a result that orthaug wrote."""
+
+def not_a_result(folder: Path, names: Sequence[str]) -> str | None:
+    """A file in a folder without manifest that is no part of a result; None where an older version wrote all."""
+    strange = [name for name in names if not _KNOWN.fullmatch(name)]
     try:
         content = json.loads((folder / "result.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    return isinstance(content, dict) and "schema" in content and "orthaug" in content
+        ours = isinstance(content, dict) and "schema" in content and "orthaug" in content
+    except (OSError, ValueError, RecursionError):
+        ours = False
+    return (strange or [None if ours else names[0]])[0]
 
 
-def check_folder(folder: Path) -> None:
+def check_folder(folder: Path, *, force: bool = False) -> None:
     """Raise InputError early where the result could not be written."""
-    check_replaceable(folder, is_result)
+    check_replaceable(folder, not_a_result, force=force)
 
 
-def check_inputs_kept(job: Job, folder: Path) -> None:
-    """Raise InputError where the result would take the place of a file that the job reads."""
-    for file in job.files:
+def check_inputs_kept(job: Job, folder: Path, models: Iterable[Path] = ()) -> None:
+    """Raise InputError where the result would take the place of a file or model that the job reads."""
+    for file in (*job.files, *models):
         if file.resolve().is_relative_to(folder.resolve()):
-            raise InputError(f"{folder}: holds {file.name}, which this fit reads; give another folder.")
+            what = file.name if file in job.files else f"the model {file}"
+            raise InputError(f"{folder}: holds {what}, which this fit reads; give another folder.")
 
 
-def check_file(out: Path | None, *read: Path) -> None:
-    """Raise InputError early where a file could not be written, or is one of those that are read."""
+def check_file(out: Path | None, *read: Path, force: bool = False) -> None:
+    """Raise InputError early where a file could not be written, is there, or is one of those that are read."""
     if out is None:
         return
     try:
-        if any(file.exists() and out.exists() and out.samefile(file) for file in read):
-            raise InputError(f"{out}: is read by this run; give another name.")
-        if out.is_dir() or not out.name:
-            raise InputError(f"{out}: is a folder; expected the name of a CSV file.")
-        if not out.absolute().parent.is_dir():
-            raise InputError(f"{out}: cannot be written; there is no folder {out.parent}.")
+        for file in read:
+            inside = file.is_dir() and out.exists() and out.resolve().is_relative_to(file.resolve())
+            if inside or (file.exists() and out.exists() and out.samefile(file)):
+                raise InputError(f"{out}: is read by this run; give another name.")
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror}).") from None
+    check_new_file(out, force=force)
+
+
+def check_figure(out: Path | None, *read: Path, force: bool = False) -> None:
+    """`check_file` of a figure, whose ending says in which format it is drawn."""
+    if out is not None and out.suffix.lower() not in (".png", ".pdf", ".svg"):
+        raise InputError(f"{out}: found the ending '{out.suffix}'; expected .png, .pdf or .svg.")
+    check_file(out, *read, force=force)

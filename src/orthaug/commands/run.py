@@ -95,11 +95,11 @@ def warnings(response: Response) -> list[Warning]:
     return [Warning("free_run_diverged", told.format(output, step)) for step, output in ends]
 
 
-def write_csv(response: Response, out: Path | None) -> None:
+def write_csv(response: Response, out: Path | None, *, force: bool = False) -> None:
     """One row per data row, empty cells where there is no value; to a file (whole or not at all) or standard output."""
     frame = response.to_frame()
     if out is None:
         frame.to_csv(sys.stdout, index=False)
         return
-    with whole_file(out) as partial:
+    with whole_file(out, force=force) as partial:
         frame.to_csv(partial, index=False)

@@ -7,11 +7,12 @@ import os
 from typing import Any
 
 from orthaug._base.errors import InputError
-from orthaug._base.memory import check_memory
+from orthaug._base.memory import check_limit, check_memory
 
 LONGEST_FIT = 30 * 86400.0  # s
 _RATE, _STEP = 2e10, 2e-4  # products per second and core; seconds of an iteration at least
 _MOST = 10**18  # weights or runs; more are as impossible, and would overflow
+_COPIES = 32  # of regressors and outputs, in a fit with its scores and findings; measured on 10⁶ rows
 _FEWEST = 50  # iterations that are counted on where more are allowed: most runs converge
 
 
@@ -25,6 +26,7 @@ def check_cost(learner: Any, *, rows: int, features: int, outputs: int, iteratio
         iterations: of a run at most.
         runs: restarts times regularizations.
     """
+    check_limit(8.0 * _COPIES * rows * (features + outputs), f"a fit of {rows} rows")
     if not hasattr(learner, "weights"):
         return
     weights, cores = min(learner.weights(features, outputs), _MOST), os.cpu_count() or 1

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
@@ -37,20 +38,25 @@ FORMAT = 2
 _DECLARATION, _ARRAYS = "model.json", "arrays.safetensors"
 
 
-def is_model(folder: Path) -> bool:
-    """Whether a folder holds a saved model and nothing else."""
-    return {p.name for p in folder.iterdir()} <= {_DECLARATION, _ARRAYS}
+def not_a_model(folder: Path, names: Sequence[str]) -> str | None:
+    """A file in a folder without manifest that is no part of a model; None where an older version saved one."""
+    return next((name for name in names if name not in (_DECLARATION, _ARRAYS)), None)
 
 
-def save(model: Model, folder: str | Path) -> None:
-    """Write a model to a folder of its own, whole or not at all.
+def save(model: Model, folder: str | Path, *, force: bool = False) -> None:
+    """Write a model to a folder of its own, whole or not at all. A model that `save` wrote there before is replaced.
 
     A baseline or learner that is a Python callable cannot be written. Its numbers can; `load` asks for the callable.
+
+    Args:
+        model: what to write.
+        folder: a new one, or one that holds a saved model.
+        force: replace the folder whatever it holds.
 
     Raises:
         InputError: the folder cannot be written, or holds something else.
     """
-    with whole_folder(Path(folder), is_model) as partial:
+    with whole_folder(Path(folder), not_a_model, force=force) as partial:
         write(model, partial)
 
 

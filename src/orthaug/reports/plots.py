@@ -10,14 +10,19 @@ from pathlib import Path
 from typing import Any, ParamSpec
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
+from orthaug._base.errors import InputError
 from orthaug.models.response import Response
 from orthaug.reports.findings import ResidualTestResult, SuspectResult
 from orthaug.reports.result import RowResult
+
+try:
+    from matplotlib import rc_context, rcParams, rcParamsDefault
+    from matplotlib.axes import Axes
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+except UnicodeDecodeError:
+    raise InputError("matplotlibrc: found letters that are not UTF-8; mend that file, or remove it.") from None
 
 # Okabe-Ito: told apart by every reader
 _BLACK, _GREY, _BLUE, _ORANGE, _GREEN = "#000000", "#B8B8B8", "#0072B2", "#E69F00", "#009E73"
@@ -34,8 +39,10 @@ _COLUMNS = round(_SIZE[0] * _SHARPNESS)  # more points than these cannot be told
 
 
 def _own_style() -> AbstractContextManager[None]:
-    """Text is shown as it is: a `$` in a unit or name begins no formula."""
-    return rc_context({"text.parse_math": False})
+    """Figures look the same whatever the user's own settings of matplotlib are; a `$` in a unit begins no formula."""
+    own: dict[Any, Any] = {key: value for key, value in rcParamsDefault.items() if not key.startswith("backend")}
+    own |= {"text.parse_math": False}
+    return rc_context({key: value for key, value in own.items() if rcParams[key] != value})
 
 
 def _plain(draw: Callable[Drawn, Figure]) -> Callable[Drawn, Figure]:
@@ -218,12 +225,15 @@ def _floats(values: Sequence[float | None]) -> np.ndarray:
     return np.array(values, dtype=float)
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a PNG that is sharp at column width."""
+def save(figure: Figure, path: Path, kind: str = "png") -> None:
+    """Write a figure that is sharp at column width; `kind` is also pdf or svg."""
     with warnings.catch_warnings(), _own_style():
         warnings.simplefilter("ignore")  # such as a unit in letters that the font lacks
         figure.set_dpi(_SHARPNESS)
-        FigureCanvasAgg(figure).print_png(path, pil_kwargs={"compress_level": 2})  # `savefig` would draw it twice
+        if kind == "png":
+            FigureCanvasAgg(figure).print_png(path, pil_kwargs={"compress_level": 2})  # `savefig` would draw it twice
+        else:
+            figure.savefig(path, format=kind)
 
 
 def _panels(response: Response, title: str, heights: tuple[int, ...] = (1,)) -> tuple[Figure, list]:

@@ -11,8 +11,6 @@ from __future__ import annotations
 import hashlib
 import inspect
 import json
-import os
-import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from orthaug._base.checks import finite_or_none
 from orthaug._base.errors import InputError
+from orthaug._base.folders import whole_file
 from orthaug._base.parallel import spread
 
 if TYPE_CHECKING:
@@ -164,27 +163,34 @@ def _path(store: Path, study: Study, case: Case) -> Path:
 
 
 def _read(store: Path | None, study: Study, case: Case) -> Run | None:
-    """A stored result; None where there is none, or where it was cut."""
+    """A stored result; None where there is none, or where it was cut or altered."""
     if store is None:
         return None
     try:
         content = json.loads(_path(store, study, case).read_text(encoding="utf-8"))
+        if content.pop("sha256") != _checksum(study, case, content):
+            return None
         return Run(case, dict(content["result"]), str(content["made"]), float(content["seconds"]), stored=True)
-    except (OSError, ValueError, TypeError, KeyError):
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return None
+
+
+def _checksum(study: Study, case: Case, content: dict[str, Any]) -> str:
+    """A digest of a record and the case it belongs to."""
+    written = json.dumps([study.key(case), content], sort_keys=True, allow_nan=False)
+    return hashlib.sha256(written.encode()).hexdigest()
 
 
 def _write(store: Path | None, study: Study, run: Run) -> None:
     if store is None:
         return
-    content = {"made": run.made, "seconds": run.seconds, "result": run.result}
+    content: dict[str, Any] = {"made": run.made, "seconds": run.seconds, "result": run.result}
+    content["sha256"] = _checksum(study, run.case, content)
     path = _path(store, study, run.case)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, partial = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".partial")
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            json.dump(content, file, allow_nan=False)
-        Path(partial).replace(path)
+        with whole_file(path, force=True) as partial:
+            partial.write_text(json.dumps(content, allow_nan=False), encoding="utf-8")
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}).") from None
 

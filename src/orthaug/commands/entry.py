@@ -1,0 +1,77 @@
+"""Where the program starts: signals first, then streams and surroundings, and only then the command line.
+
+The user's switches for libraries that orthaug uses within itself do not reach them.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import sys
+
+from orthaug.commands.signals import WATCH
+
+_OF_JAX = ("JAX_PLATFORMS", "JAX_ENABLE_X64", "JAX_COMPILATION_CACHE_DIR", "JAX_DISABLE_JIT")  # the others are dropped
+_LEAST_MEMORY, _MEMORY_PER_CORE = 3.0 * 2**30, 0.15 * 2**30  # bytes of addresses that JAX and BLAS take for themselves
+
+
+def main() -> None:
+    """Entry point of the program."""
+    gc.set_threshold(100_000, 50, 100)  # what imports and traces leave is no garbage: looking for it costs a tenth
+    _open_streams()
+    WATCH.start()
+    from orthaug.commands import streams
+
+    streams.prepare()
+    _settle()
+    complaint = _complaint()
+    if complaint is not None:
+        streams.say(f"error: {complaint}")
+        sys.exit(2)
+    from orthaug.commands import cli
+
+    try:
+        cli.main()
+    finally:
+        WATCH.hold()
+
+
+def _open_streams() -> None:
+    """Open standard streams that are closed, so that no file takes their number. Writing to a closed output fails."""
+    for number, way in ((0, os.O_RDONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, way)  # takes the lowest number that is free
+
+
+def _complaint() -> str | None:
+    """What keeps every command from running, in words."""
+    from orthaug._base.memory import in_words, limit
+
+    try:
+        os.getcwd()
+    except OSError:
+        return "the working folder is gone; change to one that exists."
+    needed = _LEAST_MEMORY + _MEMORY_PER_CORE * (os.cpu_count() or 1)
+    if limit() < needed and not {"--help", "--version"} & set(sys.argv):
+        return (
+            f"the limit on memory (ulimit -v) is {in_words(limit())}; with its libraries orthaug takes "
+            f"{in_words(needed)} of addresses on this machine. Raise the limit."
+        )
+    return None
+
+
+def _settle() -> None:
+    """Surroundings in which libraries neither fail nor talk: their warnings are no lines for users."""
+    import logging
+    import warnings
+
+    for name in list(os.environ):
+        if name.startswith("JAX_") and name not in _OF_JAX:
+            del os.environ[name]
+    os.environ |= {"MPLBACKEND": "agg", "MATPLOTLIBRC": os.devnull}
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    warnings.resetwarnings()
+    warnings.simplefilter("ignore")
+    logging.getLogger().addHandler(logging.NullHandler())

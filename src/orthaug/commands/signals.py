@@ -1,0 +1,106 @@
+"""Signals that end the program: Ctrl-C, a request to terminate, a terminal that is closed.
+
+A thread waits for them, so that the program ends at once, whatever compiled code runs: what is partial is removed, one
+line says so, and the exit code is 128 and the signal's number. An exception in the main thread would come late, or
+inside a callback of JAX, which swallows it and prints a traceback instead.
+
+Little is imported here: signals may come while everything else is being imported.
+"""
+
+from __future__ import annotations
+
+import _thread
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+_WORDS = {"SIGINT": "interrupted", "SIGTERM": "terminated", "SIGHUP": "ended with its terminal"}
+_PATIENCE = 0.5  # s for a progress bar to leave the terminal as it was
+
+
+def _nothing() -> str:
+    return ""
+
+
+class Watch:
+    """Ends the program on a signal, once it is started; before that, signals do what they always do."""
+
+    def __init__(self) -> None:
+        self.active = self.ending = False
+        self._during: Callable[[], str] = _nothing
+        self._stop: Callable[[], Any] = _nothing
+
+    def start(self) -> None:
+        """Wait for signals from now on. Those that the program is to ignore, as `nohup` asks, are ignored."""
+        if os.name != "posix":  # elsewhere Ctrl-C is an exception in the main thread
+            return
+        reader, writer = os.pipe()
+        os.set_blocking(writer, False)
+        signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+        for name in _WORDS:
+            number = getattr(signal, name)
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, _leave_to_the_thread)
+        self.active = True
+        _thread.start_new_thread(self._wait, (reader,))
+
+    @contextmanager
+    def telling(self, during: Callable[[], str], stop: Callable[[], Any]) -> Iterator[None]:
+        """Say what a signal stopped, and stop drawing before that."""
+        self._during, self._stop = during, stop
+        try:
+            yield
+        finally:
+            self._during = self._stop = _nothing
+
+    def hold(self) -> None:
+        """Do not go on where the program is about to end: what fails then fails because of that."""
+        while self.ending:
+            time.sleep(1.0)
+
+    def _wait(self, reader: int) -> None:
+        known = {getattr(signal, name): words for name, words in _WORDS.items()}
+        while True:
+            number = os.read(reader, 1)[0]
+            if number in known:
+                self.ending = True
+                self._end(number, known[number])
+
+    def _end(self, number: int, words: str) -> None:
+        try:
+            partials = getattr(sys.modules.get("orthaug._base.partials"), "PARTIALS", None)
+            during = self._during()
+            if partials is not None:
+                partials.discard_all()
+            kept = f"{', '.join(map(str, partials.placed))} is written" if partials and partials.placed else ""
+            self._stop_drawing()
+            line = f"{words}{f' during {during}' if during else ''}; {kept or 'nothing was written'}\n"
+            with suppress(OSError):
+                os.write(2, line.encode("utf-8" if sys.stderr is None else sys.stderr.encoding, "backslashreplace"))
+        finally:
+            os._exit(128 + number)
+
+    def _stop_drawing(self) -> None:
+        if self._stop is _nothing:
+            return
+        done = _thread.allocate_lock()
+        done.acquire()
+
+        def stop() -> None:
+            with suppress(Exception):
+                self._stop()
+            done.release()
+
+        _thread.start_new_thread(stop, ())
+        done.acquire(timeout=_PATIENCE)
+
+
+def _leave_to_the_thread(number: int, frame: object) -> None:
+    """Python must have a handler, or the signal ends the process before the thread hears of it."""
+
+
+WATCH = Watch()  # of the process, as its signals are

@@ -1,0 +1,74 @@
+"""Standard input, output and error as they may be: closed, full, or in an encoding that lacks our letters."""
+
+from __future__ import annotations
+
+import codecs
+import os
+import sys
+import unicodedata
+from contextlib import suppress
+from typing import Any, TextIO
+
+_PLAIN = {
+    **{"‖": "||", "±": "+-", "…": "...", "–": "-", "−": "-", "×": "x", "·": "*", "⊥": "_|_", "ᵀ": "^T", "\u0303": "~"},
+    **{"≤": "<=", "≥": ">=", "≠": "!=", "≈": "~", "→": "->", "½": "1/2", "\u2011": "-", "√": "sqrt", "∂": "d"},
+    **{"✓": "", "\u0302": "^", "“": '"', "”": '"', "’": "'", "─": "-", "━": "-"},
+}
+
+
+def prepare() -> None:
+    """Let every letter be written, and a stream that was closed be written to."""
+    codecs.register_error("orthaug.plain", plain)
+    for name, number in (("stdout", 1), ("stderr", 2)):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, "w", encoding="utf-8", closefd=False))  # noqa: SIM115
+        stream = getattr(sys, name)
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="orthaug.plain")
+
+
+def plain(error: UnicodeError) -> tuple[str, int]:
+    """What stands for letters that an encoding lacks: words and ASCII; in JSON the escape that means the same."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    missing = error.object[error.start : error.end]
+    is_json = error.object.startswith("{")
+    return "".join(_escaped(letter) if is_json else _plain(letter) for letter in missing), error.end
+
+
+def _plain(letter: str) -> str:
+    if letter in _PLAIN:
+        return _PLAIN[letter]
+    name = unicodedata.name(letter, "")
+    if name.startswith("GREEK ") and "LETTER" in name:
+        word = name.split()[-1].lower()
+        return word.capitalize() if "CAPITAL" in name else word
+    text = unicodedata.normalize("NFKD", letter).encode("ascii", "ignore").decode()
+    return text or letter.encode("ascii", "backslashreplace").decode()
+
+
+def _escaped(letter: str) -> str:
+    """As JSON writes it: two escapes for a letter beyond 16 bits."""
+    units = letter.encode("utf-16-be", "surrogatepass")
+    return "".join(f"\\u{units[i]:02x}{units[i + 1]:02x}" for i in range(0, len(units), 2))
+
+
+def echo(text: str) -> None:
+    """A result on standard output."""
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def say(line: str) -> None:
+    """A line on standard error, if it can be written."""
+    with suppress(OSError, ValueError):
+        sys.stderr.write(line + "\n")
+        sys.stderr.flush()
+
+
+def silence(stream: TextIO | Any) -> None:
+    """Let what a stream still holds go nowhere, so that the end of the program does not fail on it."""
+    with suppress(OSError, ValueError, AttributeError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
