@@ -13,7 +13,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.warning import Warning
-from orthaug.commands.bias import bias_of
+from orthaug.commands.bias import bias_of, with_biases
 from orthaug.commands.folder import is_result
 from orthaug.commands.job import ALONE, AS_DECLARED, Job, Variant, run_fit
 from orthaug.commands.parts import Part
@@ -83,6 +83,7 @@ def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitt
             scores[part.name], responses[part.name] = score_part(fit.model, part, warnings)
         one_step, free_run = responses[job.train.name]
         content |= _analysed(fit, one_step, free_run, warnings)
+    shared = shared_of(job, others=False)
     nothing_known = np.full(len(fit.theta), np.nan)
     content |= {
         "spec": job.declaration,
@@ -100,13 +101,16 @@ def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitt
         "measure": fit.model.measure if fit.model.structure == "orthogonal" else None,
         "measure_detail": fit.measure,
         "orthogonality_defect": fit.defect,
-        "shared": shared_of(job, others=False),
         "output_weights": None if fit.problem.weight.one_output else fit.problem.weight.as_dict(),
         "excitation": fit.excitation,
         "scores": scores,
+        "shared": shared,
         "validation": None,
         "warnings": warnings,
     }
+    rows, biased = with_biases(job, fit, shared, content)
+    content |= rows
+    warnings += biased
     return Fitted(job, fit, FitResult.model_validate(content), responses)
 
 

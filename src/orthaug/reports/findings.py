@@ -60,6 +60,8 @@ class SuspectResult(Content):
     expected_bias: ByName | None
     physical_bias: ByName | None
     cosine: Number
+    seen: Flag | None
+    removed_by: str | None
     explained: Number
     coefficient_found: Number
     certificate: CertificateResult | None

@@ -14,6 +14,7 @@ from orthaug.reports.fields import ByName, Content, Flag, Number, Numbers, Warni
 from orthaug.reports.findings import DiagnosisResult, SharedResult, StabilityResult, SuspectResult, ValidationResult
 
 if TYPE_CHECKING:
+    from orthaug.analysis.budget import ParameterBias
     from orthaug.analysis.design import Design
     from orthaug.inference.physical import PhysicalEstimate
 
@@ -73,10 +74,18 @@ class RestartResult(Content):
     validation: Number
 
 
+class BiasResult(Content):
+    """The bias of a parameter by what the learner found: estimate less truth, its cause, the cause's share of it."""
+
+    value: Number
+    cause: str
+    share: Number
+
+
 class ParameterResult(Content):
     """A parameter with its interval."""
 
-    absent: ClassVar = frozenset({"one_step", "profile95"})
+    absent: ClassVar = frozenset({"one_step", "profile95", "shared"})
 
     name: str
     unit: str
@@ -86,6 +95,17 @@ class ParameterResult(Content):
     std: Number = None
     ci95: Numbers | None = None
     profile95: Numbers | None = None
+    shared: Flag | None = None
+    bias: BiasResult | None = None
+    ci95_with_bias: Numbers | None = None
+
+    def told(self, shared: bool | None, bias: ParameterBias | None) -> ParameterResult:
+        """The same with whether the learner could imitate it, and its bias."""
+        found: dict[str, object] = {"shared": shared}
+        if bias is not None:
+            interval = None if bias.ci95 is None else list(bias.ci95)
+            found |= {"bias": BiasResult.model_validate(bias), "ci95_with_bias": interval}
+        return self.model_copy(update=found)
 
 
 class ConsistencyResult(Content):

@@ -68,7 +68,8 @@ def check_text(result: CheckResult) -> str:
         lines += [
             "",
             "Bias of each parameter if a term is missing from the physics. Size: its share of the output's deviation,",
-            "1 % where no coefficient is given. Removable: whether some weighting of these points leaves no bias.",
+            "1 % where no coefficient is given. Removed by: a measure, if some weighting of these points leaves no bias;",
+            "the learner, if it sees the term, from what it could not imitate.",
             *_suspect_lines(result.bias),
         ]
     return "\n".join([*lines, *_warning_lines(result.warnings)])
@@ -150,16 +151,19 @@ def _warning_lines(warnings: Iterable[WarningResult]) -> list[str]:
 
 def _suspect_lines(suspects: Sequence[SuspectResult]) -> list[str]:
     """What each suspect does, biases in per cent."""
-    rows = [["suspect", "size", *suspects[0].percent, "cosine", "removable"]]
+    rows = [["suspect", "size", *suspects[0].percent, "cosine", "removed by"]]
     for suspect in suspects:
-        guess, certificate = suspect.coefficient, suspect.certificate
+        guess = suspect.coefficient
         cosine = "–" if suspect.cosine is None else f"{suspect.cosine:.3f}"
-        verdict = certificate.verdict if certificate else ""
-        answer = {"unremovable": "no", "removable": "yes", "orthogonal": "yes"}.get(verdict, "–")
         size = "1 %" if guess is None else "–" if suspect.size is None else f"{100 * abs(guess) * suspect.size:.2g} %"
-        biases = ("–" if share is None else f"{share:+.2g} %" for share in suspect.percent.values())
-        rows.append([suspect.name, size, *biases, cosine, answer])
+        biases = ("–" if share is None else f"{_rounded(share):+.2g} %" for share in suspect.percent.values())
+        rows.append([suspect.name, size, *biases, cosine, suspect.removed_by or "–"])
     return _table(rows)
+
+
+def _rounded(share: float) -> float:
+    """Zero for what is rounding of zero."""
+    return 0.0 if abs(share) < 1e-9 else share
 
 
 def _physical_lines(result: FitResult) -> list[str]:
