@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 import scipy.linalg
+import scipy.spatial
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
@@ -55,48 +56,53 @@ class Smoother:
         return slice(None, None, -(-len(self.problem.rows) // _ROWS))
 
     @cached_property
-    def _waves(self) -> tuple[Vector, Vector, Matrix, Vector]:
-        """Centre and half of the range of z, and the waves' directions and offsets."""
-        z = self.problem.feature_rows()[self.every]
-        rng = np.random.default_rng(_SEED)
-        centre = (z.max(axis=0) + z.min(axis=0)) / 2
-        half = np.where(np.ptp(z, axis=0) > 0, np.ptp(z, axis=0) / 2, 1.0)
-        count = min(_WAVES, len(z) // _ROWS_PER_WAVE)
-        directions = rng.normal(size=(count, z.shape[1]))
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        directions *= np.exp(rng.uniform(0.0, np.log(_STEEPEST), size=(count, 1)))
-        places = ((z - centre) / half)[rng.integers(len(z), size=count)]
-        return centre, half, directions, -np.sum(directions * places, axis=1)
+    def _unit(self) -> tuple[Vector, Vector]:
+        """Centre and half of the range of z."""
+        z = self.problem.feature_rows()
+        low, high = z.min(axis=0), z.max(axis=0)
+        return (low + high) / 2, np.where(high > low, (high - low) / 2, 1.0)
 
-    def _functions(self, x: Matrix) -> Matrix:
-        """The functions of z on rows of the regressor, (M, h)."""
-        problem, (centre, half, directions, offsets) = self.problem, self._waves
+    def _z(self, x: Matrix) -> Matrix:
+        """z on rows of the regressor, over its range in the data."""
+        centre, half = self._unit
         with np.errstate(all="ignore"):
-            z = (np.asarray(problem.features.evaluate(x, problem.layout, np)) - centre) / half
-            phi = np.asarray(problem.baseline.phi(x, problem.layout, problem.outputs, np))
-        shared = (phi @ problem.shared.basis).reshape(len(x), -1)
-        return np.column_stack([np.ones(len(x)), z, shared, np.tanh(z @ directions.T + offsets)])
+            z = (np.asarray(self.problem.features.evaluate(x, self.problem.layout, np)) - centre) / half
+        return np.nan_to_num(z)
 
     @cached_property
-    def _factored(self) -> tuple[Matrix, Matrix]:
-        """An orthonormal basis of the functions on the training rows, and the matrix that makes it of them."""
-        raw = self._functions(self.problem.rows.x[self.every])
-        scale = np.sqrt(np.mean(raw**2, axis=0))
-        scale = np.where(scale > 0, scale, 1.0)
-        u, sigma, vt = scipy.linalg.svd(raw / scale, full_matrices=False)
-        kept = sigma > _ROUNDING * sigma[0]
-        return u[:, kept], (vt[kept].T / sigma[kept]) / scale[:, None]
+    def _basis(self) -> Matrix:
+        """An orthonormal basis of the functions on the training rows that are used."""
+        problem, rng = self.problem, np.random.default_rng(_SEED)
+        x = problem.rows.x[self.every]
+        z = self._z(x)
+        count = min(_WAVES, len(z) // _ROWS_PER_WAVE)
+        slopes = rng.normal(size=(count, z.shape[1]))
+        slopes *= np.exp(rng.uniform(0.0, np.log(_STEEPEST), size=(count, 1))) / np.linalg.norm(slopes, axis=1)[:, None]
+        centres = z[rng.integers(len(z), size=count)]
+        waves = np.tanh(z @ slopes.T - np.sum(slopes * centres, axis=1))
+        phi = np.asarray(problem.baseline.phi(x, problem.layout, problem.outputs, np))
+        shared = (phi @ problem.shared.basis).reshape(len(x), -1)
+        functions = np.column_stack([np.ones(len(x)), z, shared, waves])
+        scale = np.sqrt(np.mean(functions**2, axis=0))
+        u, sigma, _ = scipy.linalg.svd(functions / np.where(scale > 0, scale, 1.0), full_matrices=False)
+        return u[:, sigma > _ROUNDING * sigma[0]]
+
+    @property
+    def inputs(self) -> Matrix:
+        """z on the training rows that are used, over its range."""
+        return self._z(self.problem.rows.x[self.every])
 
     def left(self, values: Float[np.ndarray, "n *m"]) -> Float[np.ndarray, "n *m"]:
         """(I − M)v of values on the training rows that are used."""
-        basis = self._factored[0]
         flat = values.reshape(len(values), -1)
-        return (flat - basis @ (basis.T @ flat)).reshape(values.shape)
+        return (flat - self._basis @ (self._basis.T @ flat)).reshape(values.shape)
 
     def mean(self, values: Float[np.ndarray, "n ny"], x: Matrix) -> Matrix:
-        """Mv at rows of the regressor, of values on the training rows that are used."""
-        basis, change = self._factored
-        return self._functions(x) @ (change @ (basis.T @ values))
+        """Mv at rows of the regressor, of values on the training rows that are used: that at the nearest z of these."""
+        known = self._basis @ (self._basis.T @ values)
+        if x is self.problem.rows.x and len(known) == len(x):
+            return known
+        return known[scipy.spatial.cKDTree(self._z(self.problem.rows.x[self.every])).query(self._z(x))[1]]
 
 
 def absorbed(

@@ -1,8 +1,8 @@
 """What the learner found, explained by a cause, and the bias of every parameter that follows from it.
 
 With F the learner's values under the measure and Δ a cause's, the coefficient is that of P⊥F on P⊥Δ and the bias,
-estimate less truth, `Φ_μ⁺Δ` times it. Only one cause is named: the declared suspect that explains most of ‖P⊥F‖² if that
-is enough, else the usual suspect or product of lags that does.
+estimate less truth, `Φ_μ⁺Δ` times it. Only one cause is named: the declared suspect that explains most of ‖P⊥F‖² if
+that is enough, else the usual suspect or product of lags that does.
 """
 
 from __future__ import annotations
@@ -119,15 +119,15 @@ def named_cause(ground: Ground, suspects: Sequence[Suspect], least: float = LEAS
     problem = ground.problem
     for group in (tuple(suspects), (*usual_suspects(problem), *usual_terms(problem))):
         table = ground.table(group, certify=False, every=False) if group else ()
+        if group != tuple(suspects):  # what it does not see is no likely cause of what the learner found
+            table = tuple(entry for entry in table if entry.seen is not False)
         best = max(table, key=lambda entry: entry.explained or 0.0, default=None)
         if best is not None and (best.explained or 0.0) >= least:
             return best
     return None
 
 
-def with_bias(
-    value: Vector, std: Vector, freedom: float, bias: Vector, share: float
-) -> Float[np.ndarray, "n 2"]:
+def with_bias(value: Vector, std: Vector, freedom: float, bias: Vector, share: float) -> Float[np.ndarray, "n 2"]:
     """95 % intervals that cover bias and noise, (n, 2): about the estimate less its bias.
 
     What the cause leaves unexplained of the learner counts as biased by as much for its size, of unknown sign.

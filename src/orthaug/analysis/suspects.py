@@ -257,9 +257,7 @@ def usual_terms(problem: Problem) -> tuple[Suspect, ...]:
     pairs = [(one, other) for i, one in enumerate(lags) for other in lags[i:]]
     texts = [f"{one}**2" if one == other else f"{one}*{other}" for one, other in pairs]
     only = len(outputs) == 1
-    return tuple(
-        Suspect(text if only else f"{text} in {output}", text, output) for output in outputs for text in texts
-    )
+    return tuple(Suspect(text if only else f"{text} in {output}", text, output) for output in outputs for text in texts)
 
 
 def _evaluate(expression: Expression, x: Matrix, layout: Layout, what: str) -> np.ndarray:
