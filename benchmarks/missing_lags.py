@@ -3,7 +3,7 @@
 Mass-spring-dampers as a lagged model, the learner on the velocity `y[k-1] - y[k-2]` alone. What the physics lacks is
 friction, a function of that, or also a hardening of the position, which is not. Noise enters the equation: white, of a
 size that grows with the force, or coloured by a moving average.
-Run: python benchmarks/missing_lags.py [draws, default 400]
+Run: python benchmarks/missing_lags.py [draws, default 200]
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from machine import describe
 import orthaug as oa
 from orthaug.analysis.missing_lags import missing_lags
 
-SAMPLES, NOISE = 1500, 0.02
+SAMPLES, NOISE = 1000, 0.02
 THETA = (1.5, -0.7, 0.3)
 BASELINE = oa.Baseline.from_terms([oa.Term(*term) for term in (("a", "y[k-1]"), ("b", "y[k-2]"), ("c", "u[k-1]"))])
 CASES = (  # noise, coefficient of y³, coefficient of u²
     ("white", 0.0, 0.0),
     ("uneven", 0.0, 0.0),
     ("moving average", 0.0, 0.0),
-    ("white", -0.003, 0.0),
+    ("white", -0.005, 0.0),
     ("white", 0.0, 0.005),
 )
 
@@ -54,9 +54,10 @@ def p_values(case: tuple[str, float, float], draws: int) -> np.ndarray:
     return np.array(found)
 
 
-def table(draws: int = 400) -> list[list[float]]:
-    """Per case the per cent of draws that reject at 5 % and at 1 %."""
-    return [[100 * float(np.mean(p < level)) for level in (0.05, 0.01)] for p in (p_values(c, draws) for c in CASES)]
+def table(draws: int = 200) -> list[list[float]]:
+    """Per case the per cent of draws that reject at 5 % and at 1 %; a quarter of the draws where a lag is missing."""
+    found = (p_values(case, draws if case[1:] == (0.0, 0.0) else draws // 4) for case in CASES)
+    return [[100 * float(np.mean(p < level)) for level in (0.05, 0.01)] for p in found]
 
 
 def main(draws: int) -> None:
@@ -69,4 +70,4 @@ def main(draws: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 400)
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 200)

@@ -10,13 +10,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.linalg
-import scipy.spatial
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.parallel import one_blas_thread
 from orthaug.physics.output_weights import times
 from orthaug.physics.problem import Problem
 
@@ -84,8 +86,11 @@ class Smoother:
         shared = (phi @ problem.shared.basis).reshape(len(x), -1)
         functions = np.column_stack([np.ones(len(x)), z, shared, waves])
         scale = np.sqrt(np.mean(functions**2, axis=0))
-        u, sigma, _ = scipy.linalg.svd(functions / np.where(scale > 0, scale, 1.0), full_matrices=False)
-        return u[:, sigma > _ROUNDING * sigma[0]]
+        functions = functions / np.where(scale > 0, scale, 1.0)
+        with one_blas_thread():
+            factors: Any = scipy.linalg.qr(functions, mode="economic", pivoting=True)
+        sizes = np.abs(np.diag(factors[1]))
+        return factors[0][:, sizes > _ROUNDING * sizes[0]]
 
     @property
     def inputs(self) -> Matrix:
@@ -102,7 +107,7 @@ class Smoother:
         known = self._basis @ (self._basis.T @ values)
         if x is self.problem.rows.x and len(known) == len(x):
             return known
-        return known[scipy.spatial.cKDTree(self._z(self.problem.rows.x[self.every])).query(self._z(x))[1]]
+        return known[KDTree(self.inputs).query(self._z(x))[1]]
 
 
 def absorbed(

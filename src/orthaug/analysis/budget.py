@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy.special
@@ -99,27 +100,31 @@ def budget_on(ground: Ground, fit: Estimate, suspects: Sequence[Suspect]) -> Bud
     cause = named_cause(ground, suspects)
     if cause is None or cause.explained is None or cause.coefficient_found is None:
         return None
-    share, bias = cause.explained, cause.coefficient_found * np.array(cause.bias)
+    share, coefficient = cause.explained, cause.coefficient_found
+    told = partial(_rows, freedom=fit.freedom, cause=cause.suspect.name, share=share)
+    rest, bias = left_over(ground, cause, suspects), coefficient * np.array(cause.bias)
     std = np.full(len(bias), np.nan) if fit.std is None else fit.std
-    label = cause.suspect.name
-    parameters = _rows(ground.problem.baseline.names, fit.theta, std, bias, fit.freedom, label, share)
-    rows = ()
+    names, rows = ground.problem.baseline.names, ()
+    parameters = told(names, fit.theta, std, bias, rest[: len(names)])
     if ground.physics is not None:
         physical = fit.physical(ground.physics)
-        moved = _physical(ground.physics, fit, bias)
         own = np.array([np.nan if s is None else s for s in physical.std])
-        rows = _rows(physical.names, np.array(physical.value), own, moved, fit.freedom, label, share)
+        moved = _physical(ground.physics, fit, bias)
+        rows = told(physical.names, np.array(physical.value), own, moved, rest[len(names) :])
     found = Budget(cause, share, parameters, rows, ())
     warning = _warning(ground, found)
     return found if warning is None else replace(found, warnings=(warning,))
 
 
 def named_cause(ground: Ground, suspects: Sequence[Suspect], least: float = LEAST_SHARE) -> SuspectedBias | None:
-    """The cause that explains most of the learner, the declared ones first; None where that is too little."""
+    """The cause that explains most of the learner, the declared ones first; None where that is less than `least`.
+
+    Of what no one declared only what the learner sees counts: the rest is no likely cause of what it found.
+    """
     problem = ground.problem
     for group in (tuple(suspects), (*usual_suspects(problem), *usual_terms(problem))):
         table = ground.table(group, certify=False, every=False) if group else ()
-        if group != tuple(suspects):  # what it does not see is no likely cause of what the learner found
+        if group != tuple(suspects):
             table = tuple(entry for entry in table if entry.seen is not False)
         best = max(table, key=lambda entry: entry.explained or 0.0, default=None)
         if best is not None and (best.explained or 0.0) >= least:
@@ -127,21 +132,47 @@ def named_cause(ground: Ground, suspects: Sequence[Suspect], least: float = LEAS
     return None
 
 
-def with_bias(value: Vector, std: Vector, freedom: float, bias: Vector, share: float) -> Float[np.ndarray, "n 2"]:
+def left_over(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) -> Vector:
+    """Standard deviations of the bias that the cause does not tell, of θ and physical parameters.
+
+    What it leaves of the learner counts as biased by as much for its size as the cause, of unknown sign; beside that by
+    what the next best cause makes of it.
+    """
+    assert cause.explained
+    rest, others = ground.without(cause), tuple(suspect for suspect in suspects if suspect != cause.suspect)
+    found = [best for group in {others, ()} if (best := named_cause(rest, group, 0.0)) is not None]
+    own = _moved(cause) * np.sqrt((1 - cause.explained) / cause.explained)
+    return np.hypot(own, _moved(max(found, key=lambda entry: entry.explained or 0.0)) if found else 0.0)
+
+
+def _moved(cause: SuspectedBias) -> Vector:
+    """What a cause of the size found makes of θ and, to first order, of the physical parameters."""
+    return (cause.coefficient_found or 0.0) * np.array([*cause.bias, *(bias for _, bias in cause.physical or ())])
+
+
+def with_bias(value: Vector, std: Vector, freedom: float, bias: Vector, rest: Vector) -> Float[np.ndarray, "n 2"]:
     """95 % intervals that cover bias and noise, (n, 2): about the estimate less its bias.
 
-    What the cause leaves unexplained of the learner counts as biased by as much for its size, of unknown sign.
+    Args:
+        rest: standard deviation of the bias that its cause does not tell, as `left_over` gives it.
     """
-    left = np.abs(bias) * np.sqrt((1 - share) / share)
-    reach = scipy.special.stdtrit(max(freedom, 1.0), 0.975) * np.sqrt(std**2 + left**2)
+    reach = scipy.special.stdtrit(max(freedom, 1.0), 0.975) * np.sqrt(std**2 + rest**2)
     return np.stack([value - bias - reach, value - bias + reach], axis=-1)
 
 
 def _rows(
-    names: Sequence[str], value: Vector, std: Vector, bias: Vector, freedom: float, cause: str, share: float
+    names: Sequence[str],
+    value: Vector,
+    std: Vector,
+    bias: Vector,
+    rest: Vector,
+    *,
+    freedom: float,
+    cause: str,
+    share: float,
 ) -> tuple[ParameterBias, ...]:
     found = []
-    for name, v, s, b, ci in zip(names, value, std, bias, with_bias(value, std, freedom, bias, share), strict=True):
+    for name, v, s, b, ci in zip(names, value, std, bias, with_bias(value, std, freedom, bias, rest), strict=True):
         if np.isfinite(b):
             errors, relative = float(abs(b) / s) if s > 0 else None, float(b / v) if v else None
             limits = (float(ci[0]), float(ci[1])) if np.isfinite(ci).all() else None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -70,6 +70,15 @@ class Ground:
             directions=self.directions,
             absorbed=None if self.directions is None else self._absorbed(chosen),
         )
+
+    def without(self, entry: SuspectedBias) -> Ground:
+        """The same with what a suspect explains of the learner taken off it."""
+        held = (
+            entry.suspect.values(self.weighed.points.x, self.problem.layout, self.problem.outputs)
+            if self.directions is None
+            else self._absorbed([entry.suspect])[0].held
+        )
+        return replace(self, learned=np.asarray(self.learned) - (entry.coefficient_found or 0.0) * held)
 
     def _absorbed(self, suspects: Sequence[Suspect]) -> list[Absorbed]:
         problem = self.problem

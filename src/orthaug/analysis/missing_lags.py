@@ -100,16 +100,19 @@ def lag_tests(problem: Problem, residual: Matrix, hidden: Sequence[int]) -> tupl
     smoother = Smoother(problem)
     x, gain = problem.rows.x[smoother.every], problem.weight.matrix
     e = smoother.left(times(gain, residual[smoother.every]))
-    phi = smoother.left(times(gain, problem.baseline.phi(x, problem.layout, problem.outputs, np)))
-    physics = _orthonormal(phi.reshape(e.size, -1), np.linalg.norm(phi.reshape(e.size, -1), axis=0).max(initial=0.0))
-    e = _without(physics, e.reshape(-1)).reshape(e.shape)
+    rows, ny = e.shape
+    phi = times(gain, np.asarray(problem.baseline.phi(x, problem.layout, problem.outputs, np)))
+    phi = phi / np.maximum(np.sqrt(np.sum(phi**2, axis=(0, 1))), np.finfo(float).tiny)
+    physics = _orthonormal(smoother.left(phi).reshape(rows * ny, phi.shape[2]), 1.0)
+    e = _without(physics, e.reshape(-1)).reshape(rows, ny)
     cuts = _experiments(problem, len(e), smoother.every.step or 1)
     found = []
     for j in hidden:
         forms = _functions(x[:, j], smoother.inputs)
-        stacked = np.einsum("kh,io->kioh", forms, np.eye(e.shape[1])).reshape(len(e), e.shape[1], -1)
-        left = _without(physics, smoother.left(stacked).reshape(e.size, -1))
-        test = _score_test(_orthonormal(left, np.sqrt(len(e))).reshape(*e.shape, -1), e, cuts)
+        stacked = np.einsum("kh,io->kioh", forms, np.eye(ny)).reshape(rows, ny, forms.shape[1] * ny)
+        left = _without(physics, smoother.left(stacked).reshape(rows * ny, forms.shape[1] * ny))
+        basis = _orthonormal(left, np.sqrt(rows))
+        test = _score_test(basis.reshape(rows, ny, basis.shape[1]), e, cuts)
         if test is not None:
             found.append(LagTest(str(problem.layout[j]), *test))
     return tuple(found)

@@ -47,9 +47,10 @@ def with_biases(
     def told(rows: list[ParameterResult] | None, determined: Sequence[str] | None) -> list[ParameterResult] | None:
         if rows is None:
             return None
-        known = shared is not None and determined is not None
         return [
-            row.told(row.name not in determined if known else None, budget.of(row.name) if budget else None)
+            row.told(
+                None if determined is None else row.name not in determined, budget.of(row.name) if budget else None
+            )
             for row in rows
         ]
 

@@ -73,8 +73,8 @@ def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitt
     """Train a variant of a job and score every part; `judge_fit` asks whether the learner helps."""
     fit = run_fit(job, variant, progress)
     warnings: list[Any] = [*job.warnings, *fit.warnings]
-    unknown = ("physical_parameters", "physical_consistency", "sensitivities", "bias", "residuals", "stability")
-    content: dict[str, Any] = dict.fromkeys(unknown)
+    unknown = ("physical_parameters", "physical_consistency", "sensitivities", "bias")
+    content: dict[str, Any] = dict.fromkeys((*unknown, "residuals", "missing_lags", "stability"))
     scores, responses = {}, {}
     if fit.status.ok:
         content |= _physical_content(job, fit, warnings)
@@ -149,6 +149,7 @@ def _analysed(fit: Estimate, one_step: Response, free_run: Response, warnings: l
     """What the residuals and the free run's sensitivity say; warnings are added."""
     from orthaug.analysis.diagnosis import diagnose
     from orthaug.analysis.free_run_stability import stability
+    from orthaug.analysis.missing_lags import missing_lags
 
     problem = fit.problem
     diagnosis = diagnose(fit, one_step=one_step, free_run=free_run)
@@ -159,7 +160,9 @@ def _analysed(fit: Estimate, one_step: Response, free_run: Response, warnings: l
         warnings.append(Warning("residual_not_analysed", told))
     else:
         warnings += diagnosis.warnings
-    return {"residuals": diagnosis, "stability": steady}
+    hidden = missing_lags(fit, one_step)
+    warnings += hidden.warnings if hidden else ()
+    return {"residuals": diagnosis, "missing_lags": hidden, "stability": steady}
 
 
 def judge_fit(fitted: Fitted, blocks: Sequence[Trial] | None = None, alone: Fitted | None = None) -> Verdict | None:

@@ -157,6 +157,23 @@ class DiagnosisResult(Content):
     noise_in_lags: Number
 
 
+class LagResult(Content):
+    """The residual against a lag that the learner does not see."""
+
+    lag: str
+    p: Number
+    share: Number
+
+
+class MissingLagsResult(Content):
+    """Whether what the physics lacks is a function of what the learner sees."""
+
+    level: Number
+    tests: list[LagResult]
+    missing: list[LagResult]
+    text: str
+
+
 class PlaceResult(Content):
     """A point of the data or beside them."""
 

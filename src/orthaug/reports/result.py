@@ -11,7 +11,14 @@ from pydantic import BeforeValidator, Field
 from orthaug import __version__
 from orthaug.physics.baseline import Parameter
 from orthaug.reports.fields import ByName, Content, Flag, Number, Numbers, WarningResult, Whole
-from orthaug.reports.findings import DiagnosisResult, SharedResult, StabilityResult, SuspectResult, ValidationResult
+from orthaug.reports.findings import (
+    DiagnosisResult,
+    MissingLagsResult,
+    SharedResult,
+    StabilityResult,
+    SuspectResult,
+    ValidationResult,
+)
 
 if TYPE_CHECKING:
     from orthaug.analysis.budget import ParameterBias
@@ -206,6 +213,7 @@ class FitResult(_Headed):
     scores: dict[str, PartScores]
     bias: list[SuspectResult] | None
     residuals: DiagnosisResult | None
+    missing_lags: MissingLagsResult | None
     stability: StabilityResult | None
     validation: ValidationResult | None
     warnings: list[WarningResult]

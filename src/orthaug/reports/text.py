@@ -40,7 +40,8 @@ def fit_text(fit: Estimate, result: FitResult) -> str:
     blocks.append(_score_lines(fit, result))
     if result.shared is not None and not result.shared.everything:
         blocks.append([result.shared.text])
-    told = [finding.text for finding in (result.residuals, result.validation) if finding]
+    blocks.append(_bias_lines(result))
+    told = [finding.text for finding in (result.residuals, result.missing_lags, result.validation) if finding]
     blocks += [told, _warning_lines(w for w in dict.fromkeys(result.warnings) if w.text not in told)]
     return "\n\n".join("\n".join(lines) for lines in blocks if lines)
 
@@ -159,6 +160,25 @@ def _suspect_lines(suspects: Sequence[SuspectResult]) -> list[str]:
         biases = ("–" if share is None else f"{_rounded(share):+.2g} %" for share in suspect.percent.values())
         rows.append([suspect.name, size, *biases, cosine, suspect.removed_by or "–"])
     return _table(rows)
+
+
+def _bias_lines(result: FitResult) -> list[str]:
+    """The bias of every parameter by what the learner found, and the interval that covers it."""
+    rows = [row for row in (*result.parameters, *(result.physical_parameters or ())) if row.bias is not None]
+    if not rows or rows[0].bias is None:
+        return []
+    cause, share, width = rows[0].bias.cause, rows[0].bias.share or 0.0, _width(rows)
+    lines = [f"{100 * share:.0f} % of what the learner found is {cause}. The bias that implies:"]
+    lines.append(f"{'parameter':<{width}}  {'bias':>11}  {'of std':>7}  {'of value':>9}  {'95 % interval with it':^29}")
+    for row in rows:
+        bias = row.bias.value if row.bias else None
+        if bias is not None and row.value is not None:
+            errors = f"{abs(bias) / row.std:7.2g}" if row.std else f"{'–':>7}"
+            part = f"{_rounded(100 * bias / row.value):+7.2g} %" if row.value else f"{'–':>9}"
+            reach = row.ci95_with_bias
+            limits = f"[{_limit(reach[0])}, {_limit(reach[1])}]" if reach else f"{'–':^29}"
+            lines.append(f"{row.name:<{width}}  {bias:+11.3g}  {errors}  {part}  {limits}".rstrip())
+    return lines
 
 
 def _rounded(share: float) -> float:
