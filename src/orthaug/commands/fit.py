@@ -71,7 +71,9 @@ def fit_job(job: Job, progress: Progress = SILENT) -> Fitted:
 
 def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitted:
     """Train a variant of a job and score every part; `judge_fit` asks whether the learner helps."""
-    fit = run_fit(job, variant, progress)
+    from orthaug.analysis.diagnosis import robust_where_coloured
+
+    fit = robust_where_coloured(run_fit(job, variant, progress))
     warnings: list[Any] = [*job.warnings, *fit.warnings]
     unknown = ("physical_parameters", "physical_consistency", "sensitivities", "bias")
     content: dict[str, Any] = dict.fromkeys((*unknown, "residuals", "missing_lags", "stability"))
@@ -96,7 +98,9 @@ def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitt
             fit.std,
             fit.interval,
             fit.one_step_theta,
+            None if fit.plain_covariance is None else np.sqrt(np.diag(fit.plain_covariance)),
         ),
+        "standard_errors": None if fit.std is None else "plain" if fit.plain_covariance is None else "robust",
         "structure": fit.model.structure,
         "measure": fit.model.measure if fit.model.structure == "orthogonal" else None,
         "measure_detail": fit.measure,

@@ -92,7 +92,7 @@ class BiasResult(Content):
 class ParameterResult(Content):
     """A parameter with its interval."""
 
-    absent: ClassVar = frozenset({"one_step", "profile95", "shared"})
+    absent: ClassVar = frozenset({"one_step", "profile95", "plain_std", "shared"})
 
     name: str
     unit: str
@@ -100,6 +100,7 @@ class ParameterResult(Content):
     value: Number
     one_step: Number = None
     std: Number = None
+    plain_std: Number = None
     ci95: Numbers | None = None
     profile95: Numbers | None = None
     shared: Flag | None = None
@@ -200,6 +201,7 @@ class FitResult(_Headed):
     status: StatusResult
     restarts: list[RestartResult]
     parameters: list[ParameterResult]
+    standard_errors: str | None
     physical_parameters: list[ParameterResult] | None
     physical_consistency: ConsistencyResult | None
     sensitivities: dict[str, ByName] | None
@@ -321,6 +323,7 @@ def parameter_rows(
     std: Any = None,
     interval: Any = None,
     one_step: Any = None,
+    plain_std: Any = None,
 ) -> list[ParameterResult]:
     """θ as results list it; what stands at a bound has no interval."""
     return [
@@ -332,6 +335,7 @@ def parameter_rows(
                 "value": values[i],
                 "one_step": None if one_step is None else one_step[i],
                 "std": None if std is None else std[i],
+                "plain_std": None if plain_std is None else plain_std[i],
                 "ci95": None if interval is None or np.isnan(interval[i]).any() else interval[i],
             }
         )
