@@ -29,6 +29,7 @@ from orthaug.inference.weighed import weigh_problem
 from orthaug.physics.parameters import PhysicsMap
 
 LEAST_SHARE = 0.5  # of the learner's energy that a cause must explain to be named
+_AS_MUCH = 0.98  # of what the cause explains: a rival cannot be told from it
 _ROUNDING = 1e-9  # of a parameter: a bias that no one can speak of
 _TOLD = 4  # parameters that a warning lists at most
 
@@ -112,7 +113,7 @@ def budget_on(ground: Ground, fit: Estimate, suspects: Sequence[Suspect]) -> Bud
         moved = _physical(ground.physics, fit, bias)
         rows = told(physical.names, np.array(physical.value), own, moved, rest[len(names) :])
     found = Budget(cause, share, parameters, rows, ())
-    warning = _warning(ground, found)
+    warning = _warning(ground, found, rival_of(ground, cause, suspects))
     return found if warning is None else replace(found, warnings=(warning,))
 
 
@@ -121,28 +122,54 @@ def named_cause(ground: Ground, suspects: Sequence[Suspect], least: float = LEAS
 
     Of what no one declared only what the learner sees counts: the rest is no likely cause of what it found.
     """
-    problem = ground.problem
-    for group in (tuple(suspects), (*usual_suspects(problem), *usual_terms(problem))):
-        table = ground.table(group, certify=False, every=False) if group else ()
-        if group != tuple(suspects):
-            table = tuple(entry for entry in table if entry.seen is not False)
+    for table in (_declared(ground, suspects), _usual(ground)):
         best = max(table, key=lambda entry: entry.explained or 0.0, default=None)
         if best is not None and (best.explained or 0.0) >= least:
             return best
     return None
 
 
+def _declared(ground: Ground, suspects: Sequence[Suspect]) -> tuple[SuspectedBias, ...]:
+    return ground.table(tuple(suspects), certify=False, every=False) if suspects else ()
+
+
+def _usual(ground: Ground) -> tuple[SuspectedBias, ...]:
+    terms = (*usual_suspects(ground.problem), *usual_terms(ground.problem))
+    return tuple(entry for entry in ground.table(terms, certify=False, every=False) if entry.seen is not False)
+
+
+def rival_of(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) -> SuspectedBias | None:
+    """A term that explains as much as a cause that no one declared, and moves θ elsewhere; None where there is none.
+
+    As a dead zone and a saturation of what the physics has a term in: their sum is that term.
+    """
+    assert cause.explained
+    if cause.suspect in suspects:
+        return None
+    equal = [entry for entry in _usual(ground) if (entry.explained or 0.0) >= _AS_MUCH * cause.explained]
+    to_coordinates, own = ground.weighed.projection.to_coordinates, _moved(cause)
+    nt = len(cause.names)
+
+    def apart(entry: SuspectedBias) -> float:
+        return float(np.linalg.norm(to_coordinates @ (_moved(entry) - own)[:nt]))
+
+    farthest = max(equal, key=apart, default=None)
+    return farthest if farthest and apart(farthest) > 0.5 * np.linalg.norm(to_coordinates @ own[:nt]) else None
+
+
 def left_over(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) -> Vector:
     """Standard deviations of the bias that the cause does not tell, of θ and physical parameters.
 
     What it leaves of the learner counts as biased by as much for its size as the cause, of unknown sign; beside that by
-    what the next best cause makes of it.
+    what the next best cause makes of it, and by how far a rival of the cause would move θ elsewhere.
     """
     assert cause.explained
     rest, others = ground.without(cause), tuple(suspect for suspect in suspects if suspect != cause.suspect)
     found = [best for group in {others, ()} if (best := named_cause(rest, group, 0.0)) is not None]
     own = _moved(cause) * np.sqrt((1 - cause.explained) / cause.explained)
-    return np.hypot(own, _moved(max(found, key=lambda entry: entry.explained or 0.0)) if found else 0.0)
+    next_best = _moved(max(found, key=lambda entry: entry.explained or 0.0)) if found else 0.0
+    rival = rival_of(ground, cause, suspects)
+    return np.sqrt(own**2 + next_best**2 + (0.0 if rival is None else _moved(rival) - _moved(cause)) ** 2)
 
 
 def _moved(cause: SuspectedBias) -> Vector:
@@ -194,7 +221,7 @@ def _physical(physics: PhysicsMap, fit: Estimate, bias: Vector) -> Vector:
     return np.asarray(biased) - np.asarray(free)
 
 
-def _warning(ground: Ground, budget: Budget) -> Warning | None:
+def _warning(ground: Ground, budget: Budget, rival: SuspectedBias | None) -> Warning | None:
     """One sentence on what is biased by more than its standard error: cause, size, remedies."""
     every = (*budget.physical, *budget.parameters)
     large = [entry for entry in every if (entry.errors or 0.0) > 1 and abs(entry.relative or 1.0) > _ROUNDING]
@@ -204,10 +231,11 @@ def _warning(ground: Ground, budget: Budget) -> Warning | None:
     listed = ", ".join(_told(entry) for entry in shown)
     more = f" and {len(large) - len(shown)} more" if len(large) > len(shown) else ""
     cures = remedies(ground, budget.cause, [entry.name for entry in large])
+    other = "" if rival is None else f" ({rival.suspect.name} explains as much and would move them elsewhere)"
     return Warning(
         "biased",
         f"{budget.cause.suspect.name} explains {100 * budget.share:.0f} % of the learner and moves {listed}{more}, "
-        f"which the standard errors do not cover: {' or '.join(cures)}.",
+        f"which the standard errors do not cover{other}: {' or '.join(cures)}.",
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -20,6 +21,7 @@ from orthaug.inference.weighed import weigh_problem
 from orthaug.physics.output_weights import times
 from orthaug.physics.shared import seen, shared_directions
 
+_LONG = re.compile(r"\d+\.\d{5,}(?:e[-+]?\d+)?")
 _REMOVED = 0.1  # of the bias may remain
 _MEASURED_ROWS = 50_000  # above which no other measure is tried
 
@@ -30,7 +32,8 @@ def remedies(ground: Ground, cause: SuspectedBias, biased: Sequence[str]) -> lis
 
 
 def _by_term(suspect: Suspect) -> str:
-    return f"give the physics the term {suspect.expression}"
+    text = _LONG.sub(lambda number: f"{float(number[0]):.4g}", suspect.expression)
+    return f"give the physics the term {text}"
 
 
 def _by_inputs(ground: Ground, cause: SuspectedBias, biased: Sequence[str]) -> Iterator[str]:
