@@ -256,7 +256,9 @@ def _estimate(parameter: ParameterResult) -> str:
     if parameter.value is None:
         return "–"
     spread = f" ± {parameter.std:.2g}" if parameter.std is not None else ""
-    return f"{parameter.value:.6g}{spread}"
+    bias = parameter.bias.value if parameter.bias and parameter.std is not None else None
+    large = bias is not None and parameter.std is not None and abs(bias) > parameter.std
+    return f"{parameter.value:.6g}{spread}{f' (bias {bias:+.2g})' if large else ''}"
 
 
 def _numbers(values: Sequence[float | None] | None) -> str:
