@@ -57,6 +57,7 @@ def test_biases_beside_a_learner_that_sees_the_velocity_alone(text, seen):
     if seen:
         assert found.bias[2] == 0 and found.bias[0] == pytest.approx(-found.bias[1], rel=1e-12)
         assert found.removed_by == "learner in part"
+        assert found.certificate is not None and found.certificate.shares is not None
         np.testing.assert_allclose(found.certificate.shares, [1, -1, 0], atol=0.05)
     else:
         assert found.removed_by == "nothing" and "does not see all of it" in found.sentence

@@ -43,6 +43,8 @@ def with_biases(
     """The rows of `parameters` and `physical_parameters` with what the learner shares and what biases them."""
     physical = content["physical_parameters"]
     budget = budget_of(job, fit) if fit.status.ok else None
+    if fit.model.structure != "orthogonal" or fit.model.form.bound is None:  # a variant of what the spec declares
+        shared = None
 
     def told(rows: list[ParameterResult] | None, determined: Sequence[str] | None) -> list[ParameterResult] | None:
         if rows is None:
