@@ -101,7 +101,8 @@ def test_a_score_that_no_output_has_is_null_as_a_whole():
 
 def test_keys_that_are_there_only_at_times():
     parameter = {"name": "a", "unit": "", "initial": 0.0, "value": np.nan}
-    assert ParameterResult.model_validate(parameter).content() == parameter | {"value": None, "std": None, "ci95": None}
+    always = dict.fromkeys(("value", "std", "ci95", "bias", "ci95_with_bias"))
+    assert ParameterResult.model_validate(parameter).content() == parameter | always
     assert DataResult(train=[]).content() == {"train": []}
 
 

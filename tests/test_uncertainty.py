@@ -15,7 +15,7 @@ from orthaug.fitting.estimation import estimate, orthogonalize
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive, OrthogonalPenalty
 from orthaug.inference.covariance import interval
-from orthaug.inference.intervals import newey_west, prediction_std
+from orthaug.inference.intervals import newey_west, prediction_std, robust_split_covariance
 from orthaug.inference.measures import Samples, Training, Uniform
 from orthaug.models.learners import MLP, Function
 from orthaug.physics.baseline import Baseline, Term
@@ -468,10 +468,21 @@ def other(kind):
     return estimate(example.train, example.baseline, structure=structure, **given)
 
 
-@pytest.mark.parametrize("kind", ["additive", "penalty", "bound", "free run", "split", "elsewhere"])
-def test_robust_errors_are_those_of_least_squares(kind):
-    with pytest.raises(InputError, match="robust standard errors are those of θ = Φ⁺Y: an orthogonal structure under"):
+@pytest.mark.parametrize("kind", ["additive", "penalty", "bound", "free run", "elsewhere"])
+def test_robust_errors_need_standard_errors_one_step_ahead(kind):
+    with pytest.raises(InputError, match="robust standard errors are those of a fit one step ahead that has standard"):
         other(kind).robust()
+
+
+def test_robust_errors_of_a_split_come_from_the_influence_of_every_row(noisy):
+    """Under the training measure that influence is `Φ⁺e`, whatever the learner; under another it is near the plain."""
+    residual = (noisy.model.predict(noisy.problem.record).trajectories[0].model - noisy.problem.rows.y) * -1
+    problem, used = noisy.problem, noisy.effective_weights
+    found = robust_split_covariance(problem, noisy.model, noisy._slope(), residual, used)
+    np.testing.assert_allclose(found, noisy.robust().covariance, rtol=1e-6)
+    moved = other("split")
+    np.testing.assert_allclose(moved.robust().std, moved.std, rtol=0.3)
+    assert moved.robust().split(Training()).plain_covariance is None
 
 
 @pytest.mark.parametrize("lags", [-1, 2.5, True, "4"])

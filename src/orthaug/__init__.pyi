@@ -2,6 +2,7 @@ from ._base import InputError as InputError
 from ._base import RankError as RankError
 from ._base import TrainingError as TrainingError
 from .analysis import Suspect as Suspect
+from .analysis import bias_budget as bias_budget
 from .analysis import design_input as design_input
 from .analysis import diagnose as diagnose
 from .analysis import stability as stability

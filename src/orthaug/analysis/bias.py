@@ -3,12 +3,15 @@
 With the truth `Y = Φθ* + Δ + E` (`eq:data_gen_sys_reformed_vect`) the estimate under a measure μ errs by
 `θ̂ − θ* = Φ_μ⁺(Δ_μ − ε_μ)` (eq:error_val), ε the misfit of the whole model. Here Φ_μ and Δ_μ are the
 rows multiplied by the square root of their weight.
+
+A learner that sees only some features shares only some directions B of θ with the physics. Along these alone the
+measure decides: the estimate errs by `d + B(Φ_μB)⁺G_μ`, d what the term moves c by and G what the learner holds of it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -16,6 +19,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector, check_unique
 from orthaug._base.errors import InputError
+from orthaug.analysis.absorbed import Absorbed
 from orthaug.analysis.suspects import Suspect
 from orthaug.physics.excitation import excitation, require_rank
 from orthaug.physics.output_weights import times
@@ -29,6 +33,7 @@ MOST_ROUNDS = 50
 IN_SPAN = 1e-10  # ‖P⊥Δ‖/‖Δ‖ below which Δ counts as physics
 
 Removability = Literal["unremovable", "removable", "undecided", "orthogonal"]
+RemovedBy = Literal["learner", "learner and measure", "learner in part", "measure", "nothing"]
 
 
 @dataclass(frozen=True)
@@ -72,11 +77,37 @@ class SuspectedBias:
     explained: float | None
     coefficient_found: float | None
     certificate: Certificate | None
+    seen: bool | None = None
+    """Whether it is a function of what the learner sees, where that leaves some directions of θ to the fit."""
+
+    @property
+    def removed_by(self) -> RemovedBy | None:
+        """What leaves θ unbiased by it; None where that is not known.
+
+        A learner that sees the term removes its bias from all that the learner could not imitate. Along the shared
+        directions a measure may remove the rest.
+        """
+        if self.seen and not any(self.bias):
+            return "learner"
+        verdict = self.certificate.verdict if self.certificate else "undecided"
+        if self.seen is False:
+            return "nothing" if any(self.bias) else None
+        answers: dict[str, tuple[RemovedBy, RemovedBy]] = {
+            "unremovable": ("nothing", "learner in part"),
+            "removable": ("measure", "learner and measure"),
+            "orthogonal": ("measure", "learner"),
+        }
+        return answers[verdict][bool(self.seen)] if verdict in answers else None
 
     @property
     def sentence(self) -> str:
         """The certificate in words; empty where none was sought."""
         certificate = self.certificate
+        if self.seen is False:
+            return (
+                f"{self.suspect.name}: the learner does not see all of it, so that it biases also what no measure "
+                "changes."
+            )
         if certificate is None:
             return ""
         if certificate.verdict == "orthogonal":
@@ -114,6 +145,8 @@ class SuspectedBias:
             "expected_bias": by_name(self.expected),
             "physical_bias": None if self.physical is None else dict(self.physical),
             "cosine": self.cosine,
+            "seen": self.seen,
+            "removed_by": self.removed_by,
             "explained": self.explained,
             "coefficient_found": self.coefficient_found,
             "certificate": None
@@ -140,6 +173,8 @@ def bias_table(
     physical: Mapping[str, Sequence[float] | Vector] | None = None,
     learned: Matrix | None = None,
     certify: bool = True,
+    directions: Matrix | None = None,
+    absorbed: Sequence[Absorbed] | None = None,
 ) -> tuple[SuspectedBias, ...]:
     """One `SuspectedBias` for each suspect, under the measure that `projection` was made with.
 
@@ -152,6 +187,8 @@ def bias_table(
         physical: a row of dp/dθ (nt,) for each physical parameter p, by name.
         learned: the learner's values (N, ny) in the outputs' units, projected or not.
         certify: search for certificates, a linear program per suspect.
+        directions: (nt, s) along which θ is split; None for all.
+        absorbed: what the fit makes of each suspect, where `directions` are not all.
 
     Raises:
         InputError: shapes that do not fit, values that are not finite, suspects of one name; RankError for
@@ -163,14 +200,16 @@ def bias_table(
     _check_shapes(projection, names, suspects, deltas, theta, physical, learned)
     gain = np.eye(deltas.shape[2]) if gain is None else _row_gain(gain, deltas.shape[1:])
     require_rank(excitation(projection.r, names), projection.q.shape[0] * projection.q.shape[1])
-    tilde = None if learned is None else projection.orthogonal_part(times(gain, np.asarray(learned)))
+    tilde = None if learned is None else _orthogonal_part(projection, times(gain, np.asarray(learned)), directions)
     entries = []
-    for suspect, delta in zip(suspects, deltas, strict=True):
+    for i, (suspect, delta) in enumerate(zip(suspects, deltas, strict=True)):
         if not np.all(np.isfinite(delta)):
             raise InputError(f"suspect '{suspect.name}' is not finite on every row.")
-        weighted = times(gain, delta)
-        bias = projection.solve(weighted)
-        cosine, explained, coefficient = _overlaps(projection, weighted, tilde)
+        part = None if absorbed is None else absorbed[i]
+        weighted = times(gain, delta if part is None else part.held)
+        bias = projection.solve_along(weighted, directions)
+        bias = bias if part is None else part.moved + bias
+        cosine, explained, coefficient = _overlaps(projection, weighted, tilde, directions)
         entries.append(
             SuspectedBias(
                 suspect,
@@ -182,23 +221,26 @@ def bias_table(
                 cosine,
                 explained,
                 coefficient,
-                find_certificate(projection, weighted) if certify else None,
+                find_certificate(projection, weighted, directions) if certify else None,
+                None if part is None else part.seen,
             )
         )
     return tuple(entries)
 
 
 def _overlaps(
-    projection: Projection, delta: Matrix, tilde: Matrix | None
+    projection: Projection, delta: Matrix, tilde: Matrix | None, directions: Matrix | None
 ) -> tuple[float | None, float | None, float | None]:
-    """cos(Δ, span Φ); R² of the learner's P⊥F on P⊥Δ; the coefficient of that fit."""
+    """cos(Δ, span Φ); R² of the learner's P⊥F on P⊥Δ; the coefficient of that fit. Along `directions` only."""
     size = np.abs(delta).max(initial=0.0)
     if size == 0:
         return None, None, None
     unit = delta / size  # squares of the smallest numbers would be lost
     norm = np.linalg.norm(unit)
-    cosine = float(min(np.linalg.norm(projection.coordinates(unit)) / norm, 1.0))
-    rest = projection.orthogonal_part(unit)
+    inside = projection.coordinates(unit)
+    inside = inside if directions is None else projection.along(directions) @ inside
+    cosine = float(min(np.linalg.norm(inside) / norm, 1.0))
+    rest = _orthogonal_part(projection, unit, directions)
     left = np.linalg.norm(rest)
     if tilde is None or not np.any(tilde) or left < IN_SPAN * norm:
         return cosine, None, None
@@ -207,7 +249,16 @@ def _overlaps(
     return cosine, float(min(explained, 1.0)), float(product / left / size)
 
 
-def find_certificate(projection: Projection, delta: Float[np.ndarray, "N ny"]) -> Certificate:
+def _orthogonal_part(projection: Projection, values: Matrix, directions: Matrix | None) -> Matrix:
+    """P⊥v, or what is left of v along some directions of θ."""
+    if directions is None:
+        return projection.orthogonal_part(values)
+    return values - projection.phi @ projection.solve_along(values, directions)
+
+
+def find_certificate(
+    projection: Projection, delta: Float[np.ndarray, "N ny"], directions: Matrix | None = None
+) -> Certificate:
     """Maximise `Σ (φᵀa)δ` subject to `(φᵀa)δ ≥ 0` on every point and `|a| ≤ 1`.
 
     In the coordinates of Q, so that neither units nor conditioning of Φ matter; a row of several outputs counts
@@ -217,7 +268,10 @@ def find_certificate(projection: Projection, delta: Float[np.ndarray, "N ny"]) -
     Args:
         projection: of the weighted rows of φ.
         delta: δ weighted alike, (N, ny).
+        directions: (nt, s), to look for a among these only; None for all.
     """
+    if directions is not None:
+        return _certificate_along(projection, delta, directions)
     from scipy.optimize import linprog  # slow to import
 
     size = np.abs(delta).max(initial=0.0)
@@ -257,6 +311,18 @@ def find_certificate(projection: Projection, delta: Float[np.ndarray, "N ny"]) -
             break
         chosen = grown
     return Certificate("undecided")
+
+
+def _certificate_along(projection: Projection, delta: Matrix, directions: Matrix) -> Certificate:
+    """The certificate among some directions, told in all parameters."""
+    if not directions.shape[1]:
+        return Certificate("orthogonal")
+    found = find_certificate(Projection.factor(projection.phi @ directions), delta)
+    if found.direction is None:
+        return found
+    direction = directions @ np.array(found.direction)
+    shares = direction * np.linalg.norm(projection.phi, axis=(0, 1))
+    return replace(found, direction=_numbers(direction), shares=_numbers(shares / np.abs(shares).max()))
 
 
 def _certificate(projection: Projection, a: Vector, cosine: float, margin: Vector, points: int) -> Certificate:

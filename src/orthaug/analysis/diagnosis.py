@@ -12,9 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthaug._base.checks import Vector
+from orthaug._base.errors import InputError
 from orthaug._base.parallel import one_blas_thread
 from orthaug._base.warning import Warning
+from orthaug.analysis.correlation import autocorrelation
 from orthaug.analysis.residuals import ResidualTest, analyse
+from orthaug.analysis.whiteness import ROWS_PER_LAG, ljung_box
 from orthaug.data.regressors import Lags
 from orthaug.fitting.criteria import Simulation
 from orthaug.fitting.estimates import Estimate
@@ -28,6 +31,8 @@ _LITTLE_COLOUR = 0.2  # of a free run's errors that are noise, beside a start fr
 _AS_GOOD = 1.05  # free-run error / one-step error up to which measured lags add nothing
 _TOLD = 5  # findings that a text lists at most
 _SHARE = 0.01  # of the residual's variance: what a regressor explains of it counts from there
+_MEMORIES = 3  # times as many lags as the residual's correlation lasts: Bartlett's weights fade
+_LEVEL = 0.01  # of the test whether a residual is white
 _ROUNDING = 1e-14  # of the output's deviation: a residual that says nothing
 _TOO_FAST = 0.05  # noise variance / smallest variance among the lagged outputs
 
@@ -94,16 +99,37 @@ def diagnose(fit: Estimate, *, one_step: Response | None = None, free_run: Respo
     free_white = free_tests is not None and all(_is_white(test, _PRACTICALLY_WHITE) for test in free_tests)
     verdict = ("white" if free_white else "equation_noise") if complete else "sensor_noise" if sensor else "unmodelled"
     text, warnings = _words(verdict, fit, tests, ratio, noise, simulated)
-    if fit.std is not None and not warnings and not (free_white if simulated else white):
+    robust = fit.plain_covariance is not None
+    if fit.std is not None and not warnings and not robust and not (free_white if simulated else white):
         warnings = (_coloured("errors of the free run are" if simulated else "one-step residual is"),)
     return Diagnosis(verdict, text, tests, free_tests, ratio, noise, warnings)
+
+
+def robust_where_coloured(fit: Estimate) -> Estimate:
+    """The fit with standard errors after Newey and West, where it is one step ahead and leaves a coloured residual."""
+    if not fit.status.ok or fit.covariance is None or fit.criterion.flown is not None or fit.at_bound:
+        return fit
+    response, memory = fit.model.predict(fit.problem.record), 0
+    for i in range(len(fit.problem.outputs)):
+        pieces = [(t.measured - t.model)[t.start :, i] for t in response.trajectories]  # type: ignore[operator]
+        rows = sum(map(len, pieces))
+        box, acf = ljung_box(pieces, LAGS), autocorrelation(pieces, rows // ROWS_PER_LAG)
+        if box is not None and acf is not None and box.p < _LEVEL and np.abs(acf[1:]).max() >= _PRACTICALLY_WHITE:
+            quiet = np.abs(acf) < 2 / np.sqrt(rows)
+            memory = max(memory, int(np.argmax(np.append(quiet, True))))
+    if not memory or np.all(_errors(response) / fit.problem.deviation < _ROUNDING):
+        return fit
+    try:
+        return fit.robust(_MEMORIES * memory)
+    except InputError:  # an ensemble, or a fit without statistics
+        return fit
 
 
 def _static(fit: Estimate, tests: tuple[ResidualTest, ...], white: bool, complete: bool) -> Diagnosis:
     """The diagnosis of a model without past outputs."""
     verdict = "white" if complete else "unmodelled"
     text, warnings = _words(verdict, fit, tests, None, None, False)
-    if fit.std is not None and not white:
+    if fit.std is not None and fit.plain_covariance is None and not white:
         warnings = (_coloured("one-step residual is"),)
     return Diagnosis(verdict, text, tests, None, None, None, warnings)
 

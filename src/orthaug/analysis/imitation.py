@@ -67,7 +67,7 @@ def imitation(problem: Problem, physics: PhysicsMap | None = None, *, others: bo
     own = problem.shared
     inputs = tuple(str(entry) for entry in problem.features.entries)
     alternatives = []
-    for other in _other_inputs(problem) if others else ():
+    for other in other_inputs(problem) if others else ():
         features = Features(tuple(parse(text, {}) for text in other))
         shared = shared_directions(problem.baseline, features, problem.layout, problem.outputs, problem.rows.x)
         if not shared.all and set(other) != set(inputs):
@@ -101,7 +101,7 @@ def _untouched(shared: Shared, slopes: dict[str, np.ndarray] | None) -> tuple[st
     )
 
 
-def _other_inputs(problem: Problem) -> Iterator[tuple[str, ...]]:
+def other_inputs(problem: Problem) -> Iterator[tuple[str, ...]]:
     """Choices of learner inputs that an engineer would think of: velocities, outputs, inputs, single lags."""
     for name in problem.outputs:
         lags = [str(lag) for lag in problem.layout if lag.channel == name]

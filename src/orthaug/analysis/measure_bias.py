@@ -2,67 +2,120 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug.analysis.absorbed import Absorbed, absorbed
 from orthaug.analysis.bias import SuspectedBias, bias_table
 from orthaug.analysis.suspects import Suspect, suspect_columns, usual_suspects
 from orthaug.inference.weighed import Weighed
 from orthaug.physics.output_weights import times
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import Problem
+from orthaug.physics.shared import seen
 
 CERTIFIED_ROWS = 200_000  # of a measure at most, over which certificates are sought for suspects that no one named
 
 
-def bias_under(
-    weighed: Weighed,
-    problem: Problem,
-    suspects: Sequence[Suspect] = (),
-    *,
-    physics: PhysicsMap | None = None,
-    theta: Vector | None = None,
-    learned: Matrix | None = None,
-    certify_usual: bool = True,
-) -> list[dict[str, Any]]:
-    """The bias of every suspect under a measure, for θ and, to first order, for the physical parameters; for JSON.
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """What biases are computed on.
 
     Args:
         weighed: the measure's points and the physics there, of one parameter or more.
-        suspects: those that were named; without any, the usual ones that have an effect.
         physics: the map from physical parameters to θ.
-        theta: θ̂ for relative biases and for dp/dθ; None for one-step least squares.
+        theta: θ̂ for relative biases and for dp/dθ.
         learned: f at the measure's points (M, ny) after a fit, to tell how much of it a suspect explains.
+        directions: (nθ, s) along which θ is split; None for all.
+    """
+
+    weighed: Weighed
+    problem: Problem
+    theta: Vector
+    physics: PhysicsMap | None = None
+    learned: Matrix | None = None
+    directions: Matrix | None = None
+
+    @cached_property
+    def slopes(self) -> tuple[dict[str, Vector], Vector] | None:
+        """dp/dθ by name, and p."""
+        return physical_slopes(self.physics, self.problem, self.theta)
+
+    def table(self, suspects: Sequence[Suspect], *, certify: bool, every: bool = True) -> tuple[SuspectedBias, ...]:
+        """What every suspect does to θ.
+
+        Args:
+            every: also what is zero on all points.
+        """
+        problem, x = self.problem, self.weighed.points.x
+        suspects = [suspect.sampled(problem.record.sampling_time) for suspect in suspects]
+        with np.errstate(all="ignore"):
+            deltas = suspect_columns(suspects, x, problem.layout, problem.outputs)
+        kept = [i for i in range(len(suspects)) if every or np.any(deltas[i])]
+        chosen = [suspects[i] for i in kept]
+        return bias_table(
+            self.weighed.projection,
+            problem.baseline.names,
+            chosen,
+            deltas[kept],
+            gain=self.weighed.unit,
+            theta=self.theta,
+            physical=None if self.slopes is None else self.slopes[0],
+            learned=self.learned,
+            certify=certify,
+            directions=self.directions,
+            absorbed=None if self.directions is None else self._absorbed(chosen),
+        )
+
+    def without(self, entry: SuspectedBias) -> Ground:
+        """The same with what a suspect explains of the learner taken off it."""
+        held = (
+            entry.suspect.values(self.weighed.points.x, self.problem.layout, self.problem.outputs)
+            if self.directions is None
+            else self._absorbed([entry.suspect])[0].held
+        )
+        return replace(self, learned=np.asarray(self.learned) - (entry.coefficient_found or 0.0) * held)
+
+    def _absorbed(self, suspects: Sequence[Suspect]) -> list[Absorbed]:
+        problem = self.problem
+        layout, outputs = problem.layout, problem.outputs
+
+        def forms(x: Matrix) -> Matrix:
+            return np.stack([suspect.form(x, layout) for suspect in suspects], axis=-1)
+
+        def term(suspect: Suspect) -> Callable[[Matrix], Matrix]:
+            return lambda x: suspect.values(x, layout, outputs)
+
+        visible = seen(problem.features, layout, problem.rows.x, forms) if suspects else ()
+        return absorbed(problem, map(term, suspects), visible, self.weighed.points.x)
+
+
+def bias_under(ground: Ground, suspects: Sequence[Suspect] = (), *, certify_usual: bool = True) -> list[dict[str, Any]]:
+    """The bias of every suspect under a measure, for θ and, to first order, for the physical parameters; for JSON.
+
+    Args:
+        suspects: those that were named; without any, the usual ones that have an effect.
         certify_usual: seek certificates, a linear program each, for suspects that no one named, too.
     """
-    named, x = bool(suspects), weighed.points.x
-    suspects = [suspect.sampled(problem.record.sampling_time) for suspect in suspects or usual_suspects(problem)]
-    with np.errstate(all="ignore"):
-        deltas = suspect_columns(suspects, x, problem.layout, problem.outputs)
-    kept = [i for i in range(len(suspects)) if named or np.any(deltas[i])]
-    theta = problem.least_squares if theta is None else theta
-    slopes = physical_slopes(physics, problem, theta)
-    table = bias_table(
-        weighed.projection,
-        problem.baseline.names,
-        [suspects[i] for i in kept],
-        deltas[kept],
-        gain=weighed.unit,
-        theta=theta,
-        physical=None if slopes is None else slopes[0],
-        learned=learned,
-        certify=named or (certify_usual and len(x) <= CERTIFIED_ROWS),
+    named, problem, points = bool(suspects), ground.problem, ground.weighed.points
+    table = ground.table(
+        suspects or usual_suspects(problem), certify=named or len(points.x) <= CERTIFIED_ROWS, every=named
     )
-    sizes = [float(np.linalg.norm(times(weighed.unit, deltas[i]))) for i in kept]
-    return [
-        entry.as_dict()
-        | {"relative_physical_bias": _relative(entry, slopes), "size": size}
-        | {"expected_physical_bias": _expected(entry, physics, problem, theta)}
-        for entry, size in zip(table, sizes, strict=True)
-    ]
+    found = []
+    for entry in table:
+        delta = entry.suspect.values(points.x, problem.layout, problem.outputs)
+        own = {
+            "relative_physical_bias": _relative(entry, ground.slopes),
+            "size": float(np.linalg.norm(times(ground.weighed.unit, delta))),
+            "expected_physical_bias": _expected(entry, ground.physics, problem, ground.theta),
+        }
+        found.append(entry.as_dict() | own)
+    return found
 
 
 def _expected(

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Matrix, check_number, check_unique, is_number, nearest
+from orthaug._base.checks import Matrix, Vector, check_number, check_unique, is_number, nearest
 from orthaug._base.errors import InputError
 from orthaug.data.expressions import SAMPLING_TIME, Expression, Lag, is_name, parse
 from orthaug.data.regressors import Layout
@@ -47,6 +47,7 @@ KINDS = tuple(_KINDS)
 WIDTHS = tuple(kind for kind, entry in _KINDS.items() if entry.width)  # the kinds that need a width
 _VELOCITY = ("coulomb", "stribeck", "quadratic_drag", "cubic")
 _POSITION = ("cubic", "dead_zone")
+_MULTIPLIED = 6  # lags at most, of which products are tried
 _INPUT = ("cubic", "dead_zone", "saturation")
 
 
@@ -56,7 +57,8 @@ class Suspect:
 
     `expression` is in the language of `orthaug.data.expressions` and may use the names in `constants` (kept as sorted
     pairs), and `Ts` for the sampling time. `coefficient` is a guess of its size, in the output's unit per unit of the
-    expression, None where there is none. `output` may be left out where there is only one.
+    expression, None where there is none. `output` may be left out where there is only one. `on` is what a known kind
+    acts on.
 
     Raises:
         InputError: an expression that is not arithmetic on lagged channels, a name or a number that is none.
@@ -71,6 +73,7 @@ class Suspect:
     output: str | None = None
     coefficient: float | None = None
     constants: Mapping[str, float] | tuple[tuple[str, float], ...] = ()
+    on: str | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.strip() or not self.name.isprintable():
@@ -143,7 +146,7 @@ class Suspect:
         text = _KINDS[kind].text(on or "", w)
         arguments = ", ".join(part for part in (on, w) if part)
         label = text if kind == "expression" else f"{kind}({arguments})" if arguments else kind
-        return cls(label if name is None else name, text, output, coefficient, constants or ())
+        return cls(label if name is None else name, text, output, coefficient, constants or (), on)
 
     @property
     def parsed(self) -> Expression:
@@ -184,6 +187,11 @@ class Suspect:
             )
         values[:, self.column_of(outputs)] = column
         return values
+
+    def form(self, x: Matrix, layout: Layout) -> Vector:
+        """The expression on rows of the regressor (N,), also where it is not finite."""
+        with np.errstate(all="ignore"):
+            return _evaluate(self.parsed, x, layout, f"suspect '{self.name}'")
 
     def column_of(self, outputs: Sequence[str]) -> int:
         known = ", ".join(outputs)
@@ -248,6 +256,15 @@ def usual_suspects(problem: Problem) -> tuple[Suspect, ...]:
             suspects.append(Suspect.of(kind, on, width=width, output=output, name=f"{kind} of {on}{label}"))
         suspects.append(Suspect.of("offset", output=output, name=f"offset{label}"))
     return tuple(suspects)
+
+
+def usual_terms(problem: Problem) -> tuple[Suspect, ...]:
+    """Products of two lags that the physics or the learner reads, for what no usual suspect explains."""
+    lags, outputs = problem.used[:_MULTIPLIED], problem.outputs
+    pairs = [(one, other) for i, one in enumerate(lags) for other in lags[i:]]
+    texts = [f"{one}**2" if one == other else f"{one}*{other}" for one, other in pairs]
+    only = len(outputs) == 1
+    return tuple(Suspect(text if only else f"{text} in {output}", text, output) for output in outputs for text in texts)
 
 
 def _evaluate(expression: Expression, x: Matrix, layout: Layout, what: str) -> np.ndarray:

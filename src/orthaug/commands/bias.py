@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from orthaug.analysis.measure_bias import bias_under
-from orthaug.commands.job import Job
+from orthaug._base.warning import Warning
+from orthaug.analysis.measure_bias import Ground, bias_under
+from orthaug.commands.job import Job, structure_of
 from orthaug.commands.suspects import declared
+from orthaug.fitting.elimination import directions
 from orthaug.inference.weighed import weigh_problem
 
 if TYPE_CHECKING:
+    from orthaug.analysis.budget import Budget
+    from orthaug.analysis.imitation import Imitation
     from orthaug.fitting.estimates import Estimate
+    from orthaug.reports.result import ParameterResult
 
 
 def bias_of(job: Job, fit: Estimate | None = None) -> list[dict[str, Any]]:
@@ -18,14 +24,57 @@ def bias_of(job: Job, fit: Estimate | None = None) -> list[dict[str, Any]]:
 
     Whether a measure can remove a bias is asked before a fit: then it is answered for the usual suspects, too.
     """
-    problem, weighed = job.problem, job.weighed
-    if fit is not None and fit.problem.weight.kind != problem.weight.kind:  # weighed by the errors that the fit left
-        problem, weighed = fit.problem, weigh_problem(job.measure, fit.problem)
-    if not problem.baseline.names:
+    if not job.problem.baseline.names:
         return []
-    suspects, theta = declared(job.spec.suspects, problem), None if fit is None else fit.theta
+    ground = _ground(job, fit)
+    return bias_under(ground, declared(job.spec.suspects, ground.problem), certify_usual=fit is None)
+
+
+def budget_of(job: Job, fit: Estimate) -> Budget | None:
+    """The bias that what the learner found implies, under the spec's measure."""
+    from orthaug.analysis.budget import budget_on
+
+    if fit.model.structure != "orthogonal" or fit.model.form.bound is None:
+        return None
+    ground = _ground(job, fit)
+    return budget_on(ground, fit, declared(job.spec.suspects, ground.problem))
+
+
+def with_biases(
+    job: Job, fit: Estimate, shared: Imitation | None, content: Mapping[str, Any]
+) -> tuple[dict[str, list[ParameterResult] | None], tuple[Warning, ...]]:
+    """The rows of `parameters` and `physical_parameters` with what the learner shares and what biases them."""
+    physical = content["physical_parameters"]
+    budget = budget_of(job, fit) if fit.status.ok else None
+    if fit.model.structure != "orthogonal" or fit.model.form.bound is None:  # a variant of what the spec declares
+        shared = None
+
+    def told(rows: list[ParameterResult] | None, determined: Sequence[str] | None) -> list[ParameterResult] | None:
+        if rows is None:
+            return None
+        return [
+            row.told(
+                None if determined is None else row.name not in determined, budget.of(row.name) if budget else None
+            )
+            for row in rows
+        ]
+
+    rows = {
+        "parameters": told(content["parameters"], shared.determined if shared else None),
+        "physical_parameters": told(physical, shared.physical if shared else None),
+    }
+    return rows, budget.warnings if budget else ()
+
+
+def _ground(job: Job, fit: Estimate | None) -> Ground:
+    problem, weighed, structure = job.problem, job.weighed, structure_of(job.spec)
+    if fit is None:
+        along = directions(structure, problem) if job.spec.declared_learner() is not None else None
+        return Ground(weighed, problem, problem.least_squares, job.physics, None, along)
+    if fit.problem.weight.kind != problem.weight.kind:  # weighed by the errors that the fit left
+        problem = fit.problem
+        weighed = weigh_problem(job.measure, problem)
     learned = None
-    if fit is not None and fit.model.form.bound is not None:
+    if fit.model.form.bound is not None:
         learned = fit.model.learner_at(weighed.points.x)
-    options: dict[str, Any] = {"physics": job.physics, "theta": theta, "learned": learned}
-    return bias_under(weighed, problem, suspects, **options, certify_usual=fit is None)
+    return Ground(weighed, problem, fit.theta, job.physics, learned, fit.model.shared)

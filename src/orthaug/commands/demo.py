@@ -109,4 +109,5 @@ def _comparison(example: Example, orthogonal: Fitted, additive: list[Estimate]) 
         theirs = [getattr(a.model, verb)(example.test).scores().rmse[0] for a in additive]
         lines.append(f"{label:<48}{ours:>26.3g}   {f'{min(theirs):.3g} … {max(theirs):.3g}':>28}")
     lines += ["", f"Both predict equally well; only the orthogonal structure keeps θ (‖QᵀF̃‖/‖F‖ = {fit.defect:.0e})."]
+    lines += [f"warning: {warning.text}" for warning in orthogonal.result.warnings if warning.code == "biased"]
     return "\n".join(lines)

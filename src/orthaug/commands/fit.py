@@ -14,7 +14,7 @@ from orthaug._base.folders import whole_folder
 from orthaug._base.parallel import one_blas_thread
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.warning import Warning
-from orthaug.commands.bias import bias_of
+from orthaug.commands.bias import bias_of, with_biases
 from orthaug.commands.folder import not_a_result
 from orthaug.commands.job import ALONE, AS_DECLARED, DEFAULT_BLOCKS, Job, Variant, run_fit
 from orthaug.commands.parts import Part
@@ -80,10 +80,12 @@ def fit_job(job: Job, progress: Progress = SILENT) -> Fitted:
 
 def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitted:
     """Train a variant of a job and score every part; `judge_fit` asks whether the learner helps."""
-    fit = run_fit(job, variant, progress)
+    from orthaug.analysis.diagnosis import robust_where_coloured
+
+    fit = robust_where_coloured(run_fit(job, variant, progress))
     warnings: list[Any] = [*job.warnings, *fit.warnings]
-    unknown = ("physical_parameters", "physical_consistency", "sensitivities", "bias", "residuals", "stability")
-    content: dict[str, Any] = dict.fromkeys(unknown)
+    unknown = ("physical_parameters", "physical_consistency", "sensitivities", "bias")
+    content: dict[str, Any] = dict.fromkeys((*unknown, "residuals", "missing_lags", "stability"))
     scores, responses = {}, {}
     if fit.status.ok:
         content |= _physical_content(job, fit, warnings)
@@ -92,6 +94,7 @@ def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitt
             scores[part.name], responses[part.name] = score_part(fit.model, part, warnings)
         one_step, free_run = responses[job.train.name]
         content |= _analysed(fit, one_step, free_run, warnings)
+    shared = shared_of(job, others=False)
     nothing_known = np.full(len(fit.theta), np.nan)
     content |= {
         "spec": job.declaration,
@@ -104,18 +107,23 @@ def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitt
             fit.std,
             fit.interval,
             fit.one_step_theta,
+            None if fit.plain_covariance is None else np.sqrt(np.diag(fit.plain_covariance)),
         ),
+        "standard_errors": None if fit.std is None else "plain" if fit.plain_covariance is None else "robust",
         "structure": fit.model.structure,
         "measure": fit.model.measure if fit.model.structure == "orthogonal" else None,
         "measure_detail": fit.measure,
         "orthogonality_defect": fit.defect,
-        "shared": shared_of(job, others=False),
         "output_weights": None if fit.problem.weight.one_output else fit.problem.weight.as_dict(),
         "excitation": fit.excitation,
         "scores": scores,
+        "shared": shared,
         "validation": None,
         "warnings": warnings,
     }
+    rows, biased = with_biases(job, fit, shared, content)
+    content |= rows
+    warnings += biased
     return Fitted(job, fit, FitResult.model_validate(content), responses)
 
 
@@ -154,6 +162,7 @@ def _analysed(fit: Estimate, one_step: Response, free_run: Response, warnings: l
     """What the residuals and the free run's sensitivity say; warnings are added."""
     from orthaug.analysis.diagnosis import diagnose
     from orthaug.analysis.free_run_stability import stability
+    from orthaug.analysis.missing_lags import missing_lags
 
     problem = fit.problem
     diagnosis = diagnose(fit, one_step=one_step, free_run=free_run)
@@ -164,7 +173,9 @@ def _analysed(fit: Estimate, one_step: Response, free_run: Response, warnings: l
         warnings.append(Warning("residual_not_analysed", told))
     else:
         warnings += diagnosis.warnings
-    return {"residuals": diagnosis, "stability": steady}
+    hidden = missing_lags(fit, one_step)
+    warnings += hidden.warnings if hidden else ()
+    return {"residuals": diagnosis, "missing_lags": hidden, "stability": steady}
 
 
 def judge_fit(fitted: Fitted, blocks: Sequence[Trial] | None = None, alone: Fitted | None = None) -> Verdict | None:

@@ -16,10 +16,10 @@ from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.held_out import Pieces, Ratio
 from orthaug.fitting.status import Status
 from orthaug.inference.covariance import interval
-from orthaug.inference.intervals import joint_covariance, robust_covariance
-from orthaug.inference.measures import Measure, Support, Training
+from orthaug.inference.intervals import joint_covariance, robust_covariance, robust_split_covariance
+from orthaug.inference.measures import Measure, Points, Support, Training
 from orthaug.inference.physical import PhysicalEstimate, profile, solve
-from orthaug.inference.splitting import MeasureSplit, split_under
+from orthaug.inference.splitting import MeasureSplit, learner_slope, split_under
 from orthaug.models.model import Model
 from orthaug.physics.baseline import check_sampling_constant
 from orthaug.physics.excitation import Excitation
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 NOT_UNIQUE = "theta_not_unique"
 """The code of the warning that a split under a measure makes untrue."""
+ROBUST = "robust (Newey-West), for the one-step residual is coloured"
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,8 @@ class Estimate:
     held_out: HeldOut | None = None
     """By what the run was chosen; None where the lowest training loss chose."""
     warnings: tuple[Warning, ...] = ()
+    plain_covariance: Matrix | None = None
+    """Cov θ̂ for white noise, where `covariance` is robust; None where it is not."""
 
     @property
     def theta(self) -> Vector:
@@ -164,6 +167,7 @@ class Estimate:
             self,
             model=replace(self.model, numbers=numbers, structure="orthogonal", measure=measure.name),
             covariance=under.covariance,
+            plain_covariance=None,
             defect=under.defect,
             measure=under,
             warnings=(*(w for w in self.warnings if w.code != NOT_UNIQUE), *under.warnings, *unknown),
@@ -179,17 +183,32 @@ class Estimate:
         """The same with standard errors of θ that hold for coloured and uneven noise (Newey-West).
 
         Raises:
-            InputError: θ that is not `Φ⁺Y`: of another structure or measure, at a bound, or trained on the free run.
+            InputError: a fit without standard errors, trained on several steps, or with a parameter at a bound.
         """
-        plain = self.covariance is not None and self.measure is None and self.criterion.flown is None
-        if not plain or self.at_bound:
+        if self.covariance is None or self.criterion.flown is not None or self.at_bound:
             raise InputError(
-                "robust standard errors are those of θ = Φ⁺Y: an orthogonal structure under the training measure, "
-                "one step ahead, with no parameter at a bound."
+                "robust standard errors are those of a fit one step ahead that has standard errors, with no parameter "
+                "at a bound."
             )
         trajectories = self.model.predict(self.problem.record).trajectories
         residual = np.concatenate([(t.measured - t.model)[t.start :] for t in trajectories])  # type: ignore[operator]
-        return replace(self, covariance=robust_covariance(self.problem, residual, self.effective_weights, lags))
+        used = (self.problem, residual, self.effective_weights, lags)
+        if self.measure is None and self.model.shared is None:
+            covariance = robust_covariance(*used)
+        else:
+            slope = self._slope()
+            covariance = robust_split_covariance(self.problem, self.model, slope, *used[1:])
+        plain = self.covariance if self.plain_covariance is None else self.plain_covariance
+        return replace(self, covariance=covariance, plain_covariance=plain)
+
+    def _slope(self) -> Matrix:
+        """∂θ_aux/∂w under the measure that θ was split under."""
+        if self.measure is not None and self.measure.slope is not None:
+            return self.measure.slope
+        problem = self.problem
+        points = Points(problem.rows.x, np.ones(len(problem.rows)))
+        unit = np.broadcast_to(problem.weight.matrix, (len(points.x), *problem.weight.matrix.shape))
+        return learner_slope(self.model, points, problem.projection, unit)
 
     def physical(self, physics: PhysicsMap) -> PhysicalEstimate:
         """The physical parameters that θ̂ is made of, with intervals by the delta method."""
@@ -254,6 +273,8 @@ def summary_lines(fit: Estimate) -> Sequence[str]:
     width = max([9, *(len(name) for name in baseline.names)])
     lines += ["", f"{'parameter':<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  {'initial':>11}  unit"]
     std, ci = fit.std, fit.interval
+    if fit.plain_covariance is not None:
+        lines.insert(-2, f"std         {ROBUST}")
     for i, parameter in enumerate(baseline.parameters):
         spread = f"{std[i]:11.4g}" if std is not None else f"{'–':>11}"
         reach = f"[{ci[i, 0]:13.7g}, {ci[i, 1]:13.7g}]" if ci is not None else f"{'–':^29}"

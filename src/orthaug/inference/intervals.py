@@ -94,17 +94,32 @@ def prediction_std(model: Model, record: Record) -> list[Matrix]:
 def _variances(
     form: Lagged, numbers: Numbers, x: Float[Array, "k nx m"], root: Float[Array, "n r"]
 ) -> Float[Array, "k ny m"]:
+    return jax.lax.map(lambda rows: jnp.sum(_along(form, numbers, rows, root) ** 2, axis=0), x)
+
+
+@partial(jax.jit, static_argnames="form")
+def _changes(
+    form: Lagged, numbers: Numbers, x: Float[Array, "k nx m"], root: Float[Array, "n r"]
+) -> Float[Array, "k ro m"]:
+    """How far each prediction moves along the columns of `root`."""
+
     def one_chunk(rows: Any) -> Any:
-        phi = jax.vmap(lambda row: form.baseline.phi(row, form.layout, form.outputs, jnp), -1, -1)(rows)
-        columns = jnp.moveaxis(phi, 1, 0)  # (nt, ny, m)
-        if form.bound is not None:
-            z = form.features.evaluate(rows.T, form.layout, jnp)
-            z = ((z - numbers.centre) / numbers.halfwidth).T
-            gain = jnp.broadcast_to(jnp.diag(numbers.gain)[..., None], (*2 * (len(form.outputs),), rows.shape[-1]))
-            columns = jnp.concatenate([columns, form.bound.jacobian(numbers.weights, z, gain)[1]])
-        return jnp.sum(jnp.einsum("nom,nr->rom", columns, root) ** 2, axis=0)
+        moved = _along(form, numbers, rows, root)
+        return moved.reshape(-1, moved.shape[-1])
 
     return jax.lax.map(one_chunk, x)
+
+
+def _along(form: Lagged, numbers: Numbers, rows: Any, root: Any) -> Float[Array, "r ny m"]:
+    """∂ŷ/∂(c, w) of a chunk of rows along the columns of `root`."""
+    phi = jax.vmap(lambda row: form.baseline.phi(row, form.layout, form.outputs, jnp), -1, -1)(rows)
+    columns = jnp.moveaxis(phi, 1, 0)  # (nt, ny, m)
+    if form.bound is not None:
+        z = form.features.evaluate(rows.T, form.layout, jnp)
+        z = ((z - numbers.centre) / numbers.halfwidth).T
+        gain = jnp.broadcast_to(jnp.diag(numbers.gain)[..., None], (*2 * (len(form.outputs),), rows.shape[-1]))
+        columns = jnp.concatenate([columns, form.bound.jacobian(numbers.weights, z, gain)[1]])
+    return jnp.einsum("nom,nr->rom", columns, root)
 
 
 def newey_west(scores: Sequence[Float[np.ndarray, "N nt"]], lags: int | None = None) -> Matrix:
@@ -135,12 +150,37 @@ def robust_covariance(problem: Problem, residual: Matrix, used: float, lags: int
     projection = problem.projection
     whitened = problem.weight.rows(residual)
     scores = np.einsum("kit,ki->kt", projection.q, whitened)
-    pieces, begin = [], 0
-    for experiment in problem.record.experiments:
-        end = begin + len(experiment) - problem.rows.start
-        pieces.append(scores[begin:end])
-        begin = end
-    rows, nt = len(whitened) * whitened.shape[1], len(projection.scale)
-    correction = rows / max(rows - nt - used, 1.0)
     factor = projection.covariance_factor()
-    return correction * factor @ newey_west(pieces, lags) @ factor.T
+    return _correction(problem, residual, used) * factor @ newey_west(_by_experiment(problem, scores), lags) @ factor.T
+
+
+def robust_split_covariance(
+    problem: Problem, model: Model, slope: Matrix, residual: Matrix, used: float, lags: int | None = None
+) -> Matrix:
+    """The same of any split `θ = c + θ_aux(w)`, from the influence `[I, ∂θ_aux/∂w] M⁻¹ ψ_k e_k` of every row.
+
+    Args:
+        slope: ∂θ_aux/∂w (nθ, nw).
+    """
+    statistics, nt, ny = model.statistics, len(slope), residual.shape[1]
+    if statistics.gram is None or model.numbers.tilt is not None:
+        raise InputError("the fit has no statistics that robust standard errors could be made of.")
+    prior = np.concatenate([np.zeros(nt), np.full(len(statistics.gram) - nt, statistics.ridge)])
+    half = half_inverse(statistics.gram + np.diag(prior), nt)
+    root = half @ (half.T @ np.column_stack([np.eye(nt), slope]).T)
+    chunks = jnp.asarray(in_chunks(problem.rows.x, chunk_shape(len(residual)), repeat=True))
+    changes = from_chunks(np.asarray(_changes(model.form, model.numbers, chunks, jnp.asarray(root))), len(residual))
+    matrix = problem.weight.matrix
+    weighed = residual @ (matrix.T @ matrix)
+    scores = np.einsum("kro,ko->kr", changes.reshape(len(residual), nt, ny), weighed)
+    return _correction(problem, residual, used) * newey_west(_by_experiment(problem, scores), lags)
+
+
+def _correction(problem: Problem, residual: Matrix, used: float) -> float:
+    """For what the fit has used up."""
+    return residual.size / max(residual.size - len(problem.baseline.names) - used, 1.0)
+
+
+def _by_experiment(problem: Problem, scores: Matrix) -> list[Matrix]:
+    ends = np.cumsum([len(experiment) - problem.rows.start for experiment in problem.record.experiments])
+    return np.split(scores, ends[:-1])

@@ -40,6 +40,8 @@ class MeasureSplit:
     warnings: tuple[Warning, ...]
     price: Vector | None = None
     """Standard error of each θ over that under the training measure (nθ,)."""
+    slope: Matrix | None = None
+    """∂θ_aux/∂w (nθ, nw)."""
 
     def __str__(self) -> str:
         told = f"{self.name}, {self.points} points, {100 * self.support:.0f} % of it within reach of the data"
@@ -72,7 +74,7 @@ def split_under(measure: Measure, model: Model, support: Support, joint: JointCo
     values = times(unit, raw)
     aux = projection.solve_along(values, model.shared)
     theta = model.theta - model.theta_aux + aux
-    covariance = None
+    covariance = slope = None
     if joint is not None and numbers.tilt is None:
         slope = learner_slope(model, points, projection, unit)
         covariance = joint.of(np.column_stack([np.eye(len(theta)), slope]))
@@ -86,7 +88,8 @@ def split_under(measure: Measure, model: Model, support: Support, joint: JointCo
     told = Warning("measure_beyond_data", f"{reach}: elsewhere θ rests on how the learner extrapolates.")
     warnings = (told,) if share < SUPPORTED and learns else ()
     condition = weighed.excitation.condition
-    return MeasureSplit(measure.name, theta, aux, covariance, defect, share, len(points.x), condition, warnings)
+    told_of = (share, len(points.x), condition, warnings)
+    return MeasureSplit(measure.name, theta, aux, covariance, defect, *told_of, slope=slope)
 
 
 def learner_slope(model: Model, points: Points, projection: Projection, unit: np.ndarray) -> Matrix:

@@ -10,14 +10,15 @@ Found by moves: pairs of regressors x, x′ with z(x) = z(x′) that differ othe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug.data.expressions import Lag
 from orthaug.data.regressors import Features, Layout
 from orthaug.physics.baseline import Baseline
 
@@ -68,8 +69,7 @@ def shared_directions(
     """
     names, everything = baseline.names, Shared(baseline.names, np.eye(len(baseline.names)))
     read = set(baseline.lags) if baseline.function is None else set(layout)
-    raw = {str(entry) for entry in features.entries}
-    if not names or not features.entries or {str(lag) for lag in read} <= raw:
+    if not names or not features.entries or _sees(features, read):
         return everything
     start, end = _moves(features, layout, x)
     with np.errstate(all="ignore"):
@@ -79,6 +79,35 @@ def shared_directions(
         return everything
     before, after = (part[kept].reshape(-1, len(names)) for part in phi)
     return Shared(names, _agreeing(before, after))
+
+
+def seen(
+    features: Features,
+    layout: Layout,
+    x: Float[np.ndarray, "N nx"],
+    values: Callable[[Float[np.ndarray, "M nx"]], Float[np.ndarray, "M k"]],
+) -> Bool[np.ndarray, "k"]:
+    """Which columns of `values` are functions of what the learner sees: moves that it does not see leave them alone.
+
+    Args:
+        x: measured regressors, where the moves begin.
+        values: of rows of the regressor, a column for each function in question.
+    """
+    if _sees(features, layout):
+        return np.ones(values(x[:1]).shape[1], dtype=bool)
+    start, end = _moves(features, layout, x)
+    with np.errstate(all="ignore"):
+        pairs = np.stack([values(start), values(end)])
+        there = np.isfinite(pairs).all(axis=0)
+        pairs = np.where(there, pairs, 0.0)
+        size = np.sqrt(np.mean(pairs**2, axis=(0, 1)))
+    still = np.abs(pairs[1] - pairs[0]).max(axis=0, initial=0.0) <= _TOLERANCE * size
+    return still & (np.sum(there, axis=0) >= _FEWEST)
+
+
+def _sees(features: Features, lags: Iterable[Lag]) -> bool:
+    """Whether all of these lags are features as they stand."""
+    return {str(lag) for lag in lags} <= {str(entry) for entry in features.entries}
 
 
 def _agreeing(before: Matrix, after: Matrix) -> Matrix:

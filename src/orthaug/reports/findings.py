@@ -60,6 +60,8 @@ class SuspectResult(Content):
     expected_bias: ByName | None
     physical_bias: ByName | None
     cosine: Number
+    seen: Flag | None
+    removed_by: str | None
     explained: Number
     coefficient_found: Number
     certificate: CertificateResult | None
@@ -153,6 +155,23 @@ class DiagnosisResult(Content):
     free_run: list[ResidualTestResult] | None
     free_run_to_one_step: Number = Field(validation_alias="ratio")
     noise_in_lags: Number
+
+
+class LagResult(Content):
+    """The residual against a lag that the learner does not see."""
+
+    lag: str
+    p: Number
+    share: Number
+
+
+class MissingLagsResult(Content):
+    """Whether what the physics lacks is a function of what the learner sees."""
+
+    level: Number
+    tests: list[LagResult]
+    missing: list[LagResult]
+    text: str
 
 
 class PlaceResult(Content):

@@ -11,9 +11,17 @@ from pydantic import BeforeValidator, Field
 from orthaug import __version__
 from orthaug.physics.baseline import Parameter
 from orthaug.reports.fields import ByName, Content, Flag, Number, Numbers, WarningResult, Whole
-from orthaug.reports.findings import DiagnosisResult, SharedResult, StabilityResult, SuspectResult, ValidationResult
+from orthaug.reports.findings import (
+    DiagnosisResult,
+    MissingLagsResult,
+    SharedResult,
+    StabilityResult,
+    SuspectResult,
+    ValidationResult,
+)
 
 if TYPE_CHECKING:
+    from orthaug.analysis.budget import ParameterBias
     from orthaug.analysis.design import Design
     from orthaug.inference.physical import PhysicalEstimate
 
@@ -74,10 +82,18 @@ class RestartResult(Content):
     validation: Number
 
 
+class BiasResult(Content):
+    """The bias of a parameter by what the learner found: estimate less truth, its cause, the cause's share of it."""
+
+    value: Number
+    cause: str
+    share: Number
+
+
 class ParameterResult(Content):
     """A parameter with its interval."""
 
-    absent: ClassVar = frozenset({"one_step", "profile95"})
+    absent: ClassVar = frozenset({"one_step", "profile95", "plain_std", "shared"})
 
     name: str
     unit: str
@@ -85,8 +101,20 @@ class ParameterResult(Content):
     value: Number
     one_step: Number = None
     std: Number = None
+    plain_std: Number = None
     ci95: Numbers | None = None
     profile95: Numbers | None = None
+    shared: Flag | None = None
+    bias: BiasResult | None = None
+    ci95_with_bias: Numbers | None = None
+
+    def told(self, shared: bool | None, bias: ParameterBias | None) -> ParameterResult:
+        """The same with whether the learner could imitate it, and its bias."""
+        found: dict[str, object] = {"shared": shared}
+        if bias is not None:
+            interval = None if bias.ci95 is None else list(bias.ci95)
+            found |= {"bias": BiasResult.model_validate(bias), "ci95_with_bias": interval}
+        return self.model_copy(update=found)
 
 
 class ConsistencyResult(Content):
@@ -174,6 +202,7 @@ class FitResult(_Headed):
     status: StatusResult
     restarts: list[RestartResult]
     parameters: list[ParameterResult]
+    standard_errors: str | None
     physical_parameters: list[ParameterResult] | None
     physical_consistency: ConsistencyResult | None
     sensitivities: dict[str, ByName] | None
@@ -187,6 +216,7 @@ class FitResult(_Headed):
     scores: dict[str, PartScores]
     bias: list[SuspectResult] | None
     residuals: DiagnosisResult | None
+    missing_lags: MissingLagsResult | None
     stability: StabilityResult | None
     validation: ValidationResult | None
     warnings: list[WarningResult]
@@ -294,6 +324,7 @@ def parameter_rows(
     std: Any = None,
     interval: Any = None,
     one_step: Any = None,
+    plain_std: Any = None,
 ) -> list[ParameterResult]:
     """θ as results list it; what stands at a bound has no interval."""
     return [
@@ -305,6 +336,7 @@ def parameter_rows(
                 "value": values[i],
                 "one_step": None if one_step is None else one_step[i],
                 "std": None if std is None else std[i],
+                "plain_std": None if plain_std is None else plain_std[i],
                 "ci95": None if interval is None or np.isnan(interval[i]).any() else interval[i],
             }
         )

@@ -41,7 +41,8 @@ def fit_text(fit: Estimate, result: FitResult) -> str:
     blocks.append(_score_lines(fit, result))
     if result.shared is not None and not result.shared.everything:
         blocks.append([result.shared.text])
-    told = [finding.text for finding in (result.residuals, result.validation) if finding]
+    blocks.append(_bias_lines(result))
+    told = [finding.text for finding in (result.residuals, result.missing_lags, result.validation) if finding]
     blocks += [told, _warning_lines(w for w in dict.fromkeys(result.warnings) if w.text not in told)]
     return "\n\n".join("\n".join(lines) for lines in blocks if lines)
 
@@ -69,7 +70,8 @@ def check_text(result: CheckResult) -> str:
         lines += [
             "",
             "Bias of each parameter if a term is missing from the physics. Size: its share of the output's deviation,",
-            "1 % where no coefficient is given. Removable: whether some weighting of these points leaves no bias.",
+            "1 % where no coefficient is given. Removed by: a measure, if some weighting of these points leaves none;",
+            "the learner, if it sees the term, from what it could not imitate.",
             *_suspect_lines(result.bias),
         ]
     return "\n".join([*lines, *_warning_lines(result.warnings)])
@@ -151,16 +153,38 @@ def _warning_lines(warnings: Iterable[WarningResult]) -> list[str]:
 
 def _suspect_lines(suspects: Sequence[SuspectResult]) -> list[str]:
     """What each suspect does, biases in per cent."""
-    rows = [["suspect", "size", *suspects[0].percent, "cosine", "removable"]]
+    rows = [["suspect", "size", *suspects[0].percent, "cosine", "removed by"]]
     for suspect in suspects:
-        guess, certificate = suspect.coefficient, suspect.certificate
+        guess = suspect.coefficient
         cosine = "–" if suspect.cosine is None else f"{suspect.cosine:.3f}"
-        verdict = certificate.verdict if certificate else ""
-        answer = {"unremovable": "no", "removable": "yes", "orthogonal": "yes"}.get(verdict, "–")
         size = "1 %" if guess is None else "–" if suspect.size is None else f"{100 * abs(guess) * suspect.size:.2g} %"
-        biases = ("–" if share is None else f"{share:+.2g} %" for share in suspect.percent.values())
-        rows.append([suspect.name, size, *biases, cosine, answer])
+        biases = ("–" if share is None else f"{_rounded(share):+.2g} %" for share in suspect.percent.values())
+        rows.append([suspect.name, size, *biases, cosine, suspect.removed_by or "–"])
     return _table(rows)
+
+
+def _bias_lines(result: FitResult) -> list[str]:
+    """The bias of every parameter by what the learner found, and the interval that covers it."""
+    rows = [row for row in (*result.parameters, *(result.physical_parameters or ())) if row.bias is not None]
+    if not rows or rows[0].bias is None:
+        return []
+    cause, share, width = rows[0].bias.cause, rows[0].bias.share or 0.0, _width(rows)
+    lines = [f"{100 * share:.0f} % of what the learner found is {cause}. The bias that implies:"]
+    lines.append(f"{'parameter':<{width}}  {'bias':>11}  {'of std':>7}  {'of value':>9}  {'95 % interval with it':^29}")
+    for row in rows:
+        bias = row.bias.value if row.bias else None
+        if bias is not None and row.value is not None:
+            errors = f"{abs(bias) / row.std:7.2g}" if row.std else f"{'–':>7}"
+            part = f"{_rounded(100 * bias / row.value):+7.2g} %" if row.value else f"{'–':>9}"
+            reach = row.ci95_with_bias
+            limits = f"[{_limit(reach[0])}, {_limit(reach[1])}]" if reach else f"{'–':^29}"
+            lines.append(f"{row.name:<{width}}  {bias:+11.3g}  {errors}  {part}  {limits}".rstrip())
+    return lines
+
+
+def _rounded(share: float) -> float:
+    """Zero for what is rounding of zero."""
+    return 0.0 if abs(share) < 1e-9 else share
 
 
 def _physical_lines(result: FitResult) -> list[str]:
@@ -246,7 +270,9 @@ def _estimate(parameter: ParameterResult) -> str:
     if parameter.value is None:
         return "–"
     spread = f" ± {parameter.std:.2g}" if parameter.std is not None else ""
-    return f"{parameter.value:.6g}{spread}"
+    bias = parameter.bias.value if parameter.bias and parameter.std is not None else None
+    large = bias is not None and parameter.std is not None and abs(bias) > parameter.std
+    return f"{parameter.value:.6g}{spread}{f' (bias {bias:+.2g})' if large else ''}"
 
 
 def _numbers(values: Sequence[float | None] | None) -> str:

@@ -1,0 +1,244 @@
+"""What the learner found, explained by a cause, and the bias of every parameter that follows from it.
+
+With F the learner's values under the measure and Δ a cause's, the coefficient is that of P⊥F on P⊥Δ and the bias,
+estimate less truth, `Φ_μ⁺Δ` times it. Only one cause is named: the declared suspect that explains most of ‖P⊥F‖² if
+that is enough, else the usual suspect or product of lags that does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import scipy.special
+from jaxtyping import Float
+
+from orthaug._base.checks import Vector
+from orthaug._base.errors import InputError
+from orthaug._base.warning import Warning
+from orthaug.analysis.bias import SuspectedBias
+from orthaug.analysis.measure_bias import Ground
+from orthaug.analysis.remedies import remedies
+from orthaug.analysis.suspects import Suspect, usual_suspects, usual_terms
+from orthaug.fitting.estimates import Estimate
+from orthaug.inference.measures import Measure, Training
+from orthaug.inference.physical import solve
+from orthaug.inference.weighed import weigh_problem
+from orthaug.physics.parameters import PhysicsMap
+
+LEAST_SHARE = 0.5  # of the learner's energy that a cause must explain to be named
+_AS_MUCH = 0.98  # of what the cause explains: a rival cannot be told from it
+_ROUNDING = 1e-9  # of a parameter: a bias that no one can speak of
+_TOLD = 4  # parameters that a warning lists at most
+
+
+@dataclass(frozen=True)
+class ParameterBias:
+    """The bias of a parameter, estimate less truth, and an interval that covers bias and noise together."""
+
+    name: str
+    value: float
+    cause: str
+    share: float
+    relative: float | None
+    errors: float | None
+    """Its size in standard errors; None where there are none."""
+    ci95: tuple[float, float] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Budget:
+    """The bias of every parameter by the cause that explains `share` of the learner."""
+
+    cause: SuspectedBias
+    share: float
+    parameters: tuple[ParameterBias, ...]
+    physical: tuple[ParameterBias, ...]
+    warnings: tuple[Warning, ...]
+
+    def of(self, name: str) -> ParameterBias | None:
+        """The bias of a parameter or physical parameter."""
+        return next((entry for entry in (*self.parameters, *self.physical) if entry.name == name), None)
+
+
+def ground_of(fit: Estimate, measure: Measure, physics: PhysicsMap | None = None) -> Ground:
+    """What biases of a fit are computed on; `measure` is the one that θ was split under."""
+    weighed = weigh_problem(measure, fit.problem)
+    learns = fit.model.form.bound is not None
+    learned = fit.model.learner_at(weighed.points.x) if learns else None
+    return Ground(weighed, fit.problem, fit.theta, physics, learned, fit.model.shared)
+
+
+def bias_budget(
+    fit: Estimate,
+    suspects: Sequence[Suspect] = (),
+    *,
+    physics: PhysicsMap | None = None,
+    measure: Measure | None = None,
+) -> Budget | None:
+    """The bias that what the learner found implies; None where no cause explains enough of it.
+
+    Args:
+        suspects: terms that may be missing, looked at first.
+        physics: the map from physical parameters to θ, for their biases.
+        measure: what θ was split under, where that is not the training measure.
+    """
+    if not fit.status.ok or fit.model.structure != "orthogonal" or fit.model.form.bound is None:
+        return None
+    measure = Training() if measure is None else measure
+    name = "training" if fit.measure is None else fit.measure.name
+    if measure.name != name:
+        raise InputError(f"`measure` is the {measure.name} measure, but θ was split under the {name} measure.")
+    return budget_on(ground_of(fit, measure, physics), fit, suspects)
+
+
+def budget_on(ground: Ground, fit: Estimate, suspects: Sequence[Suspect]) -> Budget | None:
+    """The same on a ground that is there already."""
+    if not ground.problem.baseline.names or ground.learned is None or not np.all(np.isfinite(ground.learned)):
+        return None
+    cause = named_cause(ground, suspects)
+    if cause is None or cause.explained is None or cause.coefficient_found is None:
+        return None
+    share, coefficient = cause.explained, cause.coefficient_found
+    told = partial(_rows, freedom=fit.freedom, cause=cause.suspect.name, share=share)
+    rest, bias = left_over(ground, cause, suspects), coefficient * np.array(cause.bias)
+    std = np.full(len(bias), np.nan) if fit.std is None else fit.std
+    names, rows = ground.problem.baseline.names, ()
+    parameters = told(names, fit.theta, std, bias, rest[: len(names)])
+    if ground.physics is not None:
+        physical = fit.physical(ground.physics)
+        own = np.array([np.nan if s is None else s for s in physical.std])
+        moved = _physical(ground.physics, fit, bias)
+        rows = told(physical.names, np.array(physical.value), own, moved, rest[len(names) :])
+    found = Budget(cause, share, parameters, rows, ())
+    warning = _warning(ground, found, rival_of(ground, cause, suspects))
+    return found if warning is None else replace(found, warnings=(warning,))
+
+
+def named_cause(ground: Ground, suspects: Sequence[Suspect], least: float = LEAST_SHARE) -> SuspectedBias | None:
+    """The cause that explains most of the learner, the declared ones first; None where that is less than `least`.
+
+    Of what no one declared only what the learner sees counts: the rest is no likely cause of what it found.
+    """
+    for table in (_declared(ground, suspects), _usual(ground)):
+        best = max(table, key=lambda entry: entry.explained or 0.0, default=None)
+        if best is not None and (best.explained or 0.0) >= least:
+            return best
+    return None
+
+
+def _declared(ground: Ground, suspects: Sequence[Suspect]) -> tuple[SuspectedBias, ...]:
+    return ground.table(tuple(suspects), certify=False, every=False) if suspects else ()
+
+
+def _usual(ground: Ground) -> tuple[SuspectedBias, ...]:
+    terms = (*usual_suspects(ground.problem), *usual_terms(ground.problem))
+    return tuple(entry for entry in ground.table(terms, certify=False, every=False) if entry.seen is not False)
+
+
+def rival_of(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) -> SuspectedBias | None:
+    """A term that explains as much as a cause that no one declared, and moves θ elsewhere; None where there is none.
+
+    As a dead zone and a saturation of what the physics has a term in: their sum is that term.
+    """
+    assert cause.explained
+    if cause.suspect in suspects:
+        return None
+    equal = [entry for entry in _usual(ground) if (entry.explained or 0.0) >= _AS_MUCH * cause.explained]
+    to_coordinates, own = ground.weighed.projection.to_coordinates, _moved(cause)
+    nt = len(cause.names)
+
+    def apart(entry: SuspectedBias) -> float:
+        return float(np.linalg.norm(to_coordinates @ (_moved(entry) - own)[:nt]))
+
+    farthest = max(equal, key=apart, default=None)
+    return farthest if farthest and apart(farthest) > 0.5 * np.linalg.norm(to_coordinates @ own[:nt]) else None
+
+
+def left_over(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) -> Vector:
+    """Standard deviations of the bias that the cause does not tell, of θ and physical parameters.
+
+    What it leaves of the learner counts as biased by as much for its size as the cause, of unknown sign; beside that by
+    what the next best cause makes of it, and by how far a rival of the cause would move θ elsewhere.
+    """
+    assert cause.explained
+    rest, others = ground.without(cause), tuple(suspect for suspect in suspects if suspect != cause.suspect)
+    found = [best for group in {others, ()} if (best := named_cause(rest, group, 0.0)) is not None]
+    own = _moved(cause) * np.sqrt((1 - cause.explained) / cause.explained)
+    next_best = _moved(max(found, key=lambda entry: entry.explained or 0.0)) if found else 0.0
+    rival = rival_of(ground, cause, suspects)
+    return np.sqrt(own**2 + next_best**2 + (0.0 if rival is None else _moved(rival) - _moved(cause)) ** 2)
+
+
+def _moved(cause: SuspectedBias) -> Vector:
+    """What a cause of the size found makes of θ and, to first order, of the physical parameters."""
+    return (cause.coefficient_found or 0.0) * np.array([*cause.bias, *(bias for _, bias in cause.physical or ())])
+
+
+def with_bias(value: Vector, std: Vector, freedom: float, bias: Vector, rest: Vector) -> Float[np.ndarray, "n 2"]:
+    """95 % intervals that cover bias and noise, (n, 2): about the estimate less its bias.
+
+    Args:
+        rest: standard deviation of the bias that its cause does not tell, as `left_over` gives it.
+    """
+    reach = scipy.special.stdtrit(max(freedom, 1.0), 0.975) * np.sqrt(std**2 + rest**2)
+    return np.stack([value - bias - reach, value - bias + reach], axis=-1)
+
+
+def _rows(
+    names: Sequence[str],
+    value: Vector,
+    std: Vector,
+    bias: Vector,
+    rest: Vector,
+    *,
+    freedom: float,
+    cause: str,
+    share: float,
+) -> tuple[ParameterBias, ...]:
+    found = []
+    for name, v, s, b, ci in zip(names, value, std, bias, with_bias(value, std, freedom, bias, rest), strict=True):
+        if np.isfinite(b):
+            errors, relative = float(abs(b) / s) if s > 0 else None, float(b / v) if v else None
+            limits = (float(ci[0]), float(ci[1])) if np.isfinite(ci).all() else None
+            found.append(ParameterBias(name, float(b), cause, share, relative, errors, limits))
+    return tuple(found)
+
+
+def _physical(physics: PhysicsMap, fit: Estimate, bias: Vector) -> Vector:
+    """p of θ̂ less p of θ̂ without the bias; NaN where that has no p."""
+    names = fit.problem.baseline.names
+    order = [names.index(name) for name in physics.theta_names]
+    covariance = None if fit.covariance is None else fit.covariance[np.ix_(order, order)]
+    try:
+        biased, free = (
+            solve(physics, theta[order], covariance, freedom=np.inf).value for theta in (fit.theta, fit.theta - bias)
+        )
+    except InputError:
+        return np.full(len(physics.names), np.nan)
+    return np.asarray(biased) - np.asarray(free)
+
+
+def _warning(ground: Ground, budget: Budget, rival: SuspectedBias | None) -> Warning | None:
+    """One sentence on what is biased by more than its standard error: cause, size, remedies."""
+    every = (*budget.physical, *budget.parameters)
+    large = [entry for entry in every if (entry.errors or 0.0) > 1 and abs(entry.relative or 1.0) > _ROUNDING]
+    if not large:
+        return None
+    shown = sorted(large, key=lambda entry: -(entry.errors or 0.0))[:_TOLD]
+    listed = ", ".join(_told(entry) for entry in shown)
+    more = f" and {len(large) - len(shown)} more" if len(large) > len(shown) else ""
+    cures = remedies(ground, budget.cause, [entry.name for entry in large])
+    other = "" if rival is None else f" ({rival.suspect.name} explains as much and would move them elsewhere)"
+    return Warning(
+        "biased",
+        f"{budget.cause.suspect.name} explains {100 * budget.share:.0f} % of the learner and moves {listed}{more}, "
+        f"which the standard errors do not cover{other}: {' or '.join(cures)}.",
+    )
+
+
+def _told(entry: ParameterBias) -> str:
+    share = "" if entry.relative is None else f", {100 * entry.relative:+.2g} %"
+    return f"{entry.name} by {entry.value:+.2g} ({entry.errors:.2g} standard errors{share})"

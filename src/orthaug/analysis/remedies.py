@@ -1,0 +1,93 @@
+"""What would remove a bias: other learner inputs, another measure, a term for the physics. Only what works is named."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from orthaug._base.checks import Vector
+from orthaug._base.errors import InputError
+from orthaug.analysis.bias import SuspectedBias
+from orthaug.analysis.imitation import other_inputs
+from orthaug.analysis.measure_bias import Ground
+from orthaug.analysis.suspects import Suspect
+from orthaug.data.expressions import parse
+from orthaug.data.regressors import Features
+from orthaug.inference.measures import Symmetrized, Uniform
+from orthaug.inference.weighed import weigh_problem
+from orthaug.physics.output_weights import times
+from orthaug.physics.shared import seen, shared_directions
+
+_LONG = re.compile(r"\d+\.\d{5,}(?:e[-+]?\d+)?")
+_REMOVED = 0.1  # of the bias may remain
+_MEASURED_ROWS = 50_000  # above which no other measure is tried
+
+
+def remedies(ground: Ground, cause: SuspectedBias, biased: Sequence[str]) -> list[str]:
+    """Sentences on what removes the bias by a cause from the parameters named, the easiest first."""
+    return [*_by_inputs(ground, cause, biased), *_by_measure(ground, cause, biased), _by_term(cause.suspect)]
+
+
+def _by_term(suspect: Suspect) -> str:
+    text = _LONG.sub(lambda number: f"{float(number[0]):.4g}", suspect.expression)
+    return f"give the physics the term {text}"
+
+
+def _by_inputs(ground: Ground, cause: SuspectedBias, biased: Sequence[str]) -> Iterator[str]:
+    """The choice of learner inputs that frees most of the parameters."""
+    problem, suspect = ground.problem, cause.suspect
+    layout, x = problem.layout, problem.rows.x
+    now = {str(entry) for entry in problem.features.entries}
+    best: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+    for inputs in dict.fromkeys((*(((suspect.on,),) if suspect.on else ()), *other_inputs(problem))):
+        if set(inputs) == now:
+            continue
+        features = Features(tuple(parse(text, dict(problem.baseline.constants)) for text in inputs))
+        if not set(features.lags) <= set(layout):
+            continue
+        if not seen(features, layout, x, lambda rows: suspect.form(rows, layout)[:, None])[0]:
+            continue
+        shared = shared_directions(problem.baseline, features, layout, problem.outputs, x)
+        if shared.all:
+            continue
+        left = _bias(replace(ground, directions=shared.basis), suspect)
+        freed = _freed(ground, cause, left, biased)
+        if len(freed) > len(best[1]):
+            best = (inputs, freed)
+    if best[1]:
+        listed = ", ".join(f'"{text}"' for text in best[0])
+        rest = "" if len(best[1]) == len(biased) else f" for {', '.join(best[1])}"
+        yield f"set learner.inputs = [{listed}]{rest}"
+
+
+def _by_measure(ground: Ground, cause: SuspectedBias, biased: Sequence[str]) -> Iterator[str]:
+    """A measure that brings the bias of all of them near zero."""
+    if cause.seen is False or len(ground.problem.rows) > _MEASURED_ROWS:
+        return
+    for measure in (Symmetrized(), Uniform()):
+        if measure.name == ground.weighed.measure.name:
+            continue
+        try:
+            other = replace(ground, weighed=weigh_problem(measure, ground.problem), learned=None)
+            left = _bias(other, cause.suspect)
+        except InputError:
+            continue
+        if len(_freed(ground, cause, left, biased)) == len(biased):
+            yield f"split under the {measure.name} measure"
+            return
+
+
+def _bias(ground: Ground, suspect: Suspect) -> Vector:
+    """The bias per unit of a suspect that the learner sees."""
+    values = suspect.values(ground.weighed.points.x, ground.problem.layout, ground.problem.outputs)
+    return ground.weighed.projection.solve_along(times(ground.weighed.unit, values), ground.directions)
+
+
+def _freed(ground: Ground, cause: SuspectedBias, left: Vector, biased: Sequence[str]) -> tuple[str, ...]:
+    """Parameters, physical ones by their slopes, whose bias shrinks to a small part."""
+    names, before = ground.problem.baseline.names, np.array(cause.bias)
+    rows = dict(zip(names, np.eye(len(names)), strict=True)) | (ground.slopes[0] if ground.slopes else {})
+    return tuple(name for name in biased if abs(rows[name] @ left) <= _REMOVED * abs(rows[name] @ before))

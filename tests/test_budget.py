@@ -1,0 +1,138 @@
+"""Biases that what the learner found implies, along shared directions too; the test of lags that it does not see."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from orthaug._base.errors import InputError
+from orthaug.analysis.budget import bias_budget, ground_of
+from orthaug.analysis.measure_bias import Ground
+from orthaug.analysis.missing_lags import missing_lags
+from orthaug.analysis.suspects import Suspect
+from orthaug.data.record import Record
+from orthaug.data.regressors import Lags
+from orthaug.fitting.estimation import estimate
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.inference.measures import Training, Uniform
+from orthaug.inference.weighed import weigh_problem
+from orthaug.models.learners import MLP
+from orthaug.physics.baseline import Baseline, Term
+from orthaug.physics.parameters import PhysicalParameter, PhysicsMap
+from orthaug.physics.problem import pose
+from orthaug.studies.synthetic import static
+
+LINEAR = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("c", "u[k-1]")])
+THETA, SIZE, VELOCITY = np.array([1.2, -0.5, 0.3]), 0.02, "y[k-1]-y[k-2]"
+FORMS = {
+    f"({VELOCITY})**3": lambda a, b, u: (a - b) ** 3,
+    "u[k-1]**2": lambda a, b, u: u * u,
+    "y[k-1]**3": lambda a, b, u: a**3,
+}
+
+
+@cache
+def system(text, noise=0.0):
+    """A fit with a learner on the velocity, of a system that lacks one term."""
+    rng = np.random.default_rng(0)
+    u, y = rng.normal(size=1500) + 0.3, np.zeros(1500)
+    e = noise * rng.normal(size=1500)
+    for k in range(2, 1500):
+        a, b = y[k - 1], y[k - 2]
+        y[k] = THETA @ [a, b, u[k - 1]] + SIZE * FORMS[text](a, b, u[k - 1]) + e[k]
+    learner = MLP((8,), inputs=(VELOCITY,))
+    return estimate(Record.from_arrays(u, y), LINEAR, learner=learner, solver=LevenbergMarquardt(150))
+
+
+@pytest.mark.parametrize(("text", "seen"), [(f"({VELOCITY})**3", True), ("u[k-1]**2", False), ("y[k-1]**3", False)])
+def test_biases_beside_a_learner_that_sees_the_velocity_alone(text, seen):
+    """What the learner sees moves only what it could imitate; what it does not see is a partially linear regression."""
+    fit = system(text)
+    (found,) = ground_of(fit, Training()).table((Suspect("missing", text),), certify=True)
+    error, bias = fit.theta - THETA, SIZE * np.array(found.bias)
+    assert found.seen == seen
+    assert np.linalg.norm(bias - error) < 0.05 * np.linalg.norm(error)
+    if seen:
+        assert found.bias[2] == 0 and found.bias[0] == pytest.approx(-found.bias[1], rel=1e-12)
+        assert found.removed_by == "learner in part"
+        assert found.certificate is not None and found.certificate.shares is not None
+        np.testing.assert_allclose(found.certificate.shares, [1, -1, 0], atol=0.05)
+    else:
+        assert found.removed_by == "nothing" and "does not see all of it" in found.sentence
+
+
+def test_what_nothing_is_shared_with_is_removed_by_the_learner():
+    fit = system(f"({VELOCITY})**3")
+    (even,) = ground_of(fit, Training()).table((Suspect("even", f"({VELOCITY})**2"),), certify=True)
+    assert even.seen and even.removed_by == "learner and measure"
+    problem = pose(fit.problem.record, Baseline.from_terms([Term("c", "u[k-1]")]), Lags(1, 1, 1), ("y[k-1]",))
+    ground = Ground(weigh_problem(Training(), problem), problem, problem.least_squares, directions=problem.shared.basis)
+    (drag,) = ground.table((Suspect("drag", "y[k-1]*abs(y[k-1])"),), certify=True)
+    assert drag.removed_by == "learner" and drag.bias == (0.0,)
+
+
+def test_the_papers_data_sets():
+    """Sets 2 and 3 are biased by the square, by 8 and 14 % of θ₃; set 1 is not. The bias told is within a tenth."""
+    for number in (1, 2, 3):
+        example = static(number)
+        fit = estimate(example.train, example.baseline, solver=LevenbergMarquardt(60))
+        found = bias_budget(fit)
+        assert found is not None and found.cause.suspect.name == "u[k]**2" and found.share > 0.95
+        told = np.array([entry.value for entry in found.parameters])
+        error = fit.theta - example.theta
+        if number == 1:
+            assert not found.warnings and np.abs(told).max() < 1e-12
+            continue
+        assert np.linalg.norm(told - error) < 0.12 * np.linalg.norm(error)
+        for entry, truth in zip(found.parameters, example.theta, strict=True):
+            assert entry.ci95 is not None and entry.ci95[0] <= truth <= entry.ci95[1]
+        (warning,) = found.warnings
+        assert warning.code == "biased" and "u[k]**2 explains 98 % of the learner and moves theta3 by" in warning.text
+        assert "split under the symmetrized measure or give the physics the term u[k]**2." in warning.text
+
+
+def test_a_declared_suspect_comes_first_and_learner_inputs_are_named_where_they_help():
+    """All lags seen, friction missing: the stiffness `a + b` is free of it with a learner on the velocity."""
+    rng = np.random.default_rng(3)
+    u, y = np.repeat(rng.uniform(-1, 1, 150), 10), np.zeros(1500)
+    for k in range(2, 1500):
+        y[k] = THETA @ [y[k - 1], y[k - 2], u[k - 1]] - 0.02 * np.sign(y[k - 1] - y[k - 2]) + 2e-4 * rng.normal()
+    fit = estimate(Record.from_arrays(u, y), LINEAR, solver=LevenbergMarquardt(60))
+    physics = PhysicsMap.of(
+        [PhysicalParameter(n, v) for n, v in (("p", 1.0), ("s", 0.6), ("g", 0.2))],
+        {"a": "p", "b": "s - p", "c": "g"},
+    )
+    friction = Suspect.of("coulomb", VELOCITY, name="friction")
+    found = bias_budget(fit, [friction, Suspect("other", "u[k-1]**3")], physics=physics)
+    assert found is not None and found.cause.suspect == friction
+    stiffness = found.of("s")
+    assert stiffness is not None and stiffness.errors is not None and stiffness.errors > 1
+    assert stiffness.value == pytest.approx(fit.theta[:2].sum() - 0.7, rel=0.3)
+    (warning,) = found.warnings
+    assert f'set learner.inputs = ["{VELOCITY}"] for' in warning.text and "s" in warning.text.rpartition("for ")[0]
+
+
+def test_no_cause_no_bias():
+    rng = np.random.default_rng(4)
+    u = rng.normal(size=600)
+    record = Record.from_arrays(u, 0.8 * u + 0.1 * rng.normal(size=600))
+    physics = Baseline.from_terms([Term("a", "u[k]")])
+    fit = estimate(record, physics, learner=MLP((8,)), solver=LevenbergMarquardt(40))
+    assert bias_budget(fit) is None
+    assert bias_budget(estimate(record, physics, learner=None)) is None
+    with pytest.raises(
+        InputError, match="`measure` is the uniform measure, but θ was split under the training measure"
+    ):
+        bias_budget(fit, measure=Uniform())
+
+
+def test_a_missing_lag_is_named():
+    fits = [system(text, noise=0.05) for text in ("u[k-1]**2", f"({VELOCITY})**3")]
+    told, fine = map(missing_lags, fits)
+    assert told is not None and told.missing[0].lag == "u[k-1]" and told.missing[0].p < 1e-10
+    assert told.warnings[0].code == "missing_lag" and "depends on u[k-1]" in told.text
+    assert fine is not None and not fine.missing and not fine.warnings
+    assert [test.lag for test in fine.tests] == ["y[k-1]", "y[k-2]", "u[k-1]"]
+    assert missing_lags(estimate(fits[0].problem.record, LINEAR, solver=LevenbergMarquardt(2))) is None
