@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import naive
 import numpy as np
 import pytest
@@ -248,9 +250,28 @@ def test_initial_of_a_diverging_run_is_not_scored():
     np.testing.assert_allclose(trajectory.model[1:, 0], 3.0 * 0.5 ** np.arange(1, 20))
 
 
+def test_a_free_run_says_where_it_leaves_the_training_data(case):
+    """The regressors of the run, made of its own outputs, against the ranges of the learner's features."""
+    model, record = case
+    (experiment,), start = record.experiments, model.form.first_row
+    begun = 5 * experiment.outputs[:start]
+    (run,) = model.simulate(record, begun).trajectories
+    if model.form.bound is None:
+        assert run.outside is None
+        return
+    own = np.concatenate([begun, run.model[start:]])
+    x = model.form.regressors(replace(experiment, outputs=own), record)
+    z = np.asarray(model.form.features.evaluate(x, model.form.layout, np))
+    z = np.abs((z - model.numbers.centre) / model.numbers.halfwidth)
+    np.testing.assert_array_equal(run.outside, np.concatenate([np.zeros(start), np.any(z > 1 + 1e-9, axis=1)]))
+    assert run.outside.any() and model.components(record).trajectories[0].outside is None
+
+
 def test_to_frame(pair):
     model, record = pair
-    frame = model.simulate(record).to_frame()
+    run = model.simulate(record)
+    frame = run.to_frame()
+    np.testing.assert_array_equal(frame.pop("extrapolates"), run.trajectories[0].outside)
     names = [f"{y}{kind}" for y in ("y1", "y2") for kind in ("", "_model", "_baseline", "_learner")]
     assert list(frame.columns) == ["time", *names]
     np.testing.assert_allclose(frame["time"], 0.5 * np.arange(30))

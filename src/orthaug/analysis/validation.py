@@ -120,12 +120,14 @@ def trial_on(
 
 
 def trials_of(held_out: HeldOut) -> list[Trial]:
-    """The errors by which a run was chosen, as trials: one for each piece that was held out."""
-    pairs = list(zip(held_out.alone, held_out.runs[held_out.chosen], strict=True))
-    root = lambda piece: math.sqrt(mean_square([piece]))  # noqa: E731
-    return [
-        Trial(f"piece {i + 1} of {len(pairs)}", root(a), root(m), True, ([a], [m])) for i, (a, m) in enumerate(pairs)
-    ]
+    """The errors by which a run was chosen, as trials."""
+    chosen, trials = held_out.runs[held_out.chosen], []
+    for label in dict.fromkeys(held_out.labels):
+        own = [i for i, other in enumerate(held_out.labels) if other == label]
+        pieces = [held_out.alone[i] for i in own], [chosen[i] for i in own]
+        alone, model = (math.sqrt(mean_square(runs)) for runs in pieces)
+        trials.append(Trial(label, alone, model, label.startswith("block "), pieces))
+    return trials
 
 
 def cross_validate(

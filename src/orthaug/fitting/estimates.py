@@ -58,6 +58,8 @@ class HeldOut:
     """
 
     where: str
+    labels: tuple[str, ...]
+    """What each piece belongs to: a block, or a part."""
     alone: Pieces
     runs: tuple[Pieces, ...]
     chosen: int = 0

@@ -154,7 +154,8 @@ def _held_out(
         record, unit = choice.validation, task.problem.deviation
         fits = [_concluded(task, structure, task.learned(run)) for run in runs]
         alone = _errors(_alone(task, structure), record, unit)
-        return HeldOut("the validation part", alone, tuple(_errors(fit, record, unit) for fit in fits))
+        labels = ("the validation part",) * len(record.experiments)
+        return HeldOut("the validation part", labels, alone, tuple(_errors(fit, record, unit) for fit in fits))
     if not choice.blocks or not choice.compares(task, starts):
         return None
     try:
@@ -178,7 +179,8 @@ def _held_out(
         return [_errors(fit, held, unit) for fit in fits]
 
     pieces = [[p for block in column for p in block] for column in zip(*spread(one, folds), strict=True)]
-    return HeldOut(f"blocked cross-validation ({choice.blocks} blocks)", pieces[0], tuple(pieces[1:]))
+    labels = tuple(f"block {i + 1} of {choice.blocks}" for i, (_, held) in enumerate(folds) for _ in held.experiments)
+    return HeldOut(f"blocked cross-validation ({choice.blocks} blocks)", labels, pieces[0], tuple(pieces[1:]))
 
 
 def _errors(fit: Estimate, record: Record, unit: Any) -> Pieces:

@@ -91,6 +91,20 @@ class Lagged:
         """The run's own past outputs: nothing needs to run again."""
         return self.start(outputs, rows)
 
+    def scaled_features(
+        self, numbers: Numbers, start: Vector, outputs: Matrix, inputs: Matrix
+    ) -> Float[np.ndarray, "T nz"]:
+        """The learner's features along a free run from a state, in [-1, 1] over the training data.
+
+        Args:
+            outputs: of the run (T, ny).
+            inputs: as its steps read them (T, nu).
+        """
+        before = start.reshape(self.memory, len(self.outputs))[::-1]
+        states = self.start(np.concatenate([before, outputs]), self.memory + np.arange(len(outputs)))
+        x = self.regressor(states.T, inputs.T, np).T
+        return (np.asarray(self.features.evaluate(x, self.layout, np)) - numbers.centre) / numbers.halfwidth
+
     def describe(self, state: Vector, inputs: Vector) -> dict[str, float]:
         """The entries of the regressor."""
         x = self.regressor(state, inputs, np)

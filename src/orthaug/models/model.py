@@ -20,6 +20,7 @@ from orthaug.models.response import Response, Trajectory
 from orthaug.models.statistics import Statistics
 
 RUNAWAY = 1e6  # times the largest training output: a free run beyond this has diverged
+_WITHIN = 1e-9  # of a feature's half width: the largest of training is no extrapolation
 _BATCH = 1024  # rows per compiled call: longer records share the program, of a free run too
 _WINDOW_CELLS = 8_000_000  # input cells of a batch of multi-step predictions
 
@@ -131,8 +132,10 @@ class Model:
         for experiment in record.experiments:
             self.check_rows(experiment, self.form.first_row)
             measured = experiment.outputs if record.outputs else None
-            parts = self._run(self._start(initial, measured), experiment, record)
-            trajectories.append(self._bounded(parts, experiment, measured))
+            start = self._start(initial, measured)
+            parts = self._run(start, experiment, record)
+            outside = self._outside(start, parts, experiment, record)
+            trajectories.append(replace(self._bounded(parts, experiment, measured), outside=outside))
         return Response(tuple(trajectories), None, self.outputs, record.sampling_time)
 
     def check_initial(self, initial: Any) -> Matrix:
@@ -189,6 +192,17 @@ class Model:
         else:
             rows = self.check_initial(initial)[: self.form.first_row]
         return self.form.start(rows, [len(rows)])[0]
+
+    def _outside(self, start: Vector, parts: Parts, experiment: Experiment, record: Record) -> Any:
+        """Where along a free run the learner's features lie outside those of training, (N,)."""
+        bound = self.form.bound
+        if bound is None or not bound.differentiable:  # a model from elsewhere: its features are not scaled
+            return None
+        inputs = self.form.inputs(experiment, record)
+        with np.errstate(all="ignore"):
+            z = self.form.scaled_features(self.numbers, start, np.asarray(parts.total), inputs)
+            beyond = ~(np.abs(z) <= 1 + _WITHIN).all(axis=1)
+        return np.concatenate([np.zeros(self.form.first_row, dtype=bool), beyond])
 
     def _bounded(self, parts: Parts, experiment: Experiment, measured: Matrix | None) -> Trajectory:
         """A free run cut where it left all bounds."""

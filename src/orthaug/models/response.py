@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
@@ -52,7 +53,9 @@ class Trajectory:
     """A model along one experiment; arrays (N, ny) are NaN on rows without a value (the first lags).
 
     `baseline + learner` is the model's output. `learner_before` is f, before θ_aux moved its share in the physics to θ.
-    `diverged` is the row and output at which a free run left all bounds; None where it did not.
+    `diverged` is the row and output at which a free run left all bounds; None where it did not. `outside` (N,) marks
+    the rows of a free run on which the learner's features lie outside those of training: there it extrapolates. None
+    without a learner, and where the features of training are not known.
     """
 
     baseline: Matrix
@@ -62,6 +65,7 @@ class Trajectory:
     start: int
     start_time: float = 0.0
     diverged: tuple[int, str] | None = None
+    outside: Bool[np.ndarray, "N"] | None = None
 
     def __repr__(self) -> str:
         samples, outputs = self.baseline.shape
@@ -119,7 +123,7 @@ class Response:
         return scores(np.concatenate(measured), np.concatenate(model))
 
     def to_frame(self, experiment: int = 0) -> pd.DataFrame:
-        """A table with `time` and, per output, measured, model, baseline and learner."""
+        """A table with `time` and, per output, measured, model, baseline and learner; of a free run `extrapolates`."""
         import pandas as pd
 
         trajectory = self.trajectories[experiment]
@@ -132,4 +136,6 @@ class Response:
             columns[f"{channel.name}_model"] = trajectory.model[:, i]
             columns[f"{channel.name}_baseline"] = trajectory.baseline[:, i]
             columns[f"{channel.name}_learner"] = trajectory.learner[:, i]
+        if trajectory.outside is not None:
+            columns["extrapolates"] = trajectory.outside.astype(int)
         return pd.DataFrame(columns)
