@@ -263,8 +263,8 @@ def test_a_free_run_says_where_it_leaves_the_training_data(case):
     x = model.form.regressors(replace(experiment, outputs=own), record)
     z = np.asarray(model.form.features.evaluate(x, model.form.layout, np))
     z = np.abs((z - model.numbers.centre) / model.numbers.halfwidth)
-    np.testing.assert_array_equal(run.outside, np.concatenate([np.zeros(start), np.any(z > 1 + 1e-9, axis=1)]))
-    assert run.outside.any() and model.components(record).trajectories[0].outside is None
+    np.testing.assert_array_equal(run.outside, np.concatenate([np.zeros(start), ~np.all(z <= 1 + 1e-9, axis=1)]))
+    assert model.components(record).trajectories[0].outside is None
 
 
 def test_to_frame(pair):
