@@ -8,7 +8,7 @@ there. Only what lowers the loss is accepted, so that no run ends above physics 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,6 +32,15 @@ from orthaug.models.learners import Bound
 from orthaug.physics.problem import Problem
 
 _LOOKED_AT = 8  # iterates of a run that ended above physics alone
+
+
+class _Place(NamedTuple):
+    """Where a run may start: p and the segments' states, the loss there, and whether the learner is silent."""
+
+    p: Vector
+    states: Any
+    loss: float
+    silent: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,43 +158,49 @@ class FreeRunTask:
             return physics
         objective, w = plan.objective(structure), np.asarray(w)
         ridge, evidence = ridge_of(regularization)
-        p, states, ceiling = self._start(objective, solver, w, structure, regularization)
+        places = self._places(objective, solver, w, structure, regularization)
+        best = min(places, key=lambda place: place.loss)
+        ceiling = min((place.loss for place in places if place.silent), default=np.inf)
+        if evidence and np.isfinite(best.loss):  # one prior deviation of the weights for one of what is left
+            ridge = best.loss / plan.residuals
 
         def tell(iteration: int, loss: float) -> None:
             progress(iteration, loss * plan.rms**2 / plan.residuals)
 
-        options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "evidence_settled": True, "ceiling": ceiling}
-        flight = plan.descend(objective, p, solver, tell, states, **options)
+        options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "evidence_settled": best.silent}
+        flight = plan.descend(objective, best.p, solver, tell, best.states, ceiling=ceiling, **options)
         return self._below_physics(flight)
 
-    def _start(
+    def _places(
         self,
         objective: FreeRunObjective,
         solver: LevenbergMarquardt,
         w: Vector,
         structure: Structure,
         regularization: str | float,
-    ) -> tuple[Vector, Any, float]:
-        """The best place to start from, p and the segments' states; and the loss of physics alone, or infinity."""
+    ) -> list[_Place]:
+        """Where a run may start: physics alone, an earlier model, the solution one step ahead where it flies well."""
         plan, measured = self.plan, objective.initial.measured
-        places: list[tuple[Vector, Any]] = []
-        silent = None if self.bound is None or self.warm is not None else self.bound.silent(w)
-        if self.physics is not None and silent is not None:
+        places: list[_Place] = []
+
+        def add(p: Vector, states: Any = measured, silent: bool = False) -> None:
+            loss = objective.fly(p, Start(states)).loss
+            places.append(_Place(p, states, loss if np.isfinite(loss) else np.inf, silent))
+
+        silenced = None if self.bound is None or self.warm is not None else self.bound.silent(w)
+        if self.physics is not None and silenced is not None:
             flown = self.physics.end.flown
-            places.append((np.concatenate([flown.theta, silent]), flown.states))
+            add(np.concatenate([flown.theta, silenced]), flown.states, silent=True)
         if self.warm is not None and not objective.follows:
-            places.append((np.concatenate([self.warm, w]), measured))
+            add(np.concatenate([self.warm, w]))
         elif not places:
-            places.append((objective.begin(w), measured))
+            add(objective.begin(w))
         if self.bound is not None and plan.flown.start_iterations and self.warm is None:
             short = LevenbergMarquardt(plan.flown.start_iterations, solver.tolerance)
-            trained = plan.task.run(short, w, structure, regularization)
-            begun = objective.begin(np.asarray(trained.w))
-            if not places or self._flies_better(objective, begun):
-                places.append((begun, measured))
-        losses = [objective.fly(p, Start(states)).loss for p, states in places]
-        best = int(np.nanargmin(losses)) if np.isfinite(losses).any() else 0
-        return *places[best], losses[0] if self.physics is not None and silent is not None else np.inf
+            begun = objective.begin(np.asarray(plan.task.run(short, w, structure, regularization).w))
+            if self._flies_better(objective, begun):
+                add(begun)
+        return places
 
     def _flies_better(self, objective: FreeRunObjective, p: Vector) -> bool:
         """Whether over whole experiments the loss at p is no higher than that of physics alone."""

@@ -173,6 +173,7 @@ def _bias_lines(result: FitResult) -> list[str]:
     lines.append(f"{'parameter':<{width}}  {'bias':>11}  {'of std':>7}  {'of value':>9}  {'95 % interval with it':^29}")
     for row in rows:
         bias = row.bias.value if row.bias else None
+        bias = None if bias is None else _rounded(bias / (row.value or 1.0)) * (row.value or 1.0)
         if bias is not None and row.value is not None:
             errors = f"{abs(bias) / row.std:7.2g}" if row.std else f"{'–':>7}"
             part = f"{_rounded(100 * bias / row.value):+7.2g} %" if row.value else f"{'–':>9}"
