@@ -523,7 +523,8 @@ def test_responses_have_a_row_per_data_row_and_the_library_s_numbers(fitted, tmp
     done = run(*command, fitted / model, fitted / "steps.csv", "--out", tmp_path / "out.csv")
     assert (done.code, done.err) == (0, "")
     frame = pd.read_csv(tmp_path / "out.csv")
-    assert list(frame.columns) == ["time", "y", "y_model", "y_baseline", "y_learner"]
+    flag = ["extrapolates"] if command == ["simulate"] else []
+    assert list(frame.columns) == ["time", "y", "y_model", "y_baseline", "y_learner", *flag]
     assert len(frame) == 60
     np.testing.assert_allclose(frame["time"], 0.5 * np.arange(60))
     assert frame["y"].notna().all()
@@ -586,7 +587,7 @@ def test_without_measured_outputs_there_is_no_measured_column(fitted, tmp_path):
         == f"note: {tmp_path / 'u.csv'} has no y: the free run starts from 0; --initial CSV gives other outputs.\n"
     )
     frame = pd.read_csv(io.StringIO(done.out))
-    assert list(frame.columns) == ["time", "y_model", "y_baseline", "y_learner"]
+    assert list(frame.columns) == ["time", "y_model", "y_baseline", "y_learner", "extrapolates"]
 
 
 def test_channels_keep_their_column_and_scale(project):

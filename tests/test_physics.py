@@ -248,6 +248,8 @@ def test_rows_are_json():
         "value": pytest.approx(1000.0),
         "std": found.std[2],
         "ci95": list(found.ci95[2]),
+        "bias": None,
+        "ci95_with_bias": None,
     }
     assert json.loads(json.dumps(rows, allow_nan=False)) == rows
     missing = physical_rows(solve(physics, theta, None, freedom=50))[0].content()

@@ -85,7 +85,7 @@ def lipschitz(model: Model, record: Record, *, x: Matrix | None = None) -> Lipsc
         scales = (y_scale, np.outer(y_scale, positive(rms)).ravel())
         sizes = []
         for batch in _gradients(form, model.numbers, x):
-            slopes = [g.reshape(len(g), len(scale), -1) for g, scale in zip(batch, scales, strict=True)]
+            slopes = [g.reshape(len(g), len(scale), x.shape[1]) for g, scale in zip(batch, scales, strict=True)]
             scaled = [g * x_scale / scale[:, None] for g, scale in zip(slopes, scales, strict=True)]
             sizes.append([*map(size, slopes), *map(size, scaled)])
         of_g, of_phi, scaled_g, scaled_phi = (np.concatenate(column) for column in zip(*sizes, strict=True))

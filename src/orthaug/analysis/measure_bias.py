@@ -104,7 +104,9 @@ def bias_under(ground: Ground, suspects: Sequence[Suspect] = (), *, certify_usua
     """
     named, problem, points = bool(suspects), ground.problem, ground.weighed.points
     table = ground.table(
-        suspects or usual_suspects(problem), certify=named or len(points.x) <= CERTIFIED_ROWS, every=named
+        suspects or usual_suspects(problem),
+        certify=named or (certify_usual and len(points.x) <= CERTIFIED_ROWS),
+        every=named,
     )
     found = []
     for entry in table:

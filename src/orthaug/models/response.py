@@ -137,5 +137,7 @@ class Response:
             columns[f"{channel.name}_baseline"] = trajectory.baseline[:, i]
             columns[f"{channel.name}_learner"] = trajectory.learner[:, i]
         if trajectory.outside is not None:
-            columns["extrapolates"] = trajectory.outside.astype(int)
+            flags = pd.array(trajectory.outside, dtype="Int64")
+            flags[: trajectory.start] = pd.NA
+            columns["extrapolates"] = flags
         return pd.DataFrame(columns)
