@@ -110,6 +110,14 @@ class Dynamics(Protocol):
         """
         ...
 
+    def scaled_features(self, numbers: Numbers, start: Vector, outputs: Matrix, inputs: Matrix) -> Matrix | None:
+        """The learner's features (T, nz) along a free run, in [-1, 1] over the training data; None if not known.
+
+        `start` (n0,) is its first state, `outputs` (T, ny) are those of the run, `inputs` (T, nu) as its steps read
+        them.
+        """
+        ...
+
     def describe(self, state: Vector, inputs: Vector) -> dict[str, float]:
         """A state and the inputs of a step as a user knows them, by names."""
         ...
@@ -137,6 +145,9 @@ class Differentiated:
     """
 
     differentiable = True
+
+    def scaled_features(self, numbers: Numbers, start: Vector, outputs: Matrix, inputs: Matrix) -> Matrix | None:
+        return None
 
     def states_at(
         self: Dynamics, numbers: Numbers, outputs: Matrix, inputs: Matrix, rows: Int[np.ndarray, "r"]

@@ -93,13 +93,13 @@ class Lagged:
 
     def scaled_features(
         self, numbers: Numbers, start: Vector, outputs: Matrix, inputs: Matrix
-    ) -> Float[np.ndarray, "T nz"]:
-        """The learner's features along a free run from a state, in [-1, 1] over the training data.
+    ) -> Float[np.ndarray, "T nz"] | None:
+        """The learner's features along a free run, in [-1, 1] over the training data.
 
-        Args:
-            outputs: of the run (T, ny).
-            inputs: as its steps read them (T, nu).
+        None without a learner, and of a function from another toolbox, whose features are not scaled.
         """
+        if self.bound is None or not self.bound.differentiable:
+            return None
         before = start.reshape(self.memory, len(self.outputs))[::-1]
         states = self.start(np.concatenate([before, outputs]), self.memory + np.arange(len(outputs)))
         x = self.regressor(states.T, inputs.T, np).T

@@ -195,12 +195,11 @@ class Model:
 
     def _outside(self, start: Vector, parts: Parts, experiment: Experiment, record: Record) -> Any:
         """Where along a free run the learner's features lie outside those of training, (N,)."""
-        bound = self.form.bound
-        if bound is None or not bound.differentiable:  # a model from elsewhere: its features are not scaled
-            return None
         inputs = self.form.inputs(experiment, record)
         with np.errstate(all="ignore"):
             z = self.form.scaled_features(self.numbers, start, np.asarray(parts.total), inputs)
+            if z is None:
+                return None
             beyond = ~(np.abs(z) <= 1 + _WITHIN).all(axis=1)
         return np.concatenate([np.zeros(self.form.first_row, dtype=bool), beyond])
 
