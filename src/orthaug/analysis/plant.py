@@ -69,6 +69,6 @@ class Plant:
             early, late = np.abs(y[:, :half]).max(axis=1), np.abs(y[:, half:]).max(axis=1)
             sound = np.isfinite(rows).all(axis=(1, 2)) & (late <= RUNS_AWAY * np.where(early > 0, early, late)).all(0)
             rows = rows.reshape(count, length - start, len(self.outputs), -1)
-            deviation = (y[:, start:].transpose(2, 1, 0) - rows[..., -1]).std(axis=1)[:, None, :, None]
+            deviation = y[:, start:].transpose(2, 1, 0).std(axis=1)[:, None, :, None]
         rows[~sound], deviation[~sound] = 0.0, 1.0
         return rows[..., :-1], 1 / np.where((deviation > 0) & (len(y) > 1), deviation, 1.0)

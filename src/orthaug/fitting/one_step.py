@@ -141,7 +141,8 @@ class OneStepTask:
         structure = Orthogonal() if structure is None else structure
         elimination = eliminate(structure, self.problem)
         run = self._run_inside(solver, w, structure, elimination, regularization, progress)
-        solved = solver.gauss_newton and solver.iterations and elimination.decoupled and not structure.from_initial
+        solved = solver.gauss_newton and solver.iterations and not structure.from_initial
+        solved = solved and not len(elimination.rows.target) and not elimination.bounded
         if not (solved and run.ending.usable and self.bound and self.loss(run) > self.start_loss):
             return run
         silent = self.bound.silent(np.asarray(w))  # from there no step ends above physics alone
