@@ -328,4 +328,4 @@ def model_files(folder: Path) -> dict[str, bytes]:
     baseline = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "g*u[k]", 0.5, "m")], {"g": 2.0})
     solver = oa.LevenbergMarquardt(iterations=2)
     oa.save(oa.estimate(record, baseline, learner=oa.MLP(hidden=(2,)), solver=solver).model, folder)
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.name != "manifest.json"}
