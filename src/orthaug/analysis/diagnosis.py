@@ -31,6 +31,7 @@ _LITTLE_COLOUR = 0.2  # of a free run's errors that are noise, beside a start fr
 _AS_GOOD = 1.05  # free-run error / one-step error up to which measured lags add nothing
 _TOLD = 5  # findings that a text lists at most
 _SHARE = 0.01  # of the residual's variance: what a regressor explains of it counts from there
+_FEWEST_ROWS, _ROWS_PER_TERM = 100, 10  # rows that a sum of autocovariances needs, in all and for each of its lags
 _MEMORIES = 3  # times as many lags as the residual's correlation lasts: Bartlett's weights fade
 _LEVEL = 0.01  # of the test whether a residual is white
 _ROUNDING = 1e-14  # of the output's deviation: a residual that says nothing
@@ -106,7 +107,10 @@ def diagnose(fit: Estimate, *, one_step: Response | None = None, free_run: Respo
 
 
 def robust_where_coloured(fit: Estimate) -> Estimate:
-    """The fit with standard errors after Newey and West, where it is one step ahead and leaves a coloured residual."""
+    """The fit with standard errors after Newey and West, where it is one step ahead and leaves a coloured residual.
+
+    Few rows, or ones that remember each other for long, leave the plain errors: their robust ones would be too small.
+    """
     if not fit.status.ok or fit.covariance is None or fit.criterion.flown is not None or fit.at_bound:
         return fit
     response, memory = fit.model.predict(fit.problem.record), 0
@@ -117,7 +121,12 @@ def robust_where_coloured(fit: Estimate) -> Estimate:
         if box is not None and acf is not None and box.p < _LEVEL and np.abs(acf[1:]).max() >= _PRACTICALLY_WHITE:
             quiet = np.abs(acf) < 2 / np.sqrt(rows)
             memory = max(memory, int(np.argmax(np.append(quiet, True))))
-    if not memory or np.all(_errors(response) / fit.problem.deviation < _ROUNDING):
+    rows = len(fit.problem.rows)
+    if (
+        not memory
+        or rows < max(_FEWEST_ROWS, _ROWS_PER_TERM * _MEMORIES * memory)
+        or np.all(_errors(response) / fit.problem.deviation < _ROUNDING)
+    ):
         return fit
     try:
         return fit.robust(_MEMORIES * memory)
