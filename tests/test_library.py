@@ -49,7 +49,8 @@ def test_structures_are_compared(job, fitted):
     for record in (job.tests[0].record, reordered(job)):
         verdict = oa.verdict(fitted.fit, alone, {"tests.steps": record}, skip=job.tests[0].skip)
         assert verdict.code == theirs.code
-        assert verdict.trials[0][1:3] == pytest.approx(theirs.trials[0][1:3], rel=1e-9)
+        (own,), (other,) = verdict.trials, theirs.trials
+        assert (own.alone, own.model) == pytest.approx((other.alone, other.model), rel=1e-9)
     for arguments, message in (
         ((1, alone, job.tests[0].record), "`fit` must be an Estimate; got 1"),
         ((fitted.fit, alone, {}), "`tests` is empty; give a record that was not fitted"),
@@ -96,7 +97,7 @@ def test_what_cannot_be_opened_or_written(job, tmp_path):
         (lambda: oa.load_spec(3), "`path` must be the name of a spec file; got 3"),  # type: ignore[arg-type]
         (lambda: oa.load_spec(os.fspath(tmp_path / "absent.toml")), "absent.toml: no such file"),
         (lambda: oa.fit_spec(job, out=3), "`out` must be the name of a folder, or None; got 3"),  # type: ignore[arg-type]
-        (lambda: oa.fit_spec(job, out=tmp_path / "notes"), "notes: holds something that is not an orthaug result"),
+        (lambda: oa.fit_spec(job, out=tmp_path / "notes"), "notes: holds notes.txt and is not an orthaug result"),
         (lambda: oa.compare(job, models="x"), "`models` must be a list of folders"),
         (lambda: oa.compare(job, models=[Path("absent")]), "absent: no saved model there"),
     ):
