@@ -23,7 +23,7 @@ from orthaug.fitting.free_run import FreeRunTask
 from orthaug.fitting.learned import Learned
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.reweighting import reweighted
-from orthaug.fitting.rules import check_solver, check_starts
+from orthaug.fitting.rules import check_solver, check_starts, tried
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Orthogonal, Structure
@@ -47,7 +47,7 @@ def estimate(
     structure: Structure = Orthogonal(),  # noqa: B008  (frozen)
     criterion: Criterion = Prediction(),  # noqa: B008  (frozen)
     solver: Solver = LevenbergMarquardt(),  # noqa: B008  (frozen)
-    regularization: Regularization | Sequence[Regularization] = "none",
+    regularization: Regularization | Sequence[Regularization] = "auto",
     restarts: int = 1,
     seed: int = 0,
     ensemble: bool = False,
@@ -71,9 +71,12 @@ def estimate(
         criterion: `Prediction(horizon)`, 1 step by default, or `Simulation(segment, washout)`, the free run: then θ is
             trained with the weights and split off at the end (F2).
         solver: `LevenbergMarquardt(…)`, or `AdamLBFGS(…)`, the paper's pipeline from θ⁰.
-        regularization: "none", "evidence" (MacKay; the weights' prior is estimated too), or a number: the
-            ridge α on the weights, against squared errors in units of the baseline's RMS residual. Several may be
-            given with `validation`, which then chooses.
+        regularization: "none"; "evidence" (MacKay; the weights' prior is estimated too); "ard" (automatic relevance
+            determination: the prior of each neuron, one step ahead); or a number: the ridge α on the weights, against
+            squared errors in units of the baseline's RMS residual. Several may be given with `validation` or `blocks`,
+            which then choose. "auto" runs none and ard from every start, one step ahead with Levenberg-Marquardt, and
+            keeps the lower generalised cross-validation; it is none otherwise, and none and evidence where
+            `validation` chooses on the free run.
         restarts: runs from initial weights of seeds `seed … seed + restarts - 1`, spread over the cores. Kept is the
             one of the lowest error of the criterion on `validation`; without that, of free runs and of several
             regularizations, on `blocks` that are held out; else of the lowest training loss.
@@ -132,7 +135,7 @@ def fit(
     structure: Structure = Orthogonal(),  # noqa: B008  (frozen)
     criterion: Criterion = Prediction(),  # noqa: B008  (frozen)
     solver: Solver = LevenbergMarquardt(),  # noqa: B008  (frozen)
-    regularization: Regularization | Sequence[Regularization] = "none",
+    regularization: Regularization | Sequence[Regularization] = "auto",
     restarts: int = 1,
     seed: int = 0,
     ensemble: bool = False,
@@ -156,7 +159,11 @@ def fit(
     _check_choices(learner, structure, criterion, solver, initial, validation)
     _check_splittable(structure, problem.baseline, learner)
     blocks = _check_blocks(blocks)
-    choices = _regularizations(regularization, validation is not None or blocks > 0)
+    solved = criterion.one_step and problem.baseline.linear
+    auto = isinstance(regularization, str) and regularization == "auto"
+    conditions = {"linear": solved, "resident": engine.resident, "validated": validation is not None}
+    choices = tried(regularization, solver, criterion, structure, **conditions)
+    _check_regularizations(choices, auto or validation is not None or blocks > 0)
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
     check_starts(restarts if initial is None else 1, seed, ensemble=ensemble)
     check_solver(solver, criterion, () if learner is None else choices)
@@ -171,7 +178,6 @@ def fit(
     else:
         task = OneStepTask.of(problem, learner, engine=engine)
         starts = _starts(task.bound, range(seed, seed + restarts), choices)
-    solved = criterion.one_step and problem.baseline.linear
     ensemble = ensemble and task.bound is not None
     _check_ensemble(ensemble, problem)
     if task.bound is None and solved:
@@ -180,7 +186,7 @@ def fit(
         estimate = replace(estimate, status=status)
     else:
         trained = task if solved else FreeRunTask.of(task, criterion, warm)
-        chosen = Choice(validation, blocks if initial is None else 0, fallback, ensemble)
+        chosen = Choice(validation, blocks if initial is None else 0, fallback, ensemble, scored=auto and solved)
         estimate = train(trained, starts, structure, solver, chosen, progress)
         if _splits(structure) and estimate.status.ok and estimate.model.form.bound is not None:
             estimate = estimate.split(structure.measure)
@@ -303,18 +309,16 @@ def _check_choices(learner: Any, structure: Any, criterion: Any, solver: Any, in
     check_type(validation, Record | None, "validation", "a Record or None")
 
 
-def _regularizations(given: Any, chosen: bool) -> tuple[Regularization, ...]:
-    """The regularizations to try, each checked."""
-    choices = tuple(given) if isinstance(given, list | tuple) else (given,)
+def _check_regularizations(choices: Sequence[Any], chosen: bool) -> None:
+    """Raise InputError for what is no regularization, or several that nothing chooses between."""
     if len(choices) > 1 and not chosen:
         raise InputError("several regularizations need `validation` or `blocks` to choose between them.")
     for choice in choices:
         if isinstance(choice, str):
-            check_choice(choice, ("none", "evidence"), "`regularization`")
+            check_choice(choice, ("none", "evidence", "ard"), "`regularization`")
         elif isinstance(choice, bool) or not isinstance(choice, int | float | np.number):
-            raise InputError(f"`regularization` must be none, evidence or a number; got {shown(choice)}.")
+            raise InputError(f"`regularization` must be auto, none, evidence, ard or a number; got {shown(choice)}.")
         elif not (is_number(choice) and choice >= 0):
             raise InputError(f"`regularization` must be 0 or more; got {shown(choice)}.")
     if not choices:
-        raise InputError("`regularization` is empty; give none, evidence or a number.")
-    return choices
+        raise InputError("`regularization` is empty; give auto, none, evidence, ard or a number.")

@@ -34,6 +34,7 @@ from orthaug.physics.problem import Problem
 
 OUTPUT_UNIT = 10.0
 """The learner's output unit in standard deviations of the baseline's residual: the table is in docs/design.md."""
+_INFLATION = 1.4  # of the effective weights in generalised cross-validation (Kim and Gu 2004)
 _ACTIVE_SETS = 10  # tries to find which bounds are active; each changes at least one entry
 _SMALLEST_RESIDUAL = 1e-10  # of an output's deviation: the physics leaves at least rounding
 
@@ -194,7 +195,10 @@ class OneStepTask:
         hold = Hold(jnp.asarray(matrix), jnp.asarray(target / self.rms))
         ridge, evidence = ridge_of(regularization)
         if solver.gauss_newton and not structure.from_initial:
-            return self._least_squares(solver, w, hold, ridge, evidence, progress)
+            options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "progress": progress}
+            if regularization == "ard":
+                options["groups"] = self.bound.groups()
+            return self._least_squares(solver, w, hold, options)
         self._check_joint(solver, ridge, evidence)
         physics = Physics.of(self.problem, elimination, fixed, ridge, self.rms, solved=structure.projects)
         if solver.gauss_newton:
@@ -229,21 +233,20 @@ class OneStepTask:
         end = solver.minimise(JointOneStep(self.bound), unknowns, (self.rows, physics), nothing, **options)
         return GradientRun(end.w[:nt], end.w[nt:], end.iterations, end.ending, end.seconds)
 
-    def _least_squares(
-        self, solver: Any, w: Any, hold: Hold, ridge: float, evidence: bool, progress: RunTell
-    ) -> compiled.TrainingRun:
+    def _least_squares(self, solver: Any, w: Any, hold: Hold, options: dict[str, Any]) -> compiled.TrainingRun:
         """Levenberg-Marquardt: compiled whole where the rows are in memory, otherwise driven by the host."""
         assert self.bound is not None
         samples = self.problem.target.size - len(self.problem.baseline.names)
-        options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "progress": progress}
         if self.engine.resident:
             criterion, arguments = OneStep(self.bound), (self.rows, hold)
             return solver.minimise(criterion, w, arguments, self._nothing, samples=samples, **options)
+        if "groups" in options:
+            raise InputError("ard regularization needs rows that are in memory; take evidence.")
         objective = Streamed(self.engine, self.bound, self.rows, hold, samples)
         first = objective.fly(np.asarray(w), self._nothing)
         first = objective.fly(np.asarray(w), first.normal.overlap)  # less what rounding left of J in the physics
         if np.isfinite(first.normal.hessian).all() and compiled.spanned(first.normal):
-            return compiled.TrainingRun(w, first.normal, ridge, 0.0, 0, Ending.SPANNED, 0.0)
+            return compiled.TrainingRun(w, first.normal, options["ridge"], 0.0, 0, Ending.SPANNED, 0.0)
         end = solver.descend(objective, np.asarray(w), first.normal.overlap, damping=IDENTITY, **options)
         normal: Normal = end.flown.normal
         weights = jnp.asarray(end.flown.p)
@@ -262,6 +265,11 @@ class OneStepTask:
     def mean_square(self, loss: Any) -> float:
         """The criterion's `‖r‖²` as the mean of squared errors with each output in its standard deviation."""
         return float(loss) * self.rms**2 / self.problem.target.size
+
+    def cross_validation(self, run: compiled.TrainingRun) -> float:
+        """Generalised cross-validation, `N RSS / (N − nθ − 1.4 γ)²`: infinite where the fit uses up all rows."""
+        left = self.problem.target.size - len(self.problem.baseline.names) - _INFLATION * run.effective
+        return self.loss(run) * (self.problem.target.size / left) ** 2 if left > 0 else np.inf
 
     def learned(self, run: compiled.TrainingRun) -> Learned:
         """What a run left."""
