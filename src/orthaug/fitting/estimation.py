@@ -159,17 +159,14 @@ def fit(
     _check_choices(learner, structure, criterion, solver, initial, validation)
     _check_splittable(structure, problem.baseline, learner)
     blocks = _check_blocks(blocks)
-    solved = criterion.one_step and problem.baseline.linear
-    auto = isinstance(regularization, str) and regularization == "auto"
-    conditions = {"linear": solved, "resident": engine.resident, "validated": validation is not None}
+    conditions = {"linear": problem.baseline.linear, "resident": engine.resident, "validated": validation is not None}
     choices = tried(regularization, solver, criterion, structure, **conditions)
-    _check_regularizations(choices, auto or validation is not None or blocks > 0)
+    auto = _check_regularizations(regularization, choices, validation is not None or blocks > 0)
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
     check_starts(restarts if initial is None else 1, seed, ensemble=ensemble)
     check_solver(solver, criterion, () if learner is None else choices)
     if initial is None:
-        sizes = {"rows": len(problem.rows), "features": len(problem.features.entries), "outputs": len(problem.outputs)}
-        check_cost(learner, **sizes, iterations=solver.iterations, runs=restarts * len(choices))
+        _check_cost(problem, learner, solver, restarts * len(choices))
     problem = replace(problem, features=Features(())) if learner is None and initial is None else problem
     warm = None
     if initial is not None:
@@ -178,6 +175,7 @@ def fit(
     else:
         task = OneStepTask.of(problem, learner, engine=engine)
         starts = _starts(task.bound, range(seed, seed + restarts), choices)
+    solved = criterion.one_step and problem.baseline.linear
     ensemble = ensemble and task.bound is not None
     _check_ensemble(ensemble, problem)
     if task.bound is None and solved:
@@ -200,6 +198,12 @@ def fit(
         return fit(problem, structure=structure, criterion=criterion, solver=solver, progress=progress, **more)
 
     return reweighted(estimate, again)
+
+
+def _check_cost(problem: Problem, learner: Learner | None, solver: Solver, runs: int) -> None:
+    """Raise InputError for what would take more memory or time than there is."""
+    sizes = {"rows": len(problem.rows), "features": len(problem.features.entries), "outputs": len(problem.outputs)}
+    check_cost(learner, **sizes, iterations=solver.iterations, runs=runs)
 
 
 def _starts(bound: Bound | None, seeds: range, choices: Sequence[Regularization]) -> list[PlannedRun]:
@@ -309,9 +313,10 @@ def _check_choices(learner: Any, structure: Any, criterion: Any, solver: Any, in
     check_type(validation, Record | None, "validation", "a Record or None")
 
 
-def _check_regularizations(choices: Sequence[Any], chosen: bool) -> None:
-    """Raise InputError for what is no regularization, or several that nothing chooses between."""
-    if len(choices) > 1 and not chosen:
+def _check_regularizations(given: Any, choices: Sequence[Any], chosen: bool) -> bool:
+    """Whether "auto" was given; raise InputError for what is no regularization, or several that nothing chooses from."""
+    auto = isinstance(given, str) and given == "auto"
+    if len(choices) > 1 and not (auto or chosen):
         raise InputError("several regularizations need `validation` or `blocks` to choose between them.")
     for choice in choices:
         if isinstance(choice, str):
@@ -322,3 +327,4 @@ def _check_regularizations(choices: Sequence[Any], chosen: bool) -> None:
             raise InputError(f"`regularization` must be 0 or more; got {shown(choice)}.")
     if not choices:
         raise InputError("`regularization` is empty; give auto, none, evidence, ard or a number.")
+    return auto

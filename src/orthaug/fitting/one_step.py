@@ -34,7 +34,6 @@ from orthaug.physics.problem import Problem
 
 OUTPUT_UNIT = 10.0
 """The learner's output unit in standard deviations of the baseline's residual: the table is in docs/design.md."""
-_INFLATION = 1.4  # of the effective weights in generalised cross-validation (Kim and Gu 2004)
 _ACTIVE_SETS = 10  # tries to find which bounds are active; each changes at least one entry
 _SMALLEST_RESIDUAL = 1e-10  # of an output's deviation: the physics leaves at least rounding
 
@@ -265,11 +264,6 @@ class OneStepTask:
     def mean_square(self, loss: Any) -> float:
         """The criterion's `‖r‖²` as the mean of squared errors with each output in its standard deviation."""
         return float(loss) * self.rms**2 / self.problem.target.size
-
-    def cross_validation(self, run: compiled.TrainingRun) -> float:
-        """Generalised cross-validation, `N RSS / (N − nθ − 1.4 γ)²`: infinite where the fit uses up all rows."""
-        left = self.problem.target.size - len(self.problem.baseline.names) - _INFLATION * run.effective
-        return self.loss(run) * (self.problem.target.size / left) ** 2 if left > 0 else np.inf
 
     def learned(self, run: compiled.TrainingRun) -> Learned:
         """What a run left."""

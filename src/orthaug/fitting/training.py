@@ -25,6 +25,7 @@ from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Structure
 
+_INFLATION = 1.4  # of the effective weights in cross-validation, against what follows the noise (Kim and Gu 2004)
 FOLD_ITERATIONS = 60  # enough to tell whether a learner helps, on every block of cross-validation
 
 
@@ -58,7 +59,7 @@ class Choice:
 
     def ranking(self, task: Task, runs: Sequence[Any], errors: Sequence[float]) -> np.ndarray:
         """What is lowest for the best run: its held-out error, its score, or its loss."""
-        scores = [task.rows_task.cross_validation(run) for run in runs] if self.scored else []
+        scores = [_cross_validation(task, run) for run in runs] if self.scored else []
         for ranking in (np.array(errors), np.array(scores)):
             if np.isfinite(ranking).any():
                 return ranking
@@ -114,6 +115,13 @@ def train(
     )
     warnings = (*estimate.warnings, *task.warnings, *_replaced(starts, runs), *told)
     return replace(estimate, restarts=restarts, status=status, held_out=held_out, warnings=warnings)
+
+
+def _cross_validation(task: Task, run: Any) -> float:
+    """Generalised: `N RSS / (N − nθ − 1.4 γ)²` of a run one step ahead; infinite where it uses up all rows."""
+    samples = task.problem.target.size
+    left = samples - len(task.problem.baseline.names) - _INFLATION * run.effective
+    return task.loss(run) * (samples / left) ** 2 if left > 0 else math.inf
 
 
 def _alike(starts: Sequence[PlannedRun], best: int) -> list[int]:

@@ -48,7 +48,7 @@ class Options(NamedTuple):
     tolerance: Float[Array, ""]
     evidence: Any
     samples: Float[Array, ""]
-    groups: Int[Array, "nw"] | None = None
+    groups: Int[Array | np.ndarray, "nw"] | None = None
     """Which weights share a ridge; None where all share one number."""
 
 
