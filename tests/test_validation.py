@@ -11,8 +11,12 @@ from test_cli import SPEC, make_project, one_line, run, signals, write_csv
 from test_parallel import PHYSICS, record_of
 
 from orthaug._base.errors import InputError
+from orthaug.fitting.criteria import Prediction, Simulation
 from orthaug.fitting.estimation import estimate
+from orthaug.fitting.rules import tried
+from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.structures import Additive, Orthogonal
 from orthaug.models.learners import MLP
 from orthaug.models.storage import load
 
@@ -75,6 +79,68 @@ def test_another_validation_record_changes_the_choice_and_nothing_else(chosen):
     np.testing.assert_allclose([r.validation for r in other.restarts], losses, rtol=1e-6)
     assert [r.chosen for r in other.restarts].index(True) == int(np.argmin(losses))
     assert other.theta.tobytes() == chosen.theta.tobytes()
+
+
+@pytest.fixture(scope="module")
+def auto():
+    return estimate(TRAIN, PHYSICS, restarts=3, seed=2, **OPTIONS)
+
+
+def test_auto_runs_none_and_ard_and_keeps_the_lowest_score(auto, candidates):
+    assert [(r.seed, r.regularization) for r in auto.restarts] == [(s, c) for c in ("none", "ard") for s in (2, 3, 4)]
+    samples, fits = len(auto.problem.rows), [candidates[s, "none"] for s in (2, 3, 4)]
+    fits += [estimate(TRAIN, PHYSICS, regularization="ard", seed=seed, **OPTIONS) for seed in (2, 3, 4)]
+    assert [r.loss for r in auto.restarts] == [fit.restarts[0].loss for fit in fits]
+    left = [samples - len(fit.theta) - 1.4 * fit.effective_weights for fit in fits]
+    scores = [fit.restarts[0].loss / n**2 if n > 0 else np.inf for fit, n in zip(fits, left, strict=True)]
+    best = int(np.argmin(scores))
+    assert [r.chosen for r in auto.restarts] == [i == best for i in range(6)]
+    np.testing.assert_array_equal(auto.model.numbers.weights, fits[best].model.numbers.weights)
+    losses = [r.loss for r in auto.restarts]
+    assert auto.restarts[best].regularization == "ard" and losses[best] > min(losses)  # not what training would choose
+
+
+def test_an_ensemble_takes_one_run_of_each_start(auto):
+    fit = estimate(TRAIN, PHYSICS, restarts=3, seed=2, ensemble=True, **OPTIONS)
+    taken = [r for r in fit.restarts if r.chosen]
+    assert sorted(r.seed for r in taken) == [2, 3, 4]
+    assert {r.seed: r.regularization for r in auto.restarts if r.chosen}.items() <= {
+        r.seed: r.regularization for r in taken
+    }.items()
+
+
+FREE, PAPER = Simulation(), AdamLBFGS()
+STANDS_FOR = [
+    ({}, ("none", "ard")),
+    ({"validated": True}, ("none", "ard")),
+    ({"resident": False}, ("none", "evidence")),
+    ({"linear": False}, ("none",)),
+    ({"criterion": Prediction(2)}, ("none",)),
+    ({"criterion": FREE}, ("none",)),
+    ({"criterion": FREE, "validated": True}, ("none", "evidence")),
+    ({"solver": PAPER, "validated": True}, ("none",)),
+    ({"structure": Additive(from_initial=True)}, ("none",)),
+    ({"given": ["evidence", 2.0]}, ("evidence", 2.0)),
+    ({"given": 0.5}, (0.5,)),
+]
+
+
+@pytest.mark.parametrize(("change", "expected"), STANDS_FOR)
+def test_what_auto_stands_for(change, expected):
+    usual = {"given": "auto", "solver": LevenbergMarquardt(), "criterion": Prediction(), "structure": Orthogonal()}
+    assert tried(**(usual | {"linear": True, "resident": True, "validated": False} | change)) == expected
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"criterion": FREE}, "ard regularization is for training one step ahead; take evidence"),
+        ({"solver": PAPER}, "ard regularization needs the Gauss-Newton matrix"),
+    ],
+)
+def test_ard_is_refused(arguments, words):
+    with pytest.raises(InputError, match=words):
+        estimate(TRAIN, PHYSICS, **({**OPTIONS, "regularization": "ard"} | arguments))
 
 
 @pytest.mark.parametrize(

@@ -314,7 +314,7 @@ def _check_choices(learner: Any, structure: Any, criterion: Any, solver: Any, in
 
 
 def _check_regularizations(given: Any, choices: Sequence[Any], chosen: bool) -> bool:
-    """Whether "auto" was given; raise InputError for what is no regularization, or several that nothing chooses from."""
+    """Whether "auto" was given; raise InputError for what is none, or for several that nothing chooses between."""
     auto = isinstance(given, str) and given == "auto"
     if len(choices) > 1 and not (auto or chosen):
         raise InputError("several regularizations need `validation` or `blocks` to choose between them.")
