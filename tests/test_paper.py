@@ -82,7 +82,9 @@ def test_theta_on_the_static_sets(noiseless):
 @pytest.mark.parametrize("learner", LEARNERS, ids=NAMES)
 def test_theta_is_the_same_for_every_learner(noiseless, learner):
     _, example, fits = noiseless
-    fit = estimate(example.train, example.baseline, learner=learner, solver=LevenbergMarquardt(iterations=20))
+    fit = estimate(
+        example.train, example.baseline, learner=learner, solver=LevenbergMarquardt(20), regularization="none"
+    )
     np.testing.assert_allclose(fit.theta, fits[0].theta, rtol=0, atol=1e-10)
     assert fit.defect is None if learner is None else fit.defect <= 1e-12
 
@@ -108,7 +110,9 @@ def test_the_default_leaves_few_weights(noisy):
 @pytest.mark.parametrize("learner", LEARNERS, ids=NAMES)
 def test_theta_with_noise_is_the_same_for_every_learner(noisy, learner):
     example, fits = noisy
-    fit = estimate(example.train, example.baseline, learner=learner, solver=LevenbergMarquardt(iterations=20))
+    fit = estimate(
+        example.train, example.baseline, learner=learner, solver=LevenbergMarquardt(20), regularization="none"
+    )
     np.testing.assert_allclose(fit.theta, fits[0].theta, rtol=0, atol=1e-10)
 
 
@@ -153,7 +157,9 @@ def test_lemma_1(noiseless, spring):
 def test_theorem_1(data_set, learner):
     """‖θ* − θ̂‖ = ‖Φ⁺Δ‖ (eq:error_val): without noise it holds however good the fit is."""
     example = static(data_set)
-    fit = estimate(example.train, example.baseline, learner=learner, solver=LevenbergMarquardt(iterations=20))
+    fit = estimate(
+        example.train, example.baseline, learner=learner, solver=LevenbergMarquardt(20), regularization="none"
+    )
     u = example.train.experiments[0].inputs[:, 0]
     delta = 0.01 - 0.5 * u**2
     error = np.linalg.lstsq(np.stack([u, u**3], axis=1), delta, rcond=None)[0]

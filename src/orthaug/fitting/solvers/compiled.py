@@ -204,11 +204,9 @@ def _evidence(w: Any, normal: Normal, alpha: Any, options: Options) -> Any:
         effective = effective_weights(normal, alpha)
         variance = normal.loss / jnp.maximum(options.samples - effective, 1.0)
         return jnp.clip(effective * variance / jnp.maximum(w @ w, 1e-300), 1e-12, 1e12)
-    used, size = (
-        jax.ops.segment_sum(each, options.groups, num_segments=len(w))[options.groups]
-        for each in (_effective(normal, alpha), w**2)
-    )
-    variance = normal.loss / jnp.maximum(options.samples - effective_weights(normal, alpha), 1.0)
+    each = _effective(normal, alpha)
+    used, size = (jax.ops.segment_sum(x, options.groups, num_segments=len(w))[options.groups] for x in (each, w**2))
+    variance = normal.loss / jnp.maximum(options.samples - jnp.sum(each), 1.0)
     return jnp.clip(jnp.maximum(used, _UNUSED) * variance / jnp.maximum(size, 1e-300), 1e-12, 1e12)
 
 
