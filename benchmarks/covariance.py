@@ -56,7 +56,7 @@ def seconds_per_row(fit: oa.Estimate, timed: int) -> float:
 
 def fitted() -> oa.Estimate:
     example = oa.synthetic.static(1, noise=True, samples=ROWS)
-    return oa.estimate(example.train, example.baseline, learner=oa.MLP((NEURONS,)))
+    return oa.estimate(example.train, example.baseline, learner=oa.MLP((NEURONS,)), regularization="none")
 
 
 def theta_block(fit: oa.Estimate | None = None) -> float:

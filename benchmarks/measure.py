@@ -46,7 +46,10 @@ def noiseless(data_set: int, iterations: int) -> np.ndarray:
     solver = oa.LevenbergMarquardt(iterations)
     return np.array(
         [
-            errors(oa.estimate(example.train, example.baseline, solver=solver, seed=seed), example.theta)
+            errors(
+                oa.estimate(example.train, example.baseline, solver=solver, regularization="none", seed=seed),
+                example.theta,
+            )
             for seed in range(INITIALISATIONS)
         ]
     )

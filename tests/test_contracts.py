@@ -107,7 +107,16 @@ def fitted(case, structure):
     record, baseline = record_of(rng, ny, experiments), baseline_of(rng, ny, nt, shared)
     learner = NETWORK if learner == "network" else QUADRATIC[ny]
     solver = LevenbergMarquardt(iterations=iterations)
-    return estimate(record, baseline, lags=LAGS, learner=learner, structure=structure, solver=solver, seed=seed % 1000)
+    return estimate(
+        record,
+        baseline,
+        lags=LAGS,
+        learner=learner,
+        structure=structure,
+        solver=solver,
+        seed=seed % 1000,
+        regularization="none",
+    )
 
 
 def close(found, expected, relative=1e-9):

@@ -58,12 +58,20 @@ def record():
 
 @pytest.fixture(scope="module")
 def fit(record):
-    return estimate(record, PHYSICS, learner=NETWORK, solver=LevenbergMarquardt(iterations=60), restarts=3, seed=4)
+    return estimate(
+        record,
+        PHYSICS,
+        learner=NETWORK,
+        solver=LevenbergMarquardt(iterations=60),
+        restarts=3,
+        seed=4,
+        regularization="none",
+    )
 
 
 @pytest.fixture(scope="module")
 def short(record):
-    return estimate(record, PHYSICS, learner=NETWORK, solver=LevenbergMarquardt(iterations=6))
+    return estimate(record, PHYSICS, learner=NETWORK, solver=LevenbergMarquardt(iterations=6), regularization="none")
 
 
 # what is refused
@@ -72,7 +80,7 @@ def short(record):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"regularization": "ridge"}, "`regularization` must be one of none, evidence; got 'ridge'"),
+        ({"regularization": "ridge"}, "`regularization` must be one of none, evidence, ard; got 'ridge'"),
         ({"regularization": -0.1}, "`regularization` must be 0 or more; got -0.1"),
         ({"regularization": float("nan")}, "`regularization` must be 0 or more; got nan"),
         ({"regularization": float("inf")}, "`regularization` must be 0 or more; got inf"),
@@ -141,7 +149,7 @@ def test_numbers_from_numpy_are_taken(record):
 def test_linear_learner_on_expressions_is_least_squares(record, structure):
     learner = MLP(hidden=(), inputs=("u[k]**2", "sin(3*u[k-1])"))
     chosen = {"additive": Additive(), "orthogonal": Orthogonal(shared="all")}[structure]
-    found = estimate(record, PHYSICS, learner=learner, structure=chosen)
+    found = estimate(record, PHYSICS, learner=learner, structure=chosen, regularization="none")
     more = (lambda y, u, k: u[k] ** 2, lambda y, u, k: np.sin(3 * u[k - 1]), lambda y, u, k: 1.0)
     a = columns(record, 1, *PHI, *more)
     b = target(record, 1)
@@ -149,12 +157,21 @@ def test_linear_learner_on_expressions_is_least_squares(record, structure):
     np.testing.assert_allclose(found.model.predict(record).model[1:, 0], a @ least_squares(a, b), atol=1e-9)
     if structure == "orthogonal":
         np.testing.assert_allclose(found.theta, least_squares(a[:, :2], b), rtol=1e-12)
-        beside = estimate(record, PHYSICS, learner=learner).theta  # it cannot imitate the physics: a joint regression
+        beside = estimate(
+            record, PHYSICS, learner=learner, regularization="none"
+        ).theta  # it cannot imitate the physics: a joint regression
         np.testing.assert_allclose(beside, least_squares(a, b)[:2], rtol=1e-6)
 
 
 def test_learner_with_other_lags_than_the_baseline(record):
-    found = estimate(record, PHYSICS, lags=Lags(na=0, nb=2, nk=2), learner=LINEAR, structure=Orthogonal(shared="all"))
+    found = estimate(
+        record,
+        PHYSICS,
+        lags=Lags(na=0, nb=2, nk=2),
+        learner=LINEAR,
+        structure=Orthogonal(shared="all"),
+        regularization="none",
+    )
     a = columns(record, 3, *PHI, lambda y, u, k: u[k - 2], lambda y, u, k: u[k - 3], lambda y, u, k: 1.0)
     b = target(record, 3)
     assert (found.model.form.first_row, len(found.problem.rows)) == (3, 118)
@@ -166,7 +183,9 @@ def test_learner_with_other_lags_than_the_baseline(record):
 def test_experiments_given_twice_weigh_twice(learner):
     one, other = record_of(1, 61), record_of(2, 61)
     structure = Orthogonal(shared="all")
-    found = estimate(Record.join([one, other, one]), PHYSICS, learner=learner, structure=structure)
+    found = estimate(
+        Record.join([one, other, one]), PHYSICS, learner=learner, structure=structure, regularization="none"
+    )
     functions = [*PHI] if learner is None else [*PHI, lambda y, u, k: u[k] ** 2, lambda y, u, k: 1.0]
     both = Record.join([one, other])
     a, b = columns(both, 1, *functions), target(both, 1)
@@ -191,7 +210,7 @@ def test_fixed_terms_are_subtracted_first(record):
 
 def test_nothing_but_fixed_terms(record):
     fixed = Baseline.from_terms([Term("a", "y[k-1]", initial=0.6, fixed=True)])
-    found = estimate(record, fixed, learner=MLP(hidden=(), inputs=("u[k]", "u[k]**2")))
+    found = estimate(record, fixed, learner=MLP(hidden=(), inputs=("u[k]", "u[k]**2")), regularization="none")
     a = columns(record, 1, lambda y, u, k: u[k], lambda y, u, k: u[k] ** 2, lambda y, u, k: 1.0)
     known = 0.6 * columns(record, 1, PHI[0])[:, 0]
     expected = known + a @ least_squares(a, target(record, 1) - known)
@@ -260,7 +279,14 @@ def test_restarts_are_reported_and_the_best_is_kept(fit):
 
 def test_a_seed_from_the_table_gives_its_run_again(record, fit):
     (chosen,) = [run for run in fit.restarts if run.chosen]
-    again = estimate(record, PHYSICS, learner=NETWORK, solver=LevenbergMarquardt(iterations=60), seed=chosen.seed)
+    again = estimate(
+        record,
+        PHYSICS,
+        learner=NETWORK,
+        solver=LevenbergMarquardt(iterations=60),
+        seed=chosen.seed,
+        regularization="none",
+    )
     np.testing.assert_array_equal(again.model.numbers.weights, fit.model.numbers.weights)
     assert again.restarts == (chosen,)
 
@@ -301,7 +327,7 @@ def test_progress_is_told(record):
     found = estimate(
         record, PHYSICS, learner=NETWORK, solver=solver, restarts=2, progress=lambda *what: told.append(what)
     )
-    assert {restart for restart, _, _ in told} == {0, 1}
+    assert {restart for restart, _, _ in told} == {0, 1, 2, 3}  # none and ard from each start
     for i, run in enumerate(found.restarts):
         _, iteration, loss = [what for what in told if what[0] == i][-1]
         assert iteration == run.iterations and loss == pytest.approx(run.loss, rel=1e-12)
@@ -338,7 +364,7 @@ def test_non_finite(record, learner, structure):
     found = estimate(record, PHYSICS, learner=learner, restarts=2, **arguments)
     assert found.status.code == "non_finite" and not found.status.ok
     assert "the learner returns NaN" in found.status.message and found.status.message in found.summary()
-    assert [run.loss for run in found.restarts] == [None, None]
+    assert [run.loss for run in found.restarts] == 4 * [None]
     assert found.std is None and np.isfinite(found.theta).all()
     assert "nan" not in repr(found.theta)
     assert found.parameters["std"].isna().all()

@@ -229,3 +229,22 @@ def test_weights_are_those_of_a_draw_at_their_own_size(hidden, nz, ny):
         a = math.sqrt(6 / (sizes[i] + sizes[i + 1])) * (math.sqrt(2) if i < len(hidden) else 1.0)
         shape = (sizes[i + 1], sizes[i])
         np.testing.assert_array_equal(weight, jax.random.uniform(keys[i], shape, minval=-a, maxval=a, dtype=float))
+
+
+GROUPS = [  # weights in the tree's order: into the neurons, their biases, out of the last layer, the output's bias
+    (MLP((2,)), 3, 1, [0, 0, 0, 1, 1, 1, 0, 1, 0, 1, 2]),
+    (MLP((2,)), 1, 2, [0, 1, 0, 1, 0, 1, 0, 1, 2, 2]),
+    (MLP((2, 1)), 1, 1, [0, 1, 0, 1, 2, 2, 2, 2, 3]),
+    (MLP(()), 2, 1, [0, 0, 1]),
+    (CUBIC, 1, 1, [0, 0, 1]),
+]
+
+
+@pytest.mark.parametrize(("learner", "nz", "ny", "expected"), GROUPS)
+def test_groups_are_neurons(learner, nz, ny, expected):
+    assert _in_order(Bound(learner, nz, ny).groups().tolist()) == expected
+
+
+def _in_order(labels):
+    names = {}
+    return [names.setdefault(label, len(names)) for label in labels]

@@ -98,6 +98,43 @@ def test_evidence_reaches_its_fixed_point_equations():
     assert np.linalg.norm(run.normal.gradient - run.ridge * w) < 1e-4 * np.linalg.norm(run.ridge * w)
 
 
+def relevance(columns, target, samples, groups):
+    """MacKay's fixed point with an α of each group, for a linear model, iterated to the end."""
+    hessian, alpha = columns.T @ columns, np.ones(len(groups))
+    for _ in range(2000):
+        inverse = np.linalg.inv(hessian + np.diag(alpha))
+        w, used = inverse @ columns.T @ target, 1 - alpha * np.diag(inverse)
+        variance = np.sum((target - columns @ w) ** 2) / (samples - used.sum())
+        for group in np.unique(groups):
+            of = groups == group
+            alpha[of] = used[of].sum() * variance / (w[of] @ w[of])
+    return w, alpha, used.sum()
+
+
+def test_relevance_of_a_linear_learner():
+    given, groups = regression(noise=1.0), np.array([0, 1, 0, 1, 2])
+    options = {"ridge": 1.0, "evidence": True, "groups": groups}
+    run = minimise(given, solver=LevenbergMarquardt(tolerance=1e-14), **options)
+    w, alpha, gamma = relevance(linear_columns(given), given.e.ravel(), SAMPLES, groups)
+    assert len(set(alpha.tolist())) == 3
+    np.testing.assert_allclose(run.ridge, alpha, rtol=1e-3)
+    np.testing.assert_allclose(run.effective, gamma, rtol=1e-4)
+    np.testing.assert_allclose(run.w, w, atol=1e-4)
+
+
+def test_a_weight_that_nothing_needs_falls_silent():
+    noise = np.random.default_rng(1).normal(size=(2, ROWS, 1))
+    z, phi = np.random.default_rng(0).uniform(-1, 1, (ROWS, 2)), noise[:1].reshape(ROWS, 1, 1)
+    given = problem(MLP(hidden=()), z, z[:, :1] + 0.1 * noise[1], phi)
+    run = minimise(given, ridge=1.0, evidence=True, groups=np.arange(3))
+    columns = linear_columns(given)
+    least_squares = np.linalg.lstsq(columns, given.e.ravel(), rcond=None)[0]
+    for i in (1, 2):  # Mackay's condition: an estimate within its standard error is pruned
+        deviation = np.sqrt(np.linalg.inv(columns.T @ columns)[i, i] * float(run.normal.loss) / SAMPLES)
+        assert (run.ridge[i] > 1e6) == (abs(least_squares[i]) < deviation)
+    assert run.ridge[0] < 1 and run.w[0] == pytest.approx(least_squares[0], rel=0.01)
+
+
 def test_start_that_is_not_finite():
     given = regression(MLP(hidden=(5,)))
     run = minimise(given, w=jnp.full(given.bound.size, jnp.nan))

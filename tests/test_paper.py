@@ -41,20 +41,23 @@ def rmse(fit, record: Record) -> float:
 @pytest.fixture(scope="module", params=[1, 2, 3])
 def noiseless(request):
     example = static(request.param)
-    return request.param, example, [estimate(example.train, example.baseline, seed=seed) for seed in SEEDS]
+    options = {"regularization": "none"}
+    return request.param, example, [estimate(example.train, example.baseline, seed=s, **options) for s in SEEDS]
 
 
 @pytest.fixture(scope="module")
 def noisy():
     example = static(1, noise=True)
-    fits = [estimate(example.train, example.baseline, regularization="evidence", seed=seed) for seed in SEEDS]
+    fits = [estimate(example.train, example.baseline, seed=seed) for seed in SEEDS]
     return example, fits
 
 
 @pytest.fixture(scope="module")
 def additive():
     example = static(1)
-    return example, [estimate(example.train, example.baseline, structure=Additive(), seed=s) for s in range(4)]
+    return example, [
+        estimate(example.train, example.baseline, structure=Additive(), regularization="none", seed=s) for s in range(4)
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +82,9 @@ def test_theta_on_the_static_sets(noiseless):
 @pytest.mark.parametrize("learner", LEARNERS, ids=NAMES)
 def test_theta_is_the_same_for_every_learner(noiseless, learner):
     _, example, fits = noiseless
-    fit = estimate(example.train, example.baseline, learner=learner, solver=LevenbergMarquardt(iterations=20))
+    fit = estimate(
+        example.train, example.baseline, learner=learner, solver=LevenbergMarquardt(20), regularization="none"
+    )
     np.testing.assert_allclose(fit.theta, fits[0].theta, rtol=0, atol=1e-10)
     assert fit.defect is None if learner is None else fit.defect <= 1e-12
 
@@ -95,17 +100,19 @@ def test_static_set_with_noise(noisy):
         assert np.linalg.norm(fit.theta - example.theta) == pytest.approx(0.0089013, abs=5e-8)
         assert fit.defect <= 1e-12
     errors = [rmse(fit, example.test) for fit in fits]
-    assert np.median(errors) <= 8e-4 and max(errors) <= 9e-4
+    assert np.median(errors) <= 7.1e-4 and max(errors) <= 8e-4  # the published scripts: 6.9e-4 to 7.2e-4
 
 
-def test_evidence_leaves_few_weights(noisy):
+def test_the_default_leaves_few_weights(noisy):
     assert all(3 < fit.effective_weights < 15 for fit in noisy[1])
 
 
 @pytest.mark.parametrize("learner", LEARNERS, ids=NAMES)
 def test_theta_with_noise_is_the_same_for_every_learner(noisy, learner):
     example, fits = noisy
-    fit = estimate(example.train, example.baseline, learner=learner, solver=LevenbergMarquardt(iterations=20))
+    fit = estimate(
+        example.train, example.baseline, learner=learner, solver=LevenbergMarquardt(20), regularization="none"
+    )
     np.testing.assert_allclose(fit.theta, fits[0].theta, rtol=0, atol=1e-10)
 
 
@@ -115,7 +122,7 @@ def test_mass_spring_damper(spring):
         np.testing.assert_allclose(fit.theta, [0.471697779, -0.471758489, 4.76104182e-5], rtol=2e-9)
         assert np.linalg.norm(fit.theta / example.theta - 1) == pytest.approx(0.013254, abs=5e-7)
         assert fit.status.iterations <= 100 and fit.defect <= 1e-12
-        assert rmse(fit, example.test) <= 2.0e-5  # the published scripts: 3.4e-5 to 1.8e-4
+        assert rmse(fit, example.test) <= 1.5e-5  # the published scripts: 3.4e-5 to 1.8e-4
 
 
 def test_additive_theta_scatters_while_predictions_agree(additive, noiseless):
@@ -150,7 +157,9 @@ def test_lemma_1(noiseless, spring):
 def test_theorem_1(data_set, learner):
     """‖θ* − θ̂‖ = ‖Φ⁺Δ‖ (eq:error_val): without noise it holds however good the fit is."""
     example = static(data_set)
-    fit = estimate(example.train, example.baseline, learner=learner, solver=LevenbergMarquardt(iterations=20))
+    fit = estimate(
+        example.train, example.baseline, learner=learner, solver=LevenbergMarquardt(20), regularization="none"
+    )
     u = example.train.experiments[0].inputs[:, 0]
     delta = 0.01 - 0.5 * u**2
     error = np.linalg.lstsq(np.stack([u, u**3], axis=1), delta, rcond=None)[0]

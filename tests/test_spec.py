@@ -146,7 +146,7 @@ def test_defaults(tmp_path):
     assert (learner.kind, learner.hidden, learner.activation) == ("mlp", [16], "tanh")
     assert (spec.structure.kind, spec.structure.measure.kind, spec.structure.weight) == ("orthogonal", "training", 1.0)
     assert (training.solver, training.focus, training.iterations) == ("levenberg-marquardt", "prediction", 300)
-    assert (training.restarts, training.seed, training.regularization) == (1, 0, None)
+    assert (training.restarts, training.seed, training.regularization) == (1, 0, "auto")
     assert (training.segment, training.washout) == (512, 40)
 
 
@@ -312,7 +312,7 @@ VALUES = [  # (changed in FULL), the key, what was found, what is expected
     ("learning_rate = 1e-2", "learning_rate = 0", "training.learning_rate", "0", "greater than 0"),
     ('focus = "prediction"', 'focus = "free"', "training.focus", '"free"', "'prediction' or 'simulation'"),
     ("regularization = 0.1", "regularization = -0.1", "training.regularization", "-0.1", "greater than or equal to 0"),
-    ("regularization = 0.1", 'regularization = "l1"', "training.regularization", '"l1"', "'none' or 'evidence'"),
+    ("regularization = 0.1", 'regularization = "l1"', "training.regularization", '"l1"', "'none', 'evidence' or 'ard'"),
     ("regularization = 0.1", "regularization = inf", "training.regularization", "inf", "finite"),
 ]
 

@@ -250,7 +250,12 @@ def test_lambda_counts_in_the_units_of_one_output_and_in_deviations_of_several(k
     initial = [0.3, 0.7, -0.2, 1.1][: 2 * ny]
     structure = kind(5.0)
     fit = estimate(
-        record, physics(ny, initial), learner=LEARNER if ny == 1 else TWO, structure=structure, solver=SOLVER
+        record,
+        physics(ny, initial),
+        learner=LEARNER if ny == 1 else TWO,
+        structure=structure,
+        solver=SOLVER,
+        regularization="none",
     )
     spread = np.ones(1) if ny == 1 else y.std(axis=0)
     theta, fitted = by_hand(structure, u, y, initial, spread)
@@ -265,7 +270,16 @@ def test_another_unit_of_one_output_with_lambda_in_it(kind, power):
     for scale in (1.0, 1000.0):
         record = measured((scale,))[2]
         baseline = physics(1, [0.3 * scale, 0.7 * scale])
-        fits.append(estimate(record, baseline, learner=LEARNER, structure=kind(2.0 * scale**power), solver=SOLVER))
+        fits.append(
+            estimate(
+                record,
+                baseline,
+                learner=LEARNER,
+                structure=kind(2.0 * scale**power),
+                solver=SOLVER,
+                regularization="none",
+            )
+        )
         values = fits[-1].model.predict(record).trajectories[0].model / scale
         fits[-1] = (fits[-1].theta / scale, values)
     np.testing.assert_allclose(fits[0][0], fits[1][0], rtol=1e-9)
@@ -279,7 +293,12 @@ def test_the_unit_of_one_of_several_outputs_does_not_matter(kind):
         record = measured(scale)[2]
         factor = np.repeat(scale, 2)
         fit = estimate(
-            record, physics(2, [0.3, 0.7, -0.2, 1.1] * factor), learner=TWO, structure=kind(2.0), solver=SOLVER
+            record,
+            physics(2, [0.3, 0.7, -0.2, 1.1] * factor),
+            learner=TWO,
+            structure=kind(2.0),
+            solver=SOLVER,
+            regularization="none",
         )
         fits.append(fit.theta / factor)
     np.testing.assert_allclose(fits[0], fits[1], rtol=1e-9)

@@ -107,7 +107,7 @@ def noisy():
 def estimable():
     """The same draw with a learner of which the data determine every weight."""
     example = static(1, noise=True)
-    return estimate(example.train, example.baseline, learner=LINEAR, solver=QUICK)
+    return estimate(example.train, example.baseline, learner=LINEAR, solver=QUICK, regularization="none")
 
 
 # --- θ under a measure
@@ -308,10 +308,10 @@ def test_prediction_std_is_the_delta_method(noisy):
     np.testing.assert_allclose(found[:, 0], spread_of(noisy, at), rtol=1e-6)
 
 
-def test_prediction_std_of_the_default_fit_is_that_of_what_the_data_see():
+def test_prediction_std_of_an_unregularised_fit_is_that_of_what_the_data_see():
     """Over-parametrised weights: on its own rows a fit of rank r has variance rσ²/N on average."""
     example = static(1, noise=True)
-    fit = estimate(example.train, example.baseline)
+    fit = estimate(example.train, example.baseline, regularization="none")
     (found,) = prediction_std(fit.model, example.train)
     rank = np.mean(found**2) * len(found) / fit.model.statistics.noise[0, 0]
     assert found.min() > 0

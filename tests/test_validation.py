@@ -11,8 +11,12 @@ from test_cli import SPEC, make_project, one_line, run, signals, write_csv
 from test_parallel import PHYSICS, record_of
 
 from orthaug._base.errors import InputError
+from orthaug.fitting.criteria import Prediction, Simulation
 from orthaug.fitting.estimation import estimate
+from orthaug.fitting.rules import tried
+from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.structures import Additive, Orthogonal
 from orthaug.models.learners import MLP
 from orthaug.models.storage import load
 
@@ -77,6 +81,68 @@ def test_another_validation_record_changes_the_choice_and_nothing_else(chosen):
     assert other.theta.tobytes() == chosen.theta.tobytes()
 
 
+@pytest.fixture(scope="module")
+def auto():
+    return estimate(TRAIN, PHYSICS, restarts=3, seed=2, **OPTIONS)
+
+
+def test_auto_runs_none_and_ard_and_keeps_the_lowest_score(auto, candidates):
+    assert [(r.seed, r.regularization) for r in auto.restarts] == [(s, c) for c in ("none", "ard") for s in (2, 3, 4)]
+    samples, fits = len(auto.problem.rows), [candidates[s, "none"] for s in (2, 3, 4)]
+    fits += [estimate(TRAIN, PHYSICS, regularization="ard", seed=seed, **OPTIONS) for seed in (2, 3, 4)]
+    assert [r.loss for r in auto.restarts] == [fit.restarts[0].loss for fit in fits]
+    left = [samples - len(fit.theta) - 1.4 * fit.effective_weights for fit in fits]
+    scores = [fit.restarts[0].loss / n**2 if n > 0 else np.inf for fit, n in zip(fits, left, strict=True)]
+    best = int(np.argmin(scores))
+    assert [r.chosen for r in auto.restarts] == [i == best for i in range(6)]
+    np.testing.assert_array_equal(auto.model.numbers.weights, fits[best].model.numbers.weights)
+    losses = [r.loss for r in auto.restarts]
+    assert auto.restarts[best].regularization == "ard" and losses[best] > min(losses)  # not what training would choose
+
+
+def test_an_ensemble_takes_one_run_of_each_start(auto):
+    fit = estimate(TRAIN, PHYSICS, restarts=3, seed=2, ensemble=True, **OPTIONS)
+    taken = [r for r in fit.restarts if r.chosen]
+    assert sorted(r.seed for r in taken) == [2, 3, 4]
+    assert {r.seed: r.regularization for r in auto.restarts if r.chosen}.items() <= {
+        r.seed: r.regularization for r in taken
+    }.items()
+
+
+FREE, PAPER = Simulation(), AdamLBFGS()
+STANDS_FOR = [
+    ({}, ("none", "ard")),
+    ({"validated": True}, ("none", "ard")),
+    ({"resident": False}, ("none", "evidence")),
+    ({"linear": False}, ("none",)),
+    ({"criterion": Prediction(2)}, ("none",)),
+    ({"criterion": FREE}, ("none",)),
+    ({"criterion": FREE, "validated": True}, ("none", "evidence")),
+    ({"solver": PAPER, "validated": True}, ("none",)),
+    ({"structure": Additive(from_initial=True)}, ("none",)),
+    ({"given": ["evidence", 2.0]}, ("evidence", 2.0)),
+    ({"given": 0.5}, (0.5,)),
+]
+
+
+@pytest.mark.parametrize(("change", "expected"), STANDS_FOR)
+def test_what_auto_stands_for(change, expected):
+    usual = {"given": "auto", "solver": LevenbergMarquardt(), "criterion": Prediction(), "structure": Orthogonal()}
+    assert tried(**(usual | {"linear": True, "resident": True, "validated": False} | change)) == expected
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"criterion": FREE}, "ard regularization is for training one step ahead; take evidence"),
+        ({"solver": PAPER}, "ard regularization needs the Gauss-Newton matrix"),
+    ],
+)
+def test_ard_is_refused(arguments, words):
+    with pytest.raises(InputError, match=words):
+        estimate(TRAIN, PHYSICS, **({**OPTIONS, "regularization": "ard"} | arguments))
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -87,9 +153,12 @@ def test_another_validation_record_changes_the_choice_and_nothing_else(chosen):
         ({"blocks": 1}, "`blocks` must be 2 or more, or 0 for none; got 1"),
         (
             {"regularization": (), "validation": VALIDATION},
-            "`regularization` is empty; give none, evidence or a number",
+            "`regularization` is empty; give auto, none, evidence, ard or a number",
         ),
-        ({"regularization": ["none", "ridge"], "validation": VALIDATION}, "must be one of none, evidence; got 'ridge'"),
+        (
+            {"regularization": ["none", "ridge"], "validation": VALIDATION},
+            "must be one of none, evidence, ard; got 'ridge'",
+        ),
         ({"regularization": ["none", -1.0], "validation": VALIDATION}, "`regularization` must be 0 or more; got -1.0"),
         ({"validation": np.zeros((9, 2))}, "`validation` must be a Record or None"),
         ({"seed": 2**63}, "`seed` must be below 2..63"),
@@ -135,8 +204,8 @@ def test_the_table_of_a_fit(project):
     assert [(r["seed"], r["regularization"]) for r in table] == [
         (5, "none"),
         (6, "none"),
-        (5, "evidence"),
-        (6, "evidence"),
+        (5, "ard"),
+        (6, "ard"),
     ]
     errors = [r["validation"] for r in table]
     assert all(r["loss"] > 0 and r["validation"] > 0 for r in table)
@@ -145,9 +214,8 @@ def test_the_table_of_a_fit(project):
 
     project.write_text(spec(part="[data.channels.y]"))
     alone = json.loads(run("fit", project, "--json", "--out", "alone").out)
-    assert [r["regularization"] for r in alone["restarts"]] == ["none", "none"]
-    assert [r["loss"] for r in alone["restarts"]] == [r["loss"] for r in table[:2]]
-    assert [r["validation"] for r in alone["restarts"]] == [None, None]
+    assert [r["loss"] for r in alone["restarts"]] == [r["loss"] for r in table]  # chosen by another score
+    assert [r["validation"] for r in alone["restarts"]] == 4 * [None]
     assert [p["value"] for p in alone["parameters"]] == [p["value"] for p in result["parameters"]]
     assert "validation" not in alone["scores"]
     assert load("out").theta.tobytes() == load("alone").theta.tobytes()

@@ -55,6 +55,7 @@ kind = "orthogonal"
 [training]
 iterations = {ITERATIONS}
 restarts = {RESTARTS}
+regularization = "none"
 """
 
 
@@ -80,6 +81,7 @@ def _additive(example: Example, seed: int, progress: Progress) -> Estimate:
         example.baseline,
         structure=Additive(),
         solver=LevenbergMarquardt(ITERATIONS),
+        regularization="none",
         seed=seed,
         progress=progress.after(runs=RESTARTS + seed),
     )

@@ -82,8 +82,7 @@ class Job:
     @property
     def run_count(self) -> int:
         """How many runs a fit makes: restarts times regularizations."""
-        choices = self.spec.training.regularizations(self.validation is not None)
-        return self.spec.training.restarts * (len(choices) if isinstance(choices, tuple) else 1)
+        return _runs(self.spec, self.problem, self.validation is not None)
 
     @property
     def iterations(self) -> int:
@@ -194,9 +193,12 @@ def _check_scored(spec: Spec, problem: Problem) -> None:
 def _check_cost(spec: Spec, problem: Problem, validated: bool) -> None:
     """`check_cost` before JAX is loaded."""
     sizes = {"rows": len(problem.rows), "features": len(problem.features.entries), "outputs": len(problem.outputs)}
-    choices = spec.training.regularizations(validated)
-    runs = spec.training.restarts * (len(choices) if isinstance(choices, tuple) else 1)
+    runs = _runs(spec, problem, validated)
     check_cost(spec.declared_learner(), **sizes, iterations=spec.declared_solver().iterations, runs=runs)
+
+
+def _runs(spec: Spec, problem: Problem, validated: bool) -> int:
+    return spec.training.restarts * len(spec.regularizations(linear=problem.baseline.linear, validated=validated))
 
 
 def structure_of(spec: Spec, kind: str | None = None, measure: Measure | None = None) -> Structure:
@@ -235,14 +237,14 @@ def run_fit(job: Job, variant: Variant = AS_DECLARED, progress: Progress = SILEN
     if variant.alone or fold is not None:  # a fold is scored by predictions, which no measure changes
         structure = structure_of(spec, variant.structure_kind)
     validated = job.validation is not None and fold is None
-    choices = training.regularizations(validated)
+    choices = training.regularization
     return fit(
         job.posed(variant),
         learner=learner,
         structure=structure,
         criterion=spec.declared_criterion(),
         solver=solver if fold is None else solver.at_most(FOLD_ITERATIONS),
-        regularization=choices if fold is None or not isinstance(choices, tuple) else choices[0],
+        regularization=choices[0] if fold is not None and isinstance(choices, list) else choices,
         restarts=training.restarts if fold is None else 1,
         seed=training.seed,
         blocks=0 if fold is not None else _blocks(spec),

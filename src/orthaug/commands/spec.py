@@ -26,7 +26,7 @@ from orthaug.data.regressors import Lags
 from orthaug.data.tables import check_readable
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.kinds import CRITERIA, SOLVERS, STRUCTURES
-from orthaug.fitting.rules import check_solver, check_starts
+from orthaug.fitting.rules import check_solver, check_starts, tried
 from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Structure
 from orthaug.inference.kinds import MEASURES
@@ -41,7 +41,7 @@ Count = Annotated[int, Field(ge=0, strict=True)]
 Positive = Annotated[int, Field(ge=1, strict=True)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Orders = Count | list[Count]
-Regularization = Literal["none", "evidence"] | Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Regularization = Literal["none", "evidence", "ard"] | Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Range = Annotated[list[Count], Field(min_length=2, max_length=2)]
 
 
@@ -221,7 +221,7 @@ class TrainingSection(KindSection):
     ensemble: bool = False
     fallback: bool = True
     seed: Annotated[int, Field(ge=0, lt=2**63, strict=True)] = 0
-    regularization: Regularization | Annotated[list[Regularization], Field(min_length=1)] | None = None
+    regularization: Literal["auto"] | Regularization | Annotated[list[Regularization], Field(min_length=1)] = "auto"
     output_weights: str | list[float] = "auto"
 
     @model_validator(mode="after")
@@ -230,12 +230,6 @@ class TrainingSection(KindSection):
         solver, criterion = self.declared(SOLVERS, self.solver), self.declared(CRITERIA, self.focus)
         check_solver(solver, criterion, _as_list(self.regularization))
         return self
-
-    def regularizations(self, validated: bool) -> str | float | tuple[str | float, ...]:
-        """The regularizations to try: by default none; none and evidence where a validation part can choose."""
-        if self.regularization is None:
-            return ("none", "evidence") if validated and SOLVERS[self.solver].gauss_newton else "none"
-        return tuple(self.regularization) if isinstance(self.regularization, list) else self.regularization
 
 
 class ValidationSection(Section):
@@ -332,6 +326,12 @@ class Spec(Section):
     def declared_solver(self) -> Solver:
         """The solver."""
         return resolve(self.training.declared(SOLVERS, self.training.solver))
+
+    def regularizations(self, *, linear: bool, validated: bool) -> tuple[str | float, ...]:
+        """Those that every start is run with."""
+        given = self.training.regularization
+        declared = (self.declared_solver(), self.declared_criterion(), self.declared_structure())
+        return tried(given, *declared, linear=linear, resident=True, validated=validated)
 
 
 def spec_model() -> type[Spec]:

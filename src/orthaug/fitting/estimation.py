@@ -22,7 +22,7 @@ from orthaug.fitting.free_run import FreeRunTask
 from orthaug.fitting.learned import Learned
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.reweighting import reweighted
-from orthaug.fitting.rules import check_solver, check_starts
+from orthaug.fitting.rules import check_solver, check_starts, tried
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Orthogonal, Structure
@@ -46,7 +46,7 @@ def estimate(
     structure: Structure = Orthogonal(),  # noqa: B008  (frozen)
     criterion: Criterion = Prediction(),  # noqa: B008  (frozen)
     solver: Solver = LevenbergMarquardt(),  # noqa: B008  (frozen)
-    regularization: Regularization | Sequence[Regularization] = "none",
+    regularization: Regularization | Sequence[Regularization] = "auto",
     restarts: int = 1,
     seed: int = 0,
     ensemble: bool = False,
@@ -70,9 +70,12 @@ def estimate(
         criterion: `Prediction(horizon)`, 1 step by default, or `Simulation(segment, washout)`, the free run: then θ is
             trained with the weights and split off at the end (F2).
         solver: `LevenbergMarquardt(…)`, or `AdamLBFGS(…)`, the paper's pipeline from θ⁰.
-        regularization: "none", "evidence" (MacKay; the weights' prior is estimated too), or a number: the
-            ridge α on the weights, against squared errors in units of the baseline's RMS residual. Several may be
-            given with `validation`, which then chooses.
+        regularization: "none"; "evidence" (MacKay; the weights' prior is estimated too); "ard" (automatic relevance
+            determination: the prior of each neuron, one step ahead); or a number: the ridge α on the weights, against
+            squared errors in units of the baseline's RMS residual. Several may be given with `validation` or `blocks`,
+            which then choose. "auto" runs none and ard from every start, one step ahead with Levenberg-Marquardt, and
+            keeps the lower generalised cross-validation; it is none otherwise, and none and evidence where
+            `validation` chooses on the free run.
         restarts: runs from initial weights of seeds `seed … seed + restarts - 1`, spread over the cores. Kept is the
             one of the lowest error of the criterion on `validation`; without that, of free runs and of several
             regularizations, on `blocks` that are held out; else of the lowest training loss.
@@ -131,7 +134,7 @@ def fit(
     structure: Structure = Orthogonal(),  # noqa: B008  (frozen)
     criterion: Criterion = Prediction(),  # noqa: B008  (frozen)
     solver: Solver = LevenbergMarquardt(),  # noqa: B008  (frozen)
-    regularization: Regularization | Sequence[Regularization] = "none",
+    regularization: Regularization | Sequence[Regularization] = "auto",
     restarts: int = 1,
     seed: int = 0,
     ensemble: bool = False,
@@ -155,13 +158,14 @@ def fit(
     _check_choices(learner, structure, criterion, solver, initial, validation)
     _check_splittable(structure, problem.baseline, learner)
     blocks = _check_blocks(blocks)
-    choices = _regularizations(regularization, validation is not None or blocks > 0)
+    conditions = {"linear": problem.baseline.linear, "resident": engine.resident, "validated": validation is not None}
+    choices = tried(regularization, solver, criterion, structure, **conditions)
+    auto = _check_regularizations(regularization, choices, validation is not None or blocks > 0)
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
     check_starts(restarts if initial is None else 1, seed, ensemble=ensemble)
     check_solver(solver, criterion, () if learner is None else choices)
     if initial is None:
-        sizes = {"rows": len(problem.rows), "features": len(problem.features.entries), "outputs": len(problem.outputs)}
-        check_cost(learner, **sizes, iterations=solver.iterations, runs=restarts * len(choices))
+        _check_cost(problem, learner, solver, restarts * len(choices))
     problem = replace(problem, features=Features(())) if learner is None and initial is None else problem
     warm = None
     if initial is not None:
@@ -179,7 +183,7 @@ def fit(
         estimate = replace(estimate, status=status)
     else:
         trained = task if solved else FreeRunTask.of(task, criterion, warm)
-        chosen = Choice(validation, blocks if initial is None else 0, fallback, ensemble)
+        chosen = Choice(validation, blocks if initial is None else 0, fallback, ensemble, scored=auto and solved)
         estimate = train(trained, starts, structure, solver, chosen, progress)
         if _splits(structure) and estimate.status.ok and estimate.model.form.bound is not None:
             estimate = estimate.split(structure.measure)
@@ -193,6 +197,12 @@ def fit(
         return fit(problem, structure=structure, criterion=criterion, solver=solver, progress=progress, **more)
 
     return reweighted(estimate, again)
+
+
+def _check_cost(problem: Problem, learner: Learner | None, solver: Solver, runs: int) -> None:
+    """Raise InputError for what would take more memory or time than there is."""
+    sizes = {"rows": len(problem.rows), "features": len(problem.features.entries), "outputs": len(problem.outputs)}
+    check_cost(learner, **sizes, iterations=solver.iterations, runs=runs)
 
 
 def _starts(bound: Bound | None, seeds: range, choices: Sequence[Regularization]) -> list[PlannedRun]:
@@ -302,18 +312,18 @@ def _check_choices(learner: Any, structure: Any, criterion: Any, solver: Any, in
     check_type(validation, Record | None, "validation", "a Record or None")
 
 
-def _regularizations(given: Any, chosen: bool) -> tuple[Regularization, ...]:
-    """The regularizations to try, each checked."""
-    choices = tuple(given) if isinstance(given, list | tuple) else (given,)
-    if len(choices) > 1 and not chosen:
+def _check_regularizations(given: Any, choices: Sequence[Any], chosen: bool) -> bool:
+    """Whether "auto" was given; raise InputError for what is none, or for several that nothing chooses between."""
+    auto = isinstance(given, str) and given == "auto"
+    if len(choices) > 1 and not (auto or chosen):
         raise InputError("several regularizations need `validation` or `blocks` to choose between them.")
     for choice in choices:
         if isinstance(choice, str):
-            check_choice(choice, ("none", "evidence"), "`regularization`")
+            check_choice(choice, ("none", "evidence", "ard"), "`regularization`")
         elif isinstance(choice, bool) or not isinstance(choice, int | float | np.number):
-            raise InputError(f"`regularization` must be none, evidence or a number; got {shown(choice)}.")
+            raise InputError(f"`regularization` must be auto, none, evidence, ard or a number; got {shown(choice)}.")
         elif not (is_number(choice) and choice >= 0):
             raise InputError(f"`regularization` must be 0 or more; got {shown(choice)}.")
     if not choices:
-        raise InputError("`regularization` is empty; give none, evidence or a number.")
-    return choices
+        raise InputError("`regularization` is empty; give auto, none, evidence, ard or a number.")
+    return auto

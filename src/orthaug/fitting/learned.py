@@ -44,8 +44,8 @@ class Learned:
     seconds: float = 0.0
     effective: float = 0.0
     gram: Matrix | None = None
-    ridge: float = 0.0
-    """Of the weights, in the units of `gram`."""
+    ridge: float | Vector = 0.0
+    """Of the weights, all or each (nw,), in the units of `gram`."""
     middle: Callable[[Matrix], Matrix] | None = None
     """ΣψᵀΣ_eψ in the units of `gram`, for the noise covariance (ny, ny) of whitened outputs."""
     coefficients: Vector | None = None

@@ -195,7 +195,10 @@ class OneStepTask:
         hold = Hold(matrix, target / self.rms)
         ridge, evidence = ridge_of(regularization)
         if solver.gauss_newton and not structure.from_initial:
-            return self._least_squares(solver, w, hold, ridge, evidence, progress)
+            options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "progress": progress}
+            if regularization == "ard":
+                options["groups"] = self.bound.groups()
+            return self._least_squares(solver, w, hold, options)
         self._check_joint(solver, ridge, evidence)
         physics = Physics.of(self.problem, elimination, fixed, ridge, self.rms, solved=structure.projects)
         if solver.gauss_newton:
@@ -230,21 +233,20 @@ class OneStepTask:
         end = solver.minimise(JointOneStep(self.bound), unknowns, (self.rows, physics), nothing, **options)
         return GradientRun(end.w[:nt], end.w[nt:], end.iterations, end.ending, end.seconds)
 
-    def _least_squares(
-        self, solver: Any, w: Any, hold: Hold, ridge: float, evidence: bool, progress: RunTell
-    ) -> compiled.TrainingRun:
+    def _least_squares(self, solver: Any, w: Any, hold: Hold, options: dict[str, Any]) -> compiled.TrainingRun:
         """Levenberg-Marquardt: compiled whole where the rows are in memory, otherwise driven by the host."""
         assert self.bound is not None
         samples = self.problem.target.size - len(self.problem.baseline.names)
-        options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "progress": progress}
         if self.engine.resident:
             criterion, arguments = OneStep(self.bound), (self.rows, hold)
             return solver.minimise(criterion, w, arguments, self._nothing, samples=samples, **options)
+        if "groups" in options:
+            raise InputError("ard regularization needs rows that are in memory; take evidence.")
         objective = Streamed(self.engine, self.bound, self.rows, hold, samples)
         first = objective.fly(np.asarray(w), self._nothing)
         first = objective.fly(np.asarray(w), first.normal.overlap)  # less what rounding left of J in the physics
         if np.isfinite(first.normal.hessian).all() and compiled.spanned(first.normal):
-            return compiled.TrainingRun(w, first.normal, ridge, 0.0, 0, Ending.SPANNED, 0.0)
+            return compiled.TrainingRun(w, first.normal, options["ridge"], 0.0, 0, Ending.SPANNED, 0.0)
         end = solver.descend(objective, np.asarray(w), first.normal.overlap, damping=IDENTITY, **options)
         normal: Normal = end.flown.normal
         weights = np.asarray(end.flown.p)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from orthaug._base.errors import KeyedError, shown
 from orthaug.fitting.criteria import Criterion
@@ -42,6 +43,12 @@ def check_scored(criterion: Criterion, longest: int) -> None:
 
 def check_solver(solver: Solver, criterion: Criterion, regularizations: Sequence[object]) -> None:
     """Raise InputError where a solver without normal equations is asked for what needs them."""
+    if "ard" in regularizations and not criterion.one_step:
+        raise KeyedError(
+            "ard regularization is for training one step ahead; take evidence on the free run.",
+            "regularization",
+            " = ard; expected none, evidence or a number on the free run, or more than one step ahead",
+        )
     if solver.gauss_newton:
         return
     name = SOLVERS.kind_of(solver)
@@ -52,15 +59,35 @@ def check_solver(solver: Solver, criterion: Criterion, regularizations: Sequence
             "solver",
             f" = {name} trains one step ahead; expected {able} here",
         )
-    if "evidence" in regularizations:
-        raise KeyedError(
-            f"evidence regularization needs the Gauss-Newton matrix of the {able} solver.",
-            "regularization",
-            f" = evidence; expected solver {able} with it",
-        )
+    for choice in ("evidence", "ard"):
+        if choice in regularizations:
+            raise KeyedError(
+                f"{choice} regularization needs the Gauss-Newton matrix of the {able} solver.",
+                "regularization",
+                f" = {choice}; expected solver {able} with it",
+            )
+
+
+def tried(
+    given: Any, solver: Solver, criterion: Criterion, structure: Any, *, linear: bool, resident: bool, validated: bool
+) -> tuple[Any, ...]:
+    """The regularizations of every start: those given, or what "auto" stands for (docs/design.md has the table).
+
+    Args:
+        linear: whether the physics is linear in θ, which is then solved.
+        resident: whether the rows are in memory.
+        validated: whether a validation part chooses.
+    """
+    if not isinstance(given, str) or given != "auto":
+        return tuple(given) if isinstance(given, list | tuple) else (given,)
+    if not solver.gauss_newton or structure.from_initial:
+        return ("none",)
+    if not (criterion.one_step and linear):
+        return ("none", "evidence") if validated else ("none",)
+    return ("none", "ard") if resident else ("none", "evidence")
 
 
 def ridge_of(regularization: str | float) -> tuple[float, bool]:
     """The ridge α that a run starts with, and whether evidence re-estimates it."""
-    evidence = regularization == "evidence"
+    evidence = regularization in ("evidence", "ard")
     return (1.0 if evidence else 0.0 if regularization == "none" else float(regularization)), evidence

@@ -25,6 +25,7 @@ from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Structure
 
+_INFLATION = 1.4  # of the effective weights in cross-validation, against what follows the noise (Kim and Gu 2004)
 FOLD_ITERATIONS = 60  # enough to tell whether a learner helps, on every block of cross-validation
 
 
@@ -40,6 +41,8 @@ class PlannedRun(NamedTuple):
 class Choice:
     """How one run is chosen: on `validation`, on held-out `blocks` of the training data, or by the lowest loss.
 
+    With `scored` and without `validation` it is the lowest generalised cross-validation instead, one step ahead.
+
     With `fallback` physics alone is handed over where no free run is better there. An `ensemble` takes them all.
     """
 
@@ -47,11 +50,20 @@ class Choice:
     blocks: int = 0
     fallback: bool = True
     ensemble: bool = False
+    scored: bool = False
 
     def compares(self, task: Task, starts: Sequence[PlannedRun]) -> bool:
         """Whether there is something to choose by held-out errors: runs that fly, or several regularizations."""
         several = len({start.regularization for start in starts}) > 1
-        return task.bound is not None and (task.criterion.flown is not None or several)
+        return task.bound is not None and (task.criterion.flown is not None or (several and not self.scored))
+
+    def ranking(self, task: Task, runs: Sequence[Any], errors: Sequence[float]) -> np.ndarray:
+        """What is lowest for the best run: its held-out error, its score, or its loss."""
+        scores = [_cross_validation(task, run) for run in runs] if self.scored else []
+        for ranking in (np.array(errors), np.array(scores)):
+            if np.isfinite(ranking).any():
+                return ranking
+        return np.array([task.loss(run) for run in runs])
 
 
 def train(
@@ -69,7 +81,7 @@ def train(
     losses = [task.loss(run) for run in runs]
     held_out = _held_out(task, starts, runs, structure, solver, choice)
     errors = [math.nan] * len(runs) if held_out is None else [mean_square(run) for run in held_out.runs]
-    ranking = np.array(errors if np.isfinite(errors).any() else losses)
+    ranking = choice.ranking(task, runs, errors)
     usable = np.array([run.ending.usable for run in runs]) & np.isfinite(ranking)
     best = int(np.argmin(np.where(usable, ranking, np.inf)))
     told = []
@@ -82,7 +94,7 @@ def train(
     if best < 0:
         estimate = _alone(task, structure)
     elif choice.ensemble:
-        members = [i for i, start in enumerate(starts) if start.regularization == starts[best].regularization]
+        members = _members(starts, ranking, best) if choice.scored else _alike(starts, best)
         estimate = _concluded(task, structure, _median(task, runs, members, best))
     else:
         estimate = _concluded(task, structure, task.learned(runs[best]))
@@ -103,6 +115,26 @@ def train(
     )
     warnings = (*estimate.warnings, *task.warnings, *_replaced(starts, runs), *told)
     return replace(estimate, restarts=restarts, status=status, held_out=held_out, warnings=warnings)
+
+
+def _cross_validation(task: Task, run: Any) -> float:
+    """Generalised: `N RSS / (N − nθ − 1.4 γ)²` of a run one step ahead; infinite where it uses up all rows."""
+    samples = task.problem.target.size
+    left = samples - len(task.problem.baseline.names) - _INFLATION * run.effective
+    return task.loss(run) * (samples / left) ** 2 if left > 0 else math.inf
+
+
+def _alike(starts: Sequence[PlannedRun], best: int) -> list[int]:
+    """The runs with the regularization of the best one."""
+    return [i for i, start in enumerate(starts) if start.regularization == starts[best].regularization]
+
+
+def _members(starts: Sequence[PlannedRun], ranking: np.ndarray, best: int) -> list[int]:
+    """The best run from every seed."""
+    seeds = dict.fromkeys(start.seed for start in starts)
+    ranking = np.where(np.isfinite(ranking), ranking, np.inf)
+    lowest = (min((i for i, s in enumerate(starts) if s.seed == seed), key=lambda i: ranking[i]) for seed in seeds)
+    return sorted({*lowest, best})
 
 
 def _run(

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Protocol, runtime_checkable
 
 import numpy as np
 from annotated_types import Ge
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, shown
@@ -101,6 +101,20 @@ class MLP:
     def silent(self, tree: Tree) -> Tree:
         """The same hidden layers with an output layer of zeros."""
         return [*tree[:-1], tuple(np.zeros_like(part) for part in tree[-1])]
+
+    def groups(self, tree: Tree) -> Tree:
+        """Of every weight the neuron that it belongs to: hidden ones by what comes in, the last also by what goes out.
+
+        So a neuron that is not needed can be silenced as one. The output's biases are a group of their own.
+        """
+        labels, first = [], 0
+        for weight, bias in tree[:-1]:
+            neurons = first + np.arange(len(bias))
+            labels.append((np.broadcast_to(neurons[:, None], np.shape(weight)), neurons))
+            last, first = neurons, first + len(bias)
+        weight, bias = tree[-1]
+        outward = np.broadcast_to(last if self.hidden else first, np.shape(weight))
+        return [*labels, (outward, np.full(np.shape(bias), first + 1))]
 
     def weights(self, nz: int, ny: int) -> int:
         """How many weights it has for `nz` features and `ny` outputs."""
@@ -312,6 +326,20 @@ class Bound:
             if not np.any(values) and np.any(slopes) and np.isfinite(slopes).all():
                 return tried
         return None
+
+    def groups(self) -> Int[np.ndarray, "nw"]:
+        """Which weights share a prior under automatic relevance determination, by number from 0.
+
+        A learner says it by a method `groups(tree)`; of others each array is one group.
+        """
+        leaves = self.leaves(np.zeros(self.size))
+        declared = getattr(self.learner, "groups", None)
+        if declared is not None:
+            leaves = jax.tree.leaves(declared(jax.tree.unflatten(self._shape[0], leaves)))
+        else:
+            leaves = [np.full(np.shape(leaf), i) for i, leaf in enumerate(leaves)]
+        labels = np.concatenate([np.zeros(0, int), *(np.ravel(np.asarray(leaf)) for leaf in leaves)])
+        return np.unique(labels, return_inverse=True)[1]
 
     @staticmethod
     def ravel(leaves: list[Any]) -> Float[Array, "nw"]:

@@ -39,7 +39,8 @@ class JointCovariance:
     """
 
     gram: Matrix
-    ridge: float
+    ridge: float | Vector
+    """Of all weights, or of each (nw,)."""
     middle: Matrix
     """ΣψᵀΣ_eψ in whitened outputs, `σ² G` for one output."""
     nt: int
@@ -50,7 +51,7 @@ class JointCovariance:
         Variances are then sums of squares, which no rounding makes negative.
         """
         nw = len(self.gram) - self.nt
-        prior = self.ridge * np.concatenate([np.zeros(self.nt), np.ones(nw)])
+        prior = np.concatenate([np.zeros(self.nt), self.ridge * np.ones(nw)])
         half = half_inverse(self.gram + np.diag(prior), self.nt)
         variance = float(np.trace(self.middle) / max(np.trace(self.gram), 1e-300))
         values, vectors = np.linalg.eigh(half.T @ (self.middle + variance * np.diag(prior)) @ half)
@@ -67,14 +68,14 @@ class Statistics:
     """What training leaves behind; None where it left nothing.
 
     `gram` (nθ + nw)² is the Gram matrix of ∂ŷ/∂(c, w) over the training rows in whitened outputs, `[Φ J]` one step
-    ahead; `ridge` the weights' prior precision beside it; `middle` = ΣψᵀΣ_eψ; `noise` (ny, ny) the noise covariance in
-    the outputs' units; `freedom` its degrees of freedom.
+    ahead; `ridge` the weights' prior precision beside it, of all or of each (nw,); `middle` = ΣψᵀΣ_eψ; `noise` (ny, ny)
+    the noise covariance in the outputs' units; `freedom` its degrees of freedom.
     """
 
     gram: Matrix | None = None
     middle: Matrix | None = None
     noise: Matrix | None = None
-    ridge: float = 0.0
+    ridge: float | Vector = 0.0
     freedom: float = np.inf
 
     def joint(self, nt: int) -> JointCovariance | None:

@@ -69,7 +69,7 @@ def write(model: Model, folder: Path) -> None:
         "largest_output": model.largest_output,
         "deviation": model.deviation,
         "output_weight": model.weight,
-        "scalars": np.array([kept.ridge, kept.freedom]),
+        "scalars": np.array([0.0 if np.ndim(kept.ridge) else kept.ridge, kept.freedom]),
     }
     arrays |= {
         name: value
@@ -77,6 +77,7 @@ def write(model: Model, folder: Path) -> None:
             ("gram", kept.gram),
             ("noise", kept.noise),
             ("middle", kept.middle),
+            ("ridge", kept.ridge if np.ndim(kept.ridge) else None),
             ("shared", model.shared),
         )
         if value is not None
@@ -239,7 +240,7 @@ def _rebuild(
             gram=arrays.get("gram"),
             middle=arrays.get("middle"),
             noise=arrays.get("noise"),
-            ridge=float(arrays["scalars"][0]),
+            ridge=arrays["ridge"] if "ridge" in arrays else float(arrays["scalars"][0]),
             freedom=float(arrays["scalars"][1]),
         ),
     )

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from orthaug._base.checks import Vector
 from orthaug._base.jax import Array, jax, jnp, training_clock
 from orthaug._base.progress import RunTell, quiet
 from orthaug.fitting.normal_equations import Normal, linearise, one_pass
@@ -22,6 +23,7 @@ from orthaug.fitting.status import Ending
 from orthaug.models.rows import Overlap
 
 _NOTHING_LEFT = 1e-22  # of ‖J‖²: what rounding leaves of a Jacobian in the span of the physics
+_UNUSED = 1e-12  # effective weights of a group at least, so that one that does nothing stays so
 _SECONDS_PER_BURST = 0.5  # how often progress is told and Ctrl-C is heard
 
 
@@ -32,7 +34,7 @@ class State(NamedTuple):
     normal: Normal
     damping: Float[Array, ""]
     growth: Float[Array, ""]
-    ridge: Float[Array, ""]
+    ridge: Float[Array, "*nw"]
     iteration: Int[Array, ""]
     accepted: Int[Array, ""]
     small: Int[Array, ""]
@@ -45,6 +47,8 @@ class Options(NamedTuple):
     tolerance: Float[Array | np.ndarray, ""]
     evidence: Any
     samples: Float[Array | np.ndarray, ""]
+    groups: Int[Array | np.ndarray, "nw"] | None = None
+    """Which weights share a ridge; None where all share one number."""
 
 
 class TrainingRun(NamedTuple):
@@ -52,7 +56,7 @@ class TrainingRun(NamedTuple):
 
     w: Float[Array | np.ndarray, "nw"]
     normal: Normal
-    ridge: float
+    ridge: float | Vector
     effective: float
     """Effective number of weights, `tr(H (H + αI)⁻¹)`."""
     iterations: int
@@ -72,6 +76,7 @@ def minimise(
     *,
     ridge: float = 0.0,
     evidence: bool = False,
+    groups: Int[np.ndarray, "nw"] | None = None,
     samples: int,
     iterations: int,
     tolerance: float,
@@ -84,12 +89,14 @@ def minimise(
         overlap: a first guess of the learner's share in the physics; zeros do.
         ridge: α in normalised units; with `evidence` where it starts.
         evidence: choose α by MacKay's re-estimation after every accepted step.
+        groups: which weights share an α, by number; None where all do.
         samples: residuals less the physics' own parameters, for the noise variance.
         iterations, tolerance: as of `LevenbergMarquardt`.
     """
     began = training_clock()
-    options = Options(np.asarray(tolerance), np.asarray(evidence), np.asarray(float(samples)))
-    state = _start(criterion, w, arguments, overlap, np.float64(ridge), options)
+    options = Options(np.asarray(tolerance), np.asarray(evidence), np.asarray(float(samples)), groups)
+    start = np.float64(ridge) if groups is None else np.full(len(groups), float(ridge))
+    state = _start(criterion, w, arguments, overlap, start, options)
     burst = 1
     while int(state.code) == Ending.RUNNING and int(state.iteration) < iterations:
         tick = training_clock()
@@ -101,7 +108,7 @@ def minimise(
     return TrainingRun(
         state.w,
         state.normal,
-        float(state.ridge),
+        float(state.ridge) if groups is None else np.asarray(state.ridge),
         float(effective_weights(state.normal, state.ridge)),
         int(state.iteration),
         Ending(int(state.code)),
@@ -149,8 +156,8 @@ def _trial(criterion: Any, state: State, arguments: tuple[Any, ...], options: Op
     step = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(shifted), downhill)
     trial = one_pass(criterion, w + step, arguments, normal.overlap)
 
-    before = normal.loss + alpha * (w @ w)
-    after = trial.loss + alpha * ((w + step) @ (w + step))
+    before = normal.loss + _prior(alpha, w)
+    after = trial.loss + _prior(alpha, w + step)
     gain = (before - after) / (step @ (state.damping * step + downhill))
     ok = jnp.isfinite(after) & (after < before) & jnp.all(jnp.isfinite(trial.hessian))
 
@@ -162,9 +169,7 @@ def _trial(criterion: Any, state: State, arguments: tuple[Any, ...], options: Op
     arrived = (accepted > 0) | _level(normal, downhill, before)
     code = jnp.where(stuck, jnp.where(arrived, Ending.CONVERGED, Ending.NO_DESCENT), code)
     moved = jax.tree.map(lambda new, old: jnp.where(ok, new, old), (w + step, trial), (w, normal))
-    ridge = jax.lax.cond(
-        ok & options.evidence, lambda: _evidence(moved[0], moved[1], alpha, options.samples), lambda: alpha
-    )
+    ridge = jax.lax.cond(ok & options.evidence, lambda: _evidence(moved[0], moved[1], alpha, options), lambda: alpha)
     return State(
         w=moved[0],
         normal=moved[1],
@@ -184,11 +189,33 @@ def _level(normal: Normal, downhill: Any, objective: Any) -> Any:
     return jnp.all(jnp.abs(downhill) <= 1e-7 * size)
 
 
-def _evidence(w: Any, normal: Normal, alpha: Any, samples: Any) -> Any:
-    """MacKay's fixed point: `γ = tr(H(H + αI)⁻¹)`, `α = γ σ² / ‖w‖²` with `σ² = ‖r‖² / (N − γ)`."""
-    effective = effective_weights(normal, alpha)
-    variance = normal.loss / jnp.maximum(samples - effective, 1.0)
-    return jnp.clip(effective * variance / jnp.maximum(w @ w, 1e-300), 1e-12, 1e12)
+def _prior(alpha: Any, w: Any) -> Any:
+    """`Σ α_i w_i²`."""
+    return alpha * (w @ w) if alpha.ndim == 0 else w @ (alpha * w)
+
+
+def _evidence(w: Any, normal: Normal, alpha: Any, options: Options) -> Any:
+    """MacKay's fixed point: `γ = tr(H(H + αI)⁻¹)`, `α = γ σ² / ‖w‖²` with `σ² = ‖r‖² / (N − γ)`.
+
+    With groups γ and ‖w‖² are those of each group (automatic relevance determination).
+    """
+    if options.groups is None:
+        effective = effective_weights(normal, alpha)
+        variance = normal.loss / jnp.maximum(options.samples - effective, 1.0)
+        return jnp.clip(effective * variance / jnp.maximum(w @ w, 1e-300), 1e-12, 1e12)
+    each = _effective(normal, alpha)
+    used, size = (jax.ops.segment_sum(x, options.groups, num_segments=len(w))[options.groups] for x in (each, w**2))
+    variance = normal.loss / jnp.maximum(options.samples - jnp.sum(each), 1.0)
+    return jnp.clip(jnp.maximum(used, _UNUSED) * variance / jnp.maximum(size, 1e-300), 1e-12, 1e12)
+
+
+def _effective(normal: Normal, alpha: Any) -> Any:
+    """The diagonal of `H (H + A)⁻¹` for a ridge of each weight, from the eigenvalues of `A^-½ H A^-½`."""
+    unit = 1 / jnp.sqrt(alpha)
+    scaled = normal.hessian * unit[:, None] * unit
+    values, vectors = jnp.linalg.eigh(jnp.where(jnp.isfinite(scaled), scaled, 0.0))
+    values = jnp.maximum(values, 0.0)
+    return vectors**2 @ (values / (1 + values))
 
 
 @jax.jit
@@ -197,6 +224,8 @@ def effective_weights(normal: Normal, alpha: Any) -> Any:
     n = normal.hessian.shape[0]
     if n == 0:
         return jnp.asarray(0.0)
+    if alpha.ndim:
+        return jnp.sum(_effective(normal, alpha))
     values = jnp.linalg.eigvalsh(jnp.where(jnp.isfinite(normal.hessian), normal.hessian, 0.0))
     floor = n * jnp.finfo(float).eps * _largest_column(normal)
     return jnp.sum(jnp.where(values > floor, values / (values + alpha), 0.0))
