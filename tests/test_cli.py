@@ -485,7 +485,7 @@ def test_ctrl_c_during_training_leaves_nothing(project, monkeypatch, before):
     done = run("fit", project, "--out", "deep/out")
     assert (done.code, done.out) == (130, "")
     assert one_line(
-        done.err, "interrupted", " of 2", "iteration 3", "nothing was written"
+        done.err, "interrupted", " of 4", "iteration 3", "nothing was written"
     )  # whichever thread was first
     assert {path: path.read_bytes() for path in project.parent.rglob("*") if path.is_file()} == kept
     assert before or not Path("deep").exists()

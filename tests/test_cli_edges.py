@@ -55,7 +55,7 @@ def refused(*arguments: object) -> str:
 def test_ctrl_c_of_a_real_process(tmp_path, tmp_path_factory):
     u, y = signals(20_000, 1)
     write_csv(tmp_path / "run.csv", u=u, y=y)
-    long = 'kind = "mlp"\nhidden = [30, 10]\n[training]\niterations = 100000\nrestarts = 2\n'
+    long = 'kind = "mlp"\nhidden = [30, 10]\n[training]\niterations = 100000\nrestarts = 2\nregularization = "none"\n'
     tests = '[data.tests.steps]\nfiles = ["steps.csv"]\nskip = 5\n'
     (tmp_path / "plant.toml").write_text(SPEC.replace('kind = "none"\n', long).replace(tests, ""))
     cache = tmp_path_factory.mktemp("cache")

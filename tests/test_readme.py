@@ -37,7 +37,7 @@ def test_from_python(tmp_path, monkeypatch, capsys):
     out = capsys.readouterr().out
     assert all(name in out for name in ("theta1", "theta2", "theta3", "m/N", "95 % interval"))
     fit = names["fit"]
-    assert len(fit.restarts) == 2 * 3
+    assert len(fit.restarts) == 3
     assert fit.parameters["value"].tolist() == fit.theta.tolist()
     loaded = names["oa"].load("model")
     np.testing.assert_array_equal(loaded.theta, fit.theta)

@@ -87,17 +87,22 @@ def auto():
 
 
 def test_auto_runs_none_and_ard_and_keeps_the_lowest_score(auto, candidates):
-    assert [(r.seed, r.regularization) for r in auto.restarts] == [(s, c) for c in ("none", "ard") for s in (2, 3, 4)]
     samples, fits = len(auto.problem.rows), [candidates[s, "none"] for s in (2, 3, 4)]
     fits += [estimate(TRAIN, PHYSICS, regularization="ard", seed=seed, **OPTIONS) for seed in (2, 3, 4)]
-    assert [r.loss for r in auto.restarts] == [fit.restarts[0].loss for fit in fits]
     left = [samples - len(fit.theta) - 1.4 * fit.effective_weights for fit in fits]
     scores = [fit.restarts[0].loss / n**2 if n > 0 else np.inf for fit, n in zip(fits, left, strict=True)]
     best = int(np.argmin(scores))
-    assert [r.chosen for r in auto.restarts] == [i == best for i in range(6)]
+    kept = [i if scores[i] <= scores[i + 3] else i + 3 for i in range(3)]  # of each start the better one
+    told = [fits[i].restarts[0] for i in kept]
+    assert [(r.seed, r.regularization, r.loss) for r in auto.restarts] == [
+        (r.seed, r.regularization, r.loss) for r in told
+    ]
+    assert [r.chosen for r in auto.restarts] == [i == best for i in kept]
     np.testing.assert_array_equal(auto.model.numbers.weights, fits[best].model.numbers.weights)
-    losses = [r.loss for r in auto.restarts]
-    assert auto.restarts[best].regularization == "ard" and losses[best] > min(losses)  # not what training would choose
+    losses = [fit.restarts[0].loss for fit in fits]
+    assert fits[best].restarts[0].regularization == "ard" and losses[best] > min(
+        losses
+    )  # not what training would choose
 
 
 def test_an_ensemble_takes_one_run_of_each_start(auto):
@@ -214,8 +219,9 @@ def test_the_table_of_a_fit(project):
 
     project.write_text(spec(part="[data.channels.y]"))
     alone = json.loads(run("fit", project, "--json", "--out", "alone").out)
-    assert [r["loss"] for r in alone["restarts"]] == [r["loss"] for r in table]  # chosen by another score
-    assert [r["validation"] for r in alone["restarts"]] == 4 * [None]
+    assert [r["seed"] for r in alone["restarts"]] == [5, 6]
+    assert {r["loss"] for r in alone["restarts"]} <= {r["loss"] for r in table}  # of each start the better one
+    assert [r["validation"] for r in alone["restarts"]] == [None, None]
     assert [p["value"] for p in alone["parameters"]] == [p["value"] for p in result["parameters"]]
     assert "validation" not in alone["scores"]
     assert load("out").theta.tobytes() == load("alone").theta.tobytes()

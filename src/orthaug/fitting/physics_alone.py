@@ -96,7 +96,10 @@ def _over_whole(
     if not end.ending.usable:
         return []
     own = plan.descend(objective, end.end.flown.p, solver.at_most(0))  # its statistics are those of the plan's segments
-    return [own._replace(iterations=end.iterations, seconds=end.seconds)] if own.ending.usable else []
+    if not own.ending.usable:
+        return []
+    own = own._replace(end=own.end._replace(ending=end.ending))
+    return [own._replace(iterations=end.iterations, seconds=end.seconds)]
 
 
 def _best(ends: Sequence[Flight]) -> Flight | None:

@@ -90,25 +90,27 @@ def train(
         flies = task.criterion.flown is not None and task.start_loss is not None
         if choice.fallback and flies and held_out.ratio.code != "helps":
             told, best = [_fell_back(held_out)], -1
+    alike = _members(starts, ranking, best) if choice.scored else _alike(starts, best)
+    shown = alike if choice.scored and held_out is None else list(range(len(starts)))
     members = [best]
     if best < 0:
         estimate = _alone(task, structure)
     elif choice.ensemble:
-        members = _members(starts, ranking, best) if choice.scored else _alike(starts, best)
+        members = alike
         estimate = _concluded(task, structure, _median(task, runs, members, best))
     else:
         estimate = _concluded(task, structure, task.learned(runs[best]))
     restarts = tuple(
         Restart(
-            seed=start.seed,
+            seed=starts[i].seed,
             loss=finite_or_none(losses[i]),
-            iterations=run.iterations,
-            code=run.ending.code,
+            iterations=runs[i].iterations,
+            code=runs[i].ending.code,
             chosen=i in members,
-            regularization=start.regularization,
+            regularization=starts[i].regularization,
             validation=finite_or_none(errors[i]),
         )
-        for i, (start, run) in enumerate(zip(starts, runs, strict=True))
+        for i in shown
     )
     status = replace(
         estimate.status, seconds=task.seconds + sum(run.seconds for run in runs), start_loss=task.start_loss
@@ -133,8 +135,8 @@ def _members(starts: Sequence[PlannedRun], ranking: np.ndarray, best: int) -> li
     """The best run from every seed."""
     seeds = dict.fromkeys(start.seed for start in starts)
     ranking = np.where(np.isfinite(ranking), ranking, np.inf)
-    lowest = (min((i for i, s in enumerate(starts) if s.seed == seed), key=lambda i: ranking[i]) for seed in seeds)
-    return sorted({*lowest, best})
+    own = {seed: [i for i, start in enumerate(starts) if start.seed == seed] for seed in seeds}
+    return [best if best in runs else min(runs, key=lambda i: ranking[i]) for runs in own.values()]
 
 
 def _run(
