@@ -226,7 +226,12 @@ def test_bounds_on_the_free_run(structure):
     w = np.asarray(found.model.numbers.weights)
     at = np.concatenate([found.theta, w])
     one_step = estimate(
-        record(3, (150,)), bounded_physics(), learner=MLP((2,)), solver=LevenbergMarquardt(10), structure=structure
+        record(3, (150,)),
+        bounded_physics(),
+        learner=MLP((2,)),
+        solver=LevenbergMarquardt(10),
+        structure=structure,
+        regularization="none",
     )
     start = np.concatenate([one_step.theta, np.asarray(one_step.model.numbers.weights)])
     low, high = (np.concatenate([side, np.full(len(w), end)]) for side, end in
@@ -342,6 +347,7 @@ def test_restarts_are_chosen_by_the_loss_of_the_free_run():
 
 def test_validation_chooses_by_the_free_run():
     options = {"learner": NETWORK, "solver": LevenbergMarquardt(3), "criterion": Simulation(64, 8, 3)}
+    options["regularization"] = "none"
     other = record(9)
     several = estimate(record(), PHYSICS, restarts=3, seed=4, validation=other, **options)
     alone = [estimate(record(), PHYSICS, seed=s, **options) for s in (4, 5, 6)]
