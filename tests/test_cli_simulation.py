@@ -35,7 +35,7 @@ ALONE = '[learner]\nkind = "none"\n'
 SMALL = "[learner]\nhidden = [4]\n"
 GREEDY = "[learner]\nhidden = [30]\n"
 FREE = '[training]\nfocus = "simulation"\nsegment = 64\nwashout = 8\nstart_iterations = 5\niterations = 25\n'
-QUICK = "[training]\niterations = 40\n"
+QUICK = '[training]\niterations = 40\nregularization = "none"\n'
 FAR = '[data.tests.far]\nfiles = ["far.csv"]\n'
 
 

@@ -233,7 +233,7 @@ def test_adam_needs_rows_in_memory():
 
 def test_progress_is_told_as_a_mean_square():
     told = []
-    found = fit(posed(1), learner=MLP(hidden=(3,)), solver=LevenbergMarquardt(6), engine=Streaming(),
+    found = fit(posed(1), learner=MLP(hidden=(3,)), solver=LevenbergMarquardt(6), engine=Streaming(), regularization="none",
                 progress=lambda *at: told.append(at))  # fmt: skip
     assert [(run, n) for run, n, _ in told] == [(0, n + 1) for n in range(found.status.iterations)]
     assert told[-1][2] == pytest.approx(found.status.loss, rel=1e-9)
@@ -242,8 +242,9 @@ def test_progress_is_told_as_a_mean_square():
 def test_a_trial_is_one_pass_over_the_rows():
     """Beside those of the start; nothing but sums is asked of the rows."""
     engines = [Streaming(), Streaming()]
+    options = {"learner": MLP(hidden=(3,)), "regularization": "none"}
     fits = [
-        fit(posed(1), learner=MLP(hidden=(3,)), solver=LevenbergMarquardt(n, tolerance=0.0), engine=engine)
+        fit(posed(1), solver=LevenbergMarquardt(n, tolerance=0.0), engine=engine, **options)
         for n, engine in zip((8, 15), engines, strict=True)  # both end below physics alone
     ]
     assert [found.status.iterations for found in fits] == [8, 15]

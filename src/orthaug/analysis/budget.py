@@ -29,6 +29,7 @@ from orthaug.inference.weighed import weigh_problem
 from orthaug.physics.parameters import PhysicsMap
 
 LEAST_SHARE = 0.5  # of the learner's energy that a cause must explain to be named
+_NOTHING = 0.01  # of the noise: a learner that is smaller found nothing that could be explained
 _AS_MUCH = 0.98  # of what the cause explains: a rival cannot be told from it
 _ROUNDING = 1e-9  # of a parameter: a bias that no one can speak of
 _TOLD = 4  # parameters that a warning lists at most
@@ -97,6 +98,9 @@ def bias_budget(
 def budget_on(ground: Ground, fit: Estimate, suspects: Sequence[Suspect]) -> Budget | None:
     """The same on a ground that is there already."""
     if not ground.problem.baseline.names or ground.learned is None or not np.all(np.isfinite(ground.learned)):
+        return None
+    noise = fit.model.statistics.noise
+    if noise is not None and np.all(np.mean(ground.learned**2, axis=0) < _NOTHING**2 * np.diag(noise)):
         return None
     cause = named_cause(ground, suspects)
     if cause is None or cause.explained is None or cause.coefficient_found is None:

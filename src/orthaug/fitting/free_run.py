@@ -167,7 +167,7 @@ class FreeRunTask:
         def tell(iteration: int, loss: float) -> None:
             progress(iteration, loss * plan.rms**2 / plan.residuals)
 
-        options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "evidence_settled": best.silent}
+        options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "evidence_settled": True}
         flight = plan.descend(objective, best.p, solver, tell, best.states, ceiling=ceiling, **options)
         return self._below_physics(flight)
 

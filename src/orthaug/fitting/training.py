@@ -58,12 +58,16 @@ class Choice:
         return task.bound is not None and (task.criterion.flown is not None or (several and not self.scored))
 
     def ranking(self, task: Task, runs: Sequence[Any], errors: Sequence[float]) -> np.ndarray:
-        """What is lowest for the best run: its held-out error, its score, or its loss."""
-        scores = [_cross_validation(task, run) for run in runs] if self.scored else []
-        for ranking in (np.array(errors), np.array(scores)):
-            if np.isfinite(ranking).any():
-                return ranking
-        return np.array([task.loss(run) for run in runs])
+        """What is lowest for the best run: its held-out error, its score, or its loss.
+
+        On blocks other runs of its kind were judged: one that ended higher on its own data than they did on what they
+        had not seen failed to train, and its loss counts.
+        """
+        losses = np.array([task.loss(run) for run in runs])
+        if np.isfinite(errors).any():
+            return np.array(errors) if self.validation is not None else np.maximum(errors, losses)
+        scores = np.array([_cross_validation(task, run) for run in runs] if self.scored else [])
+        return scores if np.isfinite(scores).any() else losses
 
 
 def train(
