@@ -71,7 +71,9 @@ def test_what_cannot_be_done_is_one_line_and_exit_code_2(tmp_path, script, words
 def test_a_signal_while_a_folder_is_written(tmp_path, number, words):
     """It ends at once though the main thread takes no notice of it."""
     program = (
-        "from pathlib import Path; import time; from orthaug.commands.signals import WATCH; WATCH.start()\n"
+        "from pathlib import Path; import signal, time; from orthaug.commands.signals import WATCH\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)  # children of a background job ignore it\n"
+        "WATCH.start()\n"
         "from orthaug._base.folders import whole_folder\n"
         "with whole_folder(Path('deep/out'), lambda *_: None) as partial:\n"
         "    (partial / 'half').touch(); print('ready', flush=True)\n"

@@ -17,6 +17,7 @@ from orthaug.fitting.held_out import Ratio, mean_square
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
 from orthaug.models.learners import MLP, Bound, EquinoxModule, Function
+from orthaug.physics.baseline import Baseline, Term
 
 OPTIONS = {"learner": NETWORK, "criterion": FREE, "solver": LM}
 
@@ -73,6 +74,15 @@ def test_no_start_ends_above_physics_alone(structure):
 def test_one_step_does_not_end_above_physics_alone_either():
     found = estimate(linear(), PHYSICS, learner=NETWORK, solver=type(LM)(1), restarts=4, regularization="none")
     assert all(run.loss <= found.status.start_loss for run in found.restarts)
+
+
+def test_physics_alone_has_the_same_bounds():
+    terms = [Term("a", "y[k-1]", 0.5, max=0.6), Term("b", "y[k-2]", -0.2), Term("g", "u[k-1]", 0.4)]
+    physics = Baseline.from_terms(terms)
+    found = estimate(record(), physics, learner=NETWORK, solver=LM)
+    alone = estimate(record(), physics, learner=None)
+    assert found.at_bound and found.status.start_loss == pytest.approx(alone.status.loss, rel=1e-9)
+    assert found.status.loss <= found.status.start_loss
 
 
 def test_a_start_that_fails_is_told_and_replaced(monkeypatch):

@@ -88,7 +88,7 @@ def _verdicts(job: Job, fitted: dict[str, Fitted]) -> dict[str, Verdict]:
     kinds = [kind for kind, tried in fitted.items() if kind != ALONE and tried.fit.status.ok]
     if not kinds or not alone.status.ok:
         return {}
-    blocks, flown = wanted_blocks(job), job.spec.declared_criterion().flown is not None
+    blocks, flown = wanted_blocks(job), job.spec.declared_criterion().simulates
     if flown or not blocks:  # free runs were chosen by the same trials
         verdicts = {kind: judge_fit(fitted[kind], None, fitted[ALONE]) for kind in kinds}
     else:

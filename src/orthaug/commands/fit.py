@@ -66,7 +66,7 @@ def fit_job(job: Job, progress: Progress = SILENT) -> Fitted:
     if not fit.status.ok or (fit.model.form.bound is None and fit.held_out is None):
         return fitted
     verdict = judge_fit(fitted)
-    if verdict is None and job.spec.validation.blocks != 0:
+    if verdict is None and fit.model.form.bound is not None and job.spec.validation.blocks != 0:
         told = (
             "whether the learner helps is not judged: no part is held out, and the training data have too few "
             "rows for cross-validation in so many blocks."
@@ -192,11 +192,12 @@ def judge_fit(fitted: Fitted, blocks: Sequence[Trial] | None = None, alone: Fitt
 
     job, model, chosen_by = fitted.job, fitted.fit.model, fitted.fit.held_out
     held_out = job.parts[1:]
+    simulated = job.spec.declared_criterion().simulates
     if chosen_by is not None and model.form.bound is None:
-        return judge(trials_of(chosen_by))
+        return judge(trials_of(chosen_by)) if simulated else None
     if blocks is None:
         wanted = wanted_blocks(job)
-        if wanted and chosen_by is not None and job.validation is None:
+        if wanted and simulated and chosen_by is not None and job.validation is None:
             blocks = trials_of(chosen_by)
         else:
             blocks = cross_validated(job, wanted, [AS_DECLARED])[0] if wanted else ()

@@ -61,6 +61,7 @@ class OneStepTask:
     engine: Engine
     rows: Any
     criterion: Criterion = Prediction()  # noqa: RUF009  (frozen)
+    physics_loss: float | None = None
 
     @classmethod
     def of(
@@ -89,8 +90,8 @@ class OneStepTask:
 
     @property
     def start_loss(self) -> float:
-        """Loss of least squares with physics alone, in the units of `loss`."""
-        return float(np.mean(self.problem.unexplained**2))
+        """Loss of physics alone, in the units of `loss`: of least squares before `prepared`."""
+        return float(np.mean(self.problem.unexplained**2)) if self.physics_loss is None else self.physics_loss
 
     @property
     def seconds(self) -> float:
@@ -118,12 +119,16 @@ class OneStepTask:
 
     def on(self, record: Record) -> OneStepTask:
         """The same problem on another record."""
-        learner = None if self.bound is None else self.bound.learner
-        return OneStepTask.of(self.problem.on(record), learner, engine=self.engine)
+        return OneStepTask.of(self.problem.on(record), self.bound and self.bound.learner, engine=self.engine)
 
     def prepared(self, solver: Any, structure: Structure, progress: RunTell = quiet) -> OneStepTask:
-        """Itself: physics alone is solved already (F1)."""
-        return self
+        """The same with the loss of physics alone under the structure's rows and bounds; it is solved (F1)."""
+        problem, elimination = self.problem, eliminate(structure, self.problem)
+        nothing = np.zeros_like(problem.target_coordinates)
+        theta = elimination.theta(nothing, elimination.active(nothing))
+        missed = problem.target_coordinates - problem.projection.to_coordinates @ theta
+        loss = float(np.sum(problem.unexplained**2) + missed @ missed) / problem.target.size
+        return replace(self, physics_loss=loss)
 
     def run(
         self,
@@ -133,22 +138,17 @@ class OneStepTask:
         regularization: str | float = "none",
         progress: RunTell = quiet,
     ) -> compiled.TrainingRun:
-        """One run from the weights `w`; the arguments as in `estimate`, `structure` None for no penalty.
-
-        An active set meets bounds that reach into training (every structure but the orthogonal, F1). Entries at a
-        bound are held there, and training goes on until the same entries stand there.
-        """
+        """One run from the weights `w`; the arguments as in `estimate`, `structure` None for no penalty."""
         structure = Orthogonal() if structure is None else structure
         elimination = eliminate(structure, self.problem)
         run = self._run_inside(solver, w, structure, elimination, regularization, progress)
-        solved = solver.gauss_newton and solver.iterations and not structure.from_initial
-        solved = solved and not len(elimination.rows.target) and not elimination.bounded
-        if not (solved and run.ending.usable and self.bound and self.loss(run) > self.start_loss):
+        plain = not (structure.from_initial or elimination.bounded or len(elimination.rows.target))
+        above = run.ending.usable and self.bound is not None and self.loss(run) > self.start_loss
+        if not (above and plain and solver.gauss_newton and solver.iterations):
             return run
-        silent = self.bound.silent(np.asarray(w))  # from there no step ends above physics alone
-        if silent is None:
-            return run
-        return self._run_inside(solver, jnp.asarray(silent), structure, elimination, regularization, progress)
+        silent = self.bound.silent(np.asarray(w)) if self.bound else None  # its runs end below physics alone
+        w = w if silent is None else jnp.asarray(silent)
+        return self._run_inside(solver, w, structure, elimination, regularization, progress)
 
     def _run_inside(
         self,
@@ -159,7 +159,10 @@ class OneStepTask:
         regularization: str | float,
         progress: RunTell,
     ) -> compiled.TrainingRun:
-        """One run with θ inside its bounds."""
+        """One run with θ inside its bounds, which an active set meets (they reach into training, F1).
+
+        Entries at a bound are held there, and training goes on until the same entries stand there.
+        """
 
         def tell(iteration: int, loss: float) -> None:
             progress(iteration, self.mean_square(loss))

@@ -53,9 +53,9 @@ def _lengthening(
     plan: FlightPlan, solver: LevenbergMarquardt, structure: Structure, starts: Sequence[Vector]
 ) -> list[Flight]:
     """The end over the plan's own segments, reached over shorter ones, from the first start that flies over them."""
-    p, segment = None, _SHORTEST
+    p, segment, shortest = None, _SHORTEST, plan.over(_SHORTEST)
     for start in starts:
-        end = plan.over(segment).descend(plan.over(segment).objective(structure), start, solver)
+        end = shortest.descend(shortest.objective(structure), start, solver)
         if end.ending.usable:
             p = end.end.flown.p
             break
