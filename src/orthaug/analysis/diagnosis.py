@@ -106,14 +106,15 @@ def diagnose(fit: Estimate, *, one_step: Response | None = None, free_run: Respo
     return Diagnosis(verdict, text, tests, free_tests, ratio, noise, warnings)
 
 
-def robust_where_coloured(fit: Estimate) -> Estimate:
+def robust_where_coloured(fit: Estimate, response: Response) -> Estimate:
     """The fit with standard errors after Newey and West, where it is one step ahead and leaves a coloured residual.
 
-    Few rows, or ones that remember each other for long, leave the plain errors: their robust ones would be too small.
+    `response` is the prediction of the training rows. Few rows, or ones that remember each other for long, leave the
+    plain errors: their robust ones would be too small.
     """
     if not fit.status.ok or fit.covariance is None or fit.criterion.flown is not None or fit.at_bound:
         return fit
-    response, memory = fit.model.predict(fit.problem.record), 0
+    memory = 0
     for i in range(len(fit.problem.outputs)):
         pieces = [(t.measured - t.model)[t.start :, i] for t in response.trajectories]  # type: ignore[operator]
         rows = sum(map(len, pieces))

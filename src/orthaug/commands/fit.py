@@ -82,17 +82,20 @@ def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitt
     """Train a variant of a job and score every part; `judge_fit` asks whether the learner helps."""
     from orthaug.analysis.diagnosis import robust_where_coloured
 
-    fit = robust_where_coloured(run_fit(job, variant, progress))
+    fit = run_fit(job, variant, progress)
     warnings: list[Any] = [*job.warnings, *fit.warnings]
     unknown = ("physical_parameters", "physical_consistency", "sensitivities", "bias")
     content: dict[str, Any] = dict.fromkeys((*unknown, "residuals", "missing_lags", "stability"))
     scores, responses = {}, {}
     if fit.status.ok:
+        scoring: list[Any] = []
+        for part in job.parts:
+            scores[part.name], responses[part.name] = score_part(fit.model, part, scoring)
+        one_step, free_run = responses[job.train.name]
+        fit = robust_where_coloured(fit, one_step)
         content |= _physical_content(job, fit, warnings)
         content["bias"] = bias_of(job, fit)
-        for part in job.parts:
-            scores[part.name], responses[part.name] = score_part(fit.model, part, warnings)
-        one_step, free_run = responses[job.train.name]
+        warnings += scoring
         content |= _analysed(fit, one_step, free_run, warnings)
     shared = shared_of(job, others=False)
     nothing_known = np.full(len(fit.theta), np.nan)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -83,7 +83,8 @@ def train(
         task = task.prepared(solver, structure, partial(progress, 0))
     starts, runs = _run(task, starts, structure, solver, progress)
     losses = [task.loss(run) for run in runs]
-    held_out = _held_out(task, starts, runs, structure, solver, choice)
+    concluded = cache(lambda i: _concluded(task, structure, task.learned(runs[i])))
+    held_out = _held_out(task, starts, concluded, structure, solver, choice)
     errors = [math.nan] * len(runs) if held_out is None else [mean_square(run) for run in held_out.runs]
     ranking = choice.ranking(task, runs, errors)
     usable = np.array([run.ending.usable for run in runs]) & np.isfinite(ranking)
@@ -103,7 +104,7 @@ def train(
         members = alike
         estimate = _concluded(task, structure, _median(task, runs, members, best))
     else:
-        estimate = _concluded(task, structure, task.learned(runs[best]))
+        estimate = concluded(best)
     restarts = tuple(
         Restart(
             seed=starts[i].seed,
@@ -182,15 +183,18 @@ def _replaced(starts: Sequence[PlannedRun], runs: Sequence[Any]) -> list[Warning
 def _held_out(
     task: Task,
     starts: Sequence[PlannedRun],
-    runs: Sequence[Any],
+    concluded: Callable[[int], Estimate],
     structure: Structure,
     solver: Solver,
     choice: Choice,
 ) -> HeldOut | None:
-    """Errors where nothing was fitted: of the runs on the validation record, or of runs on folds on their blocks."""
+    """Errors where nothing was fitted: of the runs on the validation record, or of runs on folds on their blocks.
+
+    `concluded` gives the estimate of a run by its number.
+    """
     if choice.validation is not None:
         record, unit = choice.validation, task.problem.deviation
-        fits = [_concluded(task, structure, task.learned(run)) for run in runs]
+        fits = [concluded(i) for i in range(len(starts))]
         alone = _errors(_alone(task, structure), record, unit)
         labels = ("the validation part",) * len(record.experiments)
         return HeldOut("the validation part", labels, alone, tuple(_errors(fit, record, unit) for fit in fits))
