@@ -15,8 +15,8 @@ from orthaug._base.parallel import spread
 from orthaug._base.warning import Warning
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout
-from orthaug.fitting.estimates import Estimate, HeldOut
-from orthaug.fitting.held_out import Pieces, Ratio, blocked, mean_square, squared_errors
+from orthaug.fitting.estimates import Estimate
+from orthaug.fitting.held_out import HeldOut, Pieces, Ratio, blocked, mean_square, squared_errors
 from orthaug.models.model import Model
 from orthaug.models.response import Response
 
@@ -124,10 +124,14 @@ def trials_of(held_out: HeldOut) -> list[Trial]:
     chosen, trials = held_out.runs[held_out.chosen], []
     for label in dict.fromkeys(held_out.labels):
         own = [i for i, other in enumerate(held_out.labels) if other == label]
-        pieces = [held_out.alone[i] for i in own], [chosen[i] for i in own]
-        alone, model = (math.sqrt(mean_square(runs)) for runs in pieces)
-        trials.append(Trial(label, alone, model, label.startswith("block "), pieces))
+        trials.append(_trial(label, [held_out.alone[i] for i in own], [chosen[i] for i in own]))
     return trials
+
+
+def _trial(label: str, alone: Pieces, model: Pieces) -> Trial:
+    """Of squared errors in deviations of the training output."""
+    block = label.startswith("block ")
+    return Trial(label, math.sqrt(mean_square(alone)), math.sqrt(mean_square(model)), block, (alone, model))
 
 
 def cross_validate(
@@ -168,16 +172,7 @@ def cross_validate(
 
 def block_trials(errors: Sequence[Sequence[Pieces]], fit: int) -> list[Trial]:
     """Trials of one way of fitting against the first one, from `cross_validate`."""
-    return [
-        Trial(
-            f"block {i + 1} of {len(errors)}",
-            math.sqrt(mean_square(block[0])),
-            math.sqrt(mean_square(block[fit])),
-            block=True,
-            pieces=(block[0], block[fit]),
-        )
-        for i, block in enumerate(errors)
-    ]
+    return [_trial(f"block {i + 1} of {len(errors)}", block[0], block[fit]) for i, block in enumerate(errors)]
 
 
 def judge(trials: Sequence[Trial], extrapolation: Sequence[Extrapolation] = ()) -> Verdict | None:

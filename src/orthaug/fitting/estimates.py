@@ -13,7 +13,7 @@ from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError
 from orthaug._base.warning import Warning
 from orthaug.fitting.criteria import Criterion, Prediction
-from orthaug.fitting.held_out import Pieces, Ratio
+from orthaug.fitting.held_out import HeldOut
 from orthaug.fitting.status import Status
 from orthaug.inference.covariance import interval
 from orthaug.inference.intervals import joint_covariance, robust_covariance, robust_split_covariance
@@ -47,27 +47,6 @@ class Restart:
     regularization: str | float = "none"
     validation: float | None = None
     """Mean squared error where nothing was fitted: on the validation record, or on held-out blocks."""
-
-
-@dataclass(frozen=True, eq=False)
-class HeldOut:
-    """Squared errors where nothing was fitted: of physics alone and of every run, in `Estimate.restarts`' order.
-
-    In deviations of the training output, of the criterion's own response; by pieces, None for one that diverged.
-    `chosen` is the number of the run of the lowest error.
-    """
-
-    where: str
-    labels: tuple[str, ...]
-    """What each piece belongs to: a block, or a part."""
-    alone: Pieces
-    runs: tuple[Pieces, ...]
-    chosen: int = 0
-
-    @property
-    def ratio(self) -> Ratio:
-        """The chosen run against physics alone."""
-        return Ratio.of(self.runs[self.chosen], self.alone)
 
 
 @dataclass(frozen=True, eq=False)

@@ -96,6 +96,27 @@ def _stretches(model: Vector, other: Vector, rows: int) -> np.ndarray:
     return np.stack([np.add.reduceat(errors, edges) for errors in (model, other)], axis=-1)
 
 
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Squared errors where nothing was fitted: of physics alone and of every run, in `Estimate.restarts`' order.
+
+    In deviations of the training output, of the criterion's own response; by pieces, None for one that diverged.
+    `chosen` is the number of the run of the lowest error.
+    """
+
+    where: str
+    labels: tuple[str, ...]
+    """What each piece belongs to: a block, or a part."""
+    alone: Pieces
+    runs: tuple[Pieces, ...]
+    chosen: int = 0
+
+    @property
+    def ratio(self) -> Ratio:
+        """The chosen run against physics alone."""
+        return Ratio.of(self.runs[self.chosen], self.alone)
+
+
 def mean_square(pieces: Pieces) -> float:
     """Over all rows of all runs; infinite where one diverged."""
     if any(piece is None for piece in pieces):

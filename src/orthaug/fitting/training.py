@@ -18,8 +18,8 @@ from orthaug._base.progress import Tell
 from orthaug._base.warning import Warning
 from orthaug.data.record import Record
 from orthaug.fitting.conclusion import conclude
-from orthaug.fitting.estimates import Estimate, HeldOut, Restart
-from orthaug.fitting.held_out import Pieces, blocked, mean_square, squared_errors
+from orthaug.fitting.estimates import Estimate, Restart
+from orthaug.fitting.held_out import HeldOut, Pieces, blocked, mean_square, squared_errors
 from orthaug.fitting.learned import Learned, Task
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.solvers.solver import Solver
