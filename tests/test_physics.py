@@ -544,7 +544,7 @@ REFUSED = [
         [M],
         {"a": "m*y[k-1]"},
         {},
-        "physics.theta 'a' = m*y[k-1]: a signal such as y[k-1] is no part of it; use parameters and constants.",
+        "physics.theta 'a' = m*y[k-1]: a signal such as y[k-1] is no part of it; known are m.",
     ),
     ([P("mass", 1.0)], {"a": "mas"}, {}, "physics.theta 'a' = mas: unknown name 'mas', did you mean 'mass'?."),
     ([M], {"a": "m*zeta"}, {"Ts": 1.0}, "physics.theta 'a' = m*zeta: unknown name 'zeta'; known are Ts, m."),

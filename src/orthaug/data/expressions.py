@@ -13,7 +13,7 @@ import math
 import re
 import unicodedata
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -104,13 +104,22 @@ class Expression:
             raise InputError(f"'{self.text}': {SAMPLING_TIME} has no value here; give it as a constant.")
         return _evaluate(self._tree, columns, dict(self.constants), xp, self.text)
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names that stand for numbers in it."""
+        return tuple(name for name, _ in self.constants)
 
-def is_name(name: str) -> bool:
+    def value(self, values: Mapping[str, Any], xp: Any) -> Any:
+        """Value where its names stand for `values`; of an expression without channels."""
+        return _evaluate(self._tree, {}, values, xp, self.text)
+
+
+def is_name(name: str, taken: Container[str] = RESERVED) -> bool:
     """Whether expressions can use `name`: Python reads an identifier in its normal form only."""
     return (
         is_identifier(name)
         and not keyword.iskeyword(name)
-        and name not in RESERVED
+        and name not in taken
         and unicodedata.normalize("NFKC", name) == name
     )
 
@@ -150,6 +159,34 @@ def parse(text: str, constants: Mapping[str, float] | None = None) -> Expression
         raise InputError(f"'{text}' is not an expression ({reason}); allowed are {_ALLOWED}.") from None
     except (RecursionError, MemoryError):
         raise InputError(f"'{text[:40]}…' is nested too deeply; write it in simpler terms.") from None
+
+
+def parse_named(
+    text: Any, known: Mapping[str, float], where: str, hints: Mapping[str, str] | None = None
+) -> Expression:
+    """Read `text` as arithmetic on the names in `known`, without channels at a lag.
+
+    Names are checked first: `parse` would take an unknown one for a channel.
+
+    Args:
+        where: what messages begin with.
+        hints: what to say of some names that are not known.
+
+    Raises:
+        InputError: anything else.
+    """
+    if not isinstance(text, str):
+        raise InputError(f"{where} must be an expression in text such as 'Ts**2 / m'; got {shown(text)}.")
+    if "[" in text:
+        raise InputError(f"{where} = {text}: a signal such as y[k-1] is no part of it; known are {', '.join(known)}.")
+    for word in re.findall(r"\b[^\W\d]\w*", unicodedata.normalize("NFKC", text)):
+        if word not in known and word not in FUNCTIONS and not keyword.iskeyword(word):
+            hint = nearest(word, known) or f"; known are {', '.join(known)}"
+            raise InputError(f"{where} = {text}: unknown name '{word}'{(hints or {}).get(word, hint)}.")
+    try:
+        return parse(text, known)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
 
 
 def _read(text: str, constants: Mapping[str, float]) -> Expression:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import keyword
 import math
-import re
-import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import SimpleNamespace
@@ -16,7 +13,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_label, check_unique, is_number, nearest
 from orthaug._base.errors import InputError, shown
-from orthaug.data.expressions import FUNCTIONS, RESERVED, SAMPLING_TIME, Expression, is_name, parse
+from orthaug.data.expressions import RESERVED, SAMPLING_TIME, Expression, is_name, parse_named
 from orthaug.physics.baseline import Baseline, check_bounds
 from orthaug.physics.excitation import Excitation, excitation
 
@@ -91,7 +88,7 @@ class PhysicsMap:
                 parameters that θ does not determine, at any point near the initial values.
         """
         constants = dict(constants or {})
-        _check_parameters(parameters, constants)
+        check_parameters(parameters, constants)
         if not theta:
             raise InputError("the physics gives no theta; give one expression for each parameter of the baseline.")
         names = [p.name for p in parameters]
@@ -148,8 +145,8 @@ class PhysicsMap:
         theta, jacobian = np.empty(len(self.expressions)), np.empty((len(self.expressions), len(p)))
         with np.errstate(all="ignore"):  # the caller says what has no value
             for i, expression in enumerate(self.expressions):
-                theta[i] = _at(expression, reals).evaluate({}, np)
-                jacobian[i] = np.imag(_at(expression, lifted).evaluate({}, _COMPLEX))
+                theta[i] = expression.value(reals, np)
+                jacobian[i] = np.imag(expression.value(lifted, _COMPLEX))
             # a root at 0 gives h^½, not h, and has no slope; nor has what has no value
             none = (np.abs(jacobian) > 1e-60 * np.maximum(np.abs(theta), 1.0)[:, None]) | ~np.isfinite(theta)[:, None]
             return theta, np.where(none, np.inf, jacobian / step)
@@ -187,20 +184,19 @@ def magnitude(values: Vector) -> Vector:
     return np.where(size > 0, size, size.max(initial=0.0) or 1.0)
 
 
-def _at(expression: Expression, values: Mapping[str, Any]) -> Expression:
-    """The expression with other values of the names that it uses."""
-    return Expression(expression.text, tuple((name, values[name]) for name, _ in expression.constants))
-
-
-def _check_parameters(parameters: Sequence[PhysicalParameter], constants: Mapping[str, float]) -> None:
+def check_parameters(
+    parameters: Sequence[PhysicalParameter], constants: Mapping[str, float], taken: Collection[str] = RESERVED
+) -> None:
+    """Raise InputError for names, values, units or bounds of parameters and constants that cannot be."""
     if not parameters:
         raise InputError("the physics has no parameters; give at least one, such as m.")
     check_unique((p.name for p in parameters), "physical parameter")
     for name in (*constants, *(p.name for p in parameters)):
-        if not is_name(name):
+        if not is_name(name, taken):
+            index = " (k is the time index)" if "k" in taken else ""
             raise InputError(
                 f"'{name}' cannot name a physical parameter or constant; use letters, digits and underscores, not "
-                f"starting with a digit, and no keyword; {', '.join(sorted(RESERVED))} are taken (k is the time index)."
+                f"starting with a digit, and no keyword; {', '.join(sorted(taken))} are taken{index}."
             )
     for name, value in constants.items():
         if not is_number(value):
@@ -219,22 +215,11 @@ def _check_parameters(parameters: Sequence[PhysicalParameter], constants: Mappin
 
 
 def _parsed(name: str, text: str, known: Mapping[str, float], parameters: Sequence[str]) -> Expression:
-    """The expression of one θ. Its names are checked first: `parse` would take an unknown name for a channel."""
+    """The expression of one θ."""
     where = f"physics.theta '{name}'"
-    if not isinstance(text, str):
-        raise InputError(f"{where} must be an expression in text such as 'Ts**2 / m'; got {shown(text)}.")
-    if "[" in text:
-        raise InputError(f"{where} = {text}: a signal such as y[k-1] is no part of it; use parameters and constants.")
-    for word in re.findall(r"\b[^\W\d]\w*", unicodedata.normalize("NFKC", text)):
-        if word not in known and word not in FUNCTIONS and not keyword.iskeyword(word):
-            hint = nearest(word, known) or f"; known are {', '.join(known)}"
-            hint = "; give it in `constants`, {'Ts': record.sampling_time}" if word == SAMPLING_TIME else hint
-            raise InputError(f"{where} = {text}: unknown name '{word}'{hint}.")
-    try:
-        expression = parse(text, known)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
-    if not any(used in parameters for used, _ in expression.constants):
+    declare = {SAMPLING_TIME: "; give it in `constants`, {'Ts': record.sampling_time}"}
+    expression = parse_named(text, known, where, declare)
+    if not any(used in parameters for used in expression.names):
         raise InputError(
             f"{where} = {text} depends on no physical parameter; use one of {', '.join(parameters)}, "
             "or make it a fixed term of the baseline."

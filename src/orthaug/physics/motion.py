@@ -1,0 +1,366 @@
+"""Equations of motion `ẋ = f(x, u; p)`, `y = h(x, u; p)`: physics whose parameters may stand anywhere.
+
+A learner may be added to some of the equations and outputs. `derivative` is that of a state in time; of a `discrete`
+motion it is the state one sample later. No JAX.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import Vector, check_choice, check_label, check_unique, is_number, nearest
+from orthaug._base.errors import InputError, shown
+from orthaug.data.expressions import FUNCTIONS, SAMPLING_TIME, Expression, is_name, parse_named
+from orthaug.physics.coordinates import Coordinates
+from orthaug.physics.parameters import PhysicalParameter, check_parameters
+
+INTEGRATORS = ("rk4", "exact", "discrete")
+HOLDS = ("zero-order", "first-order", "spline")
+MOST_SUBSTEPS = 256
+_DERIVATIVE = "derivative of "
+
+
+@dataclass(frozen=True)
+class State:
+    """A state: its equation, where it starts (a number, an output, "derivative of" one, None: guessed), its unit.
+
+    `derivative` is text, or None where the motion is a function.
+    """
+
+    name: str
+    derivative: str | None = None
+    start: float | str | None = None
+    learned: bool = False
+    unit: str = ""
+
+    @property
+    def from_output(self) -> tuple[str, int] | None:
+        """The output that it starts from, and how often that is differentiated."""
+        if not isinstance(self.start, str):
+            return None
+        return (self.start[len(_DERIVATIVE) :].strip(), 1) if self.start.startswith(_DERIVATIVE) else (self.start, 0)
+
+
+@dataclass(frozen=True)
+class Output:
+    """An output channel as an expression of the states; None where the motion is a function."""
+
+    name: str
+    expression: str | None = None
+    learned: bool = False
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Equations of motion; make one with `from_equations` or `from_functions`. Hashable.
+
+    Examples:
+        >>> motion = Motion.from_equations(
+        ...     states=[State("v", "(force - c*v)/m", start=0.0)], outputs=[Output("speed", "v")], inputs=["force"],
+        ...     parameters=[PhysicalParameter("m", 2.0, "kg", min=0), PhysicalParameter("c", 1.0, "N s/m")])
+        >>> motion.rates(np.array([3.0]), np.array([1.0]), motion.initial, np)
+        array([-1.])
+    """
+
+    states: tuple[State, ...]
+    outputs: tuple[Output, ...]
+    inputs: tuple[str, ...]
+    parameters: tuple[PhysicalParameter, ...]
+    constants: tuple[tuple[str, float], ...] = ()
+    definitions: tuple[tuple[str, Expression], ...] = ()
+    """Names for longer expressions, each after those that it uses."""
+    integrator: str = "rk4"
+    substeps: int | None = None
+    """Steps of the integrator in a sample; None to choose them by the data."""
+    hold: str = "zero-order"
+    functions: tuple[Callable[..., Any], Callable[..., Any]] | None = None
+    """f(x, u, p) and h(x, u, p) on JAX arrays, instead of expressions."""
+
+    @classmethod
+    def from_equations(
+        cls,
+        states: Sequence[State],
+        outputs: Sequence[Output],
+        parameters: Sequence[PhysicalParameter],
+        inputs: Sequence[str] = (),
+        *,
+        constants: Mapping[str, float] | None = None,
+        define: Mapping[str, str] | None = None,
+        integrator: str = "rk4",
+        substeps: int | None = None,
+        hold: str = "zero-order",
+    ) -> Motion:
+        """Of expressions on the names of states, inputs, parameters, constants and definitions.
+
+        Args:
+            inputs: names of the input channels, in the record's order.
+            define: names for longer expressions.
+            integrator: rk4, exact (the linear part by matrix exponential), or discrete.
+            hold: how inputs run between samples: zero-order, first-order or spline.
+
+        Raises:
+            InputError: names or expressions that cannot be, definitions that need each other, parameters that
+                no equation uses, an output that no state enters.
+        """
+        constants, define = dict(constants or {}), dict(define or {})
+        plain = cls._declared(states, outputs, inputs, parameters, constants, integrator, substeps, hold, tuple(define))
+        known = dict.fromkeys((*plain.names_of_states, *plain.inputs, *plain.names), 1.0) | constants
+        known.setdefault(SAMPLING_TIME, 1.0)
+        everything = known | dict.fromkeys(define, 1.0)
+        parsed = {name: parse_named(text, everything, f"motion.define '{name}'") for name, text in define.items()}
+        motion = replace(plain, definitions=tuple((name, parsed[name]) for name in _ordered(parsed)))
+        for state in plain.states:
+            if state.derivative is None:
+                what = "next" if integrator == "discrete" else "derivative"
+                raise InputError(f"the state '{state.name}' has no `{what}`; give its equation.")
+            parse_named(state.derivative, everything, f"the equation of '{state.name}'")
+        for output in plain.outputs:
+            if output.expression is None:
+                raise InputError(f"the output '{output.name}' has no expression; give it in terms of the states.")
+            parse_named(output.expression, everything, f"the output '{output.name}'")
+        motion._check_used()
+        return motion
+
+    @classmethod
+    def from_functions(
+        cls,
+        f: Callable[..., Any],
+        h: Callable[..., Any],
+        states: Sequence[State | str],
+        outputs: Sequence[Output | str],
+        parameters: Sequence[PhysicalParameter],
+        inputs: Sequence[str] = (),
+        *,
+        integrator: str = "rk4",
+        substeps: int | None = None,
+        hold: str = "zero-order",
+    ) -> Motion:
+        """Of JAX functions f(x, u, p) → (nx,) and h(x, u, p) → (ny,) on vectors of states, inputs and parameters.
+
+        Raises:
+            InputError: names that cannot be, or what is no function.
+        """
+        for name, function in (("f", f), ("h", h)):
+            if not callable(function):
+                raise InputError(f"`{name}` must be a function {name}(x, u, p); got {shown(function)}.")
+        states = [State(state) if isinstance(state, str) else state for state in states]
+        outputs = [Output(output) if isinstance(output, str) else output for output in outputs]
+        plain = cls._declared(states, outputs, inputs, parameters, {}, integrator, substeps, hold)
+        return replace(plain, functions=(f, h))
+
+    @classmethod
+    def _declared(
+        cls,
+        states: Sequence[State],
+        outputs: Sequence[Output],
+        inputs: Sequence[str],
+        parameters: Sequence[PhysicalParameter],
+        constants: Mapping[str, float],
+        integrator: str,
+        substeps: int | None,
+        hold: str,
+        defined: Sequence[str] = (),
+    ) -> Motion:
+        check_choice(integrator, INTEGRATORS, "`integrator`")
+        check_choice(hold, HOLDS, "`hold`")
+        whole = isinstance(substeps, int | np.integer) and not isinstance(substeps, bool)
+        if substeps is not None and not (whole and 1 <= substeps <= MOST_SUBSTEPS):
+            raise InputError(f"`substeps` must be a whole number from 1 to {MOST_SUBSTEPS}; got {shown(substeps)}.")
+        if integrator == "discrete" and hold != "zero-order":
+            raise InputError("a discrete motion has no input between samples; leave `hold` out.")
+        if not states:
+            raise InputError("the motion has no states; give at least one with its equation.")
+        if not outputs:
+            raise InputError("the motion has no outputs; say how the measured channels follow from the states.")
+        check_parameters(parameters, constants, FUNCTIONS)
+        motion = cls(
+            states=tuple(states),
+            outputs=tuple(outputs),
+            inputs=tuple(inputs),
+            parameters=tuple(parameters),
+            constants=tuple(sorted((name, float(value)) for name, value in constants.items())),
+            integrator=integrator,
+            substeps=None if substeps is None else int(substeps),
+            hold=hold,
+        )
+        motion._check_names(defined)
+        for state in motion.states:
+            motion._check_start(state)
+        return motion
+
+    def _check_names(self, defined: Sequence[str]) -> None:
+        groups = {
+            "a state": self.names_of_states,
+            "an input": self.inputs,
+            "a parameter": self.names,
+            "a constant": tuple(name for name, _ in self.constants),
+            "a definition": tuple(defined),
+        }
+        owner: dict[str, str] = {}
+        for what, names in groups.items():
+            check_unique(names, what.split()[-1])
+            for name in names:
+                if not is_name(name, FUNCTIONS):
+                    raise InputError(
+                        f"{shown(name)} cannot name {what}; use letters, digits and underscores, not starting with a "
+                        f"digit, and none of {', '.join(sorted(FUNCTIONS))}."
+                    )
+                if name in owner:
+                    raise InputError(f"'{name}' is {owner[name]} and {what}; give one of them another name.")
+                owner[name] = what
+        check_unique((output.name for output in self.outputs), "output")
+
+    def _check_start(self, state: State) -> None:
+        check_label(state.unit, f"the unit of '{state.name}'")
+        start, source = state.start, state.from_output
+        if source is not None:
+            known = [output.name for output in self.outputs]
+            if source[0] not in known:
+                hint = nearest(source[0], known) or "; expected"
+                raise InputError(
+                    f"the state '{state.name}' starts from '{start}'{hint} a number, an output ({', '.join(known)}), "
+                    "or 'derivative of' one."
+                )
+        elif start is not None and not is_number(start):
+            raise InputError(f"the start of '{state.name}' must be a finite number or an output; got {shown(start)}.")
+
+    def _check_used(self) -> None:
+        """Every parameter is used, and every output follows from a state."""
+        reach = {name: set(expression.names) for name, expression in self.definitions}
+        for name, expression in self.definitions:  # each after those that it uses
+            for used in expression.names:
+                reach[name] |= reach.get(used, set())
+
+        def names_in(expression: Expression) -> set[str]:
+            return set(expression.names).union(*(reach.get(name, set()) for name in expression.names))
+
+        used: set[str] = set()
+        for state in self.states:
+            used |= names_in(self._expressions[state.name])
+        for output, expression in zip(self.outputs, self._observed, strict=True):
+            there = names_in(expression)
+            used |= there
+            if not there & set(self.names_of_states):
+                raise InputError(
+                    f"the output '{output.name}' = {expression} is no expression of a state; expected one of "
+                    f"{', '.join(self.names_of_states)} in it."
+                )
+        for name in self.names:
+            if name not in used:
+                raise InputError(f"the parameter '{name}' is in no equation and no output; use or remove it.")
+
+    @property
+    def names_of_states(self) -> tuple[str, ...]:
+        """Names of x in order."""
+        return tuple(state.name for state in self.states)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of p in order."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+    @property
+    def learned(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """The numbers of the states whose equations, and of the outputs that a learner is added to."""
+        states = tuple(i for i, state in enumerate(self.states) if state.learned)
+        return states, tuple(i for i, output in enumerate(self.outputs) if output.learned)
+
+    @property
+    def known(self) -> dict[str, float]:
+        """Every name that expressions may use."""
+        named = dict.fromkeys((*self.names_of_states, *self.inputs, *self.names), 1.0) | dict(self.constants)
+        return {SAMPLING_TIME: 1.0} | named | dict.fromkeys((name for name, _ in self.definitions), 1.0)
+
+    def sampled(self, sampling_time: float) -> Motion:
+        """The motion with this value [s] of `Ts`, where its expressions read it and it was not given."""
+        if SAMPLING_TIME in (*dict(self.constants), *self.names, *self.names_of_states, *self.inputs):
+            return self
+        return replace(self, constants=tuple(sorted((*self.constants, (SAMPLING_TIME, float(sampling_time))))))
+
+    @cached_property
+    def _expressions(self) -> dict[str, Expression]:
+        return {s.name: parse_named(s.derivative, self.known, f"the equation of '{s.name}'") for s in self.states}
+
+    @cached_property
+    def _observed(self) -> tuple[Expression, ...]:
+        return tuple(parse_named(o.expression, self.known, f"the output '{o.name}'") for o in self.outputs)
+
+    def values(self, x: Any, u: Any, p: Any, xp: Any) -> dict[str, Any]:
+        """What every name stands for; x (nx, …), u (nu, …), p (np,)."""
+        values = dict(self.constants)
+        values |= dict(zip(self.names, p, strict=True))
+        values |= dict(zip(self.names_of_states, x, strict=True))
+        values |= dict(zip(self.inputs, u, strict=True))
+        for name, expression in self.definitions:
+            values[name] = expression.value(values, xp)
+        return values
+
+    def rates(self, x: Any, u: Any, p: Any, xp: Any) -> Any:
+        """f(x, u; p) (nx, …) by `xp` (numpy or jax.numpy); of a discrete motion the next state."""
+        if self.functions is not None:
+            return xp.asarray(self.functions[0](x, u, p))
+        values = self.values(x, u, p, xp)
+        rates = [self._expressions[state.name].value(values, xp) for state in self.states]
+        return xp.stack([xp.broadcast_to(xp.asarray(rate, dtype=float), x.shape[1:]) for rate in rates])
+
+    def observed(self, x: Any, u: Any, p: Any, xp: Any) -> Any:
+        """h(x, u; p) (ny, …)."""
+        if self.functions is not None:
+            return xp.asarray(self.functions[1](x, u, p))
+        values = self.values(x, u, p, xp)
+        outputs = [expression.value(values, xp) for expression in self._observed]
+        return xp.stack([xp.broadcast_to(xp.asarray(output, dtype=float), x.shape[1:]) for output in outputs])
+
+    @property
+    def initial(self) -> Vector:
+        """p⁰ (np,)."""
+        return np.array([parameter.initial for parameter in self.parameters], dtype=float)
+
+    @property
+    def coordinates(self) -> Coordinates:
+        """What is estimated of p."""
+        return Coordinates(self.parameters)
+
+    def check_channels(self, inputs: Sequence[str], outputs: Sequence[str]) -> None:
+        """Raise InputError unless these are the record's channels."""
+        given = [output.name for output in self.outputs]
+        for name in outputs:
+            if name not in given:
+                raise InputError(f"the output '{name}' has no expression in the motion; it gives {', '.join(given)}.")
+        for name in given:
+            if name not in outputs:
+                hint = nearest(name, outputs) or f"; its outputs are {', '.join(outputs)}"
+                raise InputError(f"the motion gives the output '{name}', which the data do not have{hint}.")
+        if tuple(inputs) != self.inputs or [*outputs] != given:
+            raise InputError(
+                f"the motion has the inputs {', '.join(self.inputs) or 'none'} and the outputs {', '.join(given)}; the "
+                f"record has {', '.join(inputs) or 'none'} and {', '.join(outputs)}. Give them in one order."
+            )
+
+
+def _ordered(definitions: Mapping[str, Expression]) -> list[str]:
+    """The names so that each stands after those that it uses.
+
+    Raises:
+        InputError: definitions that need each other.
+    """
+    done: list[str] = []
+
+    def visit(name: str, above: tuple[str, ...]) -> None:
+        if name in above:
+            loop = " → ".join((*above[above.index(name) :], name))
+            raise InputError(f"motion.define: an algebraic loop, {loop}; no definition may need itself.")
+        if name not in done:
+            for used in definitions[name].names:
+                if used in definitions:
+                    visit(used, (*above, name))
+            done.append(name)
+
+    for name in definitions:
+        visit(name, ())
+    return done
