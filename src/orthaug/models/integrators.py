@@ -1,0 +1,132 @@
+"""One sample of a motion: from x(t) to x(t + Ts), with the input held as declared between samples.
+
+`rk4` is the classical Runge-Kutta method. `exact` is exponential time differencing (Cox and Matthews 2002, ETDRK4): the
+part of the motion that is linear at the origin goes by its matrix exponential, so a linear motion has no error under a
+zero-order or first-order hold. Both take several substeps in a sample.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import Matrix
+from orthaug._base.jax import jax, jnp
+
+_UNROLLED = 4  # substeps; more run as a loop, which compiles faster
+_SQUARINGS, _TERMS = 12, 12  # of the matrix exponential
+
+Field = Callable[[Any, Any], Any]
+"""F(x (nx,), u (nu,)) → (nx,)."""
+
+
+def held(inputs: Matrix, hold: str, substeps: int) -> Matrix:
+    """What the steps of a run read of its inputs (N, nu): the input at points of each sample, (N, points nu).
+
+    One point under a zero-order hold, both ends under a first-order hold, and under a spline hold the ends and middles
+    of all substeps, on a cubic spline through the record.
+    """
+    rows, nu = inputs.shape
+    if hold == "zero-order" or not nu:
+        return inputs
+    if hold == "first-order" or rows < 4:
+        return _stacked(inputs, np.concatenate([inputs[1:], inputs[-1:]]))
+    from scipy.interpolate import CubicSpline  # slow to import, and few runs need it
+
+    spline, k = CubicSpline(np.arange(rows), inputs), np.arange(rows)
+    return _stacked(*(spline(np.minimum(k + i / (2 * substeps), rows - 1)) for i in range(2 * substeps + 1)))
+
+
+def _stacked(*points: Matrix) -> Matrix:
+    return np.stack(points, axis=1).reshape(len(points[0]), -1)
+
+
+def points_of(hold: str, substeps: int) -> int:
+    """At how many points of a sample the steps read the input."""
+    return {"zero-order": 1, "first-order": 2}.get(hold, 2 * substeps + 1)
+
+
+def _input_at(row: Any, nu: int) -> Callable[[Any, int], Any]:
+    """u at the half substep i of a sample that has `halves` of them, by (i, halves)."""
+    points = row.reshape(-1, nu) if nu else row.reshape(1, 0)
+    if len(points) == 1:
+        return lambda i, halves: points[0]
+    if len(points) == 2:
+        return lambda i, halves: points[0] + (points[1] - points[0]) * (i / halves)
+    return lambda i, halves: points[i]
+
+
+def advance(field: Field, linear: Any, x: Any, row: Any, nu: int, step: float, substeps: int, integrator: str) -> Any:
+    """x one sample later.
+
+    Args:
+        field: ẋ = F(x, u).
+        linear: A (nx, nx), its part that goes by the matrix exponential; None for `rk4`.
+        row: the input as `held` lays it out.
+        step: the sampling time.
+    """
+    at, halves, h = _input_at(row, nu), 2 * substeps, step / substeps
+    one = _exponential(field, linear, h) if integrator == "exact" else _runge_kutta(field, h)
+    if substeps <= _UNROLLED:
+        for j in range(substeps):
+            x = one(x, at(2 * j, halves), at(2 * j + 1, halves), at(2 * j + 2, halves))
+        return x
+    u = jnp.stack([at(i, halves) for i in range(halves + 1)])
+    return jax.lax.scan(lambda x, u: (one(x, *u), None), x, (u[:-2:2], u[1:-1:2], u[2::2]))[0]
+
+
+def _runge_kutta(field: Field, h: float) -> Callable[..., Any]:
+    def one(x: Any, first: Any, middle: Any, last: Any) -> Any:
+        k1 = field(x, first)
+        k2 = field(x + h / 2 * k1, middle)
+        k3 = field(x + h / 2 * k2, middle)
+        k4 = field(x + h * k3, last)
+        return x + h / 6 * (k1 + 2 * (k2 + k3) + k4)
+
+    return one
+
+
+def _exponential(field: Field, linear: Any, h: float) -> Callable[..., Any]:
+    whole, phi1, phi2, phi3 = _phi(linear * h, 3)
+    half, half1 = _phi(linear * h / 2, 1)
+    half1 = half1 * h / 2
+
+    def rest(x: Any, u: Any) -> Any:
+        return field(x, u) - linear @ x
+
+    def one(x: Any, first: Any, middle: Any, last: Any) -> Any:
+        begin = rest(x, first)
+        a = half @ x + half1 @ begin
+        at_a = rest(a, middle)
+        b = half @ x + half1 @ at_a
+        at_b = rest(b, middle)
+        c = half @ a + half1 @ (2 * at_b - begin)
+        ends = (phi1 - 3 * phi2 + 4 * phi3) @ begin + (4 * phi3 - phi2) @ rest(c, last)
+        return whole @ x + h * (ends + 2 * (phi2 - 2 * phi3) @ (at_a + at_b))
+
+    return one
+
+
+def _phi(a: Any, order: int) -> list[Any]:
+    """e^A, φ₁(A) … φ_order(A), of one exponential of a block matrix (Sidje 1998)."""
+    n = len(a)
+    size = (order + 1) * n
+    block = jnp.zeros((size, size)).at[:n, :n].set(a)
+    block = block.at[jnp.arange(size - n), jnp.arange(n, size)].set(1.0)
+    top = jnp.eye(n, size) + _exponential_less_one(block)[:n]
+    return [top[:, i * n : (i + 1) * n] for i in range(order + 1)]
+
+
+def _exponential_less_one(a: Any) -> Any:
+    """e^A − I by scaling and squaring: `E ← 2E + E²` keeps the digits that squaring e^A would lose.
+
+    The number of squarings is fixed, so that it compiles to a few products; it is right for ‖A‖ up to some thousand.
+    """
+    a = a / 2**_SQUARINGS
+    term = total = a
+    for i in range(2, _TERMS + 1):
+        term = term @ a / i
+        total = total + term
+    return jax.lax.fori_loop(0, _SQUARINGS, lambda _, e: 2 * e + e @ e, total)
