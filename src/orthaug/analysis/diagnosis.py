@@ -32,6 +32,7 @@ _AS_GOOD = 1.05  # free-run error / one-step error up to which measured lags add
 _TOLD = 5  # findings that a text lists at most
 _SHARE = 0.01  # of the residual's variance: what a regressor explains of it counts from there
 _FEWEST_ROWS, _ROWS_PER_TERM = 100, 10  # rows that a sum of autocovariances needs, in all and for each of its lags
+_FEWEST_BLOCKS = 20  # of which the variance of a sum can be told: its standard error is then a third of it
 _MEMORIES = 3  # times as many lags as the residual's correlation lasts: Bartlett's weights fade
 _LEVEL = 0.01  # of the test whether a residual is white
 _ROUNDING = 1e-14  # of the output's deviation: a residual that says nothing
@@ -107,32 +108,57 @@ def diagnose(fit: Estimate, *, one_step: Response | None = None, free_run: Respo
 
 
 def robust_where_coloured(fit: Estimate, response: Response) -> Estimate:
-    """The fit with standard errors after Newey and West, where it is one step ahead and leaves a coloured residual.
+    """The fit with robust standard errors, where it leaves a coloured residual: Newey and West, or batch means.
 
     `response` is the prediction of the training rows. Few rows, or ones that remember each other for long, leave the
     plain errors: their robust ones would be too small.
     """
-    if not fit.status.ok or fit.covariance is None or fit.criterion.flown is not None or fit.at_bound:
+    if not fit.status.ok or fit.covariance is None or fit.at_bound:
         return fit
-    memory = 0
-    for i in range(len(fit.problem.outputs)):
-        pieces = [(t.measured - t.model)[t.start :, i] for t in response.trajectories]  # type: ignore[operator]
-        rows = sum(map(len, pieces))
-        box, acf = ljung_box(pieces, LAGS), autocorrelation(pieces, rows // ROWS_PER_LAG)
-        if box is not None and acf is not None and box.p < _LEVEL and np.abs(acf[1:]).max() >= _PRACTICALLY_WHITE:
-            quiet = np.abs(acf) < 2 / np.sqrt(rows)
-            memory = max(memory, int(np.argmax(np.append(quiet, True))))
-    rows = len(fit.problem.rows)
-    if (
-        not memory
-        or rows < max(_FEWEST_ROWS, _ROWS_PER_TERM * _MEMORIES * memory)
-        or np.all(_errors(response) / fit.problem.deviation < _ROUNDING)
-    ):
+    lags = _memory(fit, response) if fit.criterion.flown is None else _block(fit)
+    if lags is None or len(fit.problem.rows) < max(_FEWEST_ROWS, _ROWS_PER_TERM * lags):
         return fit
     try:
-        return fit.robust(_MEMORIES * memory)
+        return fit.robust(lags)
     except InputError:  # an ensemble, or a fit without statistics
         return fit
+
+
+def _memory(fit: Estimate, response: Response) -> int | None:
+    """Lags for the one-step residual; None where it is white, or rounding."""
+    memory = 0
+    if np.all(_errors(response) / fit.problem.deviation < _ROUNDING):
+        return None
+    for i in range(len(fit.problem.outputs)):
+        pieces = [(t.measured - t.model)[t.start :, i] for t in response.trajectories]  # type: ignore[operator]
+        if _is_coloured(pieces):
+            rows = sum(map(len, pieces))
+            acf = np.asarray(autocorrelation(pieces, rows // ROWS_PER_LAG))
+            quiet = np.abs(acf) < 2 / np.sqrt(rows)
+            memory = max(memory, int(np.argmax(np.append(quiet, True))))
+    return _MEMORIES * memory or None
+
+
+def _block(fit: Estimate) -> int | None:
+    """Steps of a block for the errors of the free run; None where these are white, or leave too few blocks."""
+    if fit.scores is None:
+        return None
+    errors = fit.scores.errors()  # (ny, segments, steps), 0 where a step is not scored
+    size = np.sqrt(np.sum(errors**2, axis=(1, 2)) / max(fit.scores.segments.count, 1))
+    if not np.isfinite(size).all() or np.all(size / fit.problem.deviation < _ROUNDING):
+        return None
+    if not any(_is_coloured([one[one != 0] for one in output]) for output in errors):
+        return None
+    steps = fit.scores.block()
+    if steps is None or steps > fit.scores.longest or fit.scores.segments.count < _FEWEST_BLOCKS * steps:
+        return None
+    return steps
+
+
+def _is_coloured(pieces: list[Vector]) -> bool:
+    """Whether Ljung-Box rejects a white residual and a correlation is large enough to matter."""
+    box, acf = ljung_box(pieces, LAGS), autocorrelation(pieces, sum(map(len, pieces)) // ROWS_PER_LAG)
+    return box is not None and acf is not None and box.p < _LEVEL and np.abs(acf[1:]).max() >= _PRACTICALLY_WHITE
 
 
 def _static(fit: Estimate, tests: tuple[ResidualTest, ...], white: bool, complete: bool) -> Diagnosis:

@@ -1,12 +1,14 @@
-"""The share of a free run's errors that is independent: coloured errors say less than their number."""
+"""The colour of a free run's errors: coloured errors say less than their number, and remember each other."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from orthaug._base.checks import Matrix
+from orthaug._base.checks import Matrix, Vector
 
 _NO_CORRELATION = 0.05  # below it a correlation of the errors does not count
+_ROWS_PER_LAG = 20
+_NOISE = 1.5  # deviations of a correlation: what is below it on average is noise
 
 
 def independent_share(residuals: Matrix) -> float:
@@ -15,15 +17,40 @@ def independent_share(residuals: Matrix) -> float:
     Args:
         residuals: stretches (s, T), 0 where there is no residual; lags never reach from one into the next.
     """
-    longest = residuals.shape[1]
-    if longest < 3:
+    rho = _correlations(residuals)
+    if rho is None:
         return 1.0
-    size = 1 << (2 * longest - 1).bit_length()
-    spectrum = np.sum(np.abs(np.fft.rfft(residuals, size, axis=1)) ** 2, axis=0)
-    covariance = np.fft.irfft(spectrum, size)[:longest]
-    if not covariance[0] > 0:
-        return 1.0
-    rho = covariance[1:] / covariance[0]
     noise = max(_NO_CORRELATION, 2 / np.sqrt(np.count_nonzero(residuals)))
     end = int(np.argmax(np.append(rho < noise, True)))
     return float(1 / (1 + 2 * np.sum(rho[:end])))
+
+
+def correlation_length(residuals: Matrix) -> int | None:
+    """The lag τ from which to twice it correlations are noise, so that a resonance is not cut where it is 0.
+
+    Their root mean square there is that of correlations of coloured noise, `√((1 + 2 Σ_{j<τ} ρ_j²) / N)` (Bartlett
+    1946), or hardly more. None where there is no such lag among the first N / 20.
+
+    Args:
+        residuals: as above.
+    """
+    there, rows = residuals != 0, np.count_nonzero(residuals)
+    rho = _correlations(np.where(there, residuals - residuals.sum() / max(rows, 1), 0.0))
+    if rho is None:
+        return None
+    before = np.concatenate([[0.0], np.cumsum(rho**2)])
+    for lag in range(1, min(len(rho), rows // _ROWS_PER_LAG) + 1):
+        if np.mean(rho[lag - 1 : 2 * lag - 1] ** 2) < _NOISE**2 * (1 + 2 * before[lag - 1]) / rows:
+            return lag
+    return None
+
+
+def _correlations(residuals: Matrix) -> Vector | None:
+    """ρ_1, ρ_2, …; None where there are none."""
+    longest = residuals.shape[1]
+    if longest < 3:
+        return None
+    size = 1 << (2 * longest - 1).bit_length()
+    spectrum = np.sum(np.abs(np.fft.rfft(residuals, size, axis=1)) ** 2, axis=0)
+    covariance = np.fft.irfft(spectrum, size)[:longest]
+    return covariance[1:] / covariance[0] if covariance[0] > 0 else None

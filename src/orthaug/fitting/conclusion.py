@@ -63,6 +63,7 @@ def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estim
         criterion=task.criterion,
         at_bound={problem.baseline.names[i]: value for i, value in fixed.items()},
         warnings=tuple(told),
+        scores=learned.scores,
     )
 
 

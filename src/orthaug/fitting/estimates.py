@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from orthaug._base.checks import Matrix, Vector, check_type
+from orthaug._base.checks import Matrix, Vector, check_count, check_type
 from orthaug._base.errors import InputError
 from orthaug._base.warning import Warning
+from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.held_out import HeldOut
 from orthaug.fitting.status import Status
@@ -21,6 +22,7 @@ from orthaug.inference.measures import Measure, Points, Support, Training
 from orthaug.inference.physical import PhysicalEstimate, profile, solve
 from orthaug.inference.splitting import MeasureSplit, learner_slope, split_under
 from orthaug.models.model import Model
+from orthaug.models.statistics import Statistics
 from orthaug.physics.baseline import check_sampling_constant
 from orthaug.physics.excitation import Excitation
 from orthaug.physics.parameters import PhysicsMap
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
 NOT_UNIQUE = "theta_not_unique"
 """The code of the warning that a split under a measure makes untrue."""
 ROBUST = "robust (Newey-West), for the one-step residual is coloured"
+ROBUST_FLOWN = "robust (batch means), for the errors of the free run are coloured"
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,8 @@ class Estimate:
     covariance: Matrix | None
     """Cov θ̂ (nθ, nθ); None where θ has no standard error."""
     freedom: float
-    """Degrees of freedom of the residual, rows less parameters less effective weights."""
+    """Degrees of freedom of the residual, rows less parameters less effective weights; of robust errors on the free run
+    blocks less one."""
     effective_weights: float
     defect: float | None
     """‖QᵀF̃‖ / ‖F‖ over the training rows: how much of the learner the physics could express; None without one."""
@@ -75,6 +79,10 @@ class Estimate:
     warnings: tuple[Warning, ...] = ()
     plain_covariance: Matrix | None = None
     """Cov θ̂ for white noise, where `covariance` is robust; None where it is not."""
+    scores: FreeRunScores | None = field(default=None, repr=False)
+    """What robust standard errors of a free run are made of; None one step ahead."""
+    plain_statistics: Statistics | None = field(default=None, repr=False)
+    """The model's statistics for white noise, where they are robust; None where they are not."""
 
     @property
     def theta(self) -> Vector:
@@ -140,6 +148,9 @@ class Estimate:
             with np.errstate(all="ignore"):
                 price = np.sqrt(np.diag(under.covariance) / np.diag(np.asarray(training)))
             under = replace(under, price=price)
+        plain = None
+        if self.plain_statistics is not None and under.slope is not None:
+            plain = self._cov_along(self.plain_statistics, under.slope)
         ensemble = under.covariance is None and self.model.numbers.tilt is not None
         text = "no standard errors after a split: an ensemble has no gradient in its weights."
         unknown = (Warning("no_standard_errors", text),) if ensemble else ()
@@ -148,7 +159,7 @@ class Estimate:
             self,
             model=replace(self.model, numbers=numbers, structure="orthogonal", measure=measure.name),
             covariance=under.covariance,
-            plain_covariance=None,
+            plain_covariance=plain,
             defect=under.defect,
             measure=under,
             warnings=(*(w for w in self.warnings if w.code != NOT_UNIQUE), *under.warnings, *unknown),
@@ -161,16 +172,26 @@ class Estimate:
         return joint_covariance(self.problem, self.model, convention)
 
     def robust(self, lags: int | None = None) -> Estimate:
-        """The same with standard errors of θ that hold for coloured and uneven noise (Newey-West).
+        """The same with standard errors of θ that hold for coloured and uneven noise.
+
+        One step ahead they are those of Newey and West. On the free run they are batch means of the scores, and hold
+        for predictions too (`fitting/block_scores.py`).
+
+        Args:
+            lags: of the autocovariances; on the free run steps of a block. By default `⌊4 (N/100)^(2/9)⌋`, on the free
+                run three times as many as the correlation of the errors lasts.
 
         Raises:
-            InputError: a fit without standard errors, trained on several steps, or with a parameter at a bound.
+            InputError: a fit without standard errors or with a parameter at a bound; errors that remember each other
+                for too long.
         """
-        if self.covariance is None or self.criterion.flown is not None or self.at_bound:
+        flown = self.criterion.flown is not None
+        if self.covariance is None or self.at_bound or (flown and self.scores is None):
             raise InputError(
-                "robust standard errors are those of a fit one step ahead that has standard errors, with no parameter "
-                "at a bound."
+                "robust standard errors are those of a fit that has standard errors, with no parameter at a bound."
             )
+        if flown:
+            return self._robust_flown(lags)
         trajectories = self.model.predict(self.problem.record).trajectories
         residual = np.concatenate([(t.measured - t.model)[t.start :] for t in trajectories])  # type: ignore[operator]
         used = (self.problem, residual, self.effective_weights, lags)
@@ -182,11 +203,39 @@ class Estimate:
         plain = self.covariance if self.plain_covariance is None else self.plain_covariance
         return replace(self, covariance=covariance, plain_covariance=plain)
 
+    def _robust_flown(self, steps: int | None) -> Estimate:
+        """From blocks of so many steps of the free run."""
+        assert self.scores is not None
+        statistics = self.model.statistics
+        if statistics.gram is None or self.model.numbers.tilt is not None:
+            raise InputError("the fit has no statistics that robust standard errors could be made of.")
+        steps = self.scores.block() if steps is None else check_count(steps, "lags")
+        if steps is None:
+            raise InputError("the errors of the free run remember each other for too long to take them in blocks.")
+        middle, blocks = self.scores.middle(steps, len(self.theta) + self.effective_weights)
+        freedom = min(self.freedom, blocks - 1.0)
+        statistics = replace(statistics, middle=middle, freedom=freedom)
+        return replace(
+            self,
+            model=replace(self.model, statistics=statistics),
+            covariance=self._cov_along(statistics, self._slope()),
+            plain_covariance=self.covariance if self.plain_covariance is None else self.plain_covariance,
+            plain_statistics=self.model.statistics if self.plain_statistics is None else self.plain_statistics,
+            freedom=freedom,
+        )
+
+    def _cov_along(self, statistics: Statistics, slope: Matrix) -> Matrix | None:
+        """Cov of `θ = c + θ_aux(w)` from statistics of (c, w)."""
+        joint = statistics.joint(len(self.theta))
+        return None if joint is None else joint.of(np.column_stack([np.eye(len(self.theta)), slope]))
+
     def _slope(self) -> Matrix:
         """∂θ_aux/∂w under the measure that θ was split under."""
         if self.measure is not None and self.measure.slope is not None:
             return self.measure.slope
         problem = self.problem
+        if self.model.form.bound is None:
+            return np.zeros((len(self.theta), 0))
         points = Points(problem.rows.x, np.ones(len(problem.rows)))
         unit = np.broadcast_to(problem.weight.matrix, (len(points.x), *problem.weight.matrix.shape))
         return learner_slope(self.model, points, problem.projection, unit)
@@ -255,7 +304,7 @@ def summary_lines(fit: Estimate) -> Sequence[str]:
     lines += ["", f"{'parameter':<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  {'initial':>11}  unit"]
     std, ci = fit.std, fit.interval
     if fit.plain_covariance is not None:
-        lines.insert(-2, f"std         {ROBUST}")
+        lines.insert(-2, f"std         {ROBUST if fit.criterion.flown is None else ROBUST_FLOWN}")
     for i, parameter in enumerate(baseline.parameters):
         spread = f"{std[i]:11.4g}" if std is not None else f"{'–':>11}"
         reach = f"[{ci[i, 0]:13.7g}, {ci[i, 1]:13.7g}]" if ci is not None else f"{'–':^29}"

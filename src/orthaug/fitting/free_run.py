@@ -16,6 +16,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.progress import RunTell, quiet
 from orthaug._base.warning import Warning
 from orthaug.data.record import Record
+from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.flight_plan import Flight, FlightPlan
 from orthaug.fitting.initial_states import Start
@@ -255,6 +256,7 @@ class FreeRunTask:
             middle=middle,
             coefficients=end.flown.c,
             errors=self._errors(run),
+            scores=self._scores(run),
         )
 
     def median(self, members: list[Learned], best: int) -> Learned:
@@ -276,6 +278,24 @@ class FreeRunTask:
         if noise is not None and end.linear is not None:
             covariance = self._covariance(objective, end, noise, tuple(at_bound))
         return ErrorStatistics(noise, covariance, freedom, run.mean_square, at_bound)
+
+    def _scores(self, run: Flight) -> FreeRunScores | None:
+        """What robust standard errors are made of; None for a run that ended nowhere."""
+        flown, linear, objective = run.end.flown, run.end.linear, run.objective
+        if linear is None or not run.end.ending.usable:
+            return None
+        rows = objective.dynamics.start_rows(objective.weight)
+        missed = np.moveaxis(objective.initial.measured - flown.states, -1, 1)
+        return FreeRunScores(
+            dynamics=objective.dynamics,
+            numbers=self.plan.numbers(flown.c, flown.w),
+            segments=objective.segments,
+            states=flown.states,
+            weight=objective.weight,
+            unit=objective.rms**2,
+            slope=linear.start.slope,
+            pull=missed @ (rows.T @ rows) if objective.initial.free else None,
+        )
 
     def _covariance(
         self, objective: FreeRunObjective, end: Descent, noise: Matrix, at_bound: tuple[int, ...]

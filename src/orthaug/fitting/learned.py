@@ -10,6 +10,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.progress import RunTell, quiet
 from orthaug._base.warning import Warning
 from orthaug.data.record import Record
+from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.elimination import Fixed
 from orthaug.fitting.status import Ending
@@ -51,6 +52,8 @@ class Learned:
     coefficients: Vector | None = None
     """c = θ − θ_aux (nθ,), if it was an unknown of training; None where θ is solved."""
     errors: ErrorStatistics | None = None
+    """Of a free run; None where they are those of the one-step residual."""
+    scores: FreeRunScores | None = None
     """Of a free run; None where they are those of the one-step residual."""
     tilt: Matrix | None = None
     """(members, nθ) of an ensemble, whose weights are (members, nw)."""

@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.data.record import Experiment, Record
@@ -129,3 +129,37 @@ def sensitivity(
 
     rows = (states, segments.inputs, segments.target, segments.scored)
     return Sensitivity(*jax.lax.scan(one_chunk, jnp.zeros((n + 1, n + 1)), rows))
+
+
+@partial(jax.jit, static_argnames=("dynamics", "blocks"))
+def block_scores(
+    dynamics: Dynamics,
+    numbers: Numbers,
+    segments: Segments,
+    states: Float[Array, "k n0 m"],
+    weight: Float[Array, "ny ny"],
+    place: Int[Array, "T"],
+    blocks: int,
+) -> Float[Array, "k blocks n0+n m"]:
+    """`Σ sᵀe` over the scored steps of every block: s the sensitivities to (start, c, w), rows times `weight`.
+
+    Args:
+        place: the block of each step, the same in every segment.
+    """
+    _, n0, width = segments.start.shape
+    n, ny = dynamics.unknowns, len(dynamics.outputs)
+
+    def step(carry: tuple[Any, ...], row: tuple[Any, ...]) -> tuple[Any, None]:
+        state, slopes, sums = carry
+        inputs, target, scored, block = row
+        state, slopes, value, slope = dynamics.tangents(numbers, state, slopes, inputs)
+        columns = jnp.where(scored, jnp.concatenate([slope, (target - value)[:, None]], axis=1), 0.0)
+        columns = jnp.einsum("oi,inm->onm", weight, columns) if ny > 1 else weight[0, 0] * columns
+        return (state, slopes, sums.at[block].add(jnp.sum(columns[:, :-1] * columns[:, -1:], axis=0))), None
+
+    def one_chunk(chunk: tuple[Any, ...]) -> Any:
+        state, *rows = chunk
+        start = (state, dynamics.first_slopes(width), jnp.zeros((blocks, n0 + n, width)))
+        return jax.lax.scan(step, start, (*rows, place))[0][2]
+
+    return jax.lax.map(one_chunk, (states, segments.inputs, segments.target, segments.scored))

@@ -1,0 +1,89 @@
+"""Scores of a free run in blocks of steps: what its standard errors are made of where its errors are coloured.
+
+θ and weights p minimise a sum of squares, so that `p̂ − p ≈ M⁻¹ Σ_k s_kᵀe_k` with M the information and s_k the
+sensitivities of step k. Coloured errors make the products s_kᵀe_k of neighbours dependent. Batch means (Carlstein 1986)
+need no model of the colour: with B_j the sum over a block of many steps, `Ω = Σ_j B_j B_jᵀ` estimates the covariance of
+the whole sum, and `M⁻¹ Ω M⁻¹` that of p̂. To first order that is Newey and West's estimate with as many lags as a block
+has steps (Andrews 1991); in the words of cluster-robust errors (Liang and Zeger 1986) a block is a cluster.
+
+The state that a segment starts from is an unknown too. It is eliminated from every step alike, with χ_k the sensitivity
+to it: `s_k − S_px S_xx⁻¹ χ_k`, the Schur complement of M. That is linear in the steps, so it can follow the sum over a
+block. What the measured state adds counts to the first block of its segment. No block crosses the end of a segment.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._base.checks import Matrix
+from orthaug.fitting.colour import correlation_length
+from orthaug.fitting.segments import Segments, block_scores, respond
+from orthaug.models.dynamics import Dynamics, Numbers
+
+_MEMORIES = 3  # times as many steps in a block as the errors' correlation lasts
+
+
+@dataclass(frozen=True, eq=False)
+class FreeRunScores:
+    """A trained free run, whose scores of p = (c, w) can be summed over blocks.
+
+    `slope` and `pull` are how the best states follow p and the measured states; None where the states are no unknowns.
+    `unit` scales the information of p to the Gram matrix that the model keeps.
+    """
+
+    dynamics: Dynamics
+    numbers: Numbers
+    segments: Segments
+    states: Float[np.ndarray, "k n0 m"]
+    weight: Matrix
+    unit: float
+    slope: Float[np.ndarray, "k m n0 n"] | None = None
+    pull: Float[np.ndarray, "k m n0"] | None = None
+
+    @property
+    def longest(self) -> int:
+        """Scored steps of the longest segment."""
+        return int(np.asarray(self.segments.scored).sum(axis=1).max())
+
+    def errors(self) -> Float[np.ndarray, "ny s T"]:
+        """The errors of each output by segments, 0 where a step is not scored."""
+        run = np.asarray(respond(self.dynamics, self.numbers, self.segments, self.states))
+        scored = np.asarray(self.segments.scored)[:, :, None]
+        errors = np.where(scored, np.asarray(self.segments.target) - run, 0.0)
+        return np.moveaxis(errors, 3, 1).reshape(-1, *errors.shape[1:3]).transpose(2, 0, 1)
+
+    def block(self) -> int | None:
+        """Steps of a block: three times as many as the correlation of the errors lasts; None where that has no end."""
+        lengths = [correlation_length(errors) for errors in self.errors()]
+        return None if None in lengths else _MEMORIES * max(n for n in lengths if n is not None)
+
+    def blocks(self, steps: int) -> Float[np.ndarray, "b n"]:
+        """The score of every block of about `steps` scored steps, no fewer where the segment has as many."""
+        scored = np.asarray(self.segments.scored)
+        first = int(np.argmax(scored.any(axis=(0, 2))))
+        count = max(self.longest // steps, 1)
+        place = np.maximum(np.arange(self.segments.steps) - first, 0) // -(-self.longest // count)
+        made = (self.dynamics, self.numbers, self.segments, self.states, self.weight)
+        sums = np.moveaxis(np.asarray(block_scores(*made, place.astype(np.int32), int(place[-1]) + 1)), -1, 1)
+        n0 = self.segments.start.shape[1]
+        scores = sums[..., n0:]  # (k, m, b, n)
+        if self.slope is not None and self.pull is not None:
+            of_state = sums[..., :n0].copy()
+            of_state[:, :, 0] += self.pull
+            scores = scores - of_state @ self.slope
+        counts = np.stack([scored[:, place == block].sum(axis=1) for block in range(int(place[-1]) + 1)], axis=-1)
+        return scores[counts > 0]
+
+    def middle(self, steps: int, used: float) -> tuple[Matrix, int]:
+        """Ω of p in the units of the model's Gram matrix, and the number of blocks that it is made of.
+
+        Args:
+            used: parameters of the fit, by which its errors are too small.
+        """
+        scores = self.blocks(steps)
+        blocks, rows = len(scores), self.segments.count * len(self.weight)
+        correction = blocks / max(blocks - 1, 1) * rows / max(rows - used, 1.0)
+        return correction * self.unit**2 * scores.T @ scores, blocks

@@ -1,0 +1,153 @@
+"""Scores of a free run in blocks: against autodiff and a loop, and the intervals that come of them."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from test_initial_states import FED_BACK, eliminated, start_rows, states_of
+from test_segments import CASES, assert_close, case, dense, found_of
+
+from orthaug._base.errors import InputError
+from orthaug.analysis.diagnosis import robust_where_coloured
+from orthaug.data.record import Record
+from orthaug.fitting.block_scores import FreeRunScores
+from orthaug.fitting.colour import correlation_length
+from orthaug.fitting.criteria import Simulation
+from orthaug.fitting.estimation import estimate
+from orthaug.inference.intervals import prediction_std
+from orthaug.inference.measures import Symmetrized, Training
+from orthaug.physics.baseline import Baseline, Term
+
+THETA = np.array([1.5, -0.7, 0.3, 0.2])
+PHYSICS = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("g", "u[k-1]"), Term("o", "1")])
+
+
+def scores_of(name, free):
+    """Of the numbers of a case, whose first chunk of segments is padded."""
+    given = case(name)
+    states = states_of(name, free)
+    slope = eliminated(name, free)[3]
+    prior = start_rows(name).T @ start_rows(name)
+    pull = np.moveaxis(states.measured - given.states, -1, 1) @ prior if free else None
+    return FreeRunScores(given.form, given.numbers, given.segments, given.states, given.weight, 1.0, slope, pull)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3, 50])
+@pytest.mark.parametrize("name", ["one output", "two outputs share theta", "no feedback"])
+def test_blocks_are_sums_of_products_of_autodiff(name, steps):
+    """Four steps of each segment are scored; the last segment of an experiment may have fewer."""
+    exact, scored = dense(name), np.asarray(case(name).segments.scored)
+    products = np.sum(exact.shared * exact.error[..., None], axis=2)  # (k, T, m, n)
+    size = {1: 1, 2: 2, 3: 4, 50: 4}[steps]
+    expected = [
+        products[k, first : first + size, m].sum(axis=0)
+        for k, m in np.ndindex(scored.shape[0], scored.shape[2])
+        for first in range(3, scored.shape[1], size)
+        if scored[k, first : first + size, m].any()
+    ]
+    assert_close(scores_of(name, free=False).blocks(steps), np.array(expected), 1e-8)
+
+
+@pytest.mark.parametrize("name", FED_BACK)
+def test_with_the_states_eliminated_all_blocks_add_up_to_the_eliminated_gradient(name):
+    assert_close(scores_of(name, free=True).blocks(2).sum(axis=0), eliminated(name)[1], 1e-8)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_without_their_elimination_they_add_up_to_the_gradient(name):
+    assert_close(scores_of(name, free=False).blocks(2).sum(axis=0), np.asarray(found_of(name).shared)[:-1, -1], 1e-8)
+
+
+# --- how long errors remember
+
+
+@pytest.mark.parametrize(("poles", "least", "most"), [((0.0,), 1, 3), ((0.9,), 12, 45), ((0.98,), 60, 250)])
+def test_the_correlation_length(poles, least, most):
+    e = lfilter([1.0], np.poly(poles), np.random.default_rng(0).normal(size=20000))
+    assert least <= correlation_length(e[None]) <= most
+
+
+def test_a_resonance_is_not_cut_where_its_correlation_is_zero():
+    """Of period 40 and a decay by e in 50: the correlation is zero at 10 already."""
+    pole = np.exp(-1 / 50 + 2j * np.pi / 40)
+    e = lfilter([1.0], np.poly([pole, pole.conj()]).real, np.random.default_rng(1).normal(size=20000))
+    assert correlation_length(e[None]) > 60
+
+
+def test_errors_that_remember_for_long_have_no_length():
+    assert correlation_length(np.cumsum(np.random.default_rng(2).normal(size=(1, 400)))[None]) is None
+    assert correlation_length(np.zeros((1, 400))) is None
+
+
+# --- the intervals
+
+
+def record(seed, pole, samples=2000):
+    """A slow input, noise of deviation 0.5 on the sensor."""
+    rng = np.random.default_rng([seed, 12])
+    u = lfilter([1.0], [1.0, -0.8], rng.normal(size=samples + 200))
+    y = lfilter([0.0, THETA[2]], [1.0, -THETA[0], -THETA[1]], u) + THETA[3] / (1 - THETA[0] - THETA[1])
+    e = lfilter([np.sqrt(1 - pole**2)], [1.0, -pole], rng.normal(size=samples + 200))
+    return Record.from_arrays(u[200:], (y + 0.5 * e)[200:])
+
+
+@cache
+def flown(seed, pole=0.9, segment=0, samples=2000):
+    return estimate(record(seed, pole, samples), PHYSICS, learner=None, criterion=Simulation(segment, 40))
+
+
+def test_blocks_cover_where_plain_intervals_do_not():
+    """AR(1) noise with coefficient 0.9, 60 draws; all four parameters together."""
+    inside = np.zeros(2)
+    for seed in range(60):
+        for i, fit in enumerate((flown(seed), flown(seed).robust(90))):
+            inside[i] += np.mean((fit.interval[:, 0] <= THETA) & (fit.interval[:, 1] >= THETA)) / 60
+    assert inside[0] < 0.75 and 0.90 < inside[1] < 0.99
+
+
+def default(fit):
+    return robust_where_coloured(fit, fit.model.predict(fit.problem.record))
+
+
+@pytest.mark.parametrize("segment", [0, 512])
+def test_coloured_errors_have_robust_intervals_by_default(segment):
+    plain = flown(0, segment=segment)
+    fit = default(plain)
+    np.testing.assert_array_equal(fit.plain_covariance, plain.covariance)
+    np.testing.assert_array_equal(fit.theta, plain.theta)
+    assert (fit.std > 1.2 * plain.std).any() and 19 <= fit.freedom < 100
+    assert "std         robust (batch means), for the errors of the free run are coloured" in fit.summary()
+    assert default(fit).freedom == fit.freedom  # robust errors of robust errors are the same
+    np.testing.assert_array_equal(fit.robust(90).plain_covariance, plain.covariance)
+
+
+def test_their_predictions_and_splits_are_robust_too():
+    plain, fit = flown(0), flown(0).robust(90)
+    assert prediction_std(fit.model, fit.problem.record)[0][50:].mean() > 1.2 * (
+        prediction_std(plain.model, plain.problem.record)[0][50:].mean()
+    )
+    split = fit.split(Training())
+    np.testing.assert_allclose(split.covariance, fit.covariance, rtol=1e-8)
+    np.testing.assert_allclose(split.plain_covariance, plain.covariance, rtol=1e-8)
+    assert plain.split(Symmetrized()).plain_covariance is None
+
+
+@pytest.mark.parametrize("why", ["white", "few rows", "short segments"])
+def test_otherwise_they_stay_plain(why):
+    given = {"white": (0, 0.0), "few rows": (0, 0.9, 0, 300), "short segments": (0, 0.9, 50)}[why]
+    assert default(flown(*given)).plain_covariance is None
+
+
+def test_for_white_errors_they_are_the_plain_ones():
+    np.testing.assert_allclose(flown(1, 0.0).robust(10).std, flown(1, 0.0).std, rtol=0.2)
+
+
+def test_errors_that_never_forget_are_refused():
+    fit = flown(0, 0.97, 0, 200)
+    with pytest.raises(InputError, match="remember each other for too long"):
+        fit.robust()
+    with pytest.raises(InputError, match="`lags`"):
+        fit.robust(0)
