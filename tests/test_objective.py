@@ -13,10 +13,10 @@ from orthaug.data.record import Record
 from orthaug.fitting.criteria import Simulation
 from orthaug.fitting.flight_plan import FlightPlan
 from orthaug.fitting.initial_states import Start
-from orthaug.fitting.objective import FreeRunObjective
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.solvers.descent import MARQUARDT, SquaredResiduals, descend
 from orthaug.fitting.status import Ending
+from orthaug.fitting.structured_objective import StructuredObjective
 from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
 from orthaug.models.learners import MLP
 from orthaug.physics.baseline import Baseline, Term
@@ -34,7 +34,7 @@ KINDS = {
 
 
 @cache
-def objective(kind="orthogonal") -> FreeRunObjective:
+def objective(kind="orthogonal") -> StructuredObjective:
     """On the noisy mass-spring-damper; segments have a washout, so their states are free."""
     example = mass_spring_damper()
     (experiment,) = example.train.experiments

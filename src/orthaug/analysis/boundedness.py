@@ -16,7 +16,8 @@ from orthaug._base.jax import Array, jax, jnp, padded_length
 from orthaug.analysis.visited import MOST_STEPS, usable
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Dynamics, Numbers
-from orthaug.models.model import RUNAWAY, Model
+from orthaug.models.model import Model
+from orthaug.models.on_records import RUNAWAY
 
 _LARGEST_FACTOR = 1e4  # outputs of a stable linear model grow with its inputs, and 10⁶ times the largest is "diverged"
 _SIDE_BY_SIDE = 16  # runs of one compiled call

@@ -1,66 +1,33 @@
-"""A problem laid out in segments for a criterion of several steps, and a descent over them."""
+"""The course of a lagged model: its problem laid out in segments, beside its rows laid out for one step."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
 
 import numpy as np
 
-from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
-from orthaug._base.progress import RunTell, quiet
 from orthaug.data.regressors import Features
-from orthaug.fitting.criteria import Criterion, Simulation
+from orthaug.fitting.course import Course, Layout
+from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.elimination import eliminate
-from orthaug.fitting.initial_states import InitialStates, Start
-from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, errors_of
+from orthaug.fitting.initial_states import InitialStates
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.rules import check_scored
-from orthaug.fitting.segments import Segments, lay_segments
-from orthaug.fitting.solvers.descent import MARQUARDT, Descent
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.status import Ending
+from orthaug.fitting.segments import lay_segments
+from orthaug.fitting.structured_objective import StructuredObjective
 from orthaug.fitting.structures import Structure
-from orthaug.inference.covariance import noise_covariance, whitening
-from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
 from orthaug.models.learners import Bound
 from orthaug.physics.problem import Problem
 
-_COLOURED_STEPS = 256  # shorter segments do not show how long the errors remember
-_COLOUR_ROWS = 4096  # of each experiment: they show it instead
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FlightPlan(Course):
+    """A problem laid out in segments, beside its rows laid out for one step."""
 
-class Flight(NamedTuple):
-    """A finished run on the free-run criterion."""
-
-    objective: FreeRunObjective
-    end: Descent
-    mean_square: float
-    iterations: int
-    seconds: float
-
-    @property
-    def ending(self) -> Ending:
-        return self.end.ending
-
-
-@dataclass(frozen=True, eq=False)
-class FlightPlan:
-    """A problem laid out in segments, beside its rows laid out for one step. `rms` is the unit of the errors."""
-
-    task: OneStepTask
     dynamics: Lagged
-    segments: Segments
-    whole: Segments
-    """Segments over which runs are compared: whole experiments; for a prediction h steps ahead its own segments."""
-    colour: Segments | None
-    """Segments that show the colour of the errors, where the others are too short for that."""
-    criterion: Criterion
-    flown: Simulation
-    rms: float
+    task: OneStepTask
 
     @classmethod
     def of(cls, task: OneStepTask, criterion: Criterion) -> FlightPlan:
@@ -73,18 +40,20 @@ class FlightPlan:
             raise InputError("a free run needs its rows in memory; train one step ahead, or take the default engine.")
         problem, flown = task.problem, criterion.flown
         assert flown is not None, "one step ahead is `OneStepTask`'s"
-        longest = max(len(e) for e in problem.record.experiments) - problem.rows.start
-        check_scored(criterion, longest)
-        record = problem.record
         dynamics = Lagged(problem.baseline, problem.features, problem.layout, problem.outputs, task.bound)
-        segments = lay_segments(record, dynamics, flown.segment, flown.washout)
-        whole, colour = segments, None
-        if criterion.simulates and flown.segment:
-            whole = lay_segments(record, dynamics, 0, flown.washout)
-            if segments.steps < _COLOURED_STEPS <= longest:
-                first = tuple(e.rows(0, _COLOUR_ROWS) for e in record.experiments)
-                colour = lay_segments(replace(record, experiments=first), dynamics, 0, flown.washout)
-        return cls(task, dynamics, segments, whole, colour, criterion, flown, task.rms)
+        return cls(
+            record=problem.record,
+            dynamics=dynamics,
+            **Layout.of(problem.record, dynamics, criterion)._asdict(),
+            criterion=criterion,
+            flown=flown,
+            rms=task.rms,
+            deviation=problem.deviation,
+            output_weights=problem.weight.choice,
+            scaling=task.scaling,
+            unit=task.unit,
+            task=task,
+        )
 
     @property
     def problem(self) -> Problem:
@@ -94,93 +63,34 @@ class FlightPlan:
     def bound(self) -> Bound | None:
         return self.task.bound
 
-    @property
-    def residuals(self) -> int:
-        """How many errors are scored."""
-        return self.segments.count * len(self.problem.outputs)
-
     @cached_property
     def alone(self) -> FlightPlan:
         """The same rows and segments without a learner."""
-        return replace(self, task=self.task.alone, dynamics=replace(self.dynamics, features=Features(()), bound=None))
+        alone, task = replace(self.dynamics, features=Features(()), bound=None), self.task.alone
+        return replace(self, task=task, dynamics=alone, scaling=task.scaling, unit=task.unit)
 
     def over(self, segment: int) -> FlightPlan:
         """The same over segments of another length; 0 for whole experiments."""
         washout = min(self.flown.washout, segment // 2) if segment else self.flown.washout
         flown = replace(self.flown, segment=segment, washout=washout)
-        segments = lay_segments(self.problem.record, self.dynamics, segment, washout)
+        segments = lay_segments(self.record, self.dynamics, segment, washout)
         return replace(self, segments=segments, flown=flown)
 
-    def numbers(self, c: Vector, w: Any, tilt: Any = None) -> Numbers:
-        """The model's numbers before the split."""
-        scaling = self.task.scaling
-        return Numbers(c, np.zeros_like(c), np.asarray(w), scaling.centre, scaling.halfwidth, self.task.unit, tilt)
-
-    def objective(self, structure: Structure) -> FreeRunObjective:
+    def objective(self, structure: Structure) -> StructuredObjective:
         """The criterion as a function of θ and the weights."""
-        start = np.asarray(self.segments.start)
-        return FreeRunObjective(
+        start, elimination = np.asarray(self.segments.start), eliminate(structure, self.problem)
+        free = elimination.projects and not elimination.bounded and self.bound is not None  # the unknown is c
+        return StructuredObjective(
             dynamics=self.dynamics,
-            task=self.task,
             numbers=self.numbers,
             segments=self.segments,
             initial=InitialStates(start, start.size > 0 and self.flown.estimates_pasts),
-            elimination=eliminate(structure, self.problem),
             weight=self.problem.weight.matrix / self.rms,
             rms=self.rms,
+            deviation=self.problem.deviation,
+            physics=len(self.problem.baseline.names),
+            bounds=None if free else (elimination.lower, elimination.upper),
             colour=self.colour,
+            task=self.task,
+            elimination=elimination,
         )
-
-    def descend(
-        self,
-        objective: FreeRunObjective,
-        p: Vector,
-        solver: LevenbergMarquardt,
-        tell: RunTell = quiet,
-        states: Any = None,
-        **options: Any,
-    ) -> Flight:
-        """From p to the end; several outputs are weighted by their errors' covariance in a second leg.
-
-        Args:
-            states: of the segments' starts at p; None for the measured ones.
-            options: of `descent.descend`.
-        """
-        ny = len(self.problem.outputs)
-        options |= {"bounds": objective.bounds, "damping": MARQUARDT}
-        two_legs = ny > 1 and self.problem.weight.choice in ("auto", "covariance")
-        first = solver.at_most(solver.iterations // 2) if two_legs else solver
-        start = Start(objective.initial.measured if states is None else states)
-        end = first.descend(objective, p, start, progress=tell, **options)
-        noise = self.noise(objective, end) if two_legs and end.ending.usable else None
-        white = None if noise is None else whitening(noise)
-        if noise is not None and white is not None:
-            size = np.trace(objective.weight @ noise @ objective.weight.T) / ny  # so that the ridge keeps its place
-            objective = replace(objective, weight=np.sqrt(size) * white)
-            done = end.iterations
-            again = solver.at_most(solver.iterations - done).descend(
-                objective,
-                end.flown.p,
-                Start(end.flown.states),
-                progress=lambda i, loss: tell(done + i, loss),
-                **(options | {"ridge": end.ridge, "ceiling": np.inf}),
-            )
-            path = (*end.path, *again.path)
-            spent = {"iterations": done + again.iterations, "seconds": end.seconds + again.seconds}
-            end = again._replace(path=path, **spent)
-        mean_square = self.mean_square(end.flown.c, end.flown.w)
-        return Flight(objective, end, mean_square, end.iterations, end.seconds)
-
-    def noise(self, objective: FreeRunObjective, end: Descent) -> Matrix | None:
-        """Covariance (ny, ny) of the errors, in the outputs' units."""
-        squares, ny = objective.squares(end.flown), len(objective.weight)
-        used = (objective.physics + end.effective) / ny
-        return None if squares is None else noise_covariance(squares, np.full(ny, self.segments.count - used))
-
-    def mean_square(self, c: Vector, w: Any, tilt: Any = None) -> float:
-        """Mean of squared errors over whole experiments, in deviations of the outputs; NaN where it diverges."""
-        with np.errstate(all="ignore"):
-            errors = errors_of(self.dynamics, self.numbers(c, w, tilt), self.whole.start, self.whole)
-            scaled = errors / self.problem.deviation[:, None]
-            mean = float(np.sum(scaled**2)) / (self.whole.count * len(self.problem.outputs))
-        return mean if mean < RUNAWAY else np.nan

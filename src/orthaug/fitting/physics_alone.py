@@ -13,7 +13,8 @@ import numpy as np
 
 from orthaug._base.checks import Vector
 from orthaug._base.progress import RunTell, quiet
-from orthaug.fitting.flight_plan import Flight, FlightPlan
+from orthaug.fitting.course import Flight
+from orthaug.fitting.flight_plan import FlightPlan
 from orthaug.fitting.initial_states import Start
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Structure

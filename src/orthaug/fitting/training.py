@@ -201,7 +201,7 @@ def _held_out(
     if not choice.blocks or not choice.compares(task, starts):
         return None
     try:
-        folds = blocked(task.problem.record, choice.blocks, task.problem.rows.start)
+        folds = blocked(task.problem.record, choice.blocks, task.problem.first_row)
     except InputError:  # too few rows to leave some out
         return None
     shorter, unit = solver.at_most(FOLD_ITERATIONS), task.problem.deviation

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Matrix, Vector, as_signal, check_count, check_type
-from orthaug._base.errors import InputError, shown
+from orthaug._base.checks import Matrix, Vector, as_signal, check_count
+from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, jnp, padded_length
-from orthaug.data.record import Channel, Experiment, Record, same_step
+from orthaug.data.record import Channel, Experiment, Record
 from orthaug.models.dynamics import Dynamics, Numbers, Parts
 from orthaug.models.lagged import Lagged
-from orthaug.models.response import Response, Trajectory
+from orthaug.models.on_records import OnRecords, trajectory
+from orthaug.models.response import Response
 from orthaug.models.statistics import Statistics
 
-RUNAWAY = 1e6  # times the largest training output: a free run beyond this has diverged
 _WITHIN = 1e-9  # of a feature's half width: the largest of training is no extrapolation
 _BATCH = 1024  # rows per compiled call: longer records share the program, of a free run too
 _WINDOW_CELLS = 8_000_000  # input cells of a batch of multi-step predictions
@@ -53,7 +53,7 @@ def _ahead(
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class Model(OnRecords):
     """A fitted model; `estimate` makes it, `orthaug.save` and `orthaug.load` keep it.
 
     `weight` (ny, ny) is the inner product of criterion and measure: rows multiplied by it are whitened. `deviation`
@@ -113,7 +113,7 @@ class Model:
                 parts = self._predict_rows(self.form.regressors(experiment, record, first))
             else:
                 parts = self._predict_ahead(experiment, record, horizon)
-            trajectories.append(_trajectory(parts, experiment, experiment.outputs, first))
+            trajectories.append(trajectory(parts, experiment, experiment.outputs, first))
         return Response(tuple(trajectories), horizon, self.outputs, record.sampling_time)
 
     def simulate(self, record: Record, initial: str | Any = "measured") -> Response:
@@ -135,7 +135,7 @@ class Model:
             start = self._start(initial, measured)
             parts = self._run(start, experiment, record)
             outside = self._outside(start, parts, experiment, record)
-            trajectories.append(replace(self._bounded(parts, experiment, measured), outside=outside))
+            trajectories.append(replace(self.bounded(parts, experiment, measured), outside=outside))
         return Response(tuple(trajectories), None, self.outputs, record.sampling_time)
 
     def check_initial(self, initial: Any) -> Matrix:
@@ -203,63 +203,6 @@ class Model:
             beyond = ~(np.abs(z) <= 1 + _WITHIN).all(axis=1)
         return np.concatenate([np.zeros(self.form.first_row, dtype=bool), beyond])
 
-    def _bounded(self, parts: Parts, experiment: Experiment, measured: Matrix | None) -> Trajectory:
-        """A free run cut where it left all bounds."""
-        trajectory = _trajectory(parts, experiment, measured, self.form.first_row)
-        with np.errstate(all="ignore"):
-            wild = ~(np.abs(trajectory.model[self.form.first_row :]) <= RUNAWAY * self.largest_output)
-        if not wild.any():
-            return trajectory
-        step = int(np.argmax(wild.any(axis=1)))
-        output = self.outputs[int(np.argmax(wild[step]))].name
-        cut = Parts(*(np.where(np.arange(len(part))[:, None] < step, part, np.nan) for part in parts))
-        bounded = _trajectory(cut, experiment, measured, self.form.first_row)
-        return replace(bounded, diverged=(step + self.form.first_row, output))
-
-    def check_rows(self, experiment: Experiment, first: int) -> None:
-        """Raises InputError where an experiment ends before the row `first`."""
-        if len(experiment) <= first:
-            name = experiment.source or "the record"
-            raise InputError(f"{name} has {len(experiment)} rows, too few: the first value is at row {shown(first)}.")
-
-    def _wanted(self, with_outputs: bool) -> str:
-        """A record of the model's channels, in the words of Python."""
-        given = {
-            "u": ("inputs", self.inputs),
-            "y": ("outputs", self.outputs if with_outputs or not self.inputs else ()),
-        }
-        arrays = [f"{name}={name}" for name, (_, channels) in given.items() if channels]
-        names = [f"{kind}={[c.name for c in channels]}" for kind, channels in given.values() if channels]
-        arguments = ", ".join([*arrays, *names, f"sampling_time={self.sampling_time:g}"])
-        return f"a Record, such as Record.from_arrays({arguments})"
-
-    def fitting(self, record: Record, *, need_outputs: bool) -> Record:
-        """The record's channels in the model's order, by name.
-
-        Raises:
-            InputError: a channel is missing, or the sampling time differs by more than 0.1 %.
-        """
-        check_type(record, Record, "record", self._wanted(need_outputs))
-        if not same_step(record.sampling_time, self.sampling_time):
-            raise InputError(
-                f"the record is sampled every {record.sampling_time:g} s, the model every {self.sampling_time:g} s; "
-                "resample the record."
-            )
-        with_outputs = need_outputs or bool(record.outputs)
-        names = {kind: [c.name for c in getattr(record, kind)] for kind in ("inputs", "outputs")}
-        wanted = {"inputs": self.inputs, "outputs": self.outputs if with_outputs else ()}
-        for kind, channels in wanted.items():
-            missing = [c.name for c in channels if c.name not in names[kind]]
-            if missing:
-                there = ", ".join(names[kind]) or "none"
-                raise InputError(f"the record lacks the {kind[:-1]} {', '.join(missing)} of the model; it has {there}.")
-        order = {kind: [names[kind].index(c.name) for c in channels] for kind, channels in wanted.items()}
-        experiments = tuple(
-            replace(e, inputs=e.inputs[:, order["inputs"]], outputs=e.outputs[:, order["outputs"]])
-            for e in record.experiments
-        )
-        return Record(self.inputs, wanted["outputs"], record.sampling_time, experiments)
-
 
 def _in_batches(function: Callable[..., Parts], rows: tuple[np.ndarray, ...], largest: int = _BATCH) -> Parts:
     """`function` over batches of rows, padded to one shape, its results concatenated."""
@@ -273,14 +216,3 @@ def _in_batches(function: Callable[..., Parts], rows: tuple[np.ndarray, ...], la
         parts = function(*padded)
         pieces.append([np.asarray(part)[: size - padding] for part in parts])
     return Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True)))
-
-
-def _trajectory(parts: Parts, experiment: Experiment, measured: Matrix | None, first: int) -> Trajectory:
-    def whole(values: Any) -> Matrix:
-        padded = np.full((len(experiment), values.shape[1]), np.nan)
-        padded[first:] = values
-        return padded
-
-    return Trajectory(
-        whole(parts.baseline), whole(parts.learner), whole(parts.raw), measured, first, experiment.start_time
-    )

@@ -233,8 +233,8 @@ class Motion:
         """Every parameter is used, and every output follows from a state."""
         reach = {name: set(expression.names) for name, expression in self.definitions}
         for name, expression in self.definitions:  # each after those that it uses
-            for used in expression.names:
-                reach[name] |= reach.get(used, set())
+            for other in expression.names:
+                reach[name] |= reach.get(other, set())
 
         def names_in(expression: Expression) -> set[str]:
             return set(expression.names).union(*(reach.get(name, set()) for name in expression.names))

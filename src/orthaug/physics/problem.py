@@ -56,6 +56,11 @@ class Problem:
         return tuple(channel.name for channel in self.record.outputs)
 
     @property
+    def first_row(self) -> int:
+        """The first row of an experiment that has a regressor."""
+        return self.rows.start
+
+    @property
     def used(self) -> tuple[Lag, ...]:
         """The raw lags that the physics or the learner reads."""
         read = {*self.baseline.lags, *self.features.lags}

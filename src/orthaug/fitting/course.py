@@ -1,0 +1,156 @@
+"""A record laid out in segments for a criterion of several steps, and a descent over them, of any dynamics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.progress import RunTell, quiet
+from orthaug.data.record import Record
+from orthaug.fitting.criteria import Criterion, Simulation
+from orthaug.fitting.initial_states import Start
+from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, errors_of
+from orthaug.fitting.rules import check_scored
+from orthaug.fitting.segments import Segments, lay_segments
+from orthaug.fitting.solvers.descent import MARQUARDT, Descent
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.status import Ending
+from orthaug.inference.covariance import noise_covariance, whitening
+from orthaug.models.dynamics import Dynamics, Numbers
+from orthaug.models.learners import Scaling
+
+_COLOURED_STEPS = 256  # shorter segments do not show how long the errors remember
+_COLOUR_ROWS = 4096  # of each experiment: they show it instead
+
+
+class Flight(NamedTuple):
+    """A finished run on the free-run criterion."""
+
+    objective: FreeRunObjective
+    end: Descent
+    mean_square: float
+    iterations: int
+    seconds: float
+
+    @property
+    def ending(self) -> Ending:
+        return self.end.ending
+
+
+class Layout(NamedTuple):
+    """Segments of a record: to train on, to compare runs over, and to see the colour of the errors by."""
+
+    segments: Segments
+    whole: Segments
+    colour: Segments | None
+
+    @classmethod
+    def of(cls, record: Record, dynamics: Dynamics, criterion: Criterion) -> Layout:
+        """As a criterion of several steps declares.
+
+        Raises:
+            InputError: nothing would be scored.
+        """
+        flown = criterion.flown
+        assert flown is not None, "one step ahead is `OneStepTask`'s"
+        longest = max(len(e) for e in record.experiments) - dynamics.first_row
+        check_scored(criterion, longest)
+        segments = lay_segments(record, dynamics, flown.segment, flown.washout)
+        if not (criterion.simulates and flown.segment):
+            return cls(segments, segments, None)
+        whole, colour = lay_segments(record, dynamics, 0, flown.washout), None
+        if segments.steps < _COLOURED_STEPS <= longest:
+            first = tuple(e.rows(0, _COLOUR_ROWS) for e in record.experiments)
+            colour = lay_segments(replace(record, experiments=first), dynamics, 0, flown.washout)
+        return cls(segments, whole, colour)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Course:
+    """A record laid out in segments for a criterion.
+
+    `rms` is the unit of the errors. `deviation` (ny,) is that of the outputs, `output_weights` how they are weighed
+    against each other; `scaling` and `unit` are the learner's.
+    """
+
+    record: Record
+    dynamics: Dynamics
+    segments: Segments
+    whole: Segments
+    """Segments over which runs are compared: whole experiments; for a prediction h steps ahead its own segments."""
+    colour: Segments | None
+    """Segments that show the colour of the errors, where the others are too short for that."""
+    criterion: Criterion
+    flown: Simulation
+    rms: float
+    deviation: Vector
+    output_weights: str | tuple[float, ...]
+    scaling: Scaling
+    unit: Vector
+
+    @property
+    def residuals(self) -> int:
+        """How many errors are scored."""
+        return self.segments.count * len(self.dynamics.outputs)
+
+    def numbers(self, c: Vector, w: Any, tilt: Any = None) -> Numbers:
+        """The model's numbers before the split."""
+        scaling = self.scaling
+        return Numbers(c, np.zeros_like(c), np.asarray(w), scaling.centre, scaling.halfwidth, self.unit, tilt)
+
+    def descend(
+        self,
+        objective: FreeRunObjective,
+        p: Vector,
+        solver: LevenbergMarquardt,
+        tell: RunTell = quiet,
+        states: Any = None,
+        **options: Any,
+    ) -> Flight:
+        """From p to the end; several outputs are weighted by their errors' covariance in a second leg.
+
+        Args:
+            states: of the segments' starts at p; None for the measured ones.
+            options: of `descent.descend`.
+        """
+        ny = len(self.dynamics.outputs)
+        options |= {"bounds": objective.bounds, "damping": MARQUARDT}
+        two_legs = ny > 1 and self.output_weights in ("auto", "covariance")
+        first = solver.at_most(solver.iterations // 2) if two_legs else solver
+        start = Start(objective.initial.measured if states is None else states)
+        end = first.descend(objective, p, start, progress=tell, **options)
+        noise = self.noise(objective, end) if two_legs and end.ending.usable else None
+        white = None if noise is None else whitening(noise)
+        if noise is not None and white is not None:
+            size = np.trace(objective.weight @ noise @ objective.weight.T) / ny  # so that the ridge keeps its place
+            objective = replace(objective, weight=np.sqrt(size) * white)
+            done = end.iterations
+            again = solver.at_most(solver.iterations - done).descend(
+                objective,
+                end.flown.p,
+                Start(end.flown.states),
+                progress=lambda i, loss: tell(done + i, loss),
+                **(options | {"ridge": end.ridge, "ceiling": np.inf}),
+            )
+            path = (*end.path, *again.path)
+            spent = {"iterations": done + again.iterations, "seconds": end.seconds + again.seconds}
+            end = again._replace(path=path, **spent)
+        mean_square = self.mean_square(end.flown.c, end.flown.w)
+        return Flight(objective, end, mean_square, end.iterations, end.seconds)
+
+    def noise(self, objective: FreeRunObjective, end: Descent) -> Matrix | None:
+        """Covariance (ny, ny) of the errors, in the outputs' units."""
+        squares, ny = objective.squares(end.flown), len(objective.weight)
+        used = (objective.physics + end.effective) / ny
+        return None if squares is None else noise_covariance(squares, np.full(ny, self.segments.count - used))
+
+    def mean_square(self, c: Vector, w: Any, tilt: Any = None) -> float:
+        """Mean of squared errors over whole experiments, in deviations of the outputs; NaN where it diverges."""
+        with np.errstate(all="ignore"):
+            errors = errors_of(self.dynamics, self.numbers(c, w, tilt), self.whole.start, self.whole)
+            scaled = errors / self.deviation[:, None]
+            mean = float(np.sum(scaled**2)) / (self.whole.count * len(self.dynamics.outputs))
+        return mean if mean < RUNAWAY else np.nan

@@ -1,0 +1,217 @@
+"""Runs on the free-run criterion that start from physics alone, of any dynamics.
+
+Every run starts where physics alone ended, with a learner that is silent there. Only what lowers the loss is accepted,
+so that no run ends above physics alone.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.progress import RunTell, quiet
+from orthaug._base.warning import Warning
+from orthaug.fitting.block_scores import FreeRunScores
+from orthaug.fitting.course import Flight
+from orthaug.fitting.criteria import Criterion
+from orthaug.fitting.initial_states import Start
+from orthaug.fitting.learned import ErrorStatistics, Learned
+from orthaug.fitting.objective import FreeRunObjective
+from orthaug.fitting.rules import ridge_of
+from orthaug.fitting.solvers.descent import Descent
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.structures import Structure
+from orthaug.inference.covariance import theta_block
+from orthaug.models.learners import Bound
+
+_LOOKED_AT = 8  # iterates of a run that ended above physics alone
+
+
+class Place(NamedTuple):
+    """Where a run may start: p and the segments' states, the loss there, and whether the learner is silent."""
+
+    p: Vector
+    states: Any
+    loss: float
+    silent: bool
+
+
+@dataclass(frozen=True, eq=False)
+class FlightTask(ABC):
+    """A course, and what physics alone does on it: None before `prepared`, and where physics alone cannot fly."""
+
+    plan: Any
+    """The `Course`."""
+    physics: Flight | None = None
+
+    @property
+    @abstractmethod
+    def bound(self) -> Bound | None: ...
+
+    @abstractmethod
+    def places(
+        self,
+        objective: Any,
+        solver: LevenbergMarquardt,
+        w: Vector,
+        structure: Structure,
+        regularization: str | float,
+    ) -> list[Place]:
+        """Where a run from the weights w may start; arguments as in `estimate`."""
+
+    @property
+    def problem(self) -> Any:
+        """What is estimated, with its record."""
+        return self.plan.problem
+
+    @property
+    def criterion(self) -> Criterion:
+        return self.plan.criterion
+
+    @property
+    def start_loss(self) -> float | None:
+        """Loss of physics alone, in the units of `loss`; None where it cannot fly."""
+        return None if self.physics is None else self.physics.mean_square
+
+    @property
+    def seconds(self) -> float:
+        """What physics alone took."""
+        return 0.0 if self.physics is None else self.physics.seconds
+
+    @property
+    def warnings(self) -> tuple[Warning, ...]:
+        """One where runs cannot be compared over whole experiments."""
+        if self.physics is None or self.plan.whole is not self.plan.segments:
+            return ()
+        if not self.criterion.simulates or not self.plan.flown.segment:
+            return ()
+        text = (
+            "the free run of physics alone diverges over whole experiments of the training data, so `loss` counts its "
+            "segments; bound what makes it run away, or trust predictions a segment ahead only."
+        )
+        return (Warning("free_run_diverges", text),)
+
+    def run(
+        self,
+        solver: LevenbergMarquardt,
+        w: Any,
+        structure: Structure,
+        regularization: str | float = "none",
+        progress: RunTell = quiet,
+    ) -> Flight:
+        """One run from the weights `w`, silenced, and physics alone; the arguments as in `estimate`.
+
+        An earlier model is gone on from where it is better than physics alone. A learner that cannot be silenced
+        starts with its weights, from the best θ for them.
+        """
+        plan, physics = self.plan, self.physics
+        if self.bound is None and physics is not None:
+            return physics
+        objective, w = plan.objective(structure), np.asarray(w)
+        ridge, evidence = ridge_of(regularization)
+        places = self.places(objective, solver, w, structure, regularization)
+        best = min(places, key=lambda place: place.loss)
+        ceiling = min((place.loss for place in places if place.silent), default=np.inf)
+        if evidence and np.isfinite(best.loss):  # one prior deviation of the weights for one of what is left
+            ridge = best.loss / plan.residuals
+
+        def tell(iteration: int, loss: float) -> None:
+            progress(iteration, loss * plan.rms**2 / plan.residuals)
+
+        options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "evidence_settled": True}
+        flight = plan.descend(objective, best.p, solver, tell, best.states, ceiling=ceiling, **options)
+        return self._below_physics(flight)
+
+    def _below_physics(self, flight: Flight) -> Flight:
+        """The run, or the best iterate of it where over whole experiments its end is above physics alone."""
+        physics = self.physics
+        if physics is None or flight.mean_square <= physics.mean_square or not flight.end.path:
+            return flight
+        objective, end, plan = flight.objective, flight.end, self.plan
+        looked = np.unique(np.linspace(0, len(end.path) - 1, _LOOKED_AT).astype(int))
+        losses = [plan.mean_square(*objective.place(end.path[i])[1:]) for i in looked]
+        if not np.isfinite(losses).any():
+            return flight
+        best = int(np.nanargmin(losses))
+        flown = objective.fly(end.path[looked[best]], Start(objective.initial.measured))
+        return flight._replace(
+            end=end._replace(flown=flown, linear=objective.linearise(flown)),
+            mean_square=min(losses[best], physics.mean_square),  # its own start differs by rounding
+        )
+
+    def loss(self, run: Flight) -> float:
+        """The run's `mean_square`."""
+        return run.mean_square
+
+    def learned(self, run: Flight) -> Learned:
+        """The learner as a run left it, with the statistics of its errors."""
+        end, objective = run.end, run.objective
+        linear, rms = end.linear, objective.rms
+        gram = None if linear is None else linear.information * rms**2
+
+        def middle(noise: Matrix) -> Matrix:
+            """ΣψᵀΣ_eψ of the rows of `gram`. They are white where `weight` made them so."""
+            assert gram is not None
+            change = objective.weight @ np.linalg.inv(self.problem.weight.matrix)  # of errors in whitened outputs
+            white = change @ noise @ change.T * rms**2
+            return gram * float(np.trace(white)) / len(white)
+
+        return Learned(
+            bound=self.bound,
+            weights=end.flown.w,
+            scaling=self.plan.scaling,
+            unit=self.plan.unit,
+            ending=end.ending,
+            iterations=run.iterations,
+            seconds=run.seconds,
+            effective=end.effective,
+            gram=gram,
+            ridge=end.ridge * rms**2,
+            middle=middle,
+            coefficients=end.flown.c,
+            errors=self._errors(run),
+            scores=self._scores(run),
+        )
+
+    def _errors(self, run: Flight) -> ErrorStatistics:
+        """Noise covariance of the free run and Cov θ̂ from its sensitivities."""
+        end, objective = run.end, run.objective
+        theta, nt = end.flown.theta, objective.physics
+        freedom = self.plan.segments.count - (nt + end.effective) / len(objective.weight)
+        noise = self.plan.noise(objective, end)
+        held = () if objective.bounds is None else zip(theta, *objective.bounds, strict=True)
+        at_bound = {i: float(value) for i, (value, *ends) in enumerate(held) if value in ends}
+        covariance = None
+        if noise is not None and end.linear is not None:
+            covariance = self._covariance(objective, end, noise, tuple(at_bound))
+        return ErrorStatistics(noise, covariance, freedom, run.mean_square, at_bound)
+
+    def _scores(self, run: Flight) -> FreeRunScores | None:
+        """What robust standard errors are made of; None for a run that ended nowhere."""
+        flown, linear, objective = run.end.flown, run.end.linear, run.objective
+        if linear is None or not run.end.ending.usable:
+            return None
+        rows = objective.start_rows
+        missed = np.moveaxis(objective.initial.measured - flown.states, -1, 1)
+        return FreeRunScores(
+            dynamics=objective.dynamics,
+            numbers=self.plan.numbers(flown.c, flown.w),
+            segments=objective.segments,
+            states=flown.states,
+            weight=objective.weight,
+            unit=objective.rms**2,
+            slope=linear.start.slope,
+            pull=missed @ (rows.T @ rows) if objective.initial.free else None,
+        )
+
+    def _covariance(
+        self, objective: FreeRunObjective, end: Descent, noise: Matrix, at_bound: tuple[int, ...]
+    ) -> Matrix | None:
+        assert end.linear is not None
+        information = objective.theta_information(end.linear, end.flown.w)
+        white = objective.weight @ noise @ objective.weight.T
+        return theta_block(information, end.ridge, objective.physics, at_bound) * float(np.trace(white)) / len(white)

@@ -1,0 +1,276 @@
+"""The fitted motion ẋ = f(x, u; p) + learner, y = h(x, u; p): free runs, predictions, and what acts in it.
+
+A run starts from a state that was not measured. It is estimated from the first rows of the record, or, for a prediction,
+from a window of rows before it: the state from which a free run over the window follows the measured outputs best.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._base.checks import Matrix, Vector, as_signal, check_count
+from orthaug._base.errors import InputError
+from orthaug._base.jax import Array, jax, padded_length
+from orthaug.data.record import Channel, Experiment, Record
+from orthaug.models.dynamics import Numbers, Parts
+from orthaug.models.moving import Moving
+from orthaug.models.on_records import OnRecords, trajectory
+from orthaug.models.response import Response, Trajectory
+from orthaug.models.settling import Windows, settle
+from orthaug.models.statistics import Statistics
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FIRST_ROWS = 64  # that tell where a free run starts
+_WITHIN = 1e-9  # of a feature's half width: the largest of training is no extrapolation
+_SIDE_BY_SIDE = 2048  # windows of predictions
+_GUESS_ITERATIONS, _WINDOW_ITERATIONS = 30, 6
+
+
+@partial(jax.jit, static_argnames="form")
+def _run(
+    form: Moving, numbers: Numbers, state: Float[Array, "n0"], inputs: Float[Array, "T nu"]
+) -> tuple[Float[Array, "T n0"], Float[Array, "T ny"]]:
+    """States and outputs of a free run."""
+
+    def step(state: Any, row: Any) -> tuple[Any, tuple[Any, Any]]:
+        following, parts = form.step(numbers, state, row)
+        return following, (state, parts.total)
+
+    return jax.lax.scan(step, state, inputs)[1]
+
+
+@partial(jax.jit, static_argnames="form")
+def _last(
+    form: Moving, numbers: Numbers, states: Float[Array, "n0 m"], inputs: Float[Array, "T nu m"]
+) -> Float[Array, "ny m"]:
+    """The last output of runs side by side."""
+    side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row), -1, -1)
+
+    def step(state: Any, row: Any) -> tuple[Any, None]:
+        return side_by_side(state, row)[0], None
+
+    states = jax.lax.scan(step, states, inputs[:-1])[0]
+    return side_by_side(states, inputs[-1])[1].total
+
+
+@partial(jax.jit, static_argnames="form")
+def _acting(
+    form: Moving, numbers: Numbers, states: Float[Array, "T n0"], inputs: Float[Array, "T nu"]
+) -> tuple[Float[Array, "T n0"], Float[Array, "T n0"]]:
+    return jax.vmap(lambda x, u: form.rates(numbers, x, u))(states, inputs)
+
+
+@dataclass(frozen=True, eq=False)
+class MotionModel(OnRecords):
+    """A fitted motion; `estimate` makes it, `orthaug.save` and `orthaug.load` keep it.
+
+    `window` rows tell a state from which to predict. `weight` (ny, ny) is the inner product of the outputs; `loose`
+    (nx,) how far a state may be from its guess. `deviation` (ny,) is that of the training outputs.
+    """
+
+    form: Moving
+    numbers: Numbers
+    """θ are the coordinates of the physical parameters, θ − θ_aux those beside the learner."""
+    outputs: tuple[Channel, ...]
+    inputs: tuple[Channel, ...]
+    sampling_time: float
+    structure: str
+    largest_output: Vector
+    deviation: Vector
+    weight: Matrix
+    loose: Vector
+    window: int
+    measure: str = field(default="training", kw_only=True)
+    time_column: str | None = None
+    statistics: Statistics = Statistics()  # noqa: RUF009  (frozen)
+
+    def __repr__(self) -> str:
+        learner = self.form.bound.learner if self.form.bound else "none"
+        return f"MotionModel({', '.join(f'{k} = {v:.5g}' for k, v in self.parameters.items())}, learner: {learner})"
+
+    @property
+    def theta(self) -> Vector:
+        """The coordinates of the physical parameters (np,)."""
+        return np.asarray(self.numbers.theta)
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """The physical parameters by name."""
+        values = self.form.motion.coordinates.physical(self.theta)
+        return {name: float(value) for name, value in zip(self.form.motion.names, values, strict=True)}
+
+    @property
+    def alone(self) -> MotionModel:
+        """Its physics without the learner."""
+        numbers = self.numbers._replace(theta_aux=np.zeros_like(self.theta), weights=np.zeros(0))
+        return replace(self, form=self.form.alone, numbers=numbers)
+
+    def simulate(self, record: Record, initial: str | Any = "measured") -> Response:
+        """Free run from the first row on.
+
+        `baseline` is the output of the physics alone from the same start, `learner` the difference.
+
+        Args:
+            record: inputs, and outputs where they are measured.
+            initial: "measured" (the state by which a free run follows the first rows of the record best), "zero", or an
+                array (rows, ny) of outputs to follow instead.
+
+        Raises:
+            InputError: other channels, no rows, or initial values that are not there.
+        """
+        record = self.fitting(record, need_outputs=False)
+        trajectories = [self._free_run(experiment, record, initial) for experiment in record.experiments]
+        return Response(tuple(trajectories), None, self.outputs, record.sampling_time)
+
+    def predict(self, record: Record, horizon: int = 1) -> Response:
+        """Predict each row from a state that was estimated over the `window` rows up to `horizon` samples before it.
+
+        Raises:
+            InputError: a record without outputs, other channels, a horizon below 1, too few rows.
+        """
+        horizon = check_count(horizon, "horizon", of="steps")
+        record = self.fitting(record, need_outputs=True)
+        trajectories = [self._ahead(experiment, record, horizon) for experiment in record.experiments]
+        return Response(tuple(trajectories), horizon, self.outputs, record.sampling_time)
+
+    def components(self, record: Record) -> Response:
+        """The free run in its parts."""
+        return self.simulate(record)
+
+    def states(self, record: Record, initial: str | Any = "measured") -> pd.DataFrame:
+        """The states of a free run, and, of each learned equation, what physics and learner add to its rate."""
+        import pandas as pd
+
+        record = self.fitting(record, need_outputs=False)
+        motion, frames = self.form.motion, []
+        for experiment in record.experiments:
+            start = self._start(experiment, initial, record)
+            inputs = self.form.inputs(experiment, record)
+            states, _ = self._follow(self.form, self.numbers, start, inputs)
+            physics, learner = (
+                np.asarray(part) for part in _acting(self.form, self.numbers, states, experiment.inputs)
+            )
+            time = experiment.start_time + np.arange(len(states)) * self.sampling_time
+            columns = {"time": time} | {name: states[:, i] for i, name in enumerate(motion.names_of_states)}
+            for i in motion.learned[0]:
+                name = motion.names_of_states[i]
+                columns |= {f"{name}_physics": physics[:, i], f"{name}_learner": learner[:, i]}
+            frames.append(pd.DataFrame(columns))
+        return pd.concat(frames, ignore_index=True)
+
+    def check_initial(self, initial: Any) -> Matrix:
+        """Outputs of the first rows (rows, ny).
+
+        Raises:
+            InputError: no rows, or not one column per output.
+        """
+        if isinstance(initial, str):
+            raise InputError(f"`initial` must be 'measured', 'zero' or an array; got '{initial}'.")
+        rows = as_signal(initial, "initial")
+        if rows.shape[1] != len(self.outputs):
+            raise InputError(f"`initial` has {rows.shape[1]} columns; expected one per output, {len(self.outputs)}.")
+        return rows
+
+    def _free_run(self, experiment: Experiment, record: Record, initial: str | Any) -> Trajectory:
+        start = self._start(experiment, initial, record)
+        inputs = self.form.inputs(experiment, record)
+        states, whole = self._follow(self.form, self.numbers, start, inputs)
+        if self.form.bound is None:
+            physics = whole
+        else:
+            alone = self.alone
+            physics = self._follow(alone.form, alone.numbers, start, inputs)[1]
+            physics = np.where(np.isfinite(physics), physics, np.nan)
+        with np.errstate(all="ignore"):
+            parts = Parts(physics, whole - physics, whole - physics)
+        measured = experiment.outputs if record.outputs else None
+        bounded = self.bounded(parts, experiment, measured)
+        if bounded.diverged is not None:
+            return bounded
+        return replace(bounded, outside=self._outside(states, self.form.now(inputs)))
+
+    def _follow(self, form: Moving, numbers: Numbers, start: Vector, inputs: Matrix) -> tuple[Matrix, Matrix]:
+        rows = len(inputs)
+        padded = np.concatenate([inputs, np.repeat(inputs[-1:], padded_length(rows) - rows, axis=0)])
+        states, outputs = _run(form, numbers, start, padded)
+        return np.asarray(states)[:rows], np.asarray(outputs)[:rows]
+
+    def _outside(self, states: Matrix, inputs: Matrix) -> Any:
+        """Where the learner's features lie outside those of training, (N,)."""
+        if self.form.bound is None:
+            return None
+        with np.errstate(all="ignore"):
+            seen = np.asarray(self.form.seen(states.T, inputs.T, np)).T
+            scaled = (seen - self.numbers.centre) / self.numbers.halfwidth
+            return ~(np.abs(scaled) <= 1 + _WITHIN).all(axis=1)
+
+    def _start(self, experiment: Experiment, initial: str | Any, record: Record) -> Vector:
+        """The state at the first row."""
+        if isinstance(initial, str) and initial == "zero":
+            return np.zeros(self.form.states)
+        if isinstance(initial, str) and initial == "measured":
+            if not record.outputs:
+                raise InputError(
+                    "the record has no measured outputs to start from; use initial='zero' or give the values."
+                )
+            rows = experiment.outputs
+        else:
+            rows = self.check_initial(initial)
+        rows = rows[: max(FIRST_ROWS, self.window)]
+        inputs = self.form.inputs(experiment, record)[: len(rows)]
+        rows = rows[: len(inputs)]
+        size = padded_length(len(rows))
+        windows = Windows(_padded(inputs, size), _padded(rows, size), (np.arange(size) < len(rows))[:, None])
+        guess = self.form.start(rows, [0]).T
+        settled = settle(self.form, self.numbers, guess, windows, self.weight, self.loose, _GUESS_ITERATIONS)[0]
+        return settled[:, 0]
+
+    def _ahead(self, experiment: Experiment, record: Record, horizon: int) -> Trajectory:
+        first = self.window + horizon - 1
+        self.check_rows(experiment, first)
+        outputs = self._predicted(experiment, record, horizon, self.window)
+        parts = Parts(outputs, np.zeros_like(outputs), np.zeros_like(outputs))
+        return trajectory(parts, experiment, experiment.outputs, first)
+
+    def _predicted(
+        self, experiment: Experiment, record: Record, horizon: int, window: int
+    ) -> Float[np.ndarray, "r ny"]:
+        """The outputs from row `window + horizon - 1` on, each `horizon` steps after a window."""
+        steps = window + horizon
+        inputs = self.form.inputs(experiment, record)
+        run = self._follow(self.form, self.numbers, self._start(experiment, "measured", record), inputs)[0]
+        begins = np.arange(len(inputs) - steps + 1)
+        states = self.form.start(experiment.outputs, begins)
+        hidden = [i for i, state in enumerate(self.form.motion.states) if state.from_output is None]
+        with np.errstate(all="ignore"):
+            known = np.isfinite(run[begins]).all(axis=1, keepdims=True)
+        states[:, hidden] = np.where(known, run[begins], states)[:, hidden]
+        scored = (np.arange(steps) < window)[:, None]
+        pieces = []
+        for begin in range(0, len(begins), _SIDE_BY_SIDE):
+            chosen = begins[begin : begin + _SIDE_BY_SIDE]
+            padded = np.concatenate(
+                [chosen, np.repeat(chosen[-1:], min(_SIDE_BY_SIDE, padded_length(len(begins))) - len(chosen))]
+            )
+            rows = padded[None, :] + np.arange(steps)[:, None]
+            windows = Windows(
+                np.moveaxis(inputs[rows], -1, 1),
+                np.moveaxis(experiment.outputs[rows], -1, 1),
+                np.broadcast_to(scored, rows.shape),
+            )
+            settled = settle(
+                self.form, self.numbers, states[padded].T, windows, self.weight, self.loose, _WINDOW_ITERATIONS
+            )[0]
+            pieces.append(np.asarray(_last(self.form, self.numbers, settled, windows.inputs)).T[: len(chosen)])
+        return np.concatenate(pieces)
+
+
+def _padded(rows: Matrix, size: int) -> Float[np.ndarray, "T n 1"]:
+    return np.concatenate([rows, np.repeat(rows[-1:], size - len(rows), axis=0)])[..., None]

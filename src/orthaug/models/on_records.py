@@ -1,0 +1,96 @@
+"""What every fitted model does with a record: match its channels and rows, and cut a run that left all bounds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import Matrix, Vector, check_type
+from orthaug._base.errors import InputError, shown
+from orthaug.data.record import Channel, Experiment, Record, same_step
+from orthaug.models.dynamics import Dynamics, Parts
+from orthaug.models.response import Trajectory
+
+RUNAWAY = 1e6  # times the largest training output: a free run beyond this has diverged
+
+
+class OnRecords:
+    """A model of some channels at a sampling time."""
+
+    form: Dynamics
+    outputs: tuple[Channel, ...]
+    inputs: tuple[Channel, ...]
+    sampling_time: float
+    largest_output: Vector
+
+    def bounded(self, parts: Parts, experiment: Experiment, measured: Matrix | None) -> Trajectory:
+        """A free run cut where it left all bounds."""
+        whole = trajectory(parts, experiment, measured, self.form.first_row)
+        with np.errstate(all="ignore"):
+            wild = ~(np.abs(whole.model[self.form.first_row :]) <= RUNAWAY * self.largest_output)
+        if not wild.any():
+            return whole
+        step = int(np.argmax(wild.any(axis=1)))
+        output = self.outputs[int(np.argmax(wild[step]))].name
+        cut = Parts(*(np.where(np.arange(len(part))[:, None] < step, part, np.nan) for part in parts))
+        bounded = trajectory(cut, experiment, measured, self.form.first_row)
+        return replace(bounded, diverged=(step + self.form.first_row, output))
+
+    def check_rows(self, experiment: Experiment, first: int) -> None:
+        """Raises InputError where an experiment ends before the row `first`."""
+        if len(experiment) <= first:
+            name = experiment.source or "the record"
+            raise InputError(f"{name} has {len(experiment)} rows, too few: the first value is at row {shown(first)}.")
+
+    def _wanted(self, with_outputs: bool) -> str:
+        """A record of the model's channels, in the words of Python."""
+        given = {
+            "u": ("inputs", self.inputs),
+            "y": ("outputs", self.outputs if with_outputs or not self.inputs else ()),
+        }
+        arrays = [f"{name}={name}" for name, (_, channels) in given.items() if channels]
+        names = [f"{kind}={[c.name for c in channels]}" for kind, channels in given.values() if channels]
+        arguments = ", ".join([*arrays, *names, f"sampling_time={self.sampling_time:g}"])
+        return f"a Record, such as Record.from_arrays({arguments})"
+
+    def fitting(self, record: Record, *, need_outputs: bool) -> Record:
+        """The record's channels in the model's order, by name.
+
+        Raises:
+            InputError: a channel is missing, or the sampling time differs by more than 0.1 %.
+        """
+        check_type(record, Record, "record", self._wanted(need_outputs))
+        if not same_step(record.sampling_time, self.sampling_time):
+            raise InputError(
+                f"the record is sampled every {record.sampling_time:g} s, the model every {self.sampling_time:g} s; "
+                "resample the record."
+            )
+        with_outputs = need_outputs or bool(record.outputs)
+        names = {kind: [c.name for c in getattr(record, kind)] for kind in ("inputs", "outputs")}
+        wanted = {"inputs": self.inputs, "outputs": self.outputs if with_outputs else ()}
+        for kind, channels in wanted.items():
+            missing = [c.name for c in channels if c.name not in names[kind]]
+            if missing:
+                there = ", ".join(names[kind]) or "none"
+                raise InputError(f"the record lacks the {kind[:-1]} {', '.join(missing)} of the model; it has {there}.")
+        order = {kind: [names[kind].index(c.name) for c in channels] for kind, channels in wanted.items()}
+        experiments = tuple(
+            replace(e, inputs=e.inputs[:, order["inputs"]], outputs=e.outputs[:, order["outputs"]])
+            for e in record.experiments
+        )
+        return Record(self.inputs, wanted["outputs"], record.sampling_time, experiments)
+
+
+def trajectory(parts: Parts, experiment: Experiment, measured: Matrix | None, first: int) -> Trajectory:
+    """Parts from a row on as a trajectory of the whole experiment."""
+
+    def whole(values: Any) -> Matrix:
+        padded = np.full((len(experiment), values.shape[1]), np.nan)
+        padded[first:] = values
+        return padded
+
+    return Trajectory(
+        whole(parts.baseline), whole(parts.learner), whole(parts.raw), measured, first, experiment.start_time
+    )

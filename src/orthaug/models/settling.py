@@ -1,0 +1,120 @@
+"""States by which runs follow what was measured: least squares on the starts alone, of many windows side by side.
+
+A damped Gauss-Newton iteration on every start by itself. Starts that a window does not show stay near the guess.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.jax import Array, jax, jnp
+from orthaug.models.dynamics import Dynamics, Numbers
+
+_FIRST_DAMPING = 1e-3
+_SETTLED = 1e-10  # relative decrease that ends the iteration
+
+
+class Windows(NamedTuple):
+    """Stretches of measured rows side by side; the last axis counts them. Only rows that are scored count."""
+
+    inputs: Float[Any, "T nu m"]
+    target: Float[Any, "T ny m"]
+    scored: Any
+    """(T, m)."""
+
+
+def settle(
+    form: Dynamics,
+    numbers: Numbers,
+    states: Float[np.ndarray, "n0 m"],
+    windows: Windows,
+    weight: Matrix,
+    loose: Vector,
+    iterations: int = 12,
+) -> tuple[Float[np.ndarray, "n0 m"], Vector]:
+    """The states at the windows' first rows that lower `‖weight e‖²` most, and its value (m,).
+
+    Args:
+        states: where to begin.
+        loose: (n0,) how far a state may be from there before that counts as much as one error.
+    """
+    begun = np.asarray(states, dtype=float)
+    prior = 1 / np.asarray(loose, dtype=float) ** 2
+    best, damping = begun, np.full(begun.shape[1], _FIRST_DAMPING)
+    matrix, right, misfit = _linearised(form, numbers, begun, windows, weight, begun, prior)
+    for _ in range(iterations):
+        trial = best + _steps(matrix, right, damping)
+        there = _linearised(form, numbers, trial, windows, weight, begun, prior)
+        with np.errstate(all="ignore"):
+            lower = there[2] < misfit
+            gained = np.where(lower, (misfit - there[2]) / misfit, 0.0)
+        best = np.where(lower, trial, best)
+        matrix = np.where(lower[:, None, None], there[0], matrix)
+        right, misfit = np.where(lower[:, None], there[1], right), np.where(lower, there[2], misfit)
+        damping = np.where(lower, damping / 8, damping * 8)
+        if not (gained > _SETTLED).any() and (damping.min(initial=1.0) > 1 or not lower.any()):
+            break
+    return best, misfit
+
+
+def _steps(
+    matrix: Float[np.ndarray, "m n0 n0"], right: Float[np.ndarray, "m n0"], damping: Vector
+) -> Float[np.ndarray, "n0 m"]:
+    size = np.diagonal(matrix, axis1=1, axis2=2)
+    damped = matrix + (damping[:, None] * size)[:, :, None] * np.eye(matrix.shape[1])
+    sound = np.isfinite(damped).all(axis=(1, 2)) & np.isfinite(right).all(axis=1)
+    damped = np.where(sound[:, None, None], damped, np.eye(matrix.shape[1]))
+    right = np.where(sound[:, None], right, 0.0)
+    return np.linalg.solve(damped, right[..., None])[..., 0].T
+
+
+def _linearised(
+    form: Dynamics, numbers: Numbers, states: Matrix, windows: Windows, weight: Matrix, begun: Matrix, prior: Vector
+) -> tuple[np.ndarray, np.ndarray, Vector]:
+    """Normal matrix (m, n0, n0), right-hand side (m, n0) and misfit (m,), infinite where a run is not finite."""
+    gram, square = (np.asarray(part) for part in _gram(form, numbers, states, *windows, weight))
+    n0, gone = len(states), begun - states
+    matrix = np.moveaxis(gram[:, :n0], -1, 0) + np.diag(prior)
+    right = np.moveaxis(gram[:, n0], -1, 0) + (prior[:, None] * gone).T
+    with np.errstate(all="ignore"):
+        misfit = square + prior @ gone**2
+    return matrix, right, np.where(np.isfinite(misfit), misfit, np.inf)
+
+
+@partial(jax.jit, static_argnames="form")
+def _gram(
+    form: Dynamics,
+    numbers: Numbers,
+    states: Float[Array, "n0 m"],
+    inputs: Float[Array, "T nu m"],
+    target: Float[Array, "T ny m"],
+    scored: Any,
+    weight: Float[Array, "ny ny"],
+) -> tuple[Float[Array, "n0 n0+1 m"], Float[Array, "m"]]:
+    """Gram matrix of the sensitivities to the start with themselves and the error, and the error's square."""
+    n0, m = states.shape
+
+    def both(state: Any, row: Any) -> Any:
+        following, parts = form.step(numbers, state, row)
+        return jnp.concatenate([following, parts.total])
+
+    def step(carry: tuple[Any, ...], row: tuple[Any, ...]) -> tuple[Any, None]:
+        state, slopes, gram, square = carry
+        inputs, target, there = row
+        value = jax.vmap(both, -1, -1)(state, inputs)
+        slope = jax.vmap(jax.jacfwd(both), -1, -1)(state, inputs)
+        slope = jnp.einsum("ijm,jnm->inm", jnp.where(jnp.isfinite(slope), slope, 0.0), slopes)
+        columns = jnp.concatenate([slope[n0:], (target - value[n0:])[:, None]], axis=1)
+        columns = jnp.einsum("oi,inm->onm", weight, jnp.where(there, columns, 0.0))
+        gram = gram + jnp.einsum("oim,ojm->ijm", columns[:, :n0], columns)
+        square = square + jnp.sum(columns[:, n0] ** 2, axis=0)
+        return (value[:n0], slope[:n0], gram, square), None
+
+    first = jnp.broadcast_to(jnp.eye(n0)[..., None], (n0, n0, m))
+    start = (states, first, jnp.zeros((n0, n0 + 1, m)), jnp.zeros(m))
+    return jax.lax.scan(step, start, (inputs, target, scored))[0][2:]
