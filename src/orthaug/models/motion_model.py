@@ -1,6 +1,6 @@
 """The fitted motion ẋ = f(x, u; p) + learner, y = h(x, u; p): free runs, predictions, and what acts in it.
 
-A run starts from a state that was not measured. It is estimated from the first rows of the record, or, for a prediction,
+A run starts from a state that was not measured. It is estimated from the first rows of the record or, for a prediction,
 from a window of rows before it: the state from which a free run over the window follows the measured outputs best.
 """
 

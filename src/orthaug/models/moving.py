@@ -20,8 +20,8 @@ from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import Differentiated, Numbers, Parts
 from orthaug.models.integrators import advance, held
 from orthaug.models.learners import Bound
-from orthaug.models.starts import guess
 from orthaug.physics.motion import Motion
+from orthaug.physics.starts import guess
 
 
 @dataclass(frozen=True)

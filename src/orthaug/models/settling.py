@@ -51,7 +51,7 @@ def settle(
         trial = best + _steps(matrix, right, damping)
         there = _linearised(form, numbers, trial, windows, weight, begun, prior)
         with np.errstate(all="ignore"):
-            lower = there[2] < misfit
+            lower = np.array(there[2] < misfit, ndmin=1)
             gained = np.where(lower, (misfit - there[2]) / misfit, 0.0)
         best = np.where(lower, trial, best)
         matrix = np.where(lower[:, None, None], there[0], matrix)
@@ -75,7 +75,7 @@ def _steps(
 
 def _linearised(
     form: Dynamics, numbers: Numbers, states: Matrix, windows: Windows, weight: Matrix, begun: Matrix, prior: Vector
-) -> tuple[np.ndarray, np.ndarray, Vector]:
+) -> tuple[Any, Any, Any]:
     """Normal matrix (m, n0, n0), right-hand side (m, n0) and misfit (m,), infinite where a run is not finite."""
     gram, square = (np.asarray(part) for part in _gram(form, numbers, states, *windows, weight))
     n0, gone = len(states), begun - states

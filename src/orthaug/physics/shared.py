@@ -71,14 +71,14 @@ def shared_directions(
     read = set(baseline.lags) if baseline.function is None else set(layout)
     if not names or not features.entries or _sees(features, read):
         return everything
-    start, end = _moves(features, layout, x)
+    start, end = moves(_values(features, layout), x)
     with np.errstate(all="ignore"):
         phi = [np.asarray(baseline.phi(rows, layout, tuple(outputs), np)) for rows in (start, end)]
     kept = np.isfinite(phi[0]).all(axis=(1, 2)) & np.isfinite(phi[1]).all(axis=(1, 2))
     if np.sum(kept) < _FEWEST * len(names):  # nothing is known: the paper's projection is right for any learner
         return everything
     before, after = (part[kept].reshape(-1, len(names)) for part in phi)
-    return Shared(names, _agreeing(before, after))
+    return Shared(names, agreeing(before, after))
 
 
 def seen(
@@ -95,7 +95,7 @@ def seen(
     """
     if _sees(features, layout):
         return np.ones(values(x[:1]).shape[1], dtype=bool)
-    start, end = _moves(features, layout, x)
+    start, end = moves(_values(features, layout), x)
     with np.errstate(all="ignore"):
         pairs = np.stack([values(start), values(end)])
         there = np.isfinite(pairs).all(axis=0)
@@ -110,7 +110,7 @@ def _sees(features: Features, lags: Iterable[Lag]) -> bool:
     return {str(lag) for lag in lags} <= {str(entry) for entry in features.entries}
 
 
-def _agreeing(before: Matrix, after: Matrix) -> Matrix:
+def agreeing(before: Matrix, after: Matrix) -> Matrix:
     """The directions a with `before a = after a`, relative to the size of `before a`, in reduced form."""
     scale = np.sqrt(np.mean(before**2 + after**2, axis=0))
     unit = 1 / np.where(scale > 0, scale, 1.0)
@@ -136,13 +136,21 @@ def _reduced(basis: Matrix, unit: Vector) -> Matrix:
     return reduced / unit[pivots]
 
 
-def _moves(
-    features: Features, layout: Layout, x: Float[np.ndarray, "N nx"]
+def _values(features: Features, layout: Layout) -> Callable[[Matrix], Matrix]:
+    return lambda rows: np.asarray(features.evaluate(rows, layout, np))
+
+
+def moves(
+    seen: Callable[[Matrix], Matrix], x: Float[np.ndarray, "N nx"]
 ) -> tuple[Float[np.ndarray, "M nx"], Float[np.ndarray, "M nx"]]:
-    """Pairs of regressors with equal features, of the size of the data's spread.
+    """Pairs of points with equal features, of the size of the data's spread.
 
     A step towards another row, or in any direction, is led back to the features' values by Newton's method; every other
     one along the null space of ∂z/∂x first. The free ones find other branches: −u beside u where the learner sees u².
+
+    Args:
+        seen: the features (M, nz) of points (M, nx).
+        x: where the moves begin.
     """
     rng = np.random.default_rng(_SEED)
     spread = np.where(x.std(axis=0) > 0, x.std(axis=0), np.maximum(np.abs(x).max(axis=0), 1.0))
@@ -153,7 +161,7 @@ def _moves(
 
     def values(rows: Matrix) -> Matrix:
         with np.errstate(all="ignore"):
-            return np.asarray(features.evaluate(rows, layout, np))
+            return seen(rows)
 
     def slopes(rows: Matrix) -> Float[np.ndarray, "M nz nx"]:
         columns = []

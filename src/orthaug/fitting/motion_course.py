@@ -1,0 +1,204 @@
+"""The course of a motion: its record laid out in segments whose starts are unknown states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.jax import Array, jax
+from orthaug.fitting.course import Course, Layout
+from orthaug.fitting.criteria import Criterion
+from orthaug.fitting.initial_states import InitialStates
+from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, errors_of
+from orthaug.fitting.segments import Segments, lay_segments
+from orthaug.fitting.structures import Structure
+from orthaug.models.dynamics import Numbers
+from orthaug.models.learners import Bound, Scaling
+from orthaug.models.motion_model import FIRST_ROWS
+from orthaug.models.moving import Moving
+from orthaug.models.settling import Windows, settle
+from orthaug.physics.motion_problem import MotionProblem
+
+LOOSE = 1e3  # times the size of a state: how far a start may be from its guess before that counts as one error
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MotionObjective(FreeRunObjective):
+    """`‖r‖²` of the free run, with starts that hardly cost anything."""
+
+    loose: Vector
+
+    @property
+    def start_rows(self) -> Matrix:
+        return np.diag(1 / self.loose)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MotionCourse(Course):
+    """A motion's record laid out in segments. `loose` (nx,) is how far a start may be from its guess."""
+
+    dynamics: Moving
+    problem: MotionProblem
+    loose: Vector
+
+    @classmethod
+    def of(cls, problem: MotionProblem, bound: Bound | None, criterion: Criterion) -> MotionCourse:
+        """Lay a record out as a criterion of several steps declares, for the motion with a learner of unit scaling.
+
+        Raises:
+            InputError: nothing would be scored.
+        """
+        record, flown = problem.record, criterion.flown
+        assert flown is not None, "a motion has no criterion one step ahead"
+        features = () if bound is None else problem.features
+        dynamics = Moving(problem.motion, features, bound, record.sampling_time, problem.substeps)
+        nz, nl = len(features), 0 if bound is None else bound.ny
+        return cls(
+            record=record,
+            dynamics=dynamics,
+            **Layout.of(record, dynamics, criterion)._asdict(),
+            criterion=criterion,
+            flown=flown,
+            rms=1.0,
+            deviation=problem.deviation,
+            output_weights=problem.weight.choice,
+            scaling=Scaling(np.zeros(nz), np.ones(nz)),
+            unit=np.ones(nl),
+            problem=problem,
+            loose=LOOSE * sizes(problem),
+        )
+
+    @property
+    def bound(self) -> Bound | None:
+        return self.dynamics.bound
+
+    @property
+    def alone(self) -> MotionCourse:
+        """The same segments without a learner."""
+        nothing = Scaling(np.zeros(0), np.ones(0))
+        return replace(self, dynamics=self.dynamics.alone, scaling=nothing, unit=np.ones(0))
+
+    def over(self, segment: int) -> MotionCourse:
+        """The same over segments of another length, without washout; 0 for whole experiments."""
+        segments = lay_segments(self.record, self.dynamics, segment, 0)
+        return replace(self, segments=segments, flown=replace(self.flown, segment=segment, washout=0))
+
+    def refined(self, substeps: int) -> MotionCourse:
+        """The same with other substeps of the integrator."""
+        dynamics = replace(self.dynamics, substeps=substeps)
+        finer = replace(self, dynamics=dynamics)
+        if dynamics.motion.hold != "spline":  # otherwise steps read the input at the points of the substeps
+            return finer
+        laid = Layout.of(self.record, dynamics, self.criterion)
+        segments = laid.segments if self.flown == self.criterion.flown else finer.over(self.flown.segment).segments
+        start = np.asarray(self.segments.start)
+        return replace(finer, segments=segments._replace(start=start), whole=laid.whole, colour=laid.colour)
+
+    def from_states(self, states: Float[np.ndarray, "k n0 m"]) -> MotionCourse:
+        """The same with segments that start there."""
+        return replace(self, segments=self.segments._replace(start=np.asarray(states)))
+
+    def objective(self, structure: Structure | None = None) -> MotionObjective:
+        """The criterion as a function of the parameters' coordinates and the weights."""
+        return MotionObjective(
+            dynamics=self.dynamics,
+            numbers=self.numbers,
+            segments=self.segments,
+            initial=InitialStates(np.asarray(self.segments.start), free=True),
+            weight=self.weight,
+            rms=self.rms,
+            deviation=self.deviation,
+            physics=len(self.problem.motion.parameters),
+            bounds=self.problem.motion.coordinates.bounds,
+            colour=None,
+            loose=self.loose,
+        )
+
+    @property
+    def weight(self) -> Matrix:
+        """(ny, ny), multiplies errors: they are then in the unit of what physics alone leaves."""
+        return self.problem.weight.matrix / self.rms
+
+    def settled(self, c: Vector, w: Any = (), segments: Segments | None = None, iterations: int = 12) -> np.ndarray:
+        """The starts (k, n0, m) by which the segments follow the outputs best."""
+        segments = self.segments if segments is None else segments
+        numbers, states = self.numbers(c, np.asarray(w)), []
+        for start, inputs, target, scored in zip(*map(np.asarray, segments), strict=True):
+            windows = Windows(inputs, target, scored)
+            made = (self.dynamics, numbers, start, windows, self.weight, self.loose, iterations)
+            states.append(settle(*made)[0])
+        return np.stack(states)
+
+    def mean_square(self, c: Vector, w: Any, tilt: Any = None) -> float:
+        """Mean of squared errors over whole experiments, in deviations of the outputs; NaN where it diverges.
+
+        A whole experiment starts where a free run follows its first rows best.
+        """
+        longest = min(FIRST_ROWS, self.whole.steps)
+        inputs, target, scored = (np.asarray(part)[:, :longest] for part in self.whole[1:])
+        first = Segments(self.whole.start, inputs, target, scored)
+        with np.errstate(all="ignore"):
+            start = self.settled(c, w, first, 30)
+            errors = errors_of(self.dynamics, self.numbers(c, w), start, self.whole)
+            scaled = errors / self.deviation[:, None]
+            mean = float(np.sum(scaled**2)) / (self.whole.count * len(self.dynamics.outputs))
+        return mean if mean < RUNAWAY else np.nan
+
+    def trajectory(self, c: Vector, w: Any, states: Any) -> tuple[Matrix, Matrix]:
+        """States (N, nx) and inputs (N, nu) of the segments' runs from these starts, on the rows that are scored."""
+        runs = np.asarray(_states(self.dynamics, self.numbers(c, w), self.segments, states))  # (k, T, n0, m)
+        scored = np.moveaxis(np.asarray(self.segments.scored), -1, 1)
+        inputs = np.moveaxis(np.asarray(self.segments.inputs), -1, 1)[scored]
+        return np.moveaxis(runs, -1, 1)[scored], self.dynamics.now(inputs)
+
+    def states_by_row(self, c: Vector, w: Any, states: Any) -> list[Matrix]:
+        """The states (N, nx) of every experiment, put together from the segments' runs."""
+        runs = np.moveaxis(np.asarray(_states(self.dynamics, self.numbers(c, w), self.segments, states)), -1, 1)
+        rows, place, found = runs.reshape(-1, *runs.shape[2:]), 0, []
+        steps, washout = self.segments.steps, min(self.flown.washout, self.segments.steps - 1)
+        for experiment in self.record.experiments:
+            own = np.zeros((len(experiment), self.dynamics.states))
+            for begin in range(0, len(experiment), steps - washout):
+                if begin and begin + washout >= len(experiment):
+                    break
+                first = begin + (washout if begin else 0)
+                last = min(begin + steps, len(experiment))
+                own[first:last] = rows[place][first - begin : last - begin]
+                place += 1
+            found.append(own)
+        return found
+
+    def starting_from(self, rows: list[Matrix]) -> MotionCourse:
+        """The same with segments that start at the states (N, nx) given for every row of every experiment."""
+        steps, washout = self.segments.steps, min(self.flown.washout, self.segments.steps - 1)
+        starts = []
+        for experiment, own in zip(self.record.experiments, rows, strict=True):
+            begins = [b for b in range(0, len(experiment), steps - washout) if b == 0 or b + washout < len(experiment)]
+            starts.append(own[begins])
+        flat = np.concatenate(starts)
+        k, n0, m = np.asarray(self.segments.start).shape
+        padded = np.concatenate([flat, np.zeros((k * m - len(flat), n0))])
+        padded = np.where(np.isfinite(padded), padded, 0.0)
+        return self.from_states(np.moveaxis(padded.reshape(k, m, n0), 1, -1))
+
+
+def sizes(problem: MotionProblem) -> Vector:
+    """How large each state is (nx,): of its guesses; 1 where nothing is known."""
+    size = np.abs(problem.looked_at[0]).max(axis=1)
+    return np.where(size > 0, size, 1.0)
+
+
+@partial(jax.jit, static_argnames="form")
+def _states(form: Moving, numbers: Numbers, segments: Segments, states: Float[Array, "k n0 m"]) -> Any:
+    """The states (k, T, n0, m) of every segment's run."""
+    side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row)[0], -1, -1)
+
+    def one_chunk(chunk: Any) -> Any:
+        return jax.lax.scan(lambda state, row: (side_by_side(state, row), state), *chunk)[1]
+
+    return jax.lax.map(one_chunk, (states, segments.inputs))

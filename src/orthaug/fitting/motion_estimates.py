@@ -1,0 +1,265 @@
+"""The result of a motion's estimation: physical parameters with intervals, the model, and what may be doubted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from orthaug._base.checks import Matrix, Vector, check_type
+from orthaug._base.warning import Warning
+from orthaug.fitting.criteria import Criterion
+from orthaug.fitting.estimates import Restart
+from orthaug.fitting.held_out import HeldOut
+from orthaug.fitting.motion_measures import field_under
+from orthaug.fitting.status import Status
+from orthaug.fitting.wobble import wobble
+from orthaug.inference.covariance import interval
+from orthaug.inference.measures import Measure, Training
+from orthaug.inference.motion_split import MotionSplit, split_motion
+from orthaug.models.dynamics import Numbers
+from orthaug.models.motion_model import MotionModel
+from orthaug.models.statistics import column_units
+from orthaug.physics.motion_problem import MotionProblem
+from orthaug.physics.shared import Shared
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from orthaug.fitting.motion_course import MotionCourse
+
+_UNSEEN = 1e-3  # share of a parameter in directions that no output shows, above which it is not identified
+_ROUNDING = 1e-11  # of the largest eigenvalue of the information with unit columns
+
+
+@dataclass(frozen=True, eq=False)
+class MotionEstimate:
+    """What `estimate` returns for a motion. Print `fit.summary()`; use `fit.model`; read `fit.parameters`."""
+
+    model: MotionModel
+    status: Status
+    restarts: tuple[Restart, ...]
+    covariance: Matrix | None
+    """Covariance of the parameters' coordinates (np, np), NaN where one has none; None where there is none at all."""
+    freedom: float
+    effective_weights: float
+    defect: float | None
+    """How much of the learner the shared directions of the physics could express; None without one."""
+    problem: MotionProblem = field(repr=False)
+    criterion: Criterion
+    split_by: MotionSplit = field(repr=False)
+    course: MotionCourse = field(repr=False)
+    states: Any = field(repr=False)
+    """The segments' starts, as estimated."""
+    slope: Any = field(repr=False)
+    """How they follow the unknowns (k, m, nx, n), less its sign; None where that is not known."""
+    alone: Vector = field(repr=False)
+    """The coordinates of physics alone, where the nearest physics is searched from."""
+    at_bound: tuple[str, ...] = ()
+    unidentified: tuple[str, ...] = ()
+    """Parameters that no output tells beside the learner."""
+    held_out: HeldOut | None = None
+    warnings: tuple[Warning, ...] = ()
+
+    @property
+    def theta(self) -> Vector:
+        """The coordinates of p̂ (np,)."""
+        return self.model.theta
+
+    @property
+    def shared(self) -> Shared:
+        """The directions of the parameters' coordinates that the learner could imitate."""
+        return self.split_by.shared
+
+    @property
+    def values(self) -> Vector:
+        """p̂ (np,)."""
+        return self.problem.motion.coordinates.physical(self.theta)
+
+    @property
+    def std(self) -> Vector | None:
+        """Standard errors of p̂ (np,), NaN where one has none."""
+        if self.covariance is None:
+            return None
+        return np.sqrt(np.diag(self.covariance)) * np.abs(self.problem.motion.coordinates.slopes(self.theta))
+
+    @property
+    def interval(self) -> Matrix | None:
+        """95 % intervals of p̂ (np, 2); those of positive parameters are positive."""
+        if self.covariance is None:
+            return None
+        ends = interval(self.theta, np.sqrt(np.diag(self.covariance)), max(self.freedom, 1.0))
+        return np.stack([self.problem.motion.coordinates.physical(side) for side in ends.T], axis=-1)
+
+    @cached_property
+    def parameters(self) -> pd.DataFrame:
+        """Table with a row per parameter: unit, initial, value, std, the 95 % interval, and whether it is shared."""
+        import pandas as pd
+
+        motion = self.problem.motion
+        nothing = np.full(len(motion.names), np.nan)
+        ci = self.interval if self.interval is not None else np.stack([nothing, nothing], axis=-1)
+        return pd.DataFrame(
+            {
+                "unit": [p.unit for p in motion.parameters],
+                "initial": motion.initial,
+                "value": self.values,
+                "std": self.std if self.std is not None else nothing,
+                "ci95_low": ci[:, 0],
+                "ci95_high": ci[:, 1],
+                "shared": [name not in self.shared.untouched for name in motion.names],
+            },
+            index=pd.Index(motion.names, name="parameter"),
+        )
+
+    def split(self, measure: Measure, shared: str = "auto") -> MotionEstimate:
+        """The same fitted motion with p̂ under another measure over states and inputs, without training.
+
+        Args:
+            measure: such as `Uniform({"v": (-1, 1)})`, by the names of states and inputs.
+            shared: "auto" for the directions that the learner could imitate, "all" for all.
+
+        Raises:
+            InputError: a measure that does not fit the motion.
+        """
+        check_type(measure, Measure, "measure", "a measure such as Uniform()")
+        form, course = self.model.form, self.course
+        whole = fitted_numbers(self.model.numbers)
+        field, support, told = field_under(measure, course, whole, self.states)
+        moving = None
+        if isinstance(measure, Training) and self.slope is not None:
+            moving = partial(wobble, form, whole, course.segments, self.states, self.slope, field.size)
+        bounds = self.problem.motion.coordinates.bounds
+        options = {"everything": shared == "all", "wobble": moving}
+        split = split_motion(measure.name, form, whole, self.alone, field, bounds, **options)
+        return _with_split(self, replace(split, support=support), told)
+
+    def __repr__(self) -> str:
+        values = ", ".join(f"{n} = {v:.6g}" for n, v in zip(self.problem.motion.names, self.values, strict=True))
+        return f"MotionEstimate({self.status.code}, loss {self.status.loss:.3g}, {values})"
+
+    def summary(self) -> str:
+        """A page of text: status, parameters, what is shared, warnings."""
+        lines = motion_lines(self)
+        warnings = ["", *(f"warning: {warning}" for warning in self.warnings)] if self.warnings else []
+        return "\n".join([*lines, *warnings])
+
+
+def fitted_numbers(numbers: Numbers) -> Numbers:
+    """The numbers before any split: θ are those beside the learner."""
+    c = np.asarray(numbers.theta - numbers.theta_aux)
+    return numbers._replace(theta=c, theta_aux=np.zeros_like(c))
+
+
+def _with_split(fit: MotionEstimate, split: MotionSplit, told: tuple[Warning, ...] = ()) -> MotionEstimate:
+    """The estimate with p̂, its intervals and its warnings as a split gives them."""
+    motion, numbers = fit.problem.motion, fit.model.numbers
+    c = np.asarray(numbers.theta - numbers.theta_aux)
+    bounds = motion.coordinates.bounds
+    at_bound = tuple(n for n, q, low, high in zip(motion.names, split.q, *bounds, strict=True) if q <= low or q >= high)
+    covariance, unseen = _covariance(fit, split, at_bound)
+    warnings = [*told, *_doubts(split, at_bound, unseen, motion.names)]
+    model = replace(fit.model, numbers=numbers._replace(theta=split.q, theta_aux=split.q - c), measure=split.name)
+    own = {"not_unique", "at_a_bound", "not_identified", "measure_beyond_data"}
+    return replace(
+        fit,
+        model=model,
+        covariance=covariance,
+        defect=split.defect,
+        split_by=split,
+        at_bound=at_bound,
+        unidentified=unseen,
+        warnings=(*(w for w in fit.warnings if w.code not in own), *warnings),
+    )
+
+
+def _covariance(
+    fit: MotionEstimate, split: MotionSplit, at_bound: tuple[str, ...]
+) -> tuple[Matrix | None, tuple[str, ...]]:
+    """Cov q̂ = K Cov(c, w) Kᵀ, and which parameters no output tells."""
+    names = fit.problem.motion.names
+    statistics = fit.model.statistics
+    joint = statistics.joint(len(names))
+    if split.slope is None or joint is None:
+        return None, ()
+    gram = np.asarray(statistics.gram)
+    unit = column_units(gram, len(names))
+    values, vectors = np.linalg.eigh(gram * np.outer(unit, unit))
+    hidden = vectors[:, values <= _ROUNDING * values.max(initial=0.0)]
+    own = split.slope * unit
+    share = np.linalg.norm(own @ hidden, axis=1) / np.maximum(np.linalg.norm(own, axis=1), 1e-300)
+    unseen = tuple(name for name, part in zip(names, share, strict=True) if part > _UNSEEN)
+    covariance = joint.of(split.slope)
+    for i, name in enumerate(names):
+        if name in unseen or name in at_bound:
+            covariance[i] = covariance[:, i] = np.nan
+    return covariance, unseen
+
+
+def _doubts(
+    split: MotionSplit, at_bound: tuple[str, ...], unseen: tuple[str, ...], names: tuple[str, ...]
+) -> list[Warning]:
+    told = []
+    if split.slope is None:
+        text = (
+            "the distance between the fitted motion and the physics has no unique minimum near the estimate (it does "
+            f"not curve upwards, {split.curvature:.2g} of its curvature at a good fit), so there are no intervals: the "
+            "learner found something that several parameters could explain as well."
+        )
+        told.append(Warning("not_unique", text))
+    if at_bound:
+        text = f"at a bound: {', '.join(at_bound)}. What stands at a bound has no interval."
+        told.append(Warning("at_a_bound", text))
+    if unseen:
+        text = (
+            f"not identified beside the learner: {', '.join(unseen)}. Other values with another learner give the same "
+            "outputs, so there is no interval; let the learner see less, or add it to fewer equations."
+        )
+        told.append(Warning("not_identified", text))
+    return told
+
+
+def motion_lines(fit: MotionEstimate) -> list[str]:
+    """The lines of `MotionEstimate.summary` before its warnings."""
+    status, motion, bound, form = fit.status, fit.problem.motion, fit.model.form.bound, fit.model.form
+    seen = ", ".join(str(entry) for entry in form.features)
+    learner = "none"
+    if bound is not None:
+        learner = f"{bound.learner} of {seen}, {bound.size} weights, {fit.effective_weights:.1f} effective"
+    steps = f"{form.substeps} substep{'s' * (form.substeps > 1)}"
+    lines = [
+        f"motion      {', '.join(motion.names_of_states)}; {motion.integrator}, {steps}, {motion.hold} hold",
+        f"learner     {learner}",
+        f"data        {fit.problem.record!r}",
+        f"status      {status.code}, {status.iterations} iterations, {status.seconds:.2f} s, loss {status.loss:.6g}",
+    ]
+    if status.message:
+        lines.append(f"            {status.message}")
+    if bound is not None:
+        told = shared_in_words(fit.shared)
+        lines.append(f"shared      {told}")
+        lines.append(f"measure     {fit.split_by.name}")
+    width = max([9, *(len(name) for name in motion.names)])
+    lines += ["", f"{'parameter':<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  {'initial':>11}  unit"]
+    std, ci = fit.std, fit.interval
+    for i, parameter in enumerate(motion.parameters):
+        known = std is not None and ci is not None and np.isfinite(std[i])
+        spread = f"{std[i]:11.4g}" if known and std is not None else f"{'–':>11}"
+        reach = f"[{ci[i, 0]:13.7g}, {ci[i, 1]:13.7g}]" if known and ci is not None else f"{'–':^29}"
+        lines.append(
+            f"{parameter.name:<{width}}  {fit.values[i]:14.8g}  {spread}  {reach}  "
+            f"{parameter.initial:11.5g}  {parameter.unit}".rstrip()
+        )
+    return lines
+
+
+def shared_in_words(shared: Shared) -> str:
+    """What the learner could imitate, in words."""
+    if not shared.basis.size:
+        return "nothing: the fit tells all parameters from the learner"
+    if shared.all:
+        return "all parameters: they are those of the physics nearest to the fitted motion"
+    moved = [" with ".join(direction) for direction in shared.directions]
+    return f"{'; '.join(moved)} (by the nearest physics); told by the fit: {', '.join(shared.untouched) or 'none'}"

@@ -1,0 +1,119 @@
+"""Training of a motion on its free run: the parameters' coordinates, the weights and the segments' starts together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import Vector
+from orthaug._base.progress import RunTell, quiet
+from orthaug.data.record import Record
+from orthaug.fitting.course import Flight
+from orthaug.fitting.criteria import Criterion
+from orthaug.fitting.flights import FlightTask, Place
+from orthaug.fitting.initial_states import Start
+from orthaug.fitting.learned import ErrorStatistics, Learned
+from orthaug.fitting.motion_course import MotionCourse
+from orthaug.fitting.motion_physics import fly_motion
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.status import Ending
+from orthaug.fitting.structures import Structure
+from orthaug.models.learners import Bound, Learner, Scaling
+from orthaug.physics.motion_problem import MotionProblem
+
+
+@dataclass(frozen=True, eq=False)
+class MotionTask(FlightTask):
+    """A motion's course, and what its physics alone does on it."""
+
+    plan: MotionCourse
+    physics: Flight | None = None
+
+    @classmethod
+    def of(cls, problem: MotionProblem, learner: Learner | None, criterion: Criterion) -> MotionTask:
+        """Bind a learner to the equations and outputs that it is added to, and lay the record out.
+
+        Raises:
+            InputError: nothing would be scored.
+        """
+        states, outputs = problem.motion.learned
+        bound = None if learner is None else Bound(learner, len(problem.features), len(states) + len(outputs))
+        return cls(MotionCourse.of(problem, bound, criterion))
+
+    @property
+    def bound(self) -> Bound | None:
+        return self.plan.bound
+
+    @property
+    def rows_task(self) -> MotionTask:
+        return self
+
+    def on(self, record: Record) -> MotionTask:
+        """The same motion on another record."""
+        course = MotionCourse.of(self.problem.on(record), self.bound, self.criterion)
+        return MotionTask(course)
+
+    def physics_alone(self) -> tuple[MotionTask, Learned]:
+        """The task without a learner, and what physics alone leaves; without an end where it cannot fly."""
+        alone = replace(self, plan=self.plan.alone)
+        if self.physics is not None:
+            return alone, alone.learned(self.physics)
+        unknown = ErrorStatistics(None, None, 0.0, np.nan, {})
+        initial = self.problem.motion.coordinates.initial
+        nothing: dict[str, Any] = {"bound": None, "weights": np.zeros(0), "errors": unknown, "coefficients": initial}
+        return alone, Learned(scaling=alone.plan.scaling, unit=alone.plan.unit, ending=Ending.NON_FINITE, **nothing)
+
+    def prepared(self, solver: LevenbergMarquardt, structure: Structure, progress: RunTell = quiet) -> MotionTask:
+        """The same with physics alone trained. It gives the learner its scaling, and the criterion its unit."""
+        plan = self.plan
+
+        def tell(iteration: int, loss: float) -> None:
+            progress(iteration, loss / plan.residuals)
+
+        plan, physics = fly_motion(plan, solver, tell)
+        if physics is None:
+            return self
+        rms = float(np.sqrt(physics.end.flown.misfit / plan.residuals))
+        plan = replace(plan, rms=max(plan.rms * rms, 1e-10))
+        if not np.isfinite(physics.mean_square):
+            plan = replace(plan, whole=plan.segments)
+            physics = physics._replace(mean_square=plan.alone.mean_square(physics.end.flown.c, ()))
+        if self.bound is not None:
+            scaling, unit = _scaled(plan, physics)
+            plan = replace(plan, scaling=scaling, unit=unit)
+        return replace(self, plan=plan, physics=physics)
+
+    def places(
+        self,
+        objective: Any,
+        solver: LevenbergMarquardt,
+        w: Vector,
+        structure: Structure,
+        regularization: str | float,
+    ) -> list[Place]:
+        """Physics alone with a silent learner; a learner that cannot be silenced starts as it is."""
+        assert self.bound is not None
+        silenced = self.bound.silent(w)
+        q = self.problem.motion.coordinates.initial if self.physics is None else self.physics.end.flown.theta
+        p = np.concatenate([q, w if silenced is None else silenced])
+        states = objective.initial.measured
+        loss = objective.fly(p, Start(states)).loss
+        return [Place(p, states, loss if np.isfinite(loss) else np.inf, silenced is not None)]
+
+
+def _scaled(plan: MotionCourse, physics: Flight) -> tuple[Scaling, Vector]:
+    """The learner's features over the runs of physics alone, and the size of what it is added to."""
+    flown, motion = physics.end.flown, plan.problem.motion
+    x, u = (part.T for part in plan.alone.trajectory(flown.c, (), flown.states))
+    p = motion.coordinates.physical(flown.c)
+    with np.errstate(all="ignore"):
+        features = np.asarray(plan.dynamics.seen(x, u, np)).T
+        rates = np.asarray(motion.rates(x, u, p, np), dtype=float)
+    if motion.integrator == "discrete":
+        rates = rates - x
+    size = np.concatenate([rates[list(motion.learned[0])].std(axis=1), plan.deviation[list(motion.learned[1])]])
+    finite = features[np.isfinite(features).all(axis=1)]
+    scaling = Scaling.fit(finite if len(finite) else np.zeros((1, features.shape[1])))
+    return scaling, np.where(np.isfinite(size) & (size > 0), size, 1.0)

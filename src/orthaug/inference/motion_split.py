@@ -1,0 +1,284 @@
+"""The nearest physics of a fitted motion, p̂ = argmin_p Σ_μ ‖G − f(·; p)‖², along what a learner could imitate.
+
+G = f(·; c) + g is the fitted field over points of states and inputs; only learned equations and outputs count. p̂
+depends on G and the measure alone, not on how G was put together. For f linear in p it is `θ = c + B (Φ_μ B)⁺ F_μ`.
+
+Intervals come from the stationarity of p̂ by the implicit function theorem: with φ the sum and q the coordinates of p,
+`B'φ_qq B ds = −B'(φ_qc + φ_qq) dc − B'φ_qw dw − B' Σ φ_qx dx`. The last term counts that the points themselves are
+those of the fitted run. p̂ is unique near by only if B'φ_qq B is positive definite.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.jax import Array, jax, jnp
+from orthaug.models.dynamics import Numbers
+from orthaug.models.moving import Moving
+from orthaug.physics.shared import Shared, agreeing, moves
+
+_BATCH = 4096  # points at a time
+_ITERATIONS = 30
+_SETTLED = 1e-12  # of a step, relative
+_FEWEST = 4  # moves that succeed, for each parameter
+
+
+class Field(NamedTuple):
+    """Points (M, nx) and (M, nu) with weights (M,), and the size (nl,) of each learned equation and output."""
+
+    x: Matrix
+    u: Matrix
+    weight: Vector
+    size: Vector
+
+
+@dataclass(frozen=True, eq=False)
+class MotionSplit:
+    """q̂ (np,) of p̂ and how it follows (c, w): `slope` (np, np + nw); None where p̂ is not unique."""
+
+    name: str
+    q: Vector
+    shared: Shared
+    slope: Matrix | None
+    defect: float | None
+    """‖projection of the rest on the shared directions‖ / ‖g‖ over the measure."""
+    share: float | None
+    """‖learner‖ / ‖field‖ of the learned equations over the measure, after the split."""
+    curvature: float
+    """Smallest eigenvalue of the second derivative of the distance, over that of a rest that is zero."""
+    field: Field
+    support: float = 1.0
+
+
+def shared_of_motion(form: Moving, q: Vector, x: Matrix, u: Matrix) -> Shared:
+    """The directions of q that a learner on the form's features could imitate, at q.
+
+    A direction is shared if it moves no equation and no output without a learner, and moves those with one by a
+    function of the features alone.
+    """
+    names, motion = form.motion.names, form.motion
+    states, outputs = motion.learned
+    if not states and not outputs:
+        return Shared(names, np.zeros((len(names), 0)))
+    nx = x.shape[1]
+    points = np.concatenate([x, u], axis=1)
+    points = points[np.isfinite(points).all(axis=1)]
+    start, end = moves(lambda rows: np.asarray(form.seen(rows[:, :nx].T, rows[:, nx:].T, np)).T, points)
+    if not len(start):  # the learner sees everything
+        start = end = points[np.linspace(0, len(points) - 1, min(len(points), 400)).astype(int)]
+    slopes = [np.asarray(_slopes(form, q, rows[:, :nx], rows[:, nx:])) for rows in (start, end)]
+    kept = np.isfinite(slopes[0]).all(axis=(1, 2)) & np.isfinite(slopes[1]).all(axis=(1, 2))
+    if kept.sum() < _FEWEST * len(names):
+        start = end = points[:: max(1, len(points) // 400)]
+        slopes = [np.asarray(_slopes(form, q, start[:, :nx], start[:, nx:]))] * 2
+        kept = np.isfinite(slopes[0]).all(axis=(1, 2))
+    before, after = (part[kept] for part in slopes)  # (M, nx + ny, np)
+    learned = np.array(
+        [i in states for i in range(len(motion.states))] + [i in outputs for i in range(len(motion.outputs))]
+    )
+    after = np.where(np.array(learned)[:, None], after, 0.0)  # what has no learner must not move at all
+    size = np.sqrt(np.mean(before**2, axis=(0, 2), keepdims=True))
+    size = np.where(size > 0, size, 1.0)
+    before, after = (np.concatenate(list(np.moveaxis(part / size, 1, 0))) for part in (before, after))
+    return Shared(names, agreeing(before, after))
+
+
+def nearest(
+    form: Moving,
+    numbers: Numbers,
+    start: Vector,
+    field: Field,
+    bounds: tuple[Vector, Vector],
+    basis: Matrix | None = None,
+) -> tuple[Vector, Shared]:
+    """q̂, searched from the point nearest to `start` that differs from c along shared directions only.
+
+    Args:
+        start: coordinates of physics alone.
+        basis: directions to search along; None for those that are shared.
+    """
+    c = np.asarray(numbers.theta - numbers.theta_aux)
+    q = c
+
+    def directions(q: Vector) -> Shared:
+        if basis is not None:
+            return Shared(form.motion.names, basis)
+        return shared_of_motion(form, q, field.x, field.u)
+
+    shared = directions(q)
+    if not shared.basis.size:
+        return q, shared
+    b = np.linalg.qr(shared.basis)[0]
+    candidates = [q, np.clip(q + b @ (b.T @ (start - q)), *bounds)]
+    q = min(candidates, key=lambda at: _distance(form, numbers, at, field))
+    damping, value = 1e-6, _distance(form, numbers, q, field)
+    for _ in range(_ITERATIONS):
+        shared = directions(q)
+        b = np.linalg.qr(shared.basis)[0]
+        gradient, gauss = (np.asarray(part) for part in _summed(_gauss_newton, form, numbers, q, field))
+        inner, right = b.T @ gauss @ b, -b.T @ gradient
+        step = b @ np.linalg.lstsq(inner + damping * np.diag(np.diag(inner)), right, rcond=None)[0]
+        trial = np.clip(q + step, *bounds)
+        there = _distance(form, numbers, trial, field)
+        if there <= value:
+            moved = np.abs(trial - q).max()
+            q, value, damping = trial, there, damping / 10
+            if moved <= _SETTLED * np.maximum(np.abs(q).max(), 1.0):
+                break
+        else:
+            damping = max(damping * 100, 1e-6)
+            if damping > 1e6:
+                break
+    return q, directions(q)
+
+
+def split_motion(
+    name: str,
+    form: Moving,
+    numbers: Numbers,
+    start: Vector,
+    field: Field,
+    bounds: tuple[Vector, Vector],
+    *,
+    everything: bool = False,
+    wobble: Any = None,
+) -> MotionSplit:
+    """p̂ of a fitted motion under a measure.
+
+    Args:
+        name: of the measure.
+        start: coordinates of physics alone.
+        everything: whether all directions count as shared (the paper's projection).
+        wobble: (np, np + nw) from (q̂): `Σ φ_qx dx/d(c, w)` of points that are the fitted run's; None where they
+            are fixed.
+    """
+    count = len(form.motion.parameters)
+    basis = np.eye(count) if everything else None
+    c = np.asarray(numbers.theta - numbers.theta_aux)
+    if form.bound is None:
+        nothing = Shared(form.motion.names, np.zeros((count, 0)))
+        return MotionSplit(name, c, nothing, np.eye(count), None, None, 1.0, field)
+    q, shared = nearest(form, numbers, start, field, bounds, basis)
+    whole = np.concatenate([np.eye(count), np.zeros((count, form.bound.size))], axis=1)
+    second, to_c, to_w, gauss, gradient, learner, rest, size = (
+        np.asarray(part) for part in _summed(_second, form, numbers, q, field)
+    )
+    with np.errstate(all="ignore"):
+        defect = share = None
+        if shared.basis.size:
+            b = np.linalg.qr(shared.basis)[0]
+            inner = b.T @ gauss @ b
+            along = float((b.T @ gradient) @ np.linalg.lstsq(inner, b.T @ gradient, rcond=None)[0])
+            defect = float(np.sqrt(max(along, 0.0) / learner)) if learner > 0 else None
+        share = float(np.sqrt(rest / size)) if size > 0 else None
+    if not shared.basis.size:
+        return MotionSplit(name, q, shared, whole, defect, share, 1.0, field)
+    inner, flat = b.T @ second @ b, b.T @ gauss @ b
+    unit = 1 / np.sqrt(np.maximum(np.diag(flat), 1e-300))
+    values = np.linalg.eigvalsh(inner * np.outer(unit, unit))
+    plain = np.linalg.eigvalsh(flat * np.outer(unit, unit))
+    curvature = float(values.min() / max(plain.min(), 1e-300))
+    if not values.min() > 1e-12:
+        return MotionSplit(name, q, shared, None, defect, share, curvature, field)
+    cross = np.concatenate([to_c + second, to_w], axis=1)
+    if wobble is not None:
+        cross = cross + wobble(q)
+    slope = whole - b @ np.linalg.solve(inner, b.T @ cross)
+    return MotionSplit(name, q, shared, slope, defect, share, curvature, field)
+
+
+def _learned_rows(form: Moving, q: Any, x: Any, u: Any) -> Any:
+    """The physics of the learned equations and outputs (nl,) at one point."""
+    motion = form.motion
+    states, outputs = motion.learned
+    p = motion.coordinates.physical(q, jnp)
+    pieces = [motion.rates(x, u, p, jnp)[np.array(states, dtype=int)]]
+    pieces.append(motion.observed(x, u, p, jnp)[np.array(outputs, dtype=int)])
+    return jnp.concatenate(pieces)
+
+
+def rest_of(form: Moving, numbers: Numbers, q: Any, c: Any, w: Any, x: Any, u: Any, size: Any) -> Any:
+    """(G − f(q)) / size (nl,) at one point."""
+    own = numbers._replace(weights=w)
+    return (_learned_rows(form, c, x, u) + form.learned(own, x, u) - _learned_rows(form, q, x, u)) / size
+
+
+@partial(jax.jit, static_argnames="form")
+def _slopes(form: Moving, q: Any, x: Float[Array, "m nx"], u: Float[Array, "m nu"]) -> Float[Array, "m r np"]:
+    """∂(f, h)/∂q at points."""
+
+    def both(q: Any, x: Any, u: Any) -> Any:
+        p = form.motion.coordinates.physical(q, jnp)
+        return jnp.concatenate([form.motion.rates(x, u, p, jnp), form.motion.observed(x, u, p, jnp)])
+
+    return jax.vmap(lambda x, u: jax.jacfwd(both)(q, x, u))(x, u)
+
+
+def _distance(form: Moving, numbers: Numbers, q: Vector, field: Field) -> float:
+    value = float(np.asarray(_summed(_square, form, numbers, q, field)))
+    return value if np.isfinite(value) else np.inf
+
+
+def _summed(function: Any, form: Moving, numbers: Numbers, q: Vector, field: Field) -> Any:
+    """The sum over the points, batch by batch."""
+    total = None
+    for begin in range(0, len(field.x), _BATCH):
+        x, u, weight = (part[begin : begin + _BATCH] for part in field[:3])
+        padding = min(_BATCH, 1 << (len(field.x) - 1).bit_length()) - len(x)
+        if padding > 0:
+            x, u = (np.concatenate([part, np.repeat(part[-1:], padding, axis=0)]) for part in (x, u))
+            weight = np.concatenate([weight, np.zeros(padding)])
+        part = function(form, numbers, q, x, u, weight, field.size)
+        total = part if total is None else jax.tree.map(jnp.add, total, part)
+    return total
+
+
+@partial(jax.jit, static_argnames="form")
+def _square(form: Moving, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any) -> Any:
+    c, w = numbers.theta - numbers.theta_aux, numbers.weights
+    rest = jax.vmap(lambda x, u: rest_of(form, numbers, q, c, w, x, u, size))(x, u)
+    return jnp.sum(jnp.where(weight[:, None] > 0, weight[:, None] * rest**2, 0.0)) / 2
+
+
+@partial(jax.jit, static_argnames="form")
+def _gauss_newton(form: Moving, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any) -> Any:
+    c, w = numbers.theta - numbers.theta_aux, numbers.weights
+
+    def one(x: Any, u: Any) -> Any:
+        def rest(q: Any) -> Any:
+            return rest_of(form, numbers, q, c, w, x, u, size)
+
+        return rest(q), jax.jacfwd(rest)(q)
+
+    rest, slope = jax.vmap(one)(x, u)
+    slope = jnp.where(jnp.isfinite(slope), slope, 0.0)
+    gradient = jnp.einsum("m,mi,mij->j", weight, rest, slope)
+    return gradient, jnp.einsum("m,mij,mik->jk", weight, slope, slope)
+
+
+@partial(jax.jit, static_argnames="form")
+def _second(form: Moving, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any) -> Any:
+    """Second derivatives of half the distance: in q, in q and c, in q and w; and what the rest is made of."""
+    c, w = numbers.theta - numbers.theta_aux, numbers.weights
+
+    def one(x: Any, u: Any) -> Any:
+        def half(q: Any, c: Any, w: Any) -> Any:
+            return jnp.sum(rest_of(form, numbers, q, c, w, x, u, size) ** 2) / 2
+
+        downhill = jax.grad(half)
+        second = jax.jacfwd(downhill)(q, c, w)
+        to_c, to_w = jax.jacrev(downhill, (1, 2))(q, c, w)
+        slope = jax.jacfwd(lambda q: rest_of(form, numbers, q, c, w, x, u, size))(q)
+        learner = jnp.sum((form.learned(numbers, x, u) / size) ** 2)
+        rest = jnp.sum(rest_of(form, numbers, q, c, w, x, u, size) ** 2)
+        whole = jnp.sum(((_learned_rows(form, c, x, u) + form.learned(numbers, x, u)) / size) ** 2)
+        return second, to_c, to_w, slope.T @ slope, downhill(q, c, w), learner, rest, whole
+
+    found = jax.vmap(one)(x, u)
+    return tuple(jnp.einsum("m,m...->...", weight, jnp.where(jnp.isfinite(part), part, 0.0)) for part in found)

@@ -1,0 +1,164 @@
+"""The estimation problem of a motion: its record, what the learner sees, and what can be said before any training."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._base.checks import Vector
+from orthaug._base.errors import InputError
+from orthaug.data.expressions import Expression, parse_named
+from orthaug.data.record import Record
+from orthaug.physics.motion import MOST_SUBSTEPS, Motion
+from orthaug.physics.output_weights import OutputWeights, check_output_weights, weigh_outputs
+from orthaug.physics.starts import guess
+
+_LOOKED_AT = 200  # rows at which the equations are looked at
+_ANGLE = 0.35  # of the fastest mode in a substep [rad]: Runge-Kutta errs by about 1e-3 of it in a period
+_STEP = 1e-6  # relative, of differences
+
+
+@dataclass(frozen=True, eq=False)
+class MotionProblem:
+    """A record with its motion. `features` are what a learner sees; `deviation` (ny,) is that of the outputs."""
+
+    record: Record
+    motion: Motion
+    features: tuple[Expression, ...]
+    deviation: Vector
+    weight: OutputWeights
+
+    first_row = 0
+
+    def __repr__(self) -> str:
+        motion = self.motion
+        return f"MotionProblem({len(self.record)} rows of {', '.join(self.outputs)}, states {motion.names_of_states})"
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return tuple(channel.name for channel in self.record.outputs)
+
+    def on(self, record: Record) -> MotionProblem:
+        """The same motion on another record."""
+        return replace(self, record=record)
+
+    @cached_property
+    def looked_at(self) -> tuple[Float[np.ndarray, "nx m"], Float[np.ndarray, "nu m"]]:
+        """Guessed states and inputs at some rows of the record."""
+        states, inputs = [], []
+        share = max(1, _LOOKED_AT // len(self.record.experiments))
+        for experiment in self.record.experiments:
+            rows = np.unique(np.linspace(0, len(experiment) - 1, share).astype(int))
+            states.append(guess(self.motion, experiment.outputs, rows, self.record.sampling_time))
+            inputs.append(experiment.inputs[rows])
+        return np.concatenate(states).T, np.concatenate(inputs).T
+
+    @cached_property
+    def fastest(self) -> float:
+        """The largest |eigenvalue| of ∂f/∂x at the initial parameters [1/s], over the guessed states."""
+        x, u = self.looked_at
+        size = np.maximum(np.abs(x).max(axis=1), 1e-6 * np.abs(x).max(initial=1e-6))
+        columns = []
+        with np.errstate(all="ignore"):
+            for i, h in enumerate(_STEP * size):
+                moved = np.zeros_like(x)
+                moved[i] = h
+                ends = (np.asarray(self.motion.rates(x + s * moved, u, self.motion.initial, np)) for s in (1, -1))
+                columns.append((next(ends) - next(ends)) / (2 * h))
+        slopes = np.moveaxis(np.stack(columns, axis=1), -1, 0)
+        slopes = slopes[np.isfinite(slopes).all(axis=(1, 2))]
+        return float(np.abs(np.linalg.eigvals(slopes)).max(initial=0.0))
+
+    @property
+    def substeps(self) -> int:
+        """With how many substeps training begins."""
+        motion = self.motion
+        if motion.integrator == "discrete":
+            return 1
+        if motion.substeps is not None:
+            return motion.substeps
+        if motion.integrator == "exact":
+            return 1
+        return max(1, int(np.ceil(self.fastest * self.record.sampling_time / _ANGLE)))
+
+
+def pose_motion(
+    record: Record,
+    motion: Motion,
+    learner_inputs: Sequence[str] | None = None,
+    output_weights: str | Sequence[float] = "auto",
+) -> MotionProblem:
+    """Check record and motion against each other.
+
+    Args:
+        learner_inputs: expressions of states and inputs that the learner sees; None for all of them.
+
+    Raises:
+        InputError: other channels, outputs that do not move, learner inputs that cannot be, equations that have no
+            value at the start, a sampling time too long for the fastest mode.
+    """
+    inputs, outputs = (tuple(c.name for c in group) for group in (record.inputs, record.outputs))
+    motion = motion.sampled(record.sampling_time)
+    motion.check_channels(inputs, outputs)
+    check_output_weights(output_weights, len(outputs))
+    for i, name in enumerate(outputs):
+        if (
+            min(np.ptp(e.outputs[:, i]) for e in record.experiments)
+            == max(np.ptp(e.outputs[:, i]) for e in record.experiments)
+            == 0.0
+        ):
+            raise InputError(f"channel '{name}' is constant over all training data; nothing can be learned from it.")
+    deviation = np.concatenate([e.outputs for e in record.experiments]).std(axis=0)
+    deviation = np.where(deviation > 0, deviation, 1.0)
+    problem = MotionProblem(
+        record, motion, _features(motion, learner_inputs), deviation, weigh_outputs(output_weights, deviation)
+    )
+    _check_start(problem)
+    return problem
+
+
+def _features(motion: Motion, texts: Sequence[str] | None) -> tuple[Expression, ...]:
+    """What the learner sees, as expressions."""
+    known = {name: value for name, value in motion.known.items() if name not in motion.names}
+    reach = {name for name, expression in motion.definitions if set(expression.names) & set(motion.names)}
+    texts = (*motion.names_of_states, *motion.inputs) if texts is None else tuple(texts)
+    if not texts:
+        raise InputError("the learner sees nothing; give `inputs` such as a state's name, or leave it out for all.")
+    found = []
+    for text in texts:
+        expression = parse_named(text, known, "learner input")
+        hidden = [name for name in expression.names if name in reach]
+        if hidden:
+            raise InputError(f"learner input = {text}: '{hidden[0]}' contains parameters; use states and inputs.")
+        found.append(expression)
+    return tuple(found)
+
+
+def _check_start(problem: MotionProblem) -> None:
+    """Raise InputError where the equations have no value at the initial parameters, or modes that are too fast."""
+    motion, (x, u) = problem.motion, problem.looked_at
+    with np.errstate(all="ignore"):
+        rates = np.asarray(motion.rates(x, u, motion.initial, np), dtype=float)
+        outputs = np.asarray(motion.observed(x, u, motion.initial, np), dtype=float)
+    for names, values, what in (
+        (motion.names_of_states, rates, "the equation of"),
+        (problem.outputs, outputs, "the output"),
+    ):
+        if values.shape != (len(names), x.shape[1]):
+            raise InputError(f"the motion's functions return shape {values.shape}; expected ({len(names)}, …).")
+        for i, name in enumerate(names):
+            if not np.isfinite(values[i]).any():
+                k = int(np.argmax(~np.isfinite(values[i])))
+                at = zip((*motion.names_of_states, *motion.inputs), (*x[:, k], *u[:, k]), strict=True)
+                where = ", ".join(f"{n} = {v:.4g}" for n, v in at)
+                raise InputError(f"{what} '{name}' is not finite at the start ({where}, initial parameters).")
+    if motion.integrator == "rk4" and problem.substeps > MOST_SUBSTEPS:
+        raise InputError(
+            f"the sampling time of {problem.record.sampling_time:g} s is too long for the fastest mode of the motion, "
+            f"{problem.fastest:.3g} 1/s: it would take {problem.substeps} substeps, at most {MOST_SUBSTEPS} are made. "
+            'Use `integrator = "exact"`, check units and initial values, or leave the fast mode out.'
+        )
