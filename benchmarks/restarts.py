@@ -41,7 +41,7 @@ def main() -> None:
         @jax.jit
         def batched(ws: object, criterion=criterion, arguments=arguments, overlap=overlap, options=options) -> object:
             def one(w: object) -> object:
-                state = _start(criterion, w, arguments, overlap, jnp.asarray(0.0), options)
+                state = _start(criterion, w, arguments, overlap, jnp.asarray(0.0))
                 return _advance(criterion, state, arguments, options, jnp.asarray(ITERATIONS))
 
             return jax.vmap(one)(ws)  # noqa: B023

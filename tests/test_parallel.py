@@ -10,9 +10,11 @@ from collections import Counter
 
 import numpy as np
 import pytest
+import scipy.linalg  # noqa: F401  (brings a BLAS of its own)
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from orthaug._base import parallel
-from orthaug._base.parallel import Stopped, spread
+from orthaug._base.parallel import Stopped, one_blas_thread, spread
 from orthaug.data.record import Record
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
@@ -25,6 +27,20 @@ from orthaug.physics.baseline import Baseline, Term
 def cores(monkeypatch):
     """Sets how many cores there are."""
     return lambda count: monkeypatch.setattr(parallel.os, "cpu_count", lambda: count)
+
+
+def test_blas_has_one_thread_inside_and_what_it_had_after():
+    def threads():
+        return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+    with threadpool_limits(limits=2, user_api="blas"):
+        before = threads()
+        with one_blas_thread():
+            assert threads() == {1}
+            with one_blas_thread():
+                assert threads() == {1}
+            assert threads() == {1}
+        assert threads() == before
 
 
 def test_results_keep_the_order_of_the_items(cores):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import scipy.stats
 from scipy.signal import lfilter
-from threadpoolctl import threadpool_limits
 
 from orthaug._base.errors import InputError
+from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.correlation import autocorrelation, cross_correlation
 from orthaug.analysis.independence import against_input, against_regressor
 from orthaug.analysis.residuals import analyse
@@ -22,9 +22,9 @@ BETWEEN = (0.005, 0.016)  # of 2000 records that a test at 1 % may reject; ± 0.
 
 
 @pytest.fixture(autouse=True)
-def one_blas_thread():
-    """Small products: where other processes run, threads that wait for each other take ten times as long."""
-    with threadpool_limits(limits=1, user_api="blas"):
+def small_products():
+    """Where other processes run, threads that wait for each other take ten times as long."""
+    with one_blas_thread():
         yield
 
 

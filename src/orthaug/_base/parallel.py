@@ -7,9 +7,10 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from functools import cache
 from typing import TypeVar
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -23,8 +24,20 @@ def one_blas_thread() -> Iterator[None]:
     Cholesky factors of a step; XLA's own threads do everything else. Where they shared the cores with waiting threads,
     an iteration took 45 % longer (benchmarks/lm_iteration.py).
     """
-    with threadpool_limits(limits=1, user_api="blas"):
+    with _blas().limit(limits=1):
         yield
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    """The BLAS libraries of NumPy and SciPy, found once.
+
+    To find them is to read the process's memory map, which gets longer with every compiled program: after some hundred
+    of them it took longer than a small fit.
+    """
+    import scipy.linalg  # noqa: F401  (brings its own BLAS, which is JAX's as well)
+
+    return ThreadpoolController().select(user_api="blas")
 
 
 class Stopped(Exception):

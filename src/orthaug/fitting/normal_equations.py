@@ -95,7 +95,6 @@ def one_pass(
     return criterion(w, *arguments, overlap)
 
 
-@partial(jax.jit, static_argnames="criterion")
 def linearise(
     criterion: Callable[..., Normal], w: Float[Array, "nw"], arguments: tuple[Any, ...], overlap: Overlap
 ) -> Normal:

@@ -93,10 +93,15 @@ def minimise(
         samples: residuals less the physics' own parameters, for the noise variance.
         iterations, tolerance: as of `LevenbergMarquardt`.
     """
-    began = training_clock()
+    single = groups is None
+    if single and not evidence:  # the program of groups serves a fixed ridge as well
+        groups = np.zeros(len(w), dtype=int)
     options = Options(np.asarray(tolerance), np.asarray(evidence), np.asarray(float(samples)), groups)
     start = np.float64(ridge) if groups is None else np.full(len(groups), float(ridge))
-    state = _start(criterion, w, arguments, overlap, start, options)
+    state = _start(criterion, w, arguments, overlap, start)
+    if int(state.code) == Ending.RUNNING and iterations:  # a run beside this one may be compiling: no time of this one
+        jax.block_until_ready(_advance(criterion, state, arguments, options, np.int64(0)))
+    began = training_clock()
     burst = 1
     while int(state.code) == Ending.RUNNING and int(state.iteration) < iterations:
         tick = training_clock()
@@ -105,11 +110,12 @@ def minimise(
         spent = training_clock() - tick
         burst = burst_length(burst, spent)
         progress(int(state.iteration), float(state.normal.loss))
+    end = np.asarray(state.ridge) if not single else np.float64(state.ridge if evidence else ridge)
     return TrainingRun(
         state.w,
         state.normal,
-        float(state.ridge) if groups is None else np.asarray(state.ridge),
-        float(effective_weights(state.normal, state.ridge)),
+        float(end) if single else end,
+        float(effective_weights(state.normal, end)),
         int(state.iteration),
         Ending(int(state.code)),
         training_clock() - began,
@@ -121,9 +127,12 @@ def burst_length(burst: int, spent: float) -> int:
     return int(np.clip(burst * _SECONDS_PER_BURST / max(spent, 1e-6), 1, 4 * burst))
 
 
-@partial(jax.jit, static_argnames="criterion")
-def _start(criterion: Any, w: Any, arguments: tuple[Any, ...], overlap: Overlap, ridge: Any, options: Options) -> State:
-    normal = linearise(criterion, w, arguments, overlap)
+def _start(criterion: Any, w: Any, arguments: tuple[Any, ...], overlap: Overlap, ridge: Any) -> State:
+    return _begun(w, linearise(criterion, w, arguments, overlap), ridge)
+
+
+@jax.jit
+def _begun(w: Any, normal: Normal, ridge: Any) -> State:
     curvature = jnp.max(jnp.diag(normal.hessian), initial=0.0)
     finite = jnp.isfinite(normal.loss) & jnp.all(jnp.isfinite(normal.hessian))
     return State(
