@@ -20,6 +20,7 @@ from .fitting import Additive as Additive
 from .fitting import BaselinePenalty as BaselinePenalty
 from .fitting import Estimate as Estimate
 from .fitting import LevenbergMarquardt as LevenbergMarquardt
+from .fitting import MotionEstimate as MotionEstimate
 from .fitting import Orthogonal as Orthogonal
 from .fitting import OrthogonalPenalty as OrthogonalPenalty
 from .fitting import Prediction as Prediction
@@ -38,15 +39,19 @@ from .models import EquinoxModule as EquinoxModule
 from .models import External as External
 from .models import Function as Function
 from .models import Model as Model
+from .models import MotionModel as MotionModel
 from .models import Response as Response
 from .models import Trajectory as Trajectory
 from .models import load as load
 from .models import save as save
 from .models import scores as scores
 from .physics import Baseline as Baseline
+from .physics import Motion as Motion
+from .physics import Output as Output
 from .physics import Parameter as Parameter
 from .physics import PhysicalParameter as PhysicalParameter
 from .physics import PhysicsMap as PhysicsMap
+from .physics import State as State
 from .physics import Term as Term
 from .physics import identifiability as identifiability
 from .reports import plot as plot

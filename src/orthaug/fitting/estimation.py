@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypedDict, Unpack, overload
 
 import numpy as np
 
@@ -20,6 +20,8 @@ from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.free_run import FreeRunTask
 from orthaug.fitting.learned import Learned
+from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.fitting.motion_estimation import DEFAULT, fit_motion, pose_for
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.reweighting import reweighted
 from orthaug.fitting.rules import check_solver, check_starts, tried
@@ -32,19 +34,44 @@ from orthaug.models.learners import MLP, Bound, External, Function, Learner, Sca
 from orthaug.models.model import Model
 from orthaug.models.rows import Engine, InMemory
 from orthaug.physics.baseline import Baseline
+from orthaug.physics.motion import Motion
 from orthaug.physics.problem import Problem, pose
 
 Regularization = str | float
 
 
+class Options(TypedDict, total=False):
+    """The options of `estimate`, for type checkers."""
+
+    lags: Lags | None
+    learner: Learner | None
+    structure: Structure
+    criterion: Criterion | None
+    solver: Solver
+    regularization: Regularization | Sequence[Regularization]
+    restarts: int
+    seed: int
+    ensemble: bool
+    blocks: int
+    fallback: bool
+    initial: Estimate | Model | None
+    validation: Record | None
+    output_weights: str | Sequence[float]
+    progress: Tell
+
+
+@overload
+def estimate(record: Record, baseline: Baseline, **options: Unpack[Options]) -> Estimate: ...
+@overload
+def estimate(record: Record, baseline: Motion, **options: Unpack[Options]) -> MotionEstimate: ...
 def estimate(
     record: Record,
-    baseline: Baseline,
+    baseline: Baseline | Motion,
     *,
     lags: Lags | None = None,
     learner: Learner | None = MLP(),  # noqa: B008  (frozen)
     structure: Structure = Orthogonal(),  # noqa: B008  (frozen)
-    criterion: Criterion = Prediction(),  # noqa: B008  (frozen)
+    criterion: Criterion | None = None,
     solver: Solver = LevenbergMarquardt(),  # noqa: B008  (frozen)
     regularization: Regularization | Sequence[Regularization] = "auto",
     restarts: int = 1,
@@ -56,19 +83,21 @@ def estimate(
     validation: Record | None = None,
     output_weights: str | Sequence[float] = "auto",
     progress: Tell = SILENT,
-) -> Estimate:
+) -> Estimate | MotionEstimate:
     """Fit `y_k = φ(x_k)θ + learner(x_k) + e_k` by prediction error (eq:cost_fun) or by the error of a free run.
 
-    θ is solved, never iterated (F1): with the orthogonal structure it is `Φ⁺Y` whatever the learner does.
+    θ is solved, never iterated (F1): with the orthogonal structure it is `Φ⁺Y` whatever the learner does. Equations of
+    motion (`Motion`) are fitted on their free run, and their parameters are the physics nearest to the fitted motion.
 
     Args:
         record: measured inputs and outputs.
-        baseline: the physics.
+        baseline: the physics; a `Motion` has no `lags`, `ensemble` and `initial`.
         lags: the learner's regressor; None for the raw lags that the baseline's expressions use.
         learner: a declaration such as `MLP(hidden=(16,))`; None for physics alone.
         structure: `Orthogonal()`, `Additive()`, `OrthogonalPenalty(λ)` or `BaselinePenalty(λ)`.
         criterion: `Prediction(horizon)`, 1 step by default, or `Simulation(segment, washout)`, the free run: then θ is
-            trained with the weights and split off at the end (F2).
+            trained with the weights and split off at the end (F2). A motion takes the latter, by default without
+            washout.
         solver: `LevenbergMarquardt(…)`, or `AdamLBFGS(…)`, the paper's pipeline from θ⁰.
         regularization: "none"; "evidence" (MacKay; the weights' prior is estimated too); "ard" (automatic relevance
             determination: the prior of each neuron, one step ahead); or a number: the ridge α on the weights, against
@@ -104,7 +133,15 @@ def estimate(
         >>> f"{fit.theta[0]:.3f}"
         '2.000'
     """
+    if isinstance(baseline, Motion):
+        if lags is not None or initial is not None or ensemble:
+            raise InputError("a motion has no `lags`, no `initial` and no `ensemble`; leave them out.")
+        problem = pose_for(record, baseline, learner, output_weights)
+        options = {"structure": structure, "criterion": criterion or DEFAULT, "solver": solver, "fallback": fallback}
+        options |= {"regularization": regularization, "restarts": restarts, "seed": seed, "validation": validation}
+        return fit_motion(problem, learner=learner, blocks=_check_blocks(blocks), progress=progress, **options)
     _check_record(record, baseline, lags, learner, initial)
+    criterion = Prediction() if criterion is None else criterion
     model = initial.model if isinstance(initial, Estimate) else initial
     inputs = None if learner is None else learner.inputs
     if model is not None:
@@ -297,7 +334,7 @@ def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStep
 
 def _check_record(record: Any, baseline: Any, lags: Any, learner: Any, initial: Any) -> None:
     check_type(record, Record, "record", "a Record")
-    check_type(baseline, Baseline, "baseline", "a Baseline")
+    check_type(baseline, Baseline, "baseline", "a Baseline or a Motion")
     check_type(lags, Lags | None, "lags", "Lags(…) or None")
     check_type(learner, Learner | None, "learner", "a learner such as MLP(), or None")
     check_type(initial, Estimate | Model | None, "initial", "an Estimate, a Model or None")

@@ -65,6 +65,10 @@ class MotionTask(FlightTask):
         nothing: dict[str, Any] = {"bound": None, "weights": np.zeros(0), "errors": unknown, "coefficients": initial}
         return alone, Learned(scaling=alone.plan.scaling, unit=alone.plan.unit, ending=Ending.NON_FINITE, **nothing)
 
+    def median(self, members: list[Learned], best: int) -> Learned:
+        """The best member: a motion has no ensemble, for medians of outputs follow no equations."""
+        return members[best]
+
     def prepared(self, solver: LevenbergMarquardt, structure: Structure, progress: RunTell = quiet) -> MotionTask:
         """The same with physics alone trained. It gives the learner its scaling, and the criterion its unit."""
         plan = self.plan

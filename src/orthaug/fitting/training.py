@@ -18,7 +18,7 @@ from orthaug._base.progress import Tell
 from orthaug._base.warning import Warning
 from orthaug.data.record import Record
 from orthaug.fitting.conclusion import conclude
-from orthaug.fitting.estimates import Estimate, Restart
+from orthaug.fitting.estimates import Restart
 from orthaug.fitting.held_out import HeldOut, Pieces, blocked, mean_square, squared_errors
 from orthaug.fitting.learned import Learned, Task
 from orthaug.fitting.one_step import OneStepTask
@@ -27,6 +27,10 @@ from orthaug.fitting.structures import Structure
 
 _INFLATION = 1.4  # of the effective weights in cross-validation, against what follows the noise (Kim and Gu 2004)
 FOLD_ITERATIONS = 60  # enough to tell whether a learner helps, on every block of cross-validation
+
+
+Concluding = Callable[[Any, Structure, Learned], Any]
+"""Makes the estimate of a task, a structure and what a run learned."""
 
 
 class PlannedRun(NamedTuple):
@@ -77,14 +81,19 @@ def train(
     solver: Solver,
     choice: Choice,
     progress: Tell,
-) -> Estimate:
-    """Run from every start and conclude with the best."""
+    conclude: Concluding = conclude,
+) -> Any:
+    """Run from every start and conclude with the best.
+
+    Args:
+        conclude: makes the estimate of a task, a structure and what a run learned.
+    """
     with one_blas_thread():
         task = task.prepared(solver, structure, partial(progress, 0))
     starts, runs = _run(task, starts, structure, solver, progress)
     losses = [task.loss(run) for run in runs]
-    concluded = cache(lambda i: _concluded(task, structure, task.learned(runs[i])))
-    held_out = _held_out(task, starts, concluded, structure, solver, choice)
+    concluded = cache(lambda i: _concluded(conclude, task, structure, task.learned(runs[i])))
+    held_out = _held_out(task, starts, concluded, structure, solver, choice, conclude)
     errors = [math.nan] * len(runs) if held_out is None else [mean_square(run) for run in held_out.runs]
     ranking = choice.ranking(task, runs, errors)
     usable = np.array([run.ending.usable for run in runs]) & np.isfinite(ranking)
@@ -99,10 +108,10 @@ def train(
     shown = alike if choice.scored and held_out is None else list(range(len(starts)))
     members = [best]
     if best < 0:
-        estimate = _alone(task, structure)
+        estimate = _alone(conclude, task, structure)
     elif choice.ensemble:
         members = alike
-        estimate = _concluded(task, structure, _median(task, runs, members, best))
+        estimate = _concluded(conclude, task, structure, _median(task, runs, members, best))
     else:
         estimate = concluded(best)
     restarts = tuple(
@@ -183,10 +192,11 @@ def _replaced(starts: Sequence[PlannedRun], runs: Sequence[Any]) -> list[Warning
 def _held_out(
     task: Task,
     starts: Sequence[PlannedRun],
-    concluded: Callable[[int], Estimate],
+    concluded: Callable[[int], Any],
     structure: Structure,
     solver: Solver,
     choice: Choice,
+    conclude: Concluding,
 ) -> HeldOut | None:
     """Errors where nothing was fitted: of the runs on the validation record, or of runs on folds on their blocks.
 
@@ -195,7 +205,7 @@ def _held_out(
     if choice.validation is not None:
         record, unit = choice.validation, task.problem.deviation
         fits = [concluded(i) for i in range(len(starts))]
-        alone = _errors(_alone(task, structure), record, unit)
+        alone = _errors(_alone(conclude, task, structure), record, unit)
         labels = ("the validation part",) * len(record.experiments)
         return HeldOut("the validation part", labels, alone, tuple(_errors(fit, record, unit) for fit in fits))
     if not choice.blocks or not choice.compares(task, starts):
@@ -211,11 +221,11 @@ def _held_out(
         failed: Pieces = [None] * len(held.experiments)
         try:
             own = task.on(training).prepared(shorter, structure)
-            fits = [_alone(own, structure)]
+            fits = [_alone(conclude, own, structure)]
             for start in starts:
                 check()
                 run = own.run(shorter, start.weights, structure, start.regularization)
-                fits.append(_concluded(own, structure, own.learned(run)))
+                fits.append(_concluded(conclude, own, structure, own.learned(run)))
         except InputError:  # the block took away what the physics needs
             return [failed] * (1 + len(starts))
         return [_errors(fit, held, unit) for fit in fits]
@@ -225,7 +235,7 @@ def _held_out(
     return HeldOut(f"blocked cross-validation ({choice.blocks} blocks)", labels, pieces[0], tuple(pieces[1:]))
 
 
-def _errors(fit: Estimate, record: Record, unit: Any) -> Pieces:
+def _errors(fit: Any, record: Record, unit: Any) -> Pieces:
     """Of the criterion's own response; None for a run without a model or a value."""
     if not fit.status.ok:
         return [None] * len(record.experiments)
@@ -244,12 +254,12 @@ def _fell_back(held_out: HeldOut) -> Warning:
     return Warning("physics_alone", text)
 
 
-def _alone(task: Task, structure: Structure) -> Estimate:
+def _alone(conclude: Concluding, task: Task, structure: Structure) -> Any:
     rows, learned = task.physics_alone()
     return replace(conclude(rows, structure, learned), criterion=task.criterion)
 
 
-def _concluded(task: Task, structure: Structure, learned: Learned) -> Estimate:
+def _concluded(conclude: Concluding, task: Task, structure: Structure, learned: Learned) -> Any:
     return replace(conclude(task.rows_task, structure, learned), criterion=task.criterion)
 
 

@@ -3,6 +3,7 @@ from .learners import EquinoxModule as EquinoxModule
 from .learners import External as External
 from .learners import Function as Function
 from .model import Model as Model
+from .motion_model import MotionModel as MotionModel
 from .response import Response as Response
 from .response import Trajectory as Trajectory
 from .response import scores as scores

@@ -51,7 +51,7 @@ def settle(
         trial = best + _steps(matrix, right, damping)
         there = _linearised(form, numbers, trial, windows, weight, begun, prior)
         with np.errstate(all="ignore"):
-            lower = np.array(there[2] < misfit, ndmin=1)
+            lower = there[2] < misfit
             gained = np.where(lower, (misfit - there[2]) / misfit, 0.0)
         best = np.where(lower, trial, best)
         matrix = np.where(lower[:, None, None], there[0], matrix)
@@ -67,7 +67,7 @@ def _steps(
 ) -> Float[np.ndarray, "n0 m"]:
     size = np.diagonal(matrix, axis1=1, axis2=2)
     damped = matrix + (damping[:, None] * size)[:, :, None] * np.eye(matrix.shape[1])
-    sound = np.isfinite(damped).all(axis=(1, 2)) & np.isfinite(right).all(axis=1)
+    sound: Any = np.isfinite(damped).all(axis=(1, 2)) & np.isfinite(right).all(axis=1)
     damped = np.where(sound[:, None, None], damped, np.eye(matrix.shape[1]))
     right = np.where(sound[:, None], right, 0.0)
     return np.linalg.solve(damped, right[..., None])[..., 0].T

@@ -2,5 +2,8 @@ from .baseline import Baseline as Baseline
 from .baseline import Parameter as Parameter
 from .baseline import Term as Term
 from .excitation import identifiability as identifiability
+from .motion import Motion as Motion
+from .motion import Output as Output
+from .motion import State as State
 from .parameters import PhysicalParameter as PhysicalParameter
 from .parameters import PhysicsMap as PhysicsMap

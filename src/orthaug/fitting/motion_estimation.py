@@ -1,0 +1,111 @@
+"""Fitting a motion to a record, with a learner beside some of its equations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from orthaug._base.checks import check_count, check_type
+from orthaug._base.errors import InputError, KeyedError
+from orthaug._base.jax import jax
+from orthaug._base.progress import SILENT, Tell
+from orthaug.data.record import Record
+from orthaug.fitting.criteria import Criterion, Simulation
+from orthaug.fitting.motion_conclusion import conclude_motion
+from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.fitting.motion_task import MotionTask
+from orthaug.fitting.rules import check_solver, check_starts, tried
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.solvers.solver import Solver
+from orthaug.fitting.structures import Orthogonal, Structure
+from orthaug.fitting.training import Choice, PlannedRun, train
+from orthaug.models.learners import Learner
+from orthaug.physics.motion import Motion
+from orthaug.physics.motion_problem import MotionProblem, pose_motion
+
+DEFAULT = Simulation(washout=0)
+"""The criterion of a motion: its segments start at estimated states, so that none of their steps is left out."""
+
+
+def pose_for(
+    record: Record, motion: Motion, learner: Learner | None, output_weights: str | Sequence[float]
+) -> MotionProblem:
+    """The problem of a motion with what a learner sees.
+
+    Raises:
+        InputError: as `pose_motion`.
+    """
+    check_type(record, Record, "record", "a Record")
+    check_type(learner, Learner | None, "learner", "a learner such as MLP(), or None")
+    return pose_motion(record, motion, None if learner is None else learner.inputs, output_weights)
+
+
+def fit_motion(
+    problem: MotionProblem,
+    *,
+    learner: Learner | None,
+    structure: Structure = Orthogonal(),  # noqa: B008  (frozen)
+    criterion: Criterion = DEFAULT,
+    solver: Solver = LevenbergMarquardt(),  # noqa: B008  (frozen)
+    regularization: str | float | Sequence[str | float] = "auto",
+    restarts: int = 1,
+    seed: int = 0,
+    blocks: int = 4,
+    fallback: bool = True,
+    validation: Record | None = None,
+    progress: Tell = SILENT,
+) -> MotionEstimate:
+    """`estimate` for a motion that is posed already; arguments as there.
+
+    Raises:
+        InputError: what a motion cannot be trained with.
+    """
+    check_motion_choices(problem, learner, structure, criterion, solver)
+    validated = validation is not None
+    choices = tried(regularization, solver, criterion, structure, linear=False, resident=True, validated=validated)
+    restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
+    check_starts(restarts, seed, ensemble=False)
+    check_solver(solver, criterion, () if learner is None else choices)
+    task = MotionTask.of(problem, learner, criterion)
+    starts = [PlannedRun(seed, (), "none")]
+    if task.bound is not None:
+        keyed = {s: task.bound.init(jax.random.key(s)) for s in range(seed, seed + restarts)}
+        starts = [PlannedRun(s, w, choice) for choice in choices for s, w in keyed.items()]
+    chosen = Choice(validation, blocks, fallback)
+    return train(task, starts, structure, solver, chosen, progress, conclude_motion)
+
+
+def check_motion_choices(
+    problem: MotionProblem, learner: Learner | None, structure: Structure, criterion: Criterion, solver: Solver
+) -> None:
+    """Raise InputError for choices that a motion cannot be trained with."""
+    states, outputs = problem.motion.learned
+    if learner is not None and not (states or outputs):
+        raise KeyedError(
+            "there is a learner, but no state and no output of the motion is learned; set `learned` where it is added.",
+            "learner",
+            ": no state and no output has `learned = true`; expected one, or kind none",
+        )
+    if criterion.flown is None or not criterion.simulates:
+        raise KeyedError(
+            "a motion is trained on its free run; take `Simulation(…)`: its states are not measured, so there is no "
+            "error one step ahead.",
+            "focus",
+            " = prediction; expected simulation for a motion, whose states are not measured",
+        )
+    if not isinstance(structure, Orthogonal):
+        raise KeyedError(
+            f"a motion has the orthogonal structure: its parameters are the nearest physics; got {structure.name}.",
+            "kind",
+            f" = {structure.name}; expected orthogonal for a motion",
+        )
+    if not solver.gauss_newton:
+        raise InputError("a motion is trained by `LevenbergMarquardt`; take that solver.")
+
+
+def without_learner(problem: MotionProblem) -> MotionProblem:
+    """The same problem with no state and no output learned."""
+    motion = problem.motion
+    states = tuple(replace(state, learned=False) for state in motion.states)
+    outputs = tuple(replace(output, learned=False) for output in motion.outputs)
+    return replace(problem, motion=replace(motion, states=states, outputs=outputs))
