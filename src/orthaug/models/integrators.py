@@ -15,7 +15,7 @@ import numpy as np
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax, jnp
 
-_UNROLLED = 4  # substeps; more run as a loop, which compiles faster
+UNROLLED = 4  # substeps; more run as a loop, which compiles faster
 _SQUARINGS, _TERMS = 12, 12  # of the matrix exponential
 
 Field = Callable[[Any, Any], Any]
@@ -48,8 +48,8 @@ def points_of(hold: str, substeps: int) -> int:
     return {"zero-order": 1, "first-order": 2}.get(hold, 2 * substeps + 1)
 
 
-def _input_at(row: Any, nu: int) -> Callable[[Any, int], Any]:
-    """u at the half substep i of a sample that has `halves` of them, by (i, halves)."""
+def input_at(row: Any, nu: int) -> Callable[[Any, int], Any]:
+    """u (nu,) as a function of the half substep i of a sample and of how many it has."""
     points = row.reshape(-1, nu) if nu else row.reshape(1, 0)
     if len(points) == 1:
         return lambda i, halves: points[0]
@@ -67,9 +67,9 @@ def advance(field: Field, linear: Any, x: Any, row: Any, nu: int, step: float, s
         row: the input as `held` lays it out.
         step: the sampling time.
     """
-    at, halves, h = _input_at(row, nu), 2 * substeps, step / substeps
+    at, halves, h = input_at(row, nu), 2 * substeps, step / substeps
     one = _exponential(field, linear, h) if integrator == "exact" else _runge_kutta(field, h)
-    if substeps <= _UNROLLED:
+    if substeps <= UNROLLED:
         for j in range(substeps):
             x = one(x, at(2 * j, halves), at(2 * j + 1, halves), at(2 * j + 2, halves))
         return x

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,9 @@ from orthaug._base.jax import jax, jnp
 from orthaug.data.expressions import Expression
 from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import Differentiated, Numbers, Parts
-from orthaug.models.integrators import advance, held
+from orthaug.models.integrators import UNROLLED, advance, held
 from orthaug.models.learners import Bound
+from orthaug.models.motion_tangents import Slopes, output_slopes, sample_slopes
 from orthaug.physics.motion import Motion
 from orthaug.physics.starts import guess
 
@@ -136,6 +138,20 @@ class Moving(Differentiated):
             self.motion.integrator,
         )
         return following, parts
+
+    def tangents(self, numbers: Numbers, state: Any, slopes: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
+        """Of a few Runge-Kutta substeps by the adjoint of their stages; otherwise by automatic differentiation."""
+        if self.motion.integrator != "rk4" or self.substeps > UNROLLED or not self.differentiable:
+            return super().tangents(numbers, state, slopes, inputs)
+        following = jax.vmap(partial(sample_slopes, self, numbers), -1, -1)(state, inputs)
+        output = jax.vmap(lambda x, row: output_slopes(self, numbers, x, self.now(row)), -1, -1)(state, inputs)
+        return following.value, self._followed(following, slopes), output.value, self._followed(output, slopes)
+
+    def _followed(self, step: Slopes, slopes: Any) -> Any:
+        """∂/∂(start, c, w) of a map of (x, c, w), where x has the `slopes`."""
+        own = step.to_c if self.bound is None else jnp.concatenate([step.to_c, step.to_w], axis=1)
+        through = sum(step.to_x[:, i, None] * slopes[None, i] for i in range(self.states))
+        return through + jnp.pad(own, ((0, 0), (self.states, 0), (0, 0)))
 
     def _linear_part(self, numbers: Numbers) -> Any:
         """∂f/∂x of the physics at the origin; 0 where it has none."""
