@@ -20,7 +20,7 @@ from orthaug.models.motion_model import MotionModel
 from orthaug.models.statistics import Statistics
 from orthaug.physics.shared import Shared
 
-_WINDOWS = (2, 6, 18)  # times (states + 1): rows of a window to predict from
+_WINDOWS = (4, 16)  # times (states + 1): rows of a window to predict from
 _TRIED_ROWS = 1000  # on which windows are compared
 
 

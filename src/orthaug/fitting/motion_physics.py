@@ -20,7 +20,8 @@ from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.physics.motion import MOST_SUBSTEPS
 
 _SHORTEST = 15  # steps of a segment
-_LONGER = 4  # times, from one length of the segments to the next
+_LONGER = 8  # times, from one length of the segments to the next; every length compiles its own programs
+_POOR = 0.5  # of the output's deviation: what is left above it may not be the best minimum
 _SHORT_ITERATIONS = 15  # over segments that are not the last
 _FINE = 0.01  # of the residual: how much the outputs may move when the substeps are doubled
 
@@ -31,7 +32,7 @@ def fly_motion(
     """Parameters of the physics alone, and the course with segments that start where its runs do; None: none flies."""
     own, initial = course.alone, course.problem.motion.coordinates.initial
     steps = own.segments.steps
-    lengths = [_SHORTEST * _LONGER**i for i in range(20) if _SHORTEST * _LONGER**i * 1.5 < steps]
+    lengths = [steps // _LONGER**i for i in range(20, 0, -1) if steps // _LONGER**i >= _SHORTEST]
     ends: list[Flight] = []
     iterations, seconds = 0, 0.0
     q, rows = initial, None
@@ -45,7 +46,7 @@ def fly_motion(
         q = end.end.flown.theta
         rows = short.states_by_row(q, (), end.end.flown.states)
     for start, known in ((q, rows), (initial, None)):
-        if start is initial and q is initial and ends:
+        if start is initial and ends and (q is initial or _follows(own, ends[0])):
             continue
         end = _descended(own, solver, [start], known, tell)
         if end is not None:
@@ -84,6 +85,13 @@ def _descended(
         return None
     flight = course.descend(objective, q, solver, tell, states)
     return flight if flight.ending.usable else None
+
+
+def _follows(course: MotionCourse, flight: Flight) -> bool:
+    """Whether the runs follow most of what the outputs do."""
+    with np.errstate(all="ignore"):
+        left = np.sum((flight.end.flown.errors / course.deviation[:, None]) ** 2)
+    return bool(left < _POOR**2 * course.residuals)
 
 
 def _fine_enough(course: MotionCourse, flight: Flight, solver: LevenbergMarquardt) -> tuple[MotionCourse, Flight]:

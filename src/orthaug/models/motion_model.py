@@ -226,7 +226,7 @@ class MotionModel(OnRecords):
         rows = rows[: max(FIRST_ROWS, self.window)]
         inputs = self.form.inputs(experiment, record)[: len(rows)]
         rows = rows[: len(inputs)]
-        size = padded_length(len(rows))
+        size = max(FIRST_ROWS, self.window)
         windows = Windows(_padded(inputs, size), _padded(rows, size), (np.arange(size) < len(rows))[:, None])
         guess = self.form.start(rows, [0]).T
         settled = settle(self.form, self.numbers, guess, windows, self.weight, self.loose, _GUESS_ITERATIONS)[0]
