@@ -26,6 +26,7 @@ from orthaug.physics.shared import Shared, agreeing, moves
 _BATCH = 4096  # points at a time
 _ITERATIONS = 30
 _SETTLED = 1e-12  # of a step, relative
+_FLAT = 1e-12  # curvature of the distance along directions of unit length: below it is none
 _FEWEST = 4  # moves that succeed, for each parameter
 
 
@@ -114,28 +115,35 @@ def nearest(
     shared = directions(q)
     if not shared.basis.size:
         return q, shared
-    b = np.linalg.qr(shared.basis)[0]
-    candidates = [q, np.clip(q + b @ (b.T @ (start - q)), *bounds)]
+    gauss = np.asarray(_summed(_gauss_newton, form, numbers, q, field)[1])
+    b, size = _unit(shared.basis, gauss), np.sqrt(np.diag(gauss))
+    along = np.linalg.lstsq(size[:, None] * b, size * (start - q), rcond=None)[0]
+    candidates = [np.clip(q + b @ along, *bounds), q]
     q = min(candidates, key=lambda at: _distance(form, numbers, at, field))
     damping, value = 1e-6, _distance(form, numbers, q, field)
     for _ in range(_ITERATIONS):
         shared = directions(q)
-        b = np.linalg.qr(shared.basis)[0]
         gradient, gauss = (np.asarray(part) for part in _summed(_gauss_newton, form, numbers, q, field))
-        inner, right = b.T @ gauss @ b, -b.T @ gradient
-        step = b @ np.linalg.lstsq(inner + damping * np.diag(np.diag(inner)), right, rcond=None)[0]
-        trial = np.clip(q + step, *bounds)
+        b = _unit(shared.basis, gauss)
+        inner, downhill = b.T @ gauss @ b, -b.T @ gradient
+        along = np.linalg.lstsq(inner + damping * np.eye(len(inner)), downhill, rcond=None)[0]
+        trial = np.clip(q + b @ along, *bounds)
         there = _distance(form, numbers, trial, field)
         if there <= value:
-            moved = np.abs(trial - q).max()
             q, value, damping = trial, there, damping / 10
-            if moved <= _SETTLED * np.maximum(np.abs(q).max(), 1.0):
+            if np.abs(along).max() <= _SETTLED * np.sqrt(max(value, 1e-300)) or not (trial != q).any():
                 break
         else:
             damping = max(damping * 100, 1e-6)
             if damping > 1e6:
                 break
     return q, directions(q)
+
+
+def _unit(basis: Matrix, gauss: Matrix) -> Matrix:
+    """The directions in such a length that each moves the learned equations by one."""
+    size = np.sqrt(np.maximum(np.einsum("ij,ik,kj->j", basis, gauss, basis), 0.0))
+    return basis / np.where(size > 0, size, 1.0)
 
 
 def split_motion(
@@ -170,26 +178,19 @@ def split_motion(
         np.asarray(part) for part in _summed(_second, form, numbers, q, field)
     )
     with np.errstate(all="ignore"):
-        defect = share = None
-        if shared.basis.size:
-            b = np.linalg.qr(shared.basis)[0]
-            inner = b.T @ gauss @ b
-            along = float((b.T @ gradient) @ np.linalg.lstsq(inner, b.T @ gradient, rcond=None)[0])
-            defect = float(np.sqrt(max(along, 0.0) / learner)) if learner > 0 else None
         share = float(np.sqrt(rest / size)) if size > 0 else None
     if not shared.basis.size:
-        return MotionSplit(name, q, shared, whole, defect, share, 1.0, field)
-    inner, flat = b.T @ second @ b, b.T @ gauss @ b
-    unit = 1 / np.sqrt(np.maximum(np.diag(flat), 1e-300))
-    values = np.linalg.eigvalsh(inner * np.outer(unit, unit))
-    plain = np.linalg.eigvalsh(flat * np.outer(unit, unit))
-    curvature = float(values.min() / max(plain.min(), 1e-300))
-    if not values.min() > 1e-12:
-        return MotionSplit(name, q, shared, None, defect, share, curvature, field)
-    cross = np.concatenate([to_c + second, to_w], axis=1)
-    if wobble is not None:
-        cross = cross + wobble(q)
-    slope = whole - b @ np.linalg.solve(inner, b.T @ cross)
+        return MotionSplit(name, q, shared, whole, None, share, 1.0, field)
+    b = _unit(shared.basis, gauss)
+    inner, flat, left = b.T @ second @ b, b.T @ gauss @ b, b.T @ gradient
+    along = float(left @ np.linalg.lstsq(flat, left, rcond=None)[0])
+    defect = float(np.sqrt(max(along, 0.0) / learner)) if learner > 0 else None
+    lowest = float(np.linalg.eigvalsh(inner).min())
+    curvature = lowest / max(float(np.linalg.eigvalsh(flat).min()), 1e-300)
+    slope = None
+    if lowest > _FLAT:
+        cross = np.concatenate([to_c + second, to_w], axis=1) + (0.0 if wobble is None else wobble(q))
+        slope = whole - b @ np.linalg.solve(inner, b.T @ cross)
     return MotionSplit(name, q, shared, slope, defect, share, curvature, field)
 
 
