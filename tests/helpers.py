@@ -62,7 +62,8 @@ def problem(
 def linear_columns(given: Problem) -> np.ndarray:
     """P⊥J (N ny, nw) of a learner that is linear in its weights, by automatic differentiation at zero."""
     w = jnp.zeros(given.bound.size)
-    jacobian = jax.jacrev(lambda w: given.gain * jax.vmap(lambda row: given.bound.values(w, row))(given.z))(w)
+    slope = jax.jacrev(lambda w: given.gain * jax.vmap(lambda row: given.bound.values(w, row))(given.z))
+    jacobian = jax.jit(slope)(w)
     columns = np.asarray(jacobian).reshape(given.e.size, -1)
     q = given.q.reshape(given.e.size, -1)
     for _ in range(2):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -204,7 +204,7 @@ def test_segments_of_a_state_space(ny):
 def test_outputs_of_a_state_space_are_those_of_a_loop(ny):
     dynamics, numbers, _, segments, states = state_space(ny)
     found = respond(dynamics, numbers, segments, states)
-    expected = by_a_loop(dynamics, numbers.theta, states, segments.inputs)
+    expected = jax.jit(partial(by_a_loop, dynamics))(numbers.theta, states, segments.inputs)
     np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
 
 
@@ -215,12 +215,13 @@ def test_sensitivities_of_a_state_space_are_those_of_a_loop(ny):
     found = sensitivity(dynamics, numbers, segments, jnp.asarray(states), jnp.asarray(weight))
     scored, target = np.asarray(segments.scored)[:, :, None], np.asarray(segments.target)
 
+    @jax.jit
     def outputs(states, theta):
         run = jnp.where(scored, by_a_loop(dynamics, theta, states, segments.inputs), 0.0)
         return jnp.einsum("oi,ktim->ktom", weight, run)
 
     theta = jnp.asarray(numbers.theta)
-    by_state, by_theta = jax.jacfwd(outputs, (0, 1))(jnp.asarray(states), theta)
+    by_state, by_theta = jax.jit(jax.jacfwd(outputs, (0, 1)))(states, theta)
     error = np.einsum("oi,ktim->ktom", weight, np.where(scored, target, 0.0)) - outputs(states, theta)
     columns = np.concatenate([by_theta, error[..., None]], axis=-1)
     rows = columns.reshape(-1, columns.shape[-1])
@@ -238,7 +239,7 @@ def test_a_longer_run_forgets_nothing():
     """Slopes of the last output to the first state: C A^(T−1), the product of all steps."""
     dynamics, numbers, *_ = state_space(2)
     a, _, c = dynamics.matrices(numbers.theta)
-    state, slopes = jnp.zeros((3, 1)), dynamics.first_slopes(1)
+    state, slopes, tangents = np.zeros((3, 1)), dynamics.first_slopes(1), jax.jit(dynamics.tangents)
     for _ in range(12):
-        state, slopes, _, slope = dynamics.tangents(numbers, state, slopes, jnp.ones((2, 1)))
+        state, slopes, _, slope = tangents(numbers, state, slopes, np.ones((2, 1)))
     np.testing.assert_allclose(slope[:, :3, 0], c @ np.linalg.matrix_power(a, 11), rtol=1e-10, atol=1e-14)

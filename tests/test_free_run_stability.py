@@ -427,7 +427,7 @@ def test_lipschitz_of_the_weights_of_a_network(network):
         slope = jax.jacfwd(lambda w, x: form.at(numbers._replace(weights=w), x).total)
         return jnp.linalg.norm(jax.jacfwd(slope, 1)(numbers.weights, row).ravel())
 
-    assert lipschitz(model, record).weights == pytest.approx(float(jax.vmap(size)(x).max()))
+    assert lipschitz(model, record).weights == pytest.approx(float(jax.jit(jax.vmap(size))(x).max()))
 
 
 def test_lipschitz_of_no_weights(duffing):

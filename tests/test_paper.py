@@ -14,7 +14,7 @@ from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.projection import Projection
 from orthaug.studies.synthetic import mass_spring_damper, static
 
-SEEDS = range(10)
+SEEDS = range(4)
 LEARNERS = [
     None,
     MLP(hidden=()),
@@ -64,7 +64,7 @@ def additive():
 def spring():
     example = mass_spring_damper()
     solver = LevenbergMarquardt(iterations=100)
-    return example, [estimate(example.train, example.baseline, solver=solver, seed=seed) for seed in range(5)]
+    return example, [estimate(example.train, example.baseline, solver=solver, seed=seed) for seed in range(2)]
 
 
 ERROR = {1: (0.0, 1e-12), 2: (0.0795547, 5e-8), 3: (0.1433322, 5e-8)}  # ‖θ* − θ̂‖ without noise

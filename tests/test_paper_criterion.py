@@ -10,6 +10,7 @@ from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Record
 from orthaug.fitting.elimination import eliminate
 from orthaug.fitting.estimation import estimate
+from orthaug.fitting.normal_equations import one_pass
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.paper_criterion import JointOneStep, Physics
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
@@ -46,8 +47,8 @@ def test_normal_equations_are_those_of_all_columns(known):
     p = jnp.asarray(rng.normal(size=2 + task.bound.size))
     criterion = JointOneStep(task.bound)
     before = Overlap(jnp.zeros((2, len(p))), jnp.zeros(2))
-    before = criterion(p, task.rows, physics, before).overlap if known else before
-    normal = criterion(p, task.rows, physics, before)
+    before = one_pass(criterion, p, (task.rows, physics), before).overlap if known else before
+    normal = one_pass(criterion, p, (task.rows, physics), before)
 
     phi = np.stack([problem.feature_rows()[:, 0], problem.feature_rows()[:, 0] ** 3], axis=1)
     scale = np.sqrt(len(phi)) / np.linalg.norm(phi * problem.weight.matrix[0, 0] / task.rms, axis=0)
@@ -57,7 +58,7 @@ def test_normal_equations_are_those_of_all_columns(known):
         model = phi @ (INITIAL + scale * p[:2]) + task.unit * values[:, 0]
         return (problem.target[:, 0] - model) * problem.weight.matrix[0, 0] / task.rms
 
-    r, columns = residual(p), -jax.jacobian(residual)(p)
+    r, columns = jax.jit(lambda p: (residual(p), -jax.jacobian(residual)(p)))(p)
     np.testing.assert_allclose(normal.loss, r @ r, rtol=1e-9)
     np.testing.assert_allclose(normal.gradient, columns.T @ r, rtol=1e-8, atol=1e-8 * float(r @ r))
     np.testing.assert_allclose(normal.hessian, columns.T @ columns, rtol=1e-8, atol=1e-9 * len(r))

@@ -208,8 +208,8 @@ def test_a_measure_beyond_the_data_is_warned_of(curve):
 def test_the_uniform_measure_finds_the_papers_parameters(data_set):
     """θ̂ errs by 0.0796 and 0.1433 under the training measure, however good the fit (F3)."""
     example = static(data_set)
-    for seed in range(3):
-        fit = estimate(example.train, example.baseline, seed=seed)
+    for seed in range(2):
+        fit = estimate(example.train, example.baseline, seed=seed, regularization="none")
         biased = {2: 0.0795547, 3: 0.1433322}[data_set]
         assert np.linalg.norm(fit.theta - example.theta) == pytest.approx(biased, abs=1e-7)
         assert np.linalg.norm(fit.split(WIDE).theta - example.theta) <= 5e-5
