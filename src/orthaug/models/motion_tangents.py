@@ -8,16 +8,14 @@ and ∂x⁺/∂w = Σ Ψ_i E G_i: the learner is differentiated once in a stage,
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from orthaug._base.jax import jax, jnp
 from orthaug.models.dynamics import Numbers
 from orthaug.models.integrators import input_at
-
-if TYPE_CHECKING:
-    from orthaug.models.moving import Moving
+from orthaug.models.motion_field import MotionField
 
 
 class Slopes(NamedTuple):
@@ -29,7 +27,7 @@ class Slopes(NamedTuple):
     to_w: Any
 
 
-def sample_slopes(form: Moving, numbers: Numbers, state: Any, row: Any) -> Slopes:
+def sample_slopes(form: MotionField, numbers: Numbers, state: Any, row: Any) -> Slopes:
     """x one sample later, at one state (nx,) and the inputs of one row, under `rk4`."""
     at, halves = input_at(row, len(form.motion.inputs)), 2 * form.substeps
     h, identity = form.sampling_time / form.substeps, jnp.eye(form.states)
@@ -56,7 +54,7 @@ def sample_slopes(form: Moving, numbers: Numbers, state: Any, row: Any) -> Slope
     return Slopes(x, to_x, to_c, to_w)
 
 
-def field_slopes(form: Moving, numbers: Numbers, x: Any, u: Any) -> Slopes:
+def field_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
     """F at one point; ∂/∂w is that of the learned equations only, (nl, nw)."""
     c = numbers.theta - numbers.theta_aux
     coordinates = form.motion.coordinates
@@ -76,7 +74,7 @@ def field_slopes(form: Moving, numbers: Numbers, x: Any, u: Any) -> Slopes:
     return Slopes(value, to_x.at[rows].add(learner.to_x[:count]), to_c, learner.to_w[:count])
 
 
-def learner_slopes(form: Moving, numbers: Numbers, x: Any, u: Any) -> Slopes:
+def learner_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
     """g at one point: of learned equations first, then of learned outputs."""
     bound = form.bound
     assert bound is not None
@@ -93,7 +91,7 @@ def learner_slopes(form: Moving, numbers: Numbers, x: Any, u: Any) -> Slopes:
     return Slopes(gain * value, _finite(to_x), jnp.zeros((bound.ny, 0)), _finite(to_w))
 
 
-def output_slopes(form: Moving, numbers: Numbers, x: Any, u: Any) -> Slopes:
+def output_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
     """y at one point."""
     c = numbers.theta - numbers.theta_aux
 

@@ -1,0 +1,84 @@
+"""The field of a motion with a learner: ẋ = f(x, u; c) + E g(z; w), y = h(x, u; c) + g(z; w).
+
+g is the learner on features z of states and inputs. Its values go to the learned equations first, then to the learned
+outputs. The unknowns are the coordinates c of the physical parameters, and the weights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.jax import jax, jnp
+from orthaug.data.expressions import Expression
+from orthaug.models.dynamics import Numbers
+from orthaug.models.learners import Bound
+from orthaug.physics.motion import Motion
+
+
+@dataclass(frozen=True)
+class MotionField:
+    """What a motion with a learner computes at a point, without its numbers.
+
+    `features` are expressions of states and inputs; `substeps` the integrator's in a sample of `sampling_time` s.
+    """
+
+    motion: Motion
+    features: tuple[Expression, ...]
+    bound: Bound | None
+    sampling_time: float
+    substeps: int
+
+    @property
+    def states(self) -> int:
+        return len(self.motion.states)
+
+    @property
+    def unknowns(self) -> int:
+        return len(self.motion.parameters) + (self.bound.size if self.bound else 0)
+
+    def now(self, inputs: Any) -> Any:
+        """u (…, nu) at the sample itself, of the rows that steps read."""
+        return inputs[..., : len(self.motion.inputs)]
+
+    def seen(self, x: Any, u: Any, xp: Any = jnp) -> Any:
+        """The learner's features z (nz, …) of states (nx, …) and inputs (nu, …)."""
+        values: Mapping[str, Any] = self.motion.values(x, u, self.motion.initial, xp)
+        columns = [xp.asarray(entry.value(values, xp), dtype=float) for entry in self.features]
+        return xp.stack([xp.broadcast_to(column, x.shape[1:]) for column in columns])
+
+    def learned(self, numbers: Numbers, x: Any, u: Any) -> Any:
+        """g (learned equations and outputs,) in their units, at one point."""
+        assert self.bound is not None
+        z = (self.seen(x, u) - numbers.centre) / numbers.halfwidth
+        return numbers.gain * self.bound.values(numbers.weights, z)
+
+    def rates(self, numbers: Numbers, x: Any, u: Any) -> tuple[Any, Any]:
+        """The equations' right-hand sides of physics and learner, each (nx,)."""
+        physics = self.motion.rates(x, u, self.parameters(numbers), jnp)
+        learned = jnp.zeros(self.states)
+        states, _ = self.motion.learned
+        if self.bound is not None and states:
+            learned = learned.at[np.array(states)].set(self.learned(numbers, x, u)[: len(states)])
+        return physics, learned
+
+    def observed(self, numbers: Numbers, x: Any, u: Any) -> Any:
+        """y (ny,)."""
+        y = self.motion.observed(x, u, self.parameters(numbers), jnp)
+        states, outputs = self.motion.learned
+        if self.bound is not None and outputs:
+            y = y.at[np.array(outputs)].add(self.learned(numbers, x, u)[len(states) :])
+        return y
+
+    def parameters(self, numbers: Numbers) -> Any:
+        """The physical parameters (np,) beside the learner, before any split."""
+        return self.motion.coordinates.physical(numbers.theta - numbers.theta_aux, jnp)
+
+    def linear_part(self, numbers: Numbers) -> Any:
+        """∂f/∂x of the physics at the origin; 0 where it has none."""
+        p, rest = self.parameters(numbers), jnp.zeros(len(self.motion.inputs))
+        slope = jax.jacfwd(lambda x: self.motion.rates(x, rest, p, jnp))(jnp.zeros(self.states))
+        return jnp.where(jnp.isfinite(slope), slope, 0.0)
