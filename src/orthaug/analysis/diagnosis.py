@@ -29,6 +29,7 @@ _LITTLE_FOLLOWED = 0.1  # correlation of such errors with an input
 _AS_GOOD = 1.05  # free-run error / one-step error up to which measured lags add nothing
 _SMALL = 0.05  # of the residual's variance: what could be predicted below that is a small effect
 _SMALL_SIZE = 0.05  # of the output's deviation, beside it
+_SMALL_COLOUR = 0.2  # the same of what a free run's own past tells: more of it is hardly noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,8 +128,11 @@ def _is_small(seen: Finding) -> bool:
     if seen.lacks or not seen.predictable:
         return False
     shares = [one.largest(own_past=not seen.simulated) for one in seen.predictable]
-    size = [np.sqrt(share) * one.rms for share, one in zip(shares, seen.predictable, strict=True)]
-    return max(shares) < _SMALL and bool(np.all(np.array(size) < _SMALL_SIZE * seen.fit.problem.deviation))
+    unit = zip(seen.predictable, seen.fit.problem.deviation, strict=True)
+    rms = np.array([one.rms / deviation for one, deviation in unit])
+    colour = np.array([one.own_past for one in seen.predictable])
+    small = bool(np.all(np.sqrt(shares) * rms < _SMALL_SIZE) and np.all(np.sqrt(colour) * rms < _SMALL_COLOUR))
+    return max(shares) < _SMALL and small
 
 
 def _effects(fit: Estimate, one_step: Response, free_run: Response | None, flown: bool) -> dict:

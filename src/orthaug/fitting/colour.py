@@ -58,7 +58,7 @@ def _correlations(residuals: Matrix) -> Vector | None:
 
 
 def _autocovariances(residuals: Matrix) -> Vector:
-    """Σ e_k e_{k−τ} over all stretches, τ = 0, 1, …"""
+    """`Σ e_k e_{k−τ}` over all stretches, from τ = 0 on."""
     longest = residuals.shape[1]
     size = 1 << (2 * longest - 1).bit_length()
     spectrum = np.sum(np.abs(np.fft.rfft(residuals, size, axis=1)) ** 2, axis=0)
