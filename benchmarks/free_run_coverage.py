@@ -15,7 +15,7 @@ from machine import describe
 from scipy.signal import lfilter
 
 import orthaug as oa
-from orthaug.analysis.diagnosis import robust_where_coloured
+from orthaug.analysis.robustness import robust_where_coloured
 
 SAMPLES, NOISE, WARM_UP = 3000, 0.5, 200
 THETA = np.array([1.5, -0.7, 0.3, 0.2])

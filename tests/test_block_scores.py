@@ -11,7 +11,7 @@ from test_initial_states import FED_BACK, eliminated, start_rows, states_of
 from test_segments import CASES, assert_close, case, dense, found_of
 
 from orthaug._base.errors import InputError
-from orthaug.analysis.diagnosis import robust_where_coloured
+from orthaug.analysis.robustness import robust_where_coloured
 from orthaug.data.record import Record
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.colour import correlation_length

@@ -244,6 +244,17 @@ def test_an_input_that_drives_the_residual_is_named_with_its_lag(colour):
     assert found.largest_cross > found.cross["pump"].band
 
 
+def test_an_input_is_followed_beyond_the_widest_band_only():
+    """On 20 000 rows a correlation of 0.04 is certain; a slow input beside a slow residual has a wide band."""
+    rng = np.random.default_rng(18)
+    e, u, slow = rng.normal(size=(3, 20000))
+    found = report(e + 0.04 * u, {"u": u})
+    assert found.correlated_inputs == ("u",) and found.follows() == [] and found.follows(0.01) == ["u"]
+    found = report(coloured(e[:2000], -0.98) + 0.5 * u[:2000], {"u": u[:2000], "slow": coloured(slow[:2000], -0.98)})
+    assert found.correlated_inputs == ("u",) and found.cross["u"].largest > found.cross["u"].band
+    assert found.follows() == []
+
+
 @pytest.mark.parametrize("colour", COLOURS)
 def test_a_curve_names_its_regressor(colour):
     rng = np.random.default_rng(18)

@@ -1,23 +1,22 @@
-"""What the residual says about the noise, and which criterion the data ask for.
+"""What the residual says about the noise, which criterion the data ask for, and which change would help.
 
 Noise in the equation leaves a white one-step residual. Noise on the measured output leaves a coloured one. It makes
 one-step least squares inconsistent, and a free run then explains the data as well as a prediction from measured lags.
+With many rows every test rejects; so effects are measured, as shares of variance that could be predicted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from orthaug._base.checks import Vector
-from orthaug._base.errors import InputError
 from orthaug._base.parallel import one_blas_thread
 from orthaug._base.warning import Warning
-from orthaug.analysis.correlation import autocorrelation
-from orthaug.analysis.residuals import ResidualTest, analyse
-from orthaug.analysis.whiteness import ROWS_PER_LAG, ljung_box
+from orthaug.analysis.changes import Change, fall_of, model_changes, own_share
+from orthaug.analysis.predictability import Predictable, predictable
+from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, rms_errors
+from orthaug.analysis.verdict_text import SHARE, Finding, words
 from orthaug.data.regressors import Lags
 from orthaug.fitting.criteria import Simulation
 from orthaug.fitting.estimates import Estimate
@@ -25,24 +24,12 @@ from orthaug.fitting.estimation import estimate
 from orthaug.models.response import Response
 from orthaug.physics.problem import Problem
 
-LAGS = 25  # as MATLAB's `resid`
-_PRACTICALLY_WHITE = 0.05  # correlations below this are no matter, however sure a long record makes them
 _LITTLE_COLOUR = 0.2  # of a free run's errors that are noise, beside a start from noisy lags and a fit of finite length
+_LITTLE_FOLLOWED = 0.1  # correlation of such errors with an input
 _AS_GOOD = 1.05  # free-run error / one-step error up to which measured lags add nothing
-_TOLD = 5  # findings that a text lists at most
-_SHARE = 0.01  # of the residual's variance: what a regressor explains of it counts from there
-_FEWEST_ROWS, _ROWS_PER_TERM = 100, 10  # rows that a sum of autocovariances needs, in all and for each of its lags
-_FEWEST_BLOCKS = 20  # of which the variance of a sum can be told: its standard error is then a third of it
-_MEMORIES = 3  # times as many lags as the residual's correlation lasts: Bartlett's weights fade
-_LEVEL = 0.01  # of the test whether a residual is white
-_ROUNDING = 1e-14  # of the output's deviation: a residual that says nothing
-_TOO_FAST = 0.05  # noise variance / smallest variance among the lagged outputs
-
-_BIASED = Warning(
-    "sensor_noise",
-    "noise on the measured output biases the one-step θ, and its intervals do not cover that bias: "
-    'train with focus = "simulation".',
-)
+_SMALL = 0.05  # of the residual's variance: what could be predicted below that is a small effect
+_SMALL_SIZE = 0.05  # of the output's deviation, beside it
+_SMALL_COLOUR = 0.2  # the same of what a free run's own past tells: more of it is hardly noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +38,8 @@ class Diagnosis:
 
     `one_step` and `free_run` are the tests of the two residuals per output. `ratio` is the free run's RMS error against
     the one-step error, `noise_in_lags` the share of noise in the least excited direction of the lagged outputs.
+    `predictable` is what could be predicted of the error that was minimised, per output. `changes` are predicted to
+    lower it, the first of them by most; there is none where it is noise.
     """
 
     verdict: str
@@ -60,6 +49,8 @@ class Diagnosis:
     ratio: float | None
     noise_in_lags: float | None
     warnings: tuple[Warning, ...]
+    predictable: tuple[Predictable, ...] = ()
+    changes: tuple[Change, ...] = ()
 
     def __repr__(self) -> str:
         return f"Diagnosis({self.verdict}: {self.text})"
@@ -77,124 +68,115 @@ def diagnose(fit: Estimate, *, one_step: Response | None = None, free_run: Respo
     problem, model, simulated = fit.problem, fit.model, fit.criterion.flown is not None
     one_step = model.predict(problem.record) if one_step is None else one_step
     tests = _tests(problem, one_step)
-    if any(test.white is None for test in tests) or np.all(_errors(one_step) / problem.deviation < _ROUNDING):
+    if any(test.white is None for test in tests) or np.all(rms_errors(one_step) / problem.deviation < ROUNDING):
         return None
-    white = all(_is_white(test, _PRACTICALLY_WHITE) for test in tests)
-    complete = white and not any(_misfits(test) for test in tests)
+    white = all(test.practically_white() for test in tests)
+    seen = Finding(fit, simulated, one_step, tests, white=white, free_white=True, ratio=None, noise=None)
     if not model.form.states:
-        return _static(fit, tests, white, complete)
+        return _concluded(replace(seen, **_effects(fit, one_step, one_step, False)), None)
     free_run = model.simulate(problem.record) if free_run is None else free_run
     skip = fit.criterion.washout
     flown = [(free_run, skip)] if not any(t.diverged for t in free_run.trajectories) else []
     free_tests = _tests(problem, free_run, skip) if flown else None
-    if not simulated and not white:
-        flown += _physics_flown(fit)
-    ratios = [_ratio(run, one_step, first) for run, first in flown]
+    trained = _physics_flown(fit) if not simulated and not white else []
+    ratios = [_ratio(run, one_step, first) for run, first in flown + trained]
     good = [
         ratio
-        for ratio, (run, first) in zip(ratios, flown, strict=True)
+        for ratio, (run, first) in zip(ratios, flown + trained, strict=True)
         if ratio and ratio < _AS_GOOD and _accounts(problem, run, first)
     ]
     sensor = not white and bool(good)
     ratio = min(good) if sensor else ratios[0] if ratios else None
-    noise = _noise_in_lags(problem, ratio, one_step) if sensor else None
-    free_white = free_tests is not None and all(_is_white(test, _PRACTICALLY_WHITE) for test in free_tests)
-    verdict = ("white" if free_white else "equation_noise") if complete else "sensor_noise" if sensor else "unmodelled"
-    text, warnings = _words(verdict, fit, tests, ratio, noise, simulated)
-    robust = fit.plain_covariance is not None
-    if fit.std is not None and not warnings and not robust and not (free_white if simulated else white):
-        warnings = (_coloured("errors of the free run are" if simulated else "one-step residual is"),)
-    return Diagnosis(verdict, text, tests, free_tests, ratio, noise, warnings)
+    seen = replace(
+        seen,
+        sensor=sensor,
+        ratio=ratio,
+        noise=_noise_in_lags(problem, ratio, one_step) if sensor else None,
+        free_white=free_tests is not None and all(test.practically_white() for test in free_tests),
+        free_tests=free_tests,
+        **_effects(fit, one_step, free_run if flown else None, fit.criterion.simulates),
+    )
+    if not simulated and not white:
+        seen = replace(seen, changes=_with_criterion(seen, free_run if flown else None, trained))
+    return _concluded(seen, free_tests)
 
 
-def robust_where_coloured(fit: Estimate, response: Response) -> Estimate:
-    """The fit with robust standard errors, where it leaves a coloured residual: Newey and West, or batch means.
-
-    `response` is the prediction of the training rows. Few rows, or ones that remember each other for long, leave the
-    plain errors: their robust ones would be too small.
-    """
-    if not fit.status.ok or fit.covariance is None or fit.at_bound:
-        return fit
-    lags = _memory(fit, response) if fit.criterion.flown is None else _block(fit)
-    if lags is None or len(fit.problem.rows) < max(_FEWEST_ROWS, _ROWS_PER_TERM * lags):
-        return fit
-    try:
-        return fit.robust(lags)
-    except InputError:  # an ensemble, or a fit without statistics
-        return fit
-
-
-def _memory(fit: Estimate, response: Response) -> int | None:
-    """Lags for the one-step residual; None where it is white, or rounding."""
-    memory = 0
-    if np.all(_errors(response) / fit.problem.deviation < _ROUNDING):
-        return None
-    for i in range(len(fit.problem.outputs)):
-        pieces = [(t.measured - t.model)[t.start :, i] for t in response.trajectories]  # type: ignore[operator]
-        if _is_coloured(pieces):
-            rows = sum(map(len, pieces))
-            acf = np.asarray(autocorrelation(pieces, rows // ROWS_PER_LAG))
-            quiet = np.abs(acf) < 2 / np.sqrt(rows)
-            memory = max(memory, int(np.argmax(np.append(quiet, True))))
-    return _MEMORIES * memory or None
+def _concluded(seen: Finding, free_tests: tuple[ResidualTest, ...] | None) -> Diagnosis:
+    """The verdict and its words."""
+    misfit = any(t.follows() or t.curved_over(SHARE) for t in seen.tests) or seen.lacks
+    complete = seen.white and not misfit
+    noise = "white" if seen.free_white and seen.white else "equation_noise"
+    if not seen.fit.model.form.states:
+        noise = "white"
+    if seen.sensor:
+        verdict = "sensor_noise"
+    elif complete or _is_small(seen):
+        verdict = noise
+    else:
+        verdict = "unmodelled"
+    seen = replace(seen, complete=complete)
+    if verdict == "equation_noise" and seen.fit.criterion.simulates and seen.white:
+        seen = replace(seen, changes=_toward_prediction(seen))
+    text, warnings = words(verdict, seen)
+    return Diagnosis(
+        verdict, text, seen.tests, free_tests, seen.ratio, seen.noise, warnings, seen.predictable, seen.changes
+    )
 
 
-def _block(fit: Estimate) -> int | None:
-    """Steps of a block for the errors of the free run; None where these are white, or leave too few blocks."""
-    if fit.scores is None:
-        return None
-    errors = fit.scores.errors()  # (ny, segments, steps), 0 where a step is not scored
-    size = np.sqrt(np.sum(errors**2, axis=(1, 2)) / max(fit.scores.segments.count, 1))
-    if not np.isfinite(size).all() or np.all(size / fit.problem.deviation < _ROUNDING):
-        return None
-    if not any(_is_coloured([one[one != 0] for one in output]) for output in errors):
-        return None
-    steps = fit.scores.block()
-    if steps is None or steps > fit.scores.longest or fit.scores.segments.count < _FEWEST_BLOCKS * steps:
-        return None
-    return steps
+def _is_small(seen: Finding) -> bool:
+    """Whether what could be predicted is a small effect: no change is worth making."""
+    if seen.lacks or not seen.predictable:
+        return False
+    shares = [one.largest(own_past=not seen.simulated) for one in seen.predictable]
+    unit = zip(seen.predictable, seen.fit.problem.deviation, strict=True)
+    rms = np.array([one.rms / deviation for one, deviation in unit])
+    colour = np.array([one.own_past for one in seen.predictable])
+    small = bool(np.all(np.sqrt(shares) * rms < _SMALL_SIZE) and np.all(np.sqrt(colour) * rms < _SMALL_COLOUR))
+    return max(shares) < _SMALL and small
 
 
-def _is_coloured(pieces: list[Vector]) -> bool:
-    """Whether Ljung-Box rejects a white residual and a correlation is large enough to matter."""
-    box, acf = ljung_box(pieces, LAGS), autocorrelation(pieces, sum(map(len, pieces)) // ROWS_PER_LAG)
-    return box is not None and acf is not None and box.p < _LEVEL and np.abs(acf[1:]).max() >= _PRACTICALLY_WHITE
+def _effects(fit: Estimate, one_step: Response, free_run: Response | None, flown: bool) -> dict:
+    """What could be predicted of the error that was minimised, and which changes would do it."""
+    response, skip = (free_run, fit.criterion.washout) if flown else (one_step, 0)
+    several = fit.criterion.flown is not None and not fit.criterion.simulates
+    if response is None or several:  # it ran away, or is the error of some steps ahead
+        return {}
+    with one_blas_thread():
+        shares = predictable(fit.problem, response, skip)
+    return {
+        "predictable": shares,
+        "changes": model_changes(fit, response, flown=flown, skip=skip, one_step=one_step),
+    }
 
 
-def _static(fit: Estimate, tests: tuple[ResidualTest, ...], white: bool, complete: bool) -> Diagnosis:
-    """The diagnosis of a model without past outputs."""
-    verdict = "white" if complete else "unmodelled"
-    text, warnings = _words(verdict, fit, tests, None, None, False)
-    if fit.std is not None and fit.plain_covariance is None and not white:
-        warnings = (_coloured("one-step residual is"),)
-    return Diagnosis(verdict, text, tests, None, None, None, warnings)
+def _with_criterion(
+    seen: Finding, free_run: Response | None, trained: list[tuple[Response, int]]
+) -> tuple[Change, ...]:
+    """The changes of a one-step fit with that of the criterion: in front where it is sensor noise, else if alone."""
+    if not trained:
+        return seen.changes
+    (run, skip), unit = trained[0], seen.fit.problem.deviation
+    after = float(np.mean((rms_errors(run, skip) / unit) ** 2))
+    before = np.inf if free_run is None else float(np.mean((rms_errors(free_run, skip) / unit) ** 2))
+    share = 1 - after / before
+    change = (Change("criterion", "simulation", fall_of(share), "simulation"),)
+    if seen.sensor:
+        return change + seen.changes
+    return seen.changes or (change if share >= _SMALL else ())
 
 
-def _coloured(what: str) -> Warning:
-    told = f"standard errors of θ are those of a white residual, but the {what} coloured: take them for a rough guide."
-    return Warning("coloured_residual", told)
-
-
-def _is_white(test: ResidualTest, small: float) -> bool:
-    """White by Ljung-Box, or with correlations too small to matter."""
-    return test.white is not False or test.largest_acf is None or test.largest_acf < small
-
-
-def _follows(test: ResidualTest, small: float) -> list[str]:
-    """Inputs that the residual follows, surely and by enough to matter."""
-    return [name for name in test.correlated_inputs if (t := test.cross[name]) and abs(t.largest) > small]
-
-
-def _misfits(test: ResidualTest) -> list[str]:
-    """Inputs and regressors that the residual still follows."""
-    curved = [name for name in test.curved_regressors if (t := test.regressors[name]) and t.share > _SHARE]
-    return _follows(test, _PRACTICALLY_WHITE) + curved
+def _toward_prediction(seen: Finding) -> tuple[Change, ...]:
+    """One step ahead instead of the free run, where its θ would predict better."""
+    share = own_share(seen.fit, seen.one_step)
+    if share.value < _SMALL or not share.sure:
+        return ()
+    return (Change("criterion", "prediction", fall_of(share.value), "prediction"),)
 
 
 def _accounts(problem: Problem, free_run: Response, skip: int) -> bool:
     """Whether the errors of a free run look like noise on a sensor: white enough, and not following the inputs."""
     tests = _tests(problem, free_run, skip)
-    return all(_is_white(test, _LITTLE_COLOUR) and not _follows(test, 2 * _PRACTICALLY_WHITE) for test in tests)
+    return all(test.practically_white(_LITTLE_COLOUR) and not test.follows(_LITTLE_FOLLOWED) for test in tests)
 
 
 def _physics_flown(fit: Estimate) -> list[tuple[Response, int]]:
@@ -238,16 +220,9 @@ def _tests(problem: Problem, response: Response, skip: int = 0) -> tuple[Residua
         return analyse(residuals, inputs, regressors, *names, lags=LAGS)
 
 
-def _errors(response: Response, skip: int = 0) -> Vector:
-    """RMS error of every output over the rows with a value, without the first `skip` of them."""
-    pieces = [(t.measured - t.model)[t.start :][skip:] for t in response.trajectories]  # type: ignore[operator]
-    with np.errstate(all="ignore"):
-        return np.sqrt(np.mean(np.concatenate(pieces) ** 2, axis=0))
-
-
 def _ratio(free_run: Response, one_step: Response, skip: int) -> float | None:
     """Geometric mean over outputs of the free run's RMS error against the one-step error."""
-    free, one = _errors(free_run, skip), _errors(one_step, skip)
+    free, one = rms_errors(free_run, skip), rms_errors(one_step, skip)
     if not (np.isfinite(free).all() and np.all(one > 0) and np.all(free > 0)):
         return None
     return float(np.exp(np.mean(np.log(free / one))))
@@ -260,7 +235,7 @@ def _noise_in_lags(problem: Problem, ratio: float | None, one_step: Response) ->
     """
     own = [j for j, lag in enumerate(problem.layout) if lag.channel in problem.outputs]
     others = [j for j in range(len(problem.layout)) if j not in own]
-    noise = (_errors(one_step) * (ratio or 1.0)) ** 2
+    noise = (rms_errors(one_step) * (ratio or 1.0)) ** 2
     channel = [problem.outputs.index(problem.layout[j].channel) for j in own]
     x = problem.rows.x - problem.rows.x.mean(axis=0)
     lagged = x[:, own] / np.sqrt(noise[channel])
@@ -269,45 +244,3 @@ def _noise_in_lags(problem: Problem, ratio: float | None, one_step: Response) ->
         lagged = lagged - rest @ np.linalg.lstsq(rest, lagged, rcond=None)[0]
     smallest = float(np.linalg.eigvalsh(lagged.T @ lagged / len(lagged)).min())
     return 1.0 / smallest if smallest > 1.0 else 1.0
-
-
-def _words(
-    verdict: str,
-    fit: Estimate,
-    tests: Sequence[ResidualTest],
-    ratio: float | None,
-    noise: float | None,
-    simulated: bool,
-) -> tuple[str, tuple[Warning, ...]]:
-    """The text of a verdict, and the warnings that intervals of θ must carry."""
-    if verdict == "white":
-        return "The one-step residual is white: the intervals hold, and no criterion is better than this one.", ()
-    if verdict == "equation_noise":
-        asked = " The one-step criterion is the more precise one here." if simulated else ""
-        return f"The one-step residual is white, the free run's is not: the noise enters the equation.{asked}", ()
-    colour = max((t.largest_acf or 0.0) for t in tests)
-    if verdict == "sensor_noise":
-        closer = "as close" if ratio is None or ratio > 0.95 else f"{1 / ratio:.1f} times closer"
-        own = "the free run is" if simulated else "the physics trained on the free run comes"
-        how = f"its largest autocorrelation is {colour:.2f}, and {own} {closer} without measured lags"
-        text = f"The one-step residual is coloured: {how}. That is noise on the measured output"
-        if simulated:
-            return f"{text}, which the simulation criterion suits.", ()
-        text += '. One-step estimates of θ are then inconsistent: train with focus = "simulation"'
-        if noise is not None and noise > _TOO_FAST:
-            text += (
-                f". The noise is {100 * noise:.0f} % of what tells the lagged outputs apart: the sampling is too fast "
-                "for one-step estimation"
-            )
-        return f"{text}.", (_BIASED,) if fit.std is not None else ()
-    told = [f"its largest autocorrelation is {colour:.2f}"]
-    for test in tests:
-        told += [f"the residual of {test.name} still follows {name}" for name in test.correlated_inputs]
-        told += [f"the residual of {test.name} is curved over {name}" for name in test.curved_regressors]
-    told = [*told[:_TOLD], *(["and more"] if len(told) > _TOLD else [])]
-    share = max((t.rms or 0.0) / d for t, d in zip(tests, fit.problem.deviation, strict=True))
-    text = (
-        f"The one-step residual, {100 * share:.2g} % of the output's deviation, is not noise alone: {'; '.join(told)}. "
-        "Dynamics or nonlinearity are missing, or the noise is coloured. Try more lags, other learner inputs or neurons"
-    )
-    return f"{text}.", ()

@@ -21,17 +21,24 @@ _WIDTH = 1e-3  # of differences, in deviations: bears a learner in single precis
 
 def linearised(model: Model, visited: Visited) -> tuple[Visited, Float[np.ndarray, "m n0 n0"], Vector]:
     """The points with finite derivatives, A_k there, and its spectral radii (m,)."""
-    n0, size = visited.states.shape[1], min(_BATCH, padded_length(len(visited)))
-    width = difference_width(visited.states) if len(visited) else np.ones(n0)
-    batches = [np.zeros((0, n0, n0))]
-    for begin in range(0, len(visited), size):
-        rows = np.minimum(np.arange(begin, begin + size), len(visited) - 1)  # the last one again: one shape
-        found = _transitions(model.form, model.numbers, visited.states[rows], visited.inputs[rows], width)
-        batches.append(np.asarray(found)[: len(visited) - begin])
-    transition = np.concatenate(batches)
+    transition = transitions(model, visited.states, visited.inputs)
     finite = (np.abs(transition) < _NO_DERIVATIVE).all(axis=(1, 2))
     radius = np.abs(np.linalg.eigvals(transition[finite])).max(axis=1, initial=0.0)
     return visited.take(finite), transition[finite], radius
+
+
+def transitions(
+    model: Model, states: Float[np.ndarray, "m n0"], inputs: Float[np.ndarray, "m nu"]
+) -> Float[np.ndarray, "m n0 n0"]:
+    """A_k at m points; not finite where there is no derivative."""
+    n0, size = states.shape[1], min(_BATCH, padded_length(len(states)))
+    width = difference_width(states) if len(states) else np.ones(n0)
+    batches = [np.zeros((0, n0, n0))]
+    for begin in range(0, len(states), size):
+        rows = np.minimum(np.arange(begin, begin + size), len(states) - 1)  # the last one again: one shape
+        found = _transitions(model.form, model.numbers, states[rows], inputs[rows], width)
+        batches.append(np.asarray(found)[: len(states) - begin])
+    return np.concatenate(batches)
 
 
 def difference_width(points: Float[np.ndarray, "m n"]) -> Vector:

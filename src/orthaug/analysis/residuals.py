@@ -18,6 +18,11 @@ from orthaug._base.errors import InputError
 from orthaug.analysis.correlation import LARGEST, autocorrelation
 from orthaug.analysis.independence import CrossTest, RegressorTest, against_input, against_regressor
 from orthaug.analysis.whiteness import LjungBox, Normality, ljung_box, normality, whitening
+from orthaug.models.response import Response
+
+LAGS = 25  # as MATLAB's `resid`
+PRACTICALLY_WHITE = 0.05  # correlations below this are no matter, however sure a long record makes them
+ROUNDING = 1e-14  # of the output's deviation: a residual that says nothing
 
 Channels = dict[str, list[Vector]]
 
@@ -50,6 +55,21 @@ class ResidualTest:
     largest_cross: float | None
     largest_share: float | None
     """Largest |r_e| beyond lag 0, largest |r_eu| over all inputs and causal lags, largest share over all regressors."""
+
+    def practically_white(self, small: float = PRACTICALLY_WHITE) -> bool:
+        """White by Ljung-Box, or with correlations too small to matter."""
+        return self.white is not False or self.largest_acf is None or self.largest_acf < small
+
+    def follows(self, small: float = PRACTICALLY_WHITE) -> list[str]:
+        """Inputs that the residual follows: surely, by enough to matter, and beyond the band of the figure."""
+        band = max([small, *(test.band for test in self.cross.values() if test is not None)])
+        named = [(name, self.cross[name]) for name in self.correlated_inputs]
+        return [name for name, test in named if test is not None and test.largest > band]
+
+    def curved_over(self, share: float) -> list[str]:
+        """Regressors over which it is surely curved, by more than a share of its variance."""
+        named = [(name, self.regressors[name]) for name in self.curved_regressors]
+        return [name for name, test in named if test is not None and test.share > share]
 
 
 def analyse(
@@ -141,3 +161,14 @@ def _channels(experiments: Sequence[Matrix], names: Sequence[str], what: str, le
             shape = f"{np.shape(one)}; its residuals and names make {(rows, len(names))}"
             raise InputError(f"`{what}` of experiment {i} has the shape {shape}.")
     return {name: [np.asarray(one, dtype=float)[:, j] for one in experiments] for j, name in enumerate(names)}
+
+
+def errors_of(response: Response, skip: int = 0) -> list[Matrix]:
+    """Measured less model of each experiment, over the rows with a value, without the first `skip` of them."""
+    return [(t.measured - t.model)[t.start :][skip:] for t in response.trajectories]  # type: ignore[operator]
+
+
+def rms_errors(response: Response, skip: int = 0) -> Vector:
+    """RMS error of every output."""
+    with np.errstate(all="ignore"):
+        return np.sqrt(np.mean(np.concatenate(errors_of(response, skip)) ** 2, axis=0))

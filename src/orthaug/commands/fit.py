@@ -80,7 +80,7 @@ def fit_job(job: Job, progress: Progress = SILENT) -> Fitted:
 
 def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitted:
     """Train a variant of a job and score every part; `judge_fit` asks whether the learner helps."""
-    from orthaug.analysis.diagnosis import robust_where_coloured
+    from orthaug.analysis.robustness import robust_where_coloured
 
     fit = run_fit(job, variant, progress)
     warnings: list[Any] = [*job.warnings, *fit.warnings]

@@ -56,9 +56,15 @@ class FreeRunScores:
         return np.moveaxis(errors, 3, 1).reshape(-1, *errors.shape[1:3]).transpose(2, 0, 1)
 
     def block(self) -> int | None:
-        """Steps of a block: three times as many as the correlation of the errors lasts; None where that has no end."""
+        """Steps of a block: three times as many as the correlation of the errors lasts, at most those of a segment.
+
+        None where the correlation has no end, or lasts longer than a segment.
+        """
         lengths = [correlation_length(errors) for errors in self.errors()]
-        return None if None in lengths else _MEMORIES * max(n for n in lengths if n is not None)
+        known = [length for length in lengths if length is not None]
+        if len(known) < len(lengths) or max(known) > self.longest:
+            return None
+        return min(_MEMORIES * max(known), self.longest)
 
     def blocks(self, steps: int) -> Float[np.ndarray, "b n"]:
         """The score of every block of about `steps` scored steps, no fewer where the segment has as many."""

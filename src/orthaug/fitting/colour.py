@@ -29,7 +29,8 @@ def correlation_length(residuals: Matrix) -> int | None:
     """The lag τ from which to twice it correlations are noise, so that a resonance is not cut where it is 0.
 
     Their root mean square there is that of correlations of coloured noise, `√((1 + 2 Σ_{j<τ} ρ_j²) / N)` (Bartlett
-    1946), or hardly more. None where there is no such lag among the first N / 20.
+    1946), or hardly more; or it is too small to count. None where there is no such lag among the first N / 20, or in
+    the first half of the stretches.
 
     Args:
         residuals: as above.
@@ -38,19 +39,27 @@ def correlation_length(residuals: Matrix) -> int | None:
     rho = _correlations(np.where(there, residuals - residuals.sum() / max(rows, 1), 0.0))
     if rho is None:
         return None
+    pairs = np.maximum(np.rint(_autocovariances(there.astype(float))[1:]), 1.0)
+    rho = rho * rows / pairs
     before = np.concatenate([[0.0], np.cumsum(rho**2)])
-    for lag in range(1, min(len(rho), rows // _ROWS_PER_LAG) + 1):
-        if np.mean(rho[lag - 1 : 2 * lag - 1] ** 2) < _NOISE**2 * (1 + 2 * before[lag - 1]) / rows:
+    for lag in range(1, min(int(there.sum(axis=1).max()) // 2, rows // _ROWS_PER_LAG) + 1):
+        noise = _NOISE**2 * (1 + 2 * before[lag - 1]) / pairs[lag - 1]
+        if np.mean(rho[lag - 1 : 2 * lag - 1] ** 2) < max(noise, _NO_CORRELATION**2):
             return lag
     return None
 
 
 def _correlations(residuals: Matrix) -> Vector | None:
     """ρ_1, ρ_2, …; None where there are none."""
-    longest = residuals.shape[1]
-    if longest < 3:
+    if residuals.shape[1] < 3:
         return None
+    covariance = _autocovariances(residuals)
+    return covariance[1:] / covariance[0] if covariance[0] > 0 else None
+
+
+def _autocovariances(residuals: Matrix) -> Vector:
+    """`Σ e_k e_{k−τ}` over all stretches, from τ = 0 on."""
+    longest = residuals.shape[1]
     size = 1 << (2 * longest - 1).bit_length()
     spectrum = np.sum(np.abs(np.fft.rfft(residuals, size, axis=1)) ** 2, axis=0)
-    covariance = np.fft.irfft(spectrum, size)[:longest]
-    return covariance[1:] / covariance[0] if covariance[0] > 0 else None
+    return np.fft.irfft(spectrum, size)[:longest]

@@ -146,8 +146,28 @@ class ResidualTestResult(Content):
     largest_share: Number
 
 
+class PredictableResult(Content):
+    """What could be predicted of an output's error."""
+
+    name: str
+    rms: Number
+    own_past: Number
+    inputs: Number
+    functions: Number
+
+
+class ChangeResult(Content):
+    """A change that is predicted to lower an error."""
+
+    kind: str
+    what: str
+    fall: Number
+    of: str
+    output: str | None
+
+
 class DiagnosisResult(Content):
-    """What the residuals say about the noise."""
+    """What the residuals say about the noise, and which change would help."""
 
     verdict: str
     text: str
@@ -155,6 +175,8 @@ class DiagnosisResult(Content):
     free_run: list[ResidualTestResult] | None
     free_run_to_one_step: Number = Field(validation_alias="ratio")
     noise_in_lags: Number
+    predictable: list[PredictableResult]
+    changes: list[ChangeResult]
 
 
 class LagResult(Content):

@@ -1,0 +1,266 @@
+"""Which change of a model would lower its error, and by how much: further lags, an offset, what a learner could find.
+
+A change adds columns h to the prediction. One step ahead the residual is regressed on them beside the physics' own; of
+a free run on what they become there, `S_k = h_k + Σ_i A_{k,i} S_{k−i}`, the sensitivity to their coefficient. The share
+of the error's variance that they explain on rows they were not fitted to is what the change is predicted to gain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.parallel import one_blas_thread
+from orthaug.analysis.local_dynamics import transitions
+from orthaug.analysis.predictability import BlockSums, Share
+from orthaug.analysis.residuals import rms_errors
+from orthaug.analysis.simple_functions import SimpleFunctions
+from orthaug.data.expressions import Lag
+from orthaug.data.record import Experiment, Record
+from orthaug.data.regressors import lag_matrix
+from orthaug.fitting.estimates import Estimate
+from orthaug.models.response import Response, Trajectory
+from orthaug.physics.shared import seen
+
+WORTH = 0.05  # of the error's variance: what explains less is no change worth making
+_INPUTS_FURTHER, _OUTPUTS_FURTHER = 10, 4  # lags beyond the largest of the model that are tried
+_ROWS = 20_000  # that are looked at, spread over the record in stretches
+_STRETCHES = 8
+_ROWS_PER_COLUMN = 5
+_FAR = 0.3  # error of a free run, in the output's deviation, beyond which sensitivities along it say little
+_SURE = 3.0  # standard errors that a gain must exceed, for it is the largest of many
+_SIMPLER = 0.8  # of the gain of a learner, with which a single lag is as good
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change of a model, and the share `fall` by which the RMS error is predicted to fall.
+
+    `kind` is criterion, input_lag, output_lag, offset or learner, `what` names it, `of` whose error falls: prediction
+    or simulation. `output` is the one whose physics lacks the term; None for one output, or for all.
+    """
+
+    kind: str
+    what: str
+    fall: float
+    of: str
+    output: str | None = None
+
+    @property
+    def advice(self) -> str:
+        """What to do, as the beginning of a sentence."""
+        where = f" of {self.output}" if self.output else ""
+        return {
+            "criterion": f'train with focus = "{self.what}"',
+            "input_lag": f"give the physics{where} (or the learner) the further input lag {self.what}",
+            "output_lag": f"give the physics{where} (or the learner) the further output lag {self.what}",
+            "offset": f"give the physics{where} an offset",
+            "learner": f"give it {self.what}",
+        }[self.kind]
+
+    def __str__(self) -> str:
+        error = "its error one step ahead" if self.of == "prediction" else "the error of its free run"
+        return f"{self.advice}: {error} is predicted to fall by {100 * self.fall:.2g} %"
+
+
+def fall_of(share: float) -> float:
+    """Of an RMS error, when a share of its square is gone."""
+    return 1.0 - float(np.sqrt(1.0 - min(max(share, 0.0), 1.0)))
+
+
+def model_changes(
+    fit: Estimate, response: Response, *, flown: bool, skip: int = 0, one_step: Response | None = None
+) -> tuple[Change, ...]:
+    """The best change of each kind that is worth making, the best one first.
+
+    Args:
+        response: of the training data, whose errors are to be explained: the prediction, or with `flown` the free run.
+        skip: its leading rows that do not count.
+        one_step: the prediction, for a free run that is far from what was measured; None to go along it all the same.
+    """
+    off = float(np.max(rms_errors(response, skip) / fit.problem.deviation))
+    with one_blas_thread():
+        found: tuple[Change, ...] = ()
+        if flown and one_step is not None and off > _FAR:
+            found = Candidates(fit, one_step, True, skip, measured=True).changes()
+        return found or Candidates(fit, response, flown, skip).changes()
+
+
+def own_share(fit: Estimate, one_step: Response) -> Share:
+    """What the physics' own columns explain of the one-step residual: nothing where they were fitted to it."""
+    with one_blas_thread():
+        candidates = Candidates(fit, one_step, False, 0, own=True)
+        return candidates.sums.share(range(candidates.base)) if candidates.usable else Share(0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Columns that a model might be given, over the rows of a response; with `own` none beside the physics'."""
+
+    fit: Estimate
+    response: Response
+    flown: bool
+    skip: int
+    own: bool = False
+    measured: bool = False
+    """Whether sensitivities are those along the measured outputs; the response is then the prediction."""
+
+    @property
+    def base(self) -> int:
+        """How many columns the physics has, its offsets with it."""
+        return len(self.fit.theta) + len(self.fit.problem.outputs)
+
+    @cached_property
+    def lags(self) -> tuple[Lag, ...]:
+        """All lags that are tried, from those of the model on."""
+        problem = self.fit.problem
+        shortest = max(len(e) for e in problem.record.experiments) // 20
+        inputs = [channel.name for channel in problem.record.inputs]
+        highest = {name: 0 for name in (*problem.outputs, *inputs)}
+        for lag in problem.layout:
+            highest[lag.channel] = max(highest[lag.channel], lag.lag)
+        own = [Lag(n, i) for n in problem.outputs for i in range(1, highest[n] + 1 + min(_OUTPUTS_FURTHER, shortest))]
+        return (*own, *(Lag(n, i) for n in inputs for i in range(highest[n] + 1 + min(_INPUTS_FURTHER, shortest))))
+
+    @property
+    def first(self) -> int:
+        """The first row with all of them."""
+        return max([self.fit.model.form.first_row, *(lag.lag for lag in self.lags)])
+
+    @cached_property
+    def stretches(self) -> list[tuple[Experiment, Trajectory, int, int]]:
+        """Rows that are looked at, from the second number on; from the first on the sensitivities are carried along."""
+        problem, first = self.fit.problem, self.first
+        most = _ROWS // len(problem.outputs)
+        total = sum(max(len(e) - first, 0) for e in problem.record.experiments)
+        found = []
+        for experiment, run in zip(problem.record.experiments, self.response.trajectories, strict=True):
+            rows = len(experiment) - first
+            count = 1 if total <= most else max(round(_STRETCHES * rows / total), 1)
+            length = min(rows, rows // count, most * rows // total // count + 1) if rows > 0 else 0
+            for begin in np.linspace(first, len(experiment) - length, count).astype(int) if length else ():
+                skipped = max(self.skip - (first - run.start), 0) if begin == first else self.skip
+                if length > skipped:
+                    found.append((experiment.rows(begin - first, begin + length), run, int(begin), skipped))
+        return found
+
+    @cached_property
+    def usable(self) -> bool:
+        """Whether there are enough rows for all columns."""
+        rows = sum(len(e) - self.first - skipped for e, _, _, skipped in self.stretches)
+        return rows * len(self.fit.problem.outputs) >= _ROWS_PER_COLUMN * max(self._width, 8)
+
+    @property
+    def _width(self) -> int:
+        outputs = len(self.fit.problem.outputs)
+        return self.base + (0 if self.own else outputs * (len(self.lags) + len(self.functions)))
+
+    @cached_property
+    def functions(self) -> SimpleFunctions:
+        return SimpleFunctions.of(self.fit.problem)
+
+    @cached_property
+    def sums(self) -> BlockSums:
+        """Of all rows, each output in its deviation."""
+        columns, targets = zip(*(self._rows(*stretch) for stretch in self.stretches), strict=True)
+        return BlockSums.of(np.concatenate(columns), np.concatenate(targets))
+
+    def _rows(self, piece: Experiment, run: Trajectory, begin: int, skip: int) -> tuple[Matrix, Vector]:
+        """Columns (rows · ny, width) and errors of one stretch."""
+        problem, record, first = self.fit.problem, self.fit.problem.record, self.first
+        there = slice(begin, begin + len(piece) - first)
+        error = (piece.outputs[first:] - run.model[there])[:, :, None]
+        if self.flown and not self.measured:
+            ran = np.where(np.isfinite(run.model), run.model, outputs_before(run))[begin - first : there.stop]
+            piece = Experiment(piece.inputs, ran)
+        columns = self._columns(piece, record)
+        if self.measured:
+            carried = self._carried(np.concatenate([columns, error], axis=2), piece, record)
+            columns, error = carried[:, :, :-1], carried[:, :, -1:]
+        elif self.flown:
+            columns = self._carried(columns, piece, record)
+        error, scaled = error[skip:, :, 0] / problem.deviation, columns[skip:] / problem.deviation[:, None]
+        return scaled.reshape(-1, columns.shape[2]), error.reshape(-1)
+
+    def _columns(self, piece: Experiment, record: Record) -> Float[np.ndarray, "N ny m"]:
+        """Physics, offsets, then unless `own` the lags and the functions, each of these for every output."""
+        problem = self.fit.problem
+        x = lag_matrix(piece, problem.layout, record, self.first)
+        phi = np.asarray(problem.baseline.phi(x, problem.layout, problem.outputs, np))
+        each = np.eye(len(problem.outputs))
+        parts = [phi, np.broadcast_to(each, (len(x), *each.shape))]
+        if not self.own:
+            new = np.column_stack([lag_matrix(piece, self.lags, record, self.first) - self._centre, self.functions(x)])
+            parts.append(np.einsum("km,oi->koim", new, each).reshape(len(x), len(each), -1))
+        with np.errstate(all="ignore"):
+            return np.nan_to_num(np.concatenate(parts, axis=2))
+
+    @cached_property
+    def _centre(self) -> Vector:
+        """Mean of each lag's channel."""
+        record = self.fit.problem.record
+        names = [*record.outputs, *record.inputs]
+        stacked = np.concatenate([np.column_stack([e.outputs, e.inputs]) for e in record.experiments])
+        means = {channel.name: float(mean) for channel, mean in zip(names, stacked.mean(axis=0), strict=True)}
+        return np.array([means[lag.channel] for lag in self.lags])
+
+    def _carried(self, columns: np.ndarray, piece: Experiment, record: Record) -> np.ndarray:
+        """What the columns become in the free run, from a start that does not depend on them."""
+        form, first, ny = self.fit.model.form, self.first, columns.shape[1]
+        states = form.start(piece.outputs, np.arange(first, len(piece)))
+        inputs = form.inputs(piece, record)[first - form.first_row :]
+        feedback = np.nan_to_num(transitions(self.fit.model, states, inputs)[:, :ny])
+        carried, past = np.empty_like(columns), np.zeros((form.states, columns.shape[2]))
+        for k, (a, own) in enumerate(zip(feedback, columns, strict=True)):
+            carried[k] = own + a @ past
+            past = np.concatenate([carried[k], past[:-ny]])
+        return carried
+
+    def changes(self) -> tuple[Change, ...]:
+        """The best of each kind that is worth making, the best one first."""
+        if not self.usable or not np.isfinite(self.sums.grams).all():
+            return ()
+        problem, of = self.fit.problem, "simulation" if self.flown else "prediction"
+        nt, outputs, base = len(self.fit.theta), problem.outputs, range(self.base)
+        width = len(self.lags) + len(self.functions)
+        found: list[tuple[float, Change]] = []
+
+        def add(share: Share, kind: str, what: str, output: str | None = None, weight: float = 1.0) -> None:
+            if share.value >= WORTH and share.value > _SURE * share.error:
+                found.append((weight * fall_of(share.value), Change(kind, what, fall_of(share.value), of, output)))
+
+        for o, output in enumerate(outputs):
+            own = output if len(outputs) > 1 else None
+            add(self.sums.share([nt + o], range(nt)), "offset", "1", own)
+            for j, lag in enumerate(self.lags):
+                kind = "output_lag" if lag.channel in outputs else "input_lag"
+                if self.measured and kind == "output_lag":  # it may be about noise, which a free run does not feed back
+                    continue
+                add(self.sums.share([self.base + o * width + j], base), kind, str(lag), own)
+        learned = [
+            self.base + o * width + len(self.lags) + j for o in range(len(outputs)) for j in range(len(self.functions))
+        ]
+        add(self.sums.share(learned, base), "learner", self._learner(), weight=_SIMPLER)
+        best: dict[str, Change] = {}
+        for _, change in sorted(found, key=lambda entry: -entry[0]):
+            best.setdefault(change.kind, change)
+        return tuple(best.values())
+
+    def _learner(self) -> str:
+        """What a learner could be given."""
+        model, problem = self.fit.model, self.fit.problem
+        if model.form.bound is None:
+            return "a learner"
+        visible = seen(problem.features, problem.layout, problem.rows.x, lambda rows: rows)
+        hidden = [str(lag) for lag, one in zip(problem.layout, visible, strict=True) if not one]
+        return f"a learner that also sees {', '.join(hidden)}" if hidden else "a learner of more neurons"
+
+
+def outputs_before(run: Trajectory) -> Matrix:
+    """What was measured, for the rows before a run begins."""
+    assert run.measured is not None
+    return run.measured

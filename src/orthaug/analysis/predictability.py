@@ -1,0 +1,142 @@
+"""How much of a signal could be predicted from others: cross-validated shares of its variance, from Gram sums.
+
+Rows are cut into contiguous blocks. Each is predicted by least squares on the others, so that the share is what a model
+with these columns would gain on rows that it has not seen; chance counts against it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug.analysis.correlation import Pieces, pieces_of
+from orthaug.analysis.residuals import errors_of
+from orthaug.analysis.simple_functions import SimpleFunctions
+from orthaug.models.response import Response
+from orthaug.physics.problem import Problem
+
+BLOCKS = 8
+_PAST = 5  # lags of an output's own error
+_FURTHER = 10  # lags of inputs beyond the largest of the regressor
+_ROWS = 20_000
+_RIDGE = 1e-6  # of a column's sum of squares, so that columns that repeat each other do no harm
+
+
+@dataclass(frozen=True)
+class Share:
+    """A share of variance, and its standard error over the blocks."""
+
+    value: float
+    error: float
+
+    @property
+    def sure(self) -> float:
+        """Two standard errors less, and not below 0."""
+        return max(self.value - 2 * self.error, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class BlockSums:
+    """Gram matrices of (columns, target) over every block of rows, (blocks, m + 1, m + 1)."""
+
+    grams: Float[np.ndarray, "b m+1 m+1"]
+
+    @classmethod
+    def of(cls, columns: Matrix, target: Vector, blocks: int = BLOCKS) -> BlockSums:
+        """From rows in their order."""
+        both = np.column_stack([columns, target])
+        edges = np.linspace(0, len(both), blocks + 1).astype(int)
+        return cls(np.stack([both[a:b].T @ both[a:b] for a, b in zip(edges[:-1], edges[1:], strict=True)]))
+
+    def share(self, columns: Sequence[int], beside: Sequence[int] = ()) -> Share:
+        """What `columns` explain of the target beyond those `beside` which they stand."""
+        without, together = self._missed(list(beside)), self._missed([*beside, *columns])
+        total, gained = float(without.sum()), without - together
+        if not (total > 0 and np.isfinite(gained).all()):
+            return Share(0.0, 0.0)
+        value = float(gained.sum() / total)
+        off = gained - value * without  # of a ratio of sums: loud blocks may gain more (Cochran 1977, sect. 2.11)
+        return Share(value, float(np.sqrt(len(off)) * off.std(ddof=1) / total))
+
+    def _missed(self, columns: list[int]) -> Vector:
+        """Sum of squared errors on every block of the regression on the others, (blocks,)."""
+        own = np.ix_(range(len(self.grams)), columns, columns)
+        inner, moment, total = self.grams[own], self.grams[:, columns, -1], self.grams[:, -1, -1]
+        if not columns:
+            return total
+        rest, right = inner.sum(axis=0) - inner, moment.sum(axis=0) - moment
+        size = np.sqrt(np.maximum(np.einsum("bii->bi", rest), np.finfo(float).tiny))
+        scaled = rest / (size[:, :, None] * size[:, None, :]) + _RIDGE * np.eye(len(columns))
+        found = np.linalg.solve(scaled, (right / size)[..., None])[..., 0] / size
+        return total - 2 * np.sum(found * moment, axis=1) + np.einsum("bi,bij,bj->b", found, inner, found)
+
+
+def from_own_past(signal: Pieces, lags: int) -> Share:
+    """What a short autoregression explains of a signal less its mean."""
+    return from_lags(signal, [signal], range(1, lags + 1))
+
+
+def from_lags(signal: Pieces, others: Sequence[Pieces], lags: Sequence[int]) -> Share:
+    """What lags of other signals explain of a signal, beside a constant."""
+    if not others or not len(lags):
+        return Share(0.0, 0.0)
+    target, columns = [], []
+    for one, *beside in zip(*map(pieces_of, (signal, *others)), strict=True):
+        rows = range(max(lags), len(one))
+        if len(rows):
+            target.append(one[rows])
+            columns.append(np.column_stack([x[np.array(rows) - lag] for x in beside for lag in lags]))
+    count = 1 + len(lags) * len(others)
+    if sum(map(len, target)) < 5 * count:
+        return Share(0.0, 0.0)
+    whole = np.concatenate(columns)
+    size = whole.std(axis=0)
+    whole = (whole - whole.mean(axis=0)) / np.where(size > 0, size, 1.0)
+    sums = BlockSums.of(np.column_stack([np.ones(len(whole)), whole]), np.concatenate(target))
+    return sums.share(range(1, count), [0])
+
+
+@dataclass(frozen=True)
+class Predictable:
+    """Of one output's error, in the output's unit: its RMS, and which shares of its square could be predicted.
+
+    From its own past, from lagged inputs, and from functions and products of the regressors, each cross-validated and
+    with two standard errors taken off; 0 where that is not surely more than nothing.
+    """
+
+    name: str
+    rms: float
+    own_past: float
+    inputs: float
+    functions: float
+
+    def largest(self, own_past: bool = True) -> float:
+        """The largest share; without the own past where that is of no use, as in a free run."""
+        return max(self.inputs, self.functions, self.own_past if own_past else 0.0)
+
+
+def predictable(problem: Problem, response: Response, skip: int = 0) -> tuple[Predictable, ...]:
+    """What could be predicted of a response's errors on the training data, after the first `skip` rows."""
+    errors, functions, found = errors_of(response, skip), SimpleFunctions.of(problem), []
+    starts = [run.start + skip for run in response.trajectories]
+    inputs = [e.inputs[a:] for e, a in zip(problem.record.experiments, starts, strict=True)]
+    ends = np.cumsum([len(e) - problem.rows.start for e in problem.record.experiments])[:-1]
+    x = np.concatenate([piece[skip:] for piece in np.split(problem.rows.x, ends)])
+    every = slice(None, None, -(-len(x) // _ROWS))
+    columns = np.column_stack([np.ones(len(x[every])), functions(x[every])])
+    longest = max((lag.lag for lag in problem.layout), default=0) + _FURTHER
+    for o, name in enumerate(problem.outputs):
+        e = [piece[:, o] for piece in errors]
+        whole, lags = np.concatenate(e), range(min(longest, min(map(len, e)) // 10) + 1)
+        own = from_own_past(e, _PAST)
+        driven = from_lags(e, [[u[:, j] for u in inputs] for j in range(len(problem.record.inputs))], lags)
+        curved = Share(0.0, 0.0)
+        if len(columns) > 5 * columns.shape[1] > 5:
+            curved = BlockSums.of(columns, whole[every]).share(range(1, columns.shape[1]), [0])
+        rms = float(np.sqrt(np.mean(whole**2)))
+        found.append(Predictable(name, rms, *(share.sure for share in (own, driven, curved))))
+    return tuple(found)

@@ -1,0 +1,166 @@
+"""The verdict on a residual in words, and the warnings that intervals of θ must carry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthaug._base.warning import Warning
+from orthaug.analysis.changes import WORTH, Change, fall_of
+from orthaug.analysis.predictability import Predictable
+from orthaug.analysis.residuals import ResidualTest
+from orthaug.fitting.estimates import Estimate
+from orthaug.models.response import Response
+
+SHARE = 0.01  # of the residual's variance: what a regressor explains of it counts from there
+_TOLD = 5  # findings that a text lists at most
+_TOO_FAST = 0.05  # noise variance / smallest variance among the lagged outputs
+
+_BIASED = Warning(
+    "sensor_noise",
+    "noise on the measured output biases the one-step θ, and its intervals do not cover that bias: "
+    'train with focus = "simulation".',
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """What was found out about a fit's residuals. `ratio` and `noise` are those of `Diagnosis`."""
+
+    fit: Estimate
+    simulated: bool
+    one_step: Response
+    tests: tuple[ResidualTest, ...]
+    white: bool
+    free_white: bool
+    ratio: float | None
+    noise: float | None
+    sensor: bool = False
+    complete: bool = False
+    """Whether no test finds anything that matters."""
+    free_tests: tuple[ResidualTest, ...] | None = None
+    predictable: tuple[Predictable, ...] = ()
+    changes: tuple[Change, ...] = ()
+
+    @property
+    def lacks(self) -> bool:
+        """Whether a change of the model itself is worth making."""
+        return any(change.kind != "criterion" for change in self.changes)
+
+    @property
+    def own(self) -> tuple[ResidualTest, ...]:
+        """The tests of the error that was minimised."""
+        return self.free_tests if self.fit.criterion.simulates and self.free_tests is not None else self.tests
+
+    @property
+    def what(self) -> str:
+        """The error that was minimised."""
+        return "error of the free run" if self.own is not self.tests else "one-step residual"
+
+
+def words(verdict: str, seen: Finding) -> tuple[str, tuple[Warning, ...]]:
+    """The text of a verdict, and its warnings."""
+    text, warnings = {
+        "white": _white,
+        "equation_noise": _equation_noise,
+        "sensor_noise": _sensor_noise,
+        "unmodelled": _unmodelled,
+    }[verdict](seen)
+    plain = seen.fit.std is not None and seen.fit.plain_covariance is None
+    if plain and not warnings and not (seen.free_white if seen.simulated else seen.white):
+        warnings = (_coloured("errors of the free run are" if seen.simulated else "one-step residual is"),)
+    return text, warnings
+
+
+def _white(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
+    if seen.complete:
+        return "The one-step residual is white: the intervals hold, and no criterion is better than this one.", ()
+    return _small(seen), ()
+
+
+def _equation_noise(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
+    if not seen.complete and not (seen.simulated and seen.white):
+        return _small(seen), ()
+    asked = ""
+    if seen.simulated:
+        asked = " The one-step criterion is the more precise one here."
+        asked += f" {_sentence(seen.changes[0])}" if seen.changes else ""
+    return f"The one-step residual is white, the free run's is not: the noise enters the equation.{asked}", ()
+
+
+def _sensor_noise(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
+    colour = max((t.largest_acf or 0.0) for t in seen.tests)
+    closer = "as close" if seen.ratio is None or seen.ratio > 0.95 else f"{1 / seen.ratio:.1f} times closer"
+    own = "the free run is" if seen.simulated else "the physics trained on the free run comes"
+    how = f"its largest autocorrelation is {colour:.2f}, and {own} {closer} without measured lags"
+    text = f"The one-step residual is coloured: {how}. That is noise on the measured output"
+    if seen.simulated:
+        more = f" {_sentence(seen.changes[0])}" if seen.changes else ""
+        return f"{text}, which the simulation criterion suits.{more}", ()
+    text += '. One-step estimates of θ are then inconsistent: train with focus = "simulation"'
+    if seen.changes and seen.changes[0].kind == "criterion":
+        text += f"; the error of the free run is predicted to fall by {100 * seen.changes[0].fall:.2g} %"
+    if seen.noise is not None and seen.noise > _TOO_FAST:
+        text += (
+            f". The noise is {100 * seen.noise:.0f} % of what tells the lagged outputs apart: the sampling is too fast "
+            "for one-step estimation"
+        )
+    return f"{text}.", (_BIASED,) if seen.fit.std is not None else ()
+
+
+def _unmodelled(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
+    told = [f"its largest autocorrelation is {max((t.largest_acf or 0.0) for t in seen.own):.2f}"]
+    for test in seen.own:
+        told += [f"the residual of {test.name} still follows {name}" for name in test.follows()]
+        told += [f"the residual of {test.name} is curved over {name}" for name in test.curved_over(SHARE)]
+    told = [*told[:_TOLD], *(["and more"] if len(told) > _TOLD else [])]
+    opening = f"The {seen.what}, {_size(seen)}, is not noise alone: {'; '.join(told)}."
+    return " ".join(part for part in (opening, _shares(seen), _advice(seen, "that is not what is missing")) if part), ()
+
+
+def _small(seen: Finding) -> str:
+    """What is said where the tests reject, but hardly anything could be predicted."""
+    colour = " Its colour is that of the noise." if seen.simulated and not seen.white else ""
+    advice = _advice(seen, "it is the noise floor")
+    return f"The {seen.what}, {_size(seen)}, is noise as far as it shows. {_shares(seen)}{colour} {advice}"
+
+
+def _size(seen: Finding) -> str:
+    share = max((t.rms or 0.0) / d for t, d in zip(seen.own, seen.fit.problem.deviation, strict=True))
+    return f"{100 * share:.2g} % of the output's deviation"
+
+
+def _shares(seen: Finding) -> str:
+    """How much could be predicted, of the output of which most could."""
+    if not seen.predictable:
+        return ""
+    one = max(seen.predictable, key=lambda entry: entry.largest())
+    of = f" of {one.name}" if len(seen.predictable) > 1 else ""
+    unit = next((c.unit for c in seen.fit.problem.record.outputs if c.name == one.name), "")
+    size = float(np.sqrt(one.largest())) * one.rms
+    past, driven, curved = (f"{100 * share:.2g} %" for share in (one.own_past, one.inputs, one.functions))
+    return (
+        f"Of its variance{of} {past} could be predicted from its own past, {driven} from the inputs, {curved} from "
+        f"functions of the regressors: {size:.2g}{f' {unit}' if unit else ''} at most."
+    )
+
+
+def _advice(seen: Finding, otherwise: str) -> str:
+    """The change that is predicted to help most; or that none of them is, and what follows."""
+    if seen.changes:
+        return _sentence(seen.changes[0])
+    if not seen.predictable:
+        return "Try more lags, other learner inputs or neurons."
+    limit = 100 * fall_of(WORTH)
+    return f"No further lag, offset or learner is predicted to lower it by {limit:.2g} %: {otherwise}."
+
+
+def _sentence(change: Change) -> str:
+    text = str(change)
+    return f"{text[0].upper()}{text[1:]}."
+
+
+def _coloured(what: str) -> Warning:
+    told = f"standard errors of θ are those of a white residual, but the {what} coloured: take them for a rough guide."
+    return Warning("coloured_residual", told)
