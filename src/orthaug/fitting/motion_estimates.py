@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from orthaug.fitting.motion_course import MotionCourse
 
 _UNSEEN = 1e-3  # share of a parameter in directions that no output shows, above which it is not identified
+_VAGUE = 1.0  # standard error of a logarithm above which only the order of magnitude is known
 _ROUNDING = 1e-11  # of the largest eigenvalue of the information with unit columns
 
 
@@ -190,8 +191,9 @@ def _covariance(
     hidden = vectors[:, values <= _ROUNDING * values.max(initial=0.0)]
     own = split.slope * unit
     share = np.linalg.norm(own @ hidden, axis=1) / np.maximum(np.linalg.norm(own, axis=1), 1e-300)
-    unseen = tuple(name for name, part in zip(names, share, strict=True) if part > _UNSEEN)
     covariance = joint.of(split.slope)
+    vague = np.sqrt(np.diag(covariance)) > np.where(fit.problem.motion.coordinates.positive, _VAGUE, np.inf)
+    unseen = tuple(name for name, part, wide in zip(names, share, vague, strict=True) if part > _UNSEEN or wide)
     for i, name in enumerate(names):
         if name in unseen or name in at_bound:
             covariance[i] = covariance[:, i] = np.nan
@@ -214,8 +216,8 @@ def _doubts(
         told.append(Warning("at_a_bound", text))
     if unseen:
         text = (
-            f"not identified beside the learner: {', '.join(unseen)}. Other values with another learner give the same "
-            "outputs, so there is no interval; let the learner see less, or add it to fewer equations."
+            f"not identified: {', '.join(unseen)}. Other values give the same outputs, so there is no interval; measure "
+            "more, fix one of them as a constant, or let the learner see less or add it to fewer equations."
         )
         told.append(Warning("not_identified", text))
     return told

@@ -17,11 +17,14 @@ from orthaug.fitting.initial_states import Start
 from orthaug.fitting.learned import ErrorStatistics, Learned
 from orthaug.fitting.motion_course import MotionCourse
 from orthaug.fitting.motion_physics import fly_motion
+from orthaug.fitting.segments import sensitivity
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Structure
 from orthaug.models.learners import Bound, Learner, Scaling
 from orthaug.physics.motion_problem import MotionProblem
+
+_LOOSER = 1e-4  # times the weight of the guesses, where it is asked what the outputs tell
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +71,17 @@ class MotionTask(FlightTask):
     def median(self, members: list[Learned], best: int) -> Learned:
         """The best member: a motion has no ensemble, for medians of outputs follow no equations."""
         return members[best]
+
+    def learned(self, run: Flight) -> Learned:
+        """The learner as a run left it. The information counts what the outputs tell, hardly what the guesses do."""
+        learned, objective = super().learned(run), run.objective
+        if learned.gram is None:
+            return learned
+        flown = run.end.flown
+        numbers, made = objective.numbers(flown.c, flown.w), (objective.segments, flown.states, objective.weight)
+        slopes = sensitivity(objective.dynamics, numbers, *made)
+        information = objective.initial.eliminate(slopes, flown.states, _LOOSER * objective.start_rows)[0]
+        return replace(learned, gram=information * objective.rms**2)
 
     def prepared(self, solver: LevenbergMarquardt, structure: Structure, progress: RunTell = quiet) -> MotionTask:
         """The same with physics alone trained. It gives the learner its scaling, and the criterion its unit."""

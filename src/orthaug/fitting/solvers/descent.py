@@ -22,6 +22,7 @@ from orthaug._base.progress import RunTell, quiet
 from orthaug.fitting.status import Ending
 
 _SETTLED = 0.1  # of the objective: a step that lowers it by less belongs to the end of a run
+_LEARNED = 0.9  # of the first loss: what is lower has learned something
 _FIRST_STEPS = 5  # accepted ones, before evidence may find that the weights are too many
 _SMALLEST_CURVATURE = 1e-14  # of the largest: it damps a direction that does nothing
 
@@ -144,8 +145,9 @@ def descend(
     Args:
         start: handed to the first trial.
         ridge: α; with `evidence` where it starts.
-        evidence_settled: whether α waits until the objective falls slowly; otherwise until the first accepted step.
-            From weights that do nothing yet, evidence would find that none are needed (w = 0 is its fixed point).
+        evidence_settled: whether α waits until the weights have lowered the loss and the objective falls slowly, or no
+            longer; otherwise until the first accepted step. From weights that do nothing yet, evidence would find that
+            none are needed (w = 0 is its fixed point).
         ceiling: a trial with a larger `‖r‖²` is rejected.
         bounds: of θ, each (physics,); the start is moved inside.
     """
@@ -159,11 +161,16 @@ def descend(
     if linear is None or not np.isfinite(linear.hessian).all():
         return Descent(flown, None, ridge, 0.0, 0, Ending.NON_FINITE, training_clock() - began)
     largest = 1.0 if damping.diagonal else float(np.diag(linear.hessian).max(initial=1e-300))
-    iterate = _Iterate(flown, linear, ridge, damping.first * largest, path=(flown.p,))
-    ending, done, taken = Ending.RUNNING, 0, 1
+    iterate, first_loss = _Iterate(flown, linear, ridge, damping.first * largest, path=(flown.p,)), flown.loss
+    ending, done, taken, begun = Ending.RUNNING, 0, 1, not evidence_settled
     while ending is Ending.RUNNING and done < iterations:
         iterate, ending = _trial(objective, iterate, limits, tolerance, damping, ceiling)
-        if evidence and len(iterate.path) > taken and (iterate.settled or not evidence_settled):
+        if evidence and not begun:
+            lower = iterate.flown.loss < _LEARNED * first_loss or iterate.small > 0
+            begun = iterate.settled and lower or ending is Ending.CONVERGED
+            if begun and ending is Ending.CONVERGED:  # under the first ridge; not yet under the one that follows
+                iterate, ending, taken = iterate._replace(small=0), Ending.RUNNING, 0
+        if evidence and begun and len(iterate.path) > taken:
             iterate = iterate._replace(ridge=_next_ridge(objective, iterate))
         taken = len(iterate.path)
         done += 1
@@ -250,7 +257,8 @@ def _level(hessian: Matrix, downhill: Vector, objective: float, held: Bool[np.nd
 def weights_hessian(hessian: Matrix, physics: int) -> Matrix:
     """The Hessian of the weights with θ eliminated, (nw, nw)."""
     h_tt, h_tw, h_ww = hessian[:physics, :physics], hessian[:physics, physics:], hessian[physics:, physics:]
-    unit = np.sqrt(np.maximum(np.diag(h_tt), np.finfo(float).tiny))
+    size = np.diag(h_tt)
+    unit = np.sqrt(np.where(size > 1e-300 * size.max(initial=0.0), size, 1.0))
     inner = np.linalg.lstsq(h_tt / np.outer(unit, unit), h_tw / unit[:, None], rcond=1e-14)[0]
     eliminated = h_ww - (h_tw / unit[:, None]).T @ inner
     return (eliminated + eliminated.T) / 2
