@@ -104,7 +104,7 @@ def estimate(
             squared errors in units of the baseline's RMS residual. Several may be given with `validation` or `blocks`,
             which then choose. "auto" runs none and ard from every start, one step ahead with Levenberg-Marquardt, and
             keeps the lower generalised cross-validation; it is none otherwise, and none and evidence where
-            `validation` chooses on the free run.
+            `validation` chooses on the free run. For a motion it is evidence.
         restarts: runs from initial weights of seeds `seed … seed + restarts - 1`, spread over the cores. Kept is the
             one of the lowest error of the criterion on `validation`; without that, of free runs and of several
             regularizations, on `blocks` that are held out; else of the lowest training loss.

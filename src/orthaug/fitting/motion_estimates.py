@@ -216,8 +216,8 @@ def _doubts(
         told.append(Warning("at_a_bound", text))
     if unseen:
         text = (
-            f"not identified: {', '.join(unseen)}. Other values give the same outputs, so there is no interval; measure "
-            "more, fix one of them as a constant, or let the learner see less or add it to fewer equations."
+            f"not identified: {', '.join(unseen)}. Other values give the same outputs, so there is no interval; "
+            "measure more, fix one of them as a constant, or let the learner see less or add it to fewer equations."
         )
         told.append(Warning("not_identified", text))
     return told

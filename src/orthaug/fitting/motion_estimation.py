@@ -14,7 +14,7 @@ from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.motion_conclusion import conclude_motion
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_task import MotionTask
-from orthaug.fitting.rules import check_solver, check_starts, tried
+from orthaug.fitting.rules import check_solver, check_starts
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Orthogonal, Structure
@@ -61,8 +61,8 @@ def fit_motion(
         InputError: what a motion cannot be trained with.
     """
     check_motion_choices(problem, learner, structure, criterion, solver)
-    validated = validation is not None
-    choices = tried(regularization, solver, criterion, structure, linear=False, resident=True, validated=validated)
+    auto = isinstance(regularization, str) and regularization == "auto"
+    choices = ("evidence",) if auto else tuple(_as_several(regularization))
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
     check_starts(restarts, seed, ensemble=False)
     check_solver(solver, criterion, () if learner is None else choices)
@@ -73,6 +73,10 @@ def fit_motion(
         starts = [PlannedRun(s, w, choice) for choice in choices for s, w in keyed.items()]
     chosen = Choice(validation, blocks, fallback)
     return train(task, starts, structure, solver, chosen, progress, conclude_motion)
+
+
+def _as_several(regularization: str | float | Sequence[str | float]) -> Sequence[str | float]:
+    return regularization if isinstance(regularization, list | tuple) else [regularization]  # type: ignore[list-item]
 
 
 def check_motion_choices(
