@@ -140,11 +140,14 @@ class MotionEstimate:
         values = ", ".join(f"{n} = {v:.6g}" for n, v in zip(self.problem.motion.names, self.values, strict=True))
         return f"MotionEstimate({self.status.code}, loss {self.status.loss:.3g}, {values})"
 
+    def lines(self) -> list[str]:
+        """The lines of `summary` before its warnings."""
+        return motion_lines(self)
+
     def summary(self) -> str:
         """A page of text: status, parameters, what is shared, warnings."""
-        lines = motion_lines(self)
         warnings = ["", *(f"warning: {warning}" for warning in self.warnings)] if self.warnings else []
-        return "\n".join([*lines, *warnings])
+        return "\n".join([*self.lines(), *warnings])
 
 
 def fitted_numbers(numbers: Numbers) -> Numbers:

@@ -15,12 +15,13 @@ from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import jax, jnp
-from orthaug.data.expressions import Expression
+from orthaug.data.expressions import Expression, Lag
 from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import Differentiated, Numbers, Parts
 from orthaug.models.integrators import advance, held
 from orthaug.models.learners import Bound
 from orthaug.physics.motion import Motion
+from orthaug.physics.motion_layout import layout_of
 from orthaug.physics.starts import guess
 
 
@@ -56,6 +57,11 @@ class Moving(Differentiated):
     @property
     def unknowns(self) -> int:
         return len(self.motion.parameters) + (self.bound.size if self.bound else 0)
+
+    @property
+    def used(self) -> tuple[Lag, ...]:
+        """States and inputs, as measures name them."""
+        return layout_of(self.motion)
 
     @property
     def alone(self) -> Moving:
