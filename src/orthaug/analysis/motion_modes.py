@@ -59,7 +59,8 @@ def motion_stability(model: MotionModel, x: Matrix, u: Matrix) -> MotionStabilit
     found = modes(model, x, u)
     if found is None:
         return MotionStability(None, (), "The motion has no finite derivative along its run.")
-    told = f"The linearised motion has modes of {found.slowest:.4g} to {found.fastest:.4g} 1/s along the free run. "
+    sizes = dict.fromkeys(f"{size:.4g}" for size in (found.slowest, found.fastest))
+    told = f"The linearised motion has modes of {' to '.join(sizes)} 1/s along the free run. "
     if not found.growing:
         told += f"All decay everywhere: the largest real part is {found.rightmost:.4g} 1/s."
         return MotionStability(found, (), told)
@@ -83,8 +84,8 @@ def modes(model: MotionModel, x: Matrix, u: Matrix) -> Modes | None:
         return None
     values = np.linalg.eigvals(slopes[kept])
     if model.form.motion.integrator == "discrete":
-        with np.errstate(all="ignore"):
-            values = np.log(np.maximum(np.abs(values), 1e-300)) / model.sampling_time + 0j
+        small = np.abs(values) < 1e-300  # gone in one sample
+        values = np.log(np.where(small, 1e-300, values).astype(complex)) / model.sampling_time
     size = np.abs(values)
     largest = values.real.max(axis=1)
     growing = largest > _STILL * max(size.max(), 1e-300)

@@ -50,7 +50,7 @@ class Variant:
 AS_DECLARED = Variant()
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Job(ABC):
     """A spec with its data read and checked: everything before training, without JAX."""
 
@@ -63,7 +63,7 @@ class Job(ABC):
 
     def __repr__(self) -> str:
         parts = ", ".join(f"{part.name} {len(part.record)} rows" for part in self.parts)
-        return f"{type(self).__name__}({self.path.name}: {parts}; {self.physics_in_words})"
+        return f"Job({self.path.name}: {parts}; {self.physics_in_words})"
 
     @property
     @abstractmethod

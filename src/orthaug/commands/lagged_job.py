@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from orthaug.models.model import Model
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class LaggedJob(Job):
     """A job with a baseline."""
 

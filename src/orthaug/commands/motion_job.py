@@ -33,7 +33,7 @@ _SECTIONS = {"learner": "learner", "kind": "structure.kind"}  # of keys that are
 WITH_LEARNER = "orthogonal"
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class MotionJob(Job):
     """A job with a motion."""
 

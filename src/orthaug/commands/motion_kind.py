@@ -78,9 +78,13 @@ def refused(job: MotionJob, result: CheckResult) -> InputError | None:
         f"{group[0]} changes no output" if len(group) == 1 else f"{', '.join(group)} cannot be told apart"
         for group in found.collinear
     )
+    lacking = found.columns - found.rank
+    constants = "one of them as a constant" if lacking == 1 else f"{lacking} of them as constants"
+    remedy = f"give {constants}"
+    if result.identifiability.identifiable:
+        remedy += ", or use data that excite them separately"
     return RankError(
-        f"the outputs do not determine the parameters (rank {found.rank} of {found.columns}): {groups}. Give one of "
-        "them as a constant, or use data that excite them separately."
+        f"the outputs do not determine the parameters (rank {found.rank} of {found.columns}): {groups}; {remedy}."
     )
 
 
