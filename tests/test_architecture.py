@@ -31,7 +31,7 @@ ROOMS = (
 )
 NUMERICAL = ROOMS[: ROOMS.index("reports")]  # these know no pictures and no user
 NOT_NUMERICAL = ("matplotlib", "typer", "rich", "pandas.io")
-ONLY_IN = {"matplotlib": {"reports.plots", "studies"}, "typer": {"commands.cli"}}  # a room, or a file
+ONLY_IN = {"matplotlib": {"reports.drawing", "studies"}, "typer": {"commands.cli"}}  # a room, or a file
 UNSAFE_MODULES = ("pickle", "cPickle", "_pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve")
 UNSAFE_CALLS = ("eval", "exec", "read_pickle", "to_pickle")
 MOST_LINES, MOST_FUNCTION_LINES = 400, 60  # of a file; of a function, its docstring aside
@@ -286,7 +286,7 @@ def test_what_a_fit_seldom_needs_is_not_loaded_for_it(tmp_path: Path) -> None:
 
 
 def test_reading_a_spec_and_its_data_does_not_load_jax() -> None:
-    names = [n for n in FILES if room_of(n) in ("data", "physics")] + ["commands.job", "commands.run"]
+    names = [n for n in FILES if room_of(n) in ("data", "physics")] + ["commands.opening", "commands.run"]
     report = loaded_by(
         "import importlib\n"
         f"for name in {names!r}:\n"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from orthaug._base.warning import Warning
 from orthaug.analysis.measure_bias import Ground, bias_under
-from orthaug.commands.job import Job, structure_of
+from orthaug.commands.lagged_job import LaggedJob, structure_of
 from orthaug.commands.suspects import declared
 from orthaug.fitting.elimination import directions
 from orthaug.inference.weighed import weigh_problem
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from orthaug.reports.result import ParameterResult
 
 
-def bias_of(job: Job, fit: Estimate | None = None) -> list[dict[str, Any]]:
+def bias_of(job: LaggedJob, fit: Estimate | None = None) -> list[dict[str, Any]]:
     """The table of suspects under the spec's measure; after a fit with its θ and what its learner explains.
 
     Whether a measure can remove a bias is asked before a fit: then it is answered for the usual suspects, too.
@@ -30,7 +30,7 @@ def bias_of(job: Job, fit: Estimate | None = None) -> list[dict[str, Any]]:
     return bias_under(ground, declared(job.spec.suspects, ground.problem), certify_usual=fit is None)
 
 
-def budget_of(job: Job, fit: Estimate) -> Budget | None:
+def budget_of(job: LaggedJob, fit: Estimate) -> Budget | None:
     """The bias that what the learner found implies, under the spec's measure."""
     from orthaug.analysis.budget import budget_on
 
@@ -41,7 +41,7 @@ def budget_of(job: Job, fit: Estimate) -> Budget | None:
 
 
 def with_biases(
-    job: Job, fit: Estimate, shared: Imitation | None, content: Mapping[str, Any]
+    job: LaggedJob, fit: Estimate, shared: Imitation | None, content: Mapping[str, Any]
 ) -> tuple[dict[str, list[ParameterResult] | None], tuple[Warning, ...]]:
     """The rows of `parameters` and `physical_parameters` with what the learner shares and what biases them."""
     physical = content["physical_parameters"]
@@ -66,7 +66,7 @@ def with_biases(
     return rows, budget.warnings if budget else ()
 
 
-def _ground(job: Job, fit: Estimate | None) -> Ground:
+def _ground(job: LaggedJob, fit: Estimate | None) -> Ground:
     problem, weighed, structure = job.problem, job.weighed, structure_of(job.spec)
     if fit is None:
         along = directions(structure, problem) if job.spec.declared_learner() is not None else None

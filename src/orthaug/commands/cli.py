@@ -138,22 +138,22 @@ def check(
     force: Force = False,
 ) -> None:
     """Report excitation and identifiability; trains nothing."""
-    from orthaug.commands.check import check_job, write_figure
+    from orthaug.commands.check import check_job, refusal, write_figure
     from orthaug.commands.folder import check_figure
-    from orthaug.commands.job import open_job
-    from orthaug.physics.excitation import require_rank
+    from orthaug.commands.opening import open_job
     from orthaug.reports.text import check_text
 
     job = open_job(spec, require_full_rank=False)
     check_figure(figure, *job.files, force=force)
+    if job.spec.motion is not None:  # its runs are computed
+        _prepare_jax()
     result = check_job(job)
     streams.echo(result.to_json() if as_json else check_text(result))
     if figure is not None and result.bias:
         write_figure(result.bias, figure, force=force)
-    try:
-        require_rank(job.problem.excitation, job.problem.rows.y.size)
-    except InputError as error:
-        raise type(error)(f"{spec}: {error}") from None
+    refused = refusal(job, result)
+    if refused is not None:
+        raise type(refused)(f"{spec}: {refused}")
 
 
 @app.command()
@@ -161,7 +161,7 @@ def fit(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force: F
     """Fit a spec, print a summary and write the result folder."""
     from orthaug.commands.fit import fit_job, write_result
     from orthaug.commands.folder import check_folder, check_inputs_kept
-    from orthaug.commands.job import open_job
+    from orthaug.commands.opening import open_job
     from orthaug.reports.text import fit_text
 
     folder = out or Path("orthaug-out") / spec.stem
@@ -193,7 +193,7 @@ def compare(
 ) -> None:
     """Physics alone and every structure, one table."""
     from orthaug.commands.folder import check_folder, check_inputs_kept
-    from orthaug.commands.job import open_job
+    from orthaug.commands.opening import open_job
     from orthaug.reports.text import compare_text
 
     folder = out or Path("orthaug-out") / spec.stem
@@ -203,7 +203,7 @@ def compare(
     _prepare_jax()
     from orthaug.commands import compare as comparing
 
-    with training_bar(job.run_count * len(comparing.compared()), job.iterations) as progress:
+    with training_bar(job.run_count * len(job.compared), job.iterations) as progress:
         comparison = comparing.compare(job, model or (), progress)
     comparing.write(comparison, folder, force=force)
     text = compare_text(comparison.result, comparison.verdicts)
@@ -289,7 +289,7 @@ def design(
     """An input within limits under which suspected terms and noise disturb the parameters least."""
     from orthaug.commands import design as designing
     from orthaug.commands.folder import check_file
-    from orthaug.commands.job import open_job
+    from orthaug.commands.opening import open_job
     from orthaug.reports.result import DesignResult
     from orthaug.reports.text import design_text
 

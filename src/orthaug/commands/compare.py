@@ -15,11 +15,11 @@ from orthaug._base.progress import SILENT, Progress
 from orthaug.analysis.validation import Verdict, dominance
 from orthaug.commands.fit import Fitted, cross_validated, fit_variant, judge_fit, score_part, wanted_blocks
 from orthaug.commands.folder import not_a_result
-from orthaug.commands.job import ALONE, Job, Variant, structure_of
+from orthaug.commands.job import ALONE, Job, Variant
 from orthaug.data.record import same_step
-from orthaug.fitting.kinds import STRUCTURES
 from orthaug.models import storage
 from orthaug.models.model import Model
+from orthaug.models.motion_model import MotionModel
 from orthaug.reports import plots
 from orthaug.reports.result import CompareResult, RowResult, parameter_rows
 
@@ -44,11 +44,6 @@ class Comparison:
         return compare_text(self.result, self.verdicts)
 
 
-def compared() -> tuple[str, ...]:
-    """What is fitted: physics alone, and every structure that is registered."""
-    return ALONE, *STRUCTURES
-
-
 def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -> Comparison:
     """Fit every structure as the spec trains, score each on every part, and put saved models beside them.
 
@@ -56,16 +51,12 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -
     the reason. With a validation part the row of the lowest error there is marked as chosen.
     """
     models = {str(path): _matching(path, job) for path in saved}
-    kinds = (ALONE,) if job.spec.declared_learner() is None else compared()
     fitted, left_out = {}, {}
-    for number, kind in enumerate(kinds):
+    for number, kind in enumerate(job.compared):
         variant = Variant(kind)
-        try:
-            structure_of(job.spec, variant.structure_kind).penalty(
-                job.problem.baseline.names, job.problem.baseline.initial, 1.0
-            )
-        except InputError as error:
-            left_out[kind] = str(error)
+        refusal = job.refusal(variant)
+        if refusal is not None:
+            left_out[kind] = refusal
             continue
         fitted[kind] = fit_variant(job, variant, progress.after(runs=number * job.run_count))
     verdicts = _verdicts(job, fitted)
@@ -111,7 +102,7 @@ def write(comparison: Comparison, folder: Path, *, force: bool = False) -> None:
         plots.save(figure, partial / "figures" / "comparison.png")
 
 
-def _matching(path: Path, job: Job) -> Model:
+def _matching(path: Path, job: Job) -> Model | MotionModel:
     """A saved model that the job's data fit."""
     model = storage.load(path)
     record = job.problem.record
@@ -150,7 +141,7 @@ def _row(kind: str, fitted: Fitted, verdict: Verdict | None) -> RowResult:
     )
 
 
-def _saved_row(name: str, model: Model, job: Job) -> RowResult:
+def _saved_row(name: str, model: Model | MotionModel, job: Job) -> RowResult:
     warnings: list[Any] = []
     scores = {part.name: score_part(model, part, warnings)[0] for part in job.parts}
     return RowResult.model_validate(
@@ -159,7 +150,7 @@ def _saved_row(name: str, model: Model, job: Job) -> RowResult:
             "status": "saved",
             "seconds": None,
             "weights": model.form.bound.size if model.form.bound else 0,
-            "parameters": parameter_rows(model.form.baseline.parameters, model.theta),
+            "parameters": parameter_rows(*model.estimated),
             "orthogonality_defect": None,
             "scores": scores,
             "residuals": None,

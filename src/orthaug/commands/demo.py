@@ -10,7 +10,7 @@ from orthaug._base.folders import whole_folder
 from orthaug._base.progress import SILENT, Progress
 from orthaug.commands.fit import Fitted, fill_result, fit_job
 from orthaug.commands.folder import not_a_result
-from orthaug.commands.job import open_job
+from orthaug.commands.opening import open_job
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt

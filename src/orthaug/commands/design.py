@@ -24,6 +24,8 @@ def design_for(job: Job) -> Design:
         InputError: no `[design]` section, limits that cannot be met, suspects without a coefficient.
     """
     section, problem = job.spec.design, job.problem
+    if job.spec.motion is not None:
+        raise InputError(f"{job.path}: experiments are designed on lagged signals; a [motion] has no design.")
     if section is None:
         raise InputError(
             f"{job.path}: the section [design] is missing; it needs `samples` and limits, such as `amplitude`."

@@ -14,27 +14,15 @@ from orthaug._base.folders import whole_folder
 from orthaug._base.parallel import one_blas_thread
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.warning import Warning
-from orthaug.commands.bias import bias_of, with_biases
 from orthaug.commands.folder import not_a_result
-from orthaug.commands.job import ALONE, AS_DECLARED, DEFAULT_BLOCKS, Job, Variant, run_fit
+from orthaug.commands.job import ALONE, AS_DECLARED, DEFAULT_BLOCKS, Job, Variant
+from orthaug.commands.kinds import kind_of
 from orthaug.commands.parts import Part
-from orthaug.commands.shared import shared_of
-from orthaug.data.regressors import lag_rows
 from orthaug.reports.fields import WarningResult
-from orthaug.reports.result import (
-    FitResult,
-    ParameterResult,
-    PartScores,
-    ScoreResult,
-    parameter_rows,
-    physical_rows,
-)
+from orthaug.reports.result import FitResult, PartScores, ScoreResult
 
 if TYPE_CHECKING:
     from orthaug.analysis.validation import Trial, Verdict
-    from orthaug.fitting.estimates import Estimate
-    from orthaug.inference.physical import PhysicalEstimate
-    from orthaug.models.model import Model
     from orthaug.models.response import Response
 
 
@@ -43,7 +31,8 @@ class Fitted:
     """A fit with the content of result.json: parameters, scores on every part, findings."""
 
     job: Job
-    fit: Estimate
+    fit: Any
+    """`Estimate`, or `MotionEstimate` of a motion."""
     result: FitResult
     responses: Mapping[str, tuple[Response, Response]]
     """One-step prediction and free run of every part, by its name; none where training failed."""
@@ -80,105 +69,27 @@ def fit_job(job: Job, progress: Progress = SILENT) -> Fitted:
 
 def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitted:
     """Train a variant of a job and score every part; `judge_fit` asks whether the learner helps."""
-    from orthaug.analysis.robustness import robust_where_coloured
-
-    fit = run_fit(job, variant, progress)
+    fit = job.run(variant, progress)
     warnings: list[Any] = [*job.warnings, *fit.warnings]
-    unknown = ("physical_parameters", "physical_consistency", "sensitivities", "bias")
-    content: dict[str, Any] = dict.fromkeys((*unknown, "residuals", "missing_lags", "stability"))
     scores, responses = {}, {}
     if fit.status.ok:
-        scoring: list[Any] = []
         for part in job.parts:
-            scores[part.name], responses[part.name] = score_part(fit.model, part, scoring)
-        one_step, free_run = responses[job.train.name]
-        fit = robust_where_coloured(fit, one_step)
-        content |= _physical_content(job, fit, warnings)
-        content["bias"] = bias_of(job, fit)
-        warnings += scoring
-        content |= _analysed(fit, one_step, free_run, warnings)
-    shared = shared_of(job, others=False)
-    nothing_known = np.full(len(fit.theta), np.nan)
-    content |= {
+            scores[part.name], responses[part.name] = score_part(fit.model, part, warnings)
+    fit, told = kind_of(job).content(job, fit, responses, warnings)
+    content = told | {
         "spec": job.declaration,
         "data": job.data,
         "status": fit.status,
         "restarts": fit.restarts,
-        "parameters": parameter_rows(
-            fit.problem.baseline.parameters,
-            fit.theta if fit.status.ok else nothing_known,
-            fit.std,
-            fit.interval,
-            fit.one_step_theta,
-            None if fit.plain_covariance is None else np.sqrt(np.diag(fit.plain_covariance)),
-        ),
-        "standard_errors": None if fit.std is None else "plain" if fit.plain_covariance is None else "robust",
         "structure": fit.model.structure,
         "measure": fit.model.measure if fit.model.structure == "orthogonal" else None,
-        "measure_detail": fit.measure,
         "orthogonality_defect": fit.defect,
         "output_weights": None if fit.problem.weight.one_output else fit.problem.weight.as_dict(),
-        "excitation": fit.excitation,
         "scores": scores,
-        "shared": shared,
         "validation": None,
         "warnings": warnings,
     }
-    rows, biased = with_biases(job, fit, shared, content)
-    content |= rows
-    warnings += biased
     return Fitted(job, fit, FitResult.model_validate(content), responses)
-
-
-def _physical_content(job: Job, fit: Estimate, warnings: list[Any]) -> dict[str, Any]:
-    """The physical parameters of θ̂ and what belongs to them, where the spec has a map; warnings are added."""
-    if job.physics is None:
-        return {}
-    physical = fit.physical(job.physics)
-    warnings += physical.warnings
-    return {
-        "physical_parameters": _physical_rows(job, physical, fit),
-        "physical_consistency": physical.consistency,
-        "sensitivities": _sensitivities(job, physical),
-    }
-
-
-def _physical_rows(job: Job, physical: PhysicalEstimate, fit: Estimate) -> list[ParameterResult]:
-    """The physical parameters, with profile intervals where the spec asks for them."""
-    assert job.physics is not None and job.spec.physics is not None
-    if not job.spec.physics.profile or physical.covariance is None:
-        return physical_rows(physical)
-    return physical_rows(physical, {name: fit.physical_profile(job.physics, name) for name in physical.names})
-
-
-def _sensitivities(job: Job, physical: PhysicalEstimate) -> dict[str, dict[str, float]] | None:
-    """∂ln p / ∂ln θ by name."""
-    if job.physics is None or physical.sensitivities is None:
-        return None
-    return {
-        name: dict(zip(job.physics.theta_names, row, strict=True))
-        for name, row in zip(physical.names, physical.sensitivities, strict=True)
-    }
-
-
-def _analysed(fit: Estimate, one_step: Response, free_run: Response, warnings: list[Any]) -> dict[str, Any]:
-    """What the residuals and the free run's sensitivity say; warnings are added."""
-    from orthaug.analysis.diagnosis import diagnose
-    from orthaug.analysis.free_run_stability import stability
-    from orthaug.analysis.missing_lags import missing_lags
-
-    problem = fit.problem
-    diagnosis = diagnose(fit, one_step=one_step, free_run=free_run)
-    steady = stability(fit.model, problem.record, response=free_run, x=problem.rows.x)
-    warnings += steady.warnings
-    if diagnosis is None:
-        told = "the residual is not analysed: there are too few rows for that, or it is rounding only."
-        warnings.append(Warning("residual_not_analysed", told))
-    else:
-        warnings += diagnosis.warnings
-    hidden = missing_lags(fit, one_step)
-    warnings += hidden.warnings if hidden else ()
-    return {"residuals": diagnosis, "missing_lags": hidden, "stability": steady}
 
 
 def judge_fit(fitted: Fitted, blocks: Sequence[Trial] | None = None, alone: Fitted | None = None) -> Verdict | None:
@@ -204,7 +115,7 @@ def judge_fit(fitted: Fitted, blocks: Sequence[Trial] | None = None, alone: Fitt
             blocks = trials_of(chosen_by)
         else:
             blocks = cross_validated(job, wanted, [AS_DECLARED])[0] if wanted else ()
-    physics = run_fit(job, Variant(ALONE)).model if alone is None else alone.fit.model
+    physics = job.run(Variant(ALONE)).model if alone is None else alone.fit.model
     trials, beyond = list(blocks), []
     for part in held_out:
         ran = None if alone is None else alone.responses[part.name][1]
@@ -212,8 +123,7 @@ def judge_fit(fitted: Fitted, blocks: Sequence[Trial] | None = None, alone: Fitt
         trials.append(
             trial_on(part.name, part.record, part.skips, physics, model, alone_response=ran, response=response)
         )
-        x = lag_rows(part.record, job.problem.layout)
-        beyond += extrapolation(part.name, x, job.problem.rows.x, job.problem.layout)
+        beyond += extrapolation(part.name, job.reach(model, part.record)[0], *job.reach(model, job.train.record))
     return judge(trials, beyond)
 
 
@@ -228,17 +138,17 @@ def cross_validated(job: Job, blocks: int, variants: Sequence[Variant]) -> list[
     from orthaug.analysis.validation import block_trials, cross_validate
 
     def fit_of(variant: Variant) -> Any:
-        return lambda fold: run_fit(job, variant.on(fold))
+        return lambda fold: job.run(variant.on(fold))
 
     fits = [fit_of(variant) for variant in (Variant(ALONE), *variants)]
     try:
-        errors = cross_validate(job.train.record, fits, blocks=blocks, start=job.problem.rows.start)
+        errors = cross_validate(job.train.record, fits, blocks=blocks, start=job.first_row)
     except InputError:
         return [[] for _ in variants]
     return [block_trials(errors, 1 + j) for j in range(len(variants))]
 
 
-def score_part(model: Model, part: Part, warnings: list[Any]) -> tuple[PartScores, tuple[Response, Response]]:
+def score_part(model: Any, part: Part, warnings: list[Any]) -> tuple[PartScores, tuple[Response, Response]]:
     """Scores of a part, and the responses they come from. For a score that does not exist a warning is added."""
     responses = model.predict(part.record), model.simulate(part.record)
     scores = {}
@@ -283,23 +193,6 @@ def fill_result(fitted: Fitted, folder: Path) -> None:
 def _draw(fitted: Fitted, folder: Path) -> None:
     from orthaug.reports import plots
 
-    last = fitted.job.parts[-1].name
-    one_step, free = fitted.responses[last]
-    result, structure = fitted.result, fitted.fit.model.structure
-    where = f"{last}, {structure}"
-    drawn = {
-        "prediction": plots.output_figure(one_step, f"one-step prediction, {where}"),
-        "simulation": plots.output_figure(free, f"free run, {where}"),
-        "residual": plots.residual_figure(one_step, f"one-step residual, {where}"),
-    }
-    if result.residuals is not None:
-        for kind, tests in (("one-step", result.residuals.one_step), ("free-run", result.residuals.free_run)):
-            if tests is not None:
-                title = f"{kind} residual on the training data, {structure}"
-                drawn[f"residuals_{kind.replace('-', '_')}"] = plots.residual_analysis_figure(tests, title)
-    if result.bias:
-        drawn["bias"] = plots.bias_figure(result.bias)
-    if fitted.fit.model.form.bound is not None:
-        drawn["components"] = plots.components_figure(one_step, f"parts of the one-step prediction, {where}")
+    drawn = kind_of(fitted.job).figures(fitted.job, fitted.fit, fitted.result, fitted.responses)
     for name, figure in drawn.items():
         plots.save(figure, folder / f"{name}.png")

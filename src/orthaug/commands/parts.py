@@ -8,7 +8,8 @@ from pathlib import Path
 
 from orthaug._base.errors import InputError
 from orthaug._base.warning import Warning
-from orthaug.commands import spec as declared
+from orthaug.commands.data_sections import PartSection
+from orthaug.commands.spec import Spec
 from orthaug.data.readers import read_record
 from orthaug.data.record import Record, same_step
 from orthaug.reports.result import FileResult
@@ -77,7 +78,7 @@ class Part:
                 )
 
 
-def load_parts(path: Path, spec: declared.Spec) -> tuple[Part, Part | None, tuple[Part, ...]]:
+def load_parts(path: Path, spec: Spec) -> tuple[Part, Part | None, tuple[Part, ...]]:
     """Training, validation and test parts of the spec at `path`, as their files hold them."""
     train = _load(path, spec, spec.data.train, "train")
     validation = _load(path, spec, spec.data.validation, "validation") if spec.data.validation else None
@@ -85,7 +86,7 @@ def load_parts(path: Path, spec: declared.Spec) -> tuple[Part, Part | None, tupl
     return train, validation, tests
 
 
-def _load(path: Path, spec: declared.Spec, part: declared.PartSection, name: str) -> Part:
+def _load(path: Path, spec: Spec, part: PartSection, name: str) -> Part:
     """Read a part's files. Messages begin with the file at fault; once it is read, with its name in the spec."""
     unknown = [channel for channel in part.columns if channel not in (*spec.data.inputs, *spec.data.outputs)]
     if unknown:

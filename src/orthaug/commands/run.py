@@ -18,6 +18,7 @@ from orthaug.data.tables import check_readable, has_column
 
 if TYPE_CHECKING:
     from orthaug.models.model import Model
+    from orthaug.models.motion_model import MotionModel
     from orthaug.models.response import Response
 
 
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 class ModelOnData:
     """A saved model with the record of a data file."""
 
-    model: Model
+    model: Model | MotionModel
     record: Record
     source: Path
 
@@ -82,6 +83,11 @@ def with_initial(opened: ModelOnData, initial: str | Any) -> Record:
     if isinstance(initial, str) and initial == "measured":
         return opened.record
     start, experiment = opened.model.form.first_row, opened.record.experiments[0]
+    if opened.model.form.states and not opened.model.form.memory:
+        raise InputError(
+            "--initial: found with a motion, whose predictions start from states that are estimated from the rows "
+            "before them; leave it out."
+        )
     outputs = experiment.outputs.copy()
     rows = np.zeros((start, outputs.shape[1])) if isinstance(initial, str) else initial[:start]
     outputs[start - len(rows) : start] = rows

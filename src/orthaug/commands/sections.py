@@ -12,6 +12,10 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from orthaug._base.registry import InSpec, Key, OneOf, Option, Registry
 
+Count = Annotated[int, Field(ge=0, strict=True)]
+Positive = Annotated[int, Field(ge=1, strict=True)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
 
 class Section(BaseModel):
     """A table of the spec; unknown keys are errors."""

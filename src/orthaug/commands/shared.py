@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from orthaug.analysis.imitation import Imitation, imitation
-from orthaug.commands.job import Job, structure_of
+from orthaug.commands.lagged_job import LaggedJob, structure_of
 
 
-def shared_of(job: Job, *, others: bool = True) -> Imitation | None:
+def shared_of(job: LaggedJob, *, others: bool = True) -> Imitation | None:
     """Before training already; None without a learner, or where the structure splits nothing along chosen directions.
 
     Args:

@@ -6,7 +6,6 @@ declare. Every error is one line that names the file, the key, what was found an
 
 from __future__ import annotations
 
-import math
 import tomllib
 from dataclasses import fields, replace
 from functools import lru_cache
@@ -15,10 +14,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, create_model, model_validator
 
-from orthaug._base.checks import check_label
 from orthaug._base.errors import InputError
 from orthaug._base.registry import resolve
-from orthaug.commands.sections import KindSection, Section, with_kinds
+from orthaug.commands.data_sections import Data
+from orthaug.commands.motion_spec import MotionSection
+from orthaug.commands.physical_section import PhysicalSection
+from orthaug.commands.sections import Count, Finite, KindSection, Positive, Section, with_kinds
 from orthaug.commands.spec_errors import first_message
 from orthaug.data.expressions import SAMPLING_TIME
 from orthaug.data.record import Channel
@@ -35,70 +36,22 @@ from orthaug.inference.measures import Measure
 from orthaug.models.kinds import LEARNERS
 from orthaug.models.learners import Learner
 from orthaug.physics.baseline import Baseline, Term
-from orthaug.physics.parameters import PhysicalParameter, PhysicsMap
+from orthaug.physics.parameters import PhysicsMap
 
-Count = Annotated[int, Field(ge=0, strict=True)]
-Positive = Annotated[int, Field(ge=1, strict=True)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
 Orders = Count | list[Count]
 Regularization = Literal["none", "evidence", "ard"] | Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Range = Annotated[list[Count], Field(min_length=2, max_length=2)]
+
+_BESIDE_MOTION = {
+    "baseline": "expected one of them, for both are the physics",
+    "lags": "expected none, for a motion has states instead; `learner.inputs` says what its learner sees",
+    "physics": "expected none, for the parameters of a motion are physical: [motion.parameters]",
+    "suspects": "expected none, for suspected terms are weighed on lagged signals only",
+    "design": "expected none, for experiments are designed on lagged signals only",
+}
 
 
 def _as_list(value: Any) -> list[Any]:
     return value if isinstance(value, list) else [value]
-
-
-class PartSection(Section):
-    """Files of training or test data; each file, and each row range, is an experiment."""
-
-    files: Annotated[list[str], Field(min_length=1)]
-    rows: Range | Annotated[list[Range], Field(min_length=1)] | None = None
-    every: Positive = 1
-    skip: Count = 0
-    columns: dict[str, str] = {}
-
-
-class ChannelSection(Section):
-    """A channel in files: value = scale * cell + offset of column."""
-
-    column: str = ""
-    unit: str = ""
-    scale: Finite = 1.0
-    offset: Finite = 0.0
-
-
-class Data(Section):
-    """Channels, sampling time and parts."""
-
-    sampling_time: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
-    time: Annotated[str, Field(min_length=1)] | None = None
-    inputs: list[str] = []
-    outputs: Annotated[list[str], Field(min_length=1)]
-    missing: Literal["error", "skip"] = "error"
-    train: PartSection
-    validation: PartSection | None = None
-    tests: dict[str, PartSection] = {}
-    channels: dict[str, ChannelSection] = {}
-
-    @property
-    def step(self) -> float | None:
-        """Seconds between the rows that are kept of the training data; None where a time column tells."""
-        return None if self.time else (self.sampling_time or 1.0) * self.train.every
-
-    @model_validator(mode="after")
-    def _one_time(self) -> Data:
-        if self.sampling_time is not None and self.time is not None:
-            raise ValueError("`sampling_time` and `time` are both given; expected one of them")
-        for name in self.channels:
-            if name not in (*self.inputs, *self.outputs):
-                known = ", ".join((*self.inputs, *self.outputs))
-                raise ValueError(f"`channels.{name}` is neither an input nor an output; expected one of {known}")
-        for name in self.tests:
-            check_label(name, "the name of a test")
-            if name in ("train", "validation"):
-                raise ValueError(f"`tests.{name}` has the name of another part of the data; expected another name")
-        return self
 
 
 class LagsSection(Section):
@@ -127,15 +80,6 @@ class BaselineSection(Section):
 
     terms: Annotated[list[TermSection], Field(min_length=1)]
     constants: dict[str, Finite] = {}
-
-
-class PhysicalSection(Section):
-    """One physical parameter."""
-
-    initial: Finite
-    unit: str = ""
-    min: Finite | None = None
-    max: Finite | None = None
 
 
 class PhysicsSection(Section):
@@ -243,14 +187,26 @@ class Spec(Section):
 
     data: Data
     lags: LagsSection | None = None
-    baseline: BaselineSection
+    baseline: BaselineSection | None = None
     physics: PhysicsSection | None = None
+    motion: MotionSection | None = None
     suspects: list[SuspectSection] = []
     design: DesignSection | None = None
     learner: LearnerSection = LearnerSection()
     structure: StructureSection = StructureSection()
     training: TrainingSection = TrainingSection()
     validation: ValidationSection = ValidationSection()
+
+    @model_validator(mode="after")
+    def _one_physics(self) -> Spec:
+        if self.motion is None and self.baseline is None:
+            raise ValueError("the key 'baseline' is missing; expected [[baseline.terms]], or a [motion] instead")
+        for name in ("baseline", "lags", "physics", "suspects", "design") if self.motion is not None else ():
+            if name in self.model_fields_set:
+                raise ValueError(f"`{name}`: found beside [motion]; {_BESIDE_MOTION[name]}")
+        if self.motion is not None and self.training.ensemble:
+            raise ValueError("`training.ensemble`: a motion has none, for medians of runs follow no equations")
+        return self
 
     @model_validator(mode="after")
     def _blocks_are_several(self) -> Spec:
@@ -280,6 +236,7 @@ class Spec(Section):
 
     def declared_baseline(self) -> Baseline:
         """The baseline as declared."""
+        assert self.baseline is not None, "a motion has no baseline"
         terms = [
             Term(t.parameter, str(t.regressor), t.initial, t.unit, t.output, t.fixed, t.min, t.max)
             for t in self.baseline.terms
@@ -288,20 +245,16 @@ class Spec(Section):
 
     def physics_map(self, sampling_time: float) -> PhysicsMap | None:
         """The physical parameters and their map to θ, if the spec has one; `Ts` in it is the sampling time [s]."""
-        if self.physics is None:
+        if self.physics is None or self.baseline is None:
             return None
-        limits = {"min": -math.inf, "max": math.inf}
-        parameters = [
-            PhysicalParameter(
-                name, p.initial, p.unit, *(limits[k] if v is None else v for k, v in (("min", p.min), ("max", p.max)))
-            )
-            for name, p in self.physics.parameters.items()
-        ]
+        parameters = [section.declared(name) for name, section in self.physics.parameters.items()]
         known = {} if SAMPLING_TIME in self.physics.parameters else {SAMPLING_TIME: sampling_time}
         return PhysicsMap.of(parameters, self.physics.theta, known | self.baseline.constants)
 
     def declared_learner(self) -> Learner | None:
-        """The learner; None for physics alone."""
+        """The learner; None for physics alone, as of a motion that nothing is added to."""
+        if self.motion is not None and not self.motion.learns and "learner" not in self.model_fields_set:
+            return None
         return resolve(self.learner.declared(LEARNERS, self.learner.kind))
 
     def learner_inputs(self) -> tuple[str, ...] | None:
@@ -320,8 +273,13 @@ class Spec(Section):
         return resolve(section.declared(MEASURES, section.kind), place)
 
     def declared_criterion(self) -> Criterion:
-        """The criterion."""
-        return resolve(self.training.declared(CRITERIA, self.training.focus))
+        """The criterion. A motion is trained on its free run, from starts that are estimated: without a washout."""
+        training = self.training
+        if self.motion is None:
+            return resolve(training.declared(CRITERIA, training.focus))
+        focus = training.focus if "focus" in training.model_fields_set else "simulation"
+        washout = {} if "washout" in training.model_fields_set else {"washout": 0}
+        return resolve(training.model_copy(update=washout).declared(CRITERIA, focus))
 
     def declared_solver(self) -> Solver:
         """The solver."""
@@ -331,7 +289,13 @@ class Spec(Section):
         """Those that every start is run with."""
         given = self.training.regularization
         declared = (self.declared_solver(), self.declared_criterion(), self.declared_structure())
-        return tried(given, *declared, linear=linear, resident=True, validated=validated)
+        conditions = {"linear": linear, "resident": True, "validated": validated, "motion": self.motion is not None}
+        return tried(given, *declared, **conditions)
+
+    def runs(self, *, linear: bool) -> int:
+        """How many runs a fit makes: restarts times regularizations."""
+        validated = self.data.validation is not None
+        return self.training.restarts * len(self.regularizations(linear=linear, validated=validated))
 
 
 def spec_model() -> type[Spec]:

@@ -18,6 +18,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from orthaug._base.checks import nearest
 from orthaug._base.errors import LONGEST, InputError, shown
 
@@ -112,6 +114,22 @@ class Expression:
     def value(self, values: Mapping[str, Any], xp: Any) -> Any:
         """Value where its names stand for `values`; of an expression without channels."""
         return _evaluate(self._tree, {}, values, xp, self.text)
+
+    def term_without_value(self, values: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
+        """The smallest term that is not finite although all in it is, and its names."""
+
+        def finite(node: ast.expr) -> bool:
+            with np.errstate(all="ignore"):
+                return bool(np.isfinite(_evaluate(node, {}, values, np, self.text)))
+
+        node = self._tree
+        while True:
+            inner = [child for child in ast.walk(node) if isinstance(child, ast.expr) and child is not node]
+            functions = [child.func for child in ast.walk(node) if isinstance(child, ast.Call)]
+            worse = [child for child in inner if child not in functions and not finite(child)]
+            if not worse:
+                return ast.unparse(node), tuple(name.id for name in _free_names(node))
+            node = min(worse, key=lambda child: len(ast.unparse(child)))
 
 
 def is_name(name: str, taken: Container[str] = RESERVED) -> bool:

@@ -265,10 +265,14 @@ class Estimate:
         values = ", ".join(f"{n} = {v:.6g}" for n, v in zip(self.problem.baseline.names, self.theta, strict=True))
         return f"Estimate({self.model.structure}, {self.status.code}, loss {self.status.loss:.3g}, {values})"
 
+    def lines(self) -> Sequence[str]:
+        """The lines of `summary` before its warnings."""
+        return summary_lines(self)
+
     def summary(self) -> str:
         """A page of text: status, parameters, excitation, warnings."""
         warnings = ["", *(f"warning: {warning}" for warning in self.warnings)] if self.warnings else []
-        return "\n".join([*summary_lines(self), *warnings])
+        return "\n".join([*self.lines(), *warnings])
 
 
 def summary_lines(fit: Estimate) -> Sequence[str]:

@@ -16,7 +16,7 @@ from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.status import Status
 from orthaug.fitting.structures import Structure
 from orthaug.inference.motion_split import Field, MotionSplit
-from orthaug.models.motion_model import MotionModel
+from orthaug.models.motion_model import MotionModel, Trained
 from orthaug.models.statistics import Statistics
 from orthaug.physics.shared import Shared
 
@@ -32,8 +32,9 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) ->
     states = plan.segments.start if learned.scores is None else learned.scores.states
     slope = None if learned.scores is None else learned.scores.slope
     errors = learned.errors
-    model = _model(plan, structure, learned)
-    alone = learned.coefficients if task.physics is None else task.physics.end.flown.theta
+    alone = np.asarray(learned.coefficients if task.physics is None else task.physics.end.flown.theta)
+    trained = Trained(plan.flown.segment, plan.flown.washout, np.asarray(states), slope, alone)
+    model = replace(_model(plan, structure, learned), trained=trained)
     unsplit = MotionSplit(
         "training",
         learned.coefficients,
@@ -58,7 +59,7 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) ->
         course=plan,
         states=states,
         slope=slope,
-        alone=np.asarray(alone),
+        alone=alone,
         warnings=_warnings(errors.mean_square),
     )
     return fit.split(structure.measure, getattr(structure, "shared", "auto")) if learned.ending.usable else fit

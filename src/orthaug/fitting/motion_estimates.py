@@ -141,11 +141,14 @@ class MotionEstimate:
         values = ", ".join(f"{n} = {v:.6g}" for n, v in zip(self.problem.motion.names, self.values, strict=True))
         return f"MotionEstimate({self.status.code}, loss {self.status.loss:.3g}, {values})"
 
+    def lines(self) -> list[str]:
+        """The lines of `summary` before its warnings."""
+        return motion_lines(self)
+
     def summary(self) -> str:
         """A page of text: status, parameters, what is shared, warnings."""
-        lines = motion_lines(self)
         warnings = ["", *(f"warning: {warning}" for warning in self.warnings)] if self.warnings else []
-        return "\n".join([*lines, *warnings])
+        return "\n".join([*self.lines(), *warnings])
 
 
 def fitted_numbers(numbers: Numbers) -> Numbers:
@@ -161,7 +164,7 @@ def _with_split(fit: MotionEstimate, split: MotionSplit, told: tuple[Warning, ..
     bounds = motion.coordinates.bounds
     at_bound = tuple(n for n, q, low, high in zip(motion.names, split.q, *bounds, strict=True) if q <= low or q >= high)
     covariance, unseen = _covariance(fit, split, at_bound)
-    warnings = [*told, *_doubts(split, at_bound, unseen, motion.names)]
+    warnings = [*told, *_doubts(split, at_bound, unseen, fit.model.form.bound is not None)]
     model = replace(fit.model, numbers=numbers._replace(theta=split.q, theta_aux=split.q - c), measure=split.name)
     own = {"not_unique", "at_a_bound", "not_identified", "measure_beyond_data"}
     return replace(
@@ -200,9 +203,7 @@ def _covariance(
     return covariance, unseen
 
 
-def _doubts(
-    split: MotionSplit, at_bound: tuple[str, ...], unseen: tuple[str, ...], names: tuple[str, ...]
-) -> list[Warning]:
+def _doubts(split: MotionSplit, at_bound: tuple[str, ...], unseen: tuple[str, ...], learns: bool) -> list[Warning]:
     told = []
     if split.slope is None:
         text = (
@@ -219,6 +220,11 @@ def _doubts(
             f"not identified: {', '.join(unseen)}. Other values give the same outputs, so there is no interval; "
             "measure more, fix one of them as a constant, or let the learner see less or add it to fewer equations."
         )
+        if not learns:
+            text = (
+                f"not identified: {', '.join(unseen)}. Other values of them together give the same outputs, so there "
+                "is no interval; give some of them as constants."
+            )
         told.append(Warning("not_identified", text))
     return told
 

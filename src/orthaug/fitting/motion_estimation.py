@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from orthaug._base.checks import check_count, check_type
-from orthaug._base.errors import InputError, KeyedError
 from orthaug._base.jax import jax
 from orthaug._base.progress import SILENT, Tell
 from orthaug.data.record import Record
@@ -14,7 +13,7 @@ from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.motion_conclusion import conclude_motion
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_task import MotionTask
-from orthaug.fitting.rules import check_solver, check_starts
+from orthaug.fitting.rules import check_motion_choices, check_solver, check_starts, tried
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Orthogonal, Structure
@@ -60,9 +59,10 @@ def fit_motion(
     Raises:
         InputError: what a motion cannot be trained with.
     """
-    check_motion_choices(problem, learner, structure, criterion, solver)
-    auto = isinstance(regularization, str) and regularization == "auto"
-    choices = ("evidence",) if auto else tuple(_as_several(regularization))
+    check_motion_choices(problem.motion, learner, structure, criterion, solver)
+    validated = validation is not None
+    conditions = {"linear": False, "resident": True, "validated": validated, "motion": True}
+    choices = tried(regularization, solver, criterion, structure, **conditions)
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
     check_starts(restarts, seed, ensemble=False)
     check_solver(solver, criterion, () if learner is None else choices)
@@ -73,38 +73,6 @@ def fit_motion(
         starts = [PlannedRun(s, w, choice) for choice in choices for s, w in keyed.items()]
     chosen = Choice(validation, blocks, fallback)
     return train(task, starts, structure, solver, chosen, progress, conclude_motion)
-
-
-def _as_several(regularization: str | float | Sequence[str | float]) -> Sequence[str | float]:
-    return regularization if isinstance(regularization, list | tuple) else [regularization]  # type: ignore[list-item]
-
-
-def check_motion_choices(
-    problem: MotionProblem, learner: Learner | None, structure: Structure, criterion: Criterion, solver: Solver
-) -> None:
-    """Raise InputError for choices that a motion cannot be trained with."""
-    states, outputs = problem.motion.learned
-    if learner is not None and not (states or outputs):
-        raise KeyedError(
-            "there is a learner, but no state and no output of the motion is learned; set `learned` where it is added.",
-            "learner",
-            ": no state and no output has `learned = true`; expected one, or kind none",
-        )
-    if criterion.flown is None or not criterion.simulates:
-        raise KeyedError(
-            "a motion is trained on its free run; take `Simulation(…)`: its states are not measured, so there is no "
-            "error one step ahead.",
-            "focus",
-            " = prediction; expected simulation for a motion, whose states are not measured",
-        )
-    if not isinstance(structure, Orthogonal):
-        raise KeyedError(
-            f"a motion has the orthogonal structure: its parameters are the nearest physics; got {structure.name}.",
-            "kind",
-            f" = {structure.name}; expected orthogonal for a motion",
-        )
-    if not solver.gauss_newton:
-        raise InputError("a motion is trained by `LevenbergMarquardt`; take that solver.")
 
 
 def without_learner(problem: MotionProblem) -> MotionProblem:

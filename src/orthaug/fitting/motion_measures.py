@@ -8,22 +8,14 @@ import numpy as np
 
 from orthaug._base.errors import InputError
 from orthaug._base.warning import Warning
-from orthaug.data.expressions import Lag
-from orthaug.data.record import Channel, Experiment, Record
-from orthaug.inference.measures import Measure, Support
+from orthaug.inference.measures import Measure
 from orthaug.inference.motion_split import Field
+from orthaug.inference.motion_support import support_of
 from orthaug.inference.splitting import SUPPORTED
 from orthaug.models.dynamics import Numbers
 
 if TYPE_CHECKING:
     from orthaug.fitting.motion_course import MotionCourse
-
-
-class Named(Lag):
-    """A state or an input as a measure names it: at the present instant, without an index."""
-
-    def __str__(self) -> str:
-        return self.channel
 
 
 def field_under(
@@ -39,11 +31,8 @@ def field_under(
     x, u = course.trajectory(c, w, states)
     finite = np.isfinite(x).all(axis=1)
     x, u = x[finite], u[finite]
-    names, nx = (*motion.names_of_states, *motion.inputs), x.shape[1]
-    layout = tuple(Named(name, 0) for name in names)
-    channels = tuple(Channel(f"c{i}") for i in range(len(names)))
-    record = Record((), channels, course.record.sampling_time, (Experiment(x[:, :0], np.concatenate([x, u], axis=1)),))
-    support = Support(record, layout, layout, np.concatenate([x, u], axis=1))
+    nx = x.shape[1]
+    support = support_of(motion, x, u)
     points = measure.points(support)
     at, beside = points.x[:, :nx], points.x[:, nx:]
     size = _sizes(course, c, x, u)

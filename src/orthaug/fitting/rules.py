@@ -9,6 +9,9 @@ from orthaug._base.errors import KeyedError, shown
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.kinds import SOLVERS
 from orthaug.fitting.solvers.solver import Solver
+from orthaug.fitting.structures import Structure
+from orthaug.models.learners import Learner
+from orthaug.physics.motion import Motion
 
 
 def check_starts(restarts: int, seed: int, *, ensemble: bool) -> None:
@@ -69,7 +72,15 @@ def check_solver(solver: Solver, criterion: Criterion, regularizations: Sequence
 
 
 def tried(
-    given: Any, solver: Solver, criterion: Criterion, structure: Any, *, linear: bool, resident: bool, validated: bool
+    given: Any,
+    solver: Solver,
+    criterion: Criterion,
+    structure: Any,
+    *,
+    linear: bool,
+    resident: bool,
+    validated: bool,
+    motion: bool = False,
 ) -> tuple[Any, ...]:
     """The regularizations of every start: those given, or what "auto" stands for (docs/design.md has the table).
 
@@ -77,9 +88,12 @@ def tried(
         linear: whether the physics is linear in θ, which is then solved.
         resident: whether the rows are in memory.
         validated: whether a validation part chooses.
+        motion: whether the physics are equations of motion.
     """
     if not isinstance(given, str) or given != "auto":
         return tuple(given) if isinstance(given, list | tuple) else (given,)
+    if motion:
+        return ("evidence",)
     if not solver.gauss_newton or structure.from_initial:
         return ("none",)
     if not (criterion.one_step and linear):
@@ -91,3 +105,35 @@ def ridge_of(regularization: str | float) -> tuple[float, bool]:
     """The ridge α that a run starts with, and whether evidence re-estimates it."""
     evidence = regularization in ("evidence", "ard")
     return (1.0 if evidence else 0.0 if regularization == "none" else float(regularization)), evidence
+
+
+def check_motion_choices(
+    motion: Motion, learner: Learner | None, structure: Structure, criterion: Criterion, solver: Solver
+) -> None:
+    """Raise InputError for choices that a motion cannot be trained with."""
+    states, outputs = motion.learned
+    if learner is not None and not (states or outputs):
+        raise KeyedError(
+            "there is a learner, but no state and no output of the motion is learned; set `learned` where it is added.",
+            "learner",
+            ": no state and no output has `learned = true`; expected one, or kind none",
+        )
+    if criterion.flown is None or not criterion.simulates:
+        raise KeyedError(
+            "a motion is trained on its free run; take `Simulation(…)`: its states are not measured, so there is no "
+            "error one step ahead.",
+            "focus",
+            " = prediction; expected simulation for a motion, whose states are not measured",
+        )
+    if not structure.projects:
+        raise KeyedError(
+            f"a motion has the orthogonal structure: its parameters are the nearest physics; got {structure.name}.",
+            "kind",
+            f" = {structure.name}; expected orthogonal for a motion",
+        )
+    if not solver.gauss_newton:
+        raise KeyedError(
+            "a motion is trained by `LevenbergMarquardt`; take that solver.",
+            "solver",
+            f" = {SOLVERS.kind_of(solver)}; expected levenberg-marquardt for a motion",
+        )

@@ -160,7 +160,8 @@ class Samples:
                 raise InputError(f"the samples' column {lag} must be numbers.") from None
         missing = [str(lag) for lag in support.used if lag not in values]
         if missing:
-            raise InputError(f"the samples lack {', '.join(missing)}; give a column for every raw lag that is used.")
+            what = _entries(support)
+            raise InputError(f"the samples lack {', '.join(missing)}; give a column for every {what} that is used.")
         lengths = {str(lag): v.shape for lag, v in values.items()}
         if len(set(lengths.values())) > 1 or any(len(shape) != 1 for shape in lengths.values()):
             raise InputError(f"the samples' columns differ in shape: {lengths}; give one vector of a length for each.")
@@ -240,9 +241,15 @@ def _lag_of(text: str, support: Support) -> Lag:
         plain = plain[:-3] + "]"
     if plain not in known:
         raise InputError(
-            f"'{text}' is no raw lag that this model reads{nearest(plain, known) or '.'} It reads {', '.join(known)}."
+            f"'{text}' is no {_entries(support)} that this model reads{nearest(plain, known) or '.'} "
+            f"It reads {', '.join(known)}."
         )
     return known[plain]
+
+
+def _entries(support: Support) -> str:
+    """What the names of a measure stand for: a motion has no lags."""
+    return "raw lag" if any("[" in str(lag) for lag in support.used) else "state or input"
 
 
 def _rule(coordinates: int) -> Points:

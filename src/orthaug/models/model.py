@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -19,6 +19,7 @@ from orthaug.models.lagged import Lagged
 from orthaug.models.on_records import OnRecords, trajectory
 from orthaug.models.response import Response
 from orthaug.models.statistics import Statistics
+from orthaug.physics.baseline import Parameter
 
 _WITHIN = 1e-9  # of a feature's half width: the largest of training is no extrapolation
 _BATCH = 1024  # rows per compiled call: longer records share the program, of a free run too
@@ -83,6 +84,11 @@ class Model(OnRecords):
     def theta(self) -> Vector:
         """θ̂ (nθ,)."""
         return np.asarray(self.numbers.theta)
+
+    @property
+    def estimated(self) -> tuple[Sequence[Parameter], Vector]:
+        """The parameters and their values, as results list them."""
+        return self.form.baseline.parameters, self.theta
 
     def learner_at(self, x: Float[np.ndarray, "M nx"]) -> Float[np.ndarray, "M ny"]:
         """f, before any split, at regressors of the form's layout; in the outputs' units."""

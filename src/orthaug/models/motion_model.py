@@ -6,9 +6,10 @@ from a window of rows before it: the state from which a free run over the window
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -18,11 +19,13 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, padded_length
 from orthaug.data.record import Channel, Experiment, Record
 from orthaug.models.dynamics import Numbers, Parts
+from orthaug.models.motion_parts import parts_at
 from orthaug.models.moving import Moving
 from orthaug.models.on_records import OnRecords, trajectory
 from orthaug.models.response import Response, Trajectory
 from orthaug.models.settling import Windows, settle
 from orthaug.models.statistics import Statistics
+from orthaug.physics.parameters import PhysicalParameter
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -60,11 +63,18 @@ def _last(
     return side_by_side(states, inputs[-1])[1].total
 
 
-@partial(jax.jit, static_argnames="form")
-def _acting(
-    form: Moving, numbers: Numbers, states: Float[Array, "T n0"], inputs: Float[Array, "T nu"]
-) -> tuple[Float[Array, "T n0"], Float[Array, "T n0"]]:
-    return jax.vmap(lambda x, u: form.rates(numbers, x, u))(states, inputs)
+class Trained(NamedTuple):
+    """What a later split under a measure needs beside the training data: how segments lay, and where they started.
+
+    `alone` (np,) are the coordinates of physics alone; `slope` (k, m, nx, n) is how the starts `states` (k, nx, m)
+    follow the unknowns, less its sign; None where that is not known.
+    """
+
+    segment: int
+    washout: int
+    states: Any
+    slope: Any
+    alone: Vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +99,7 @@ class MotionModel(OnRecords):
     window: int
     measure: str = field(default="training", kw_only=True)
     time_column: str | None = None
+    trained: Trained | None = field(default=None, repr=False)
     statistics: Statistics = Statistics()  # noqa: RUF009  (frozen)
 
     def __repr__(self) -> str:
@@ -105,6 +116,12 @@ class MotionModel(OnRecords):
         """The physical parameters by name."""
         values = self.form.motion.coordinates.physical(self.theta)
         return {name: float(value) for name, value in zip(self.form.motion.names, values, strict=True)}
+
+    @property
+    def estimated(self) -> tuple[Sequence[PhysicalParameter], Vector]:
+        """The physical parameters and their values, as results list them."""
+        coordinates = self.form.motion.coordinates
+        return coordinates.parameters, np.asarray(coordinates.physical(self.theta))
 
     @property
     def alone(self) -> MotionModel:
@@ -132,6 +149,8 @@ class MotionModel(OnRecords):
     def predict(self, record: Record, horizon: int = 1) -> Response:
         """Predict each row from a state that was estimated over the `window` rows up to `horizon` samples before it.
 
+        Where an experiment is shorter than that, over fewer.
+
         Raises:
             InputError: a record without outputs, other channels, a horizon below 1, too few rows.
         """
@@ -145,7 +164,10 @@ class MotionModel(OnRecords):
         return self.simulate(record)
 
     def states(self, record: Record, initial: str | Any = "measured") -> pd.DataFrame:
-        """The states of a free run, and, of each learned equation, what physics and learner add to its rate."""
+        """The states of a free run; of each learned equation its rate by the physics, and what is learned beside it.
+
+        Of a learned output likewise.
+        """
         import pandas as pd
 
         record = self.fitting(record, need_outputs=False)
@@ -154,13 +176,12 @@ class MotionModel(OnRecords):
             start = self._start(experiment, initial, record)
             inputs = self.form.inputs(experiment, record)
             states, _ = self._follow(self.form, self.numbers, start, inputs)
-            physics, learner = (
-                np.asarray(part) for part in _acting(self.form, self.numbers, states, experiment.inputs)
-            )
+            physics, learner = parts_at(self.form, self.numbers, states, experiment.inputs)
             time = experiment.start_time + np.arange(len(states)) * self.sampling_time
             columns = {"time": time} | {name: states[:, i] for i, name in enumerate(motion.names_of_states)}
-            for i in motion.learned[0]:
-                name = motion.names_of_states[i]
+            learned = [motion.names_of_states[i] for i in motion.learned[0]]
+            learned += [motion.outputs[i].name for i in motion.learned[1]]
+            for i, name in enumerate(learned):
                 columns |= {f"{name}_physics": physics[:, i], f"{name}_learner": learner[:, i]}
             frames.append(pd.DataFrame(columns))
         return pd.concat(frames, ignore_index=True)
@@ -233,16 +254,17 @@ class MotionModel(OnRecords):
         return settled[:, 0]
 
     def _ahead(self, experiment: Experiment, record: Record, horizon: int) -> Trajectory:
-        first = self.window + horizon - 1
-        self.check_rows(experiment, first)
-        outputs = self._predicted(experiment, record, horizon, self.window)
-        parts = Parts(outputs, np.zeros_like(outputs), np.zeros_like(outputs))
+        self.check_rows(experiment, horizon)
+        window = min(self.window, len(experiment) - horizon)  # short recordings have at least one prediction
+        first = window + horizon - 1
+        outputs, physics = self._predicted(experiment, record, horizon, window)
+        parts = Parts(physics, outputs - physics, outputs - physics)
         return trajectory(parts, experiment, experiment.outputs, first)
 
     def _predicted(
         self, experiment: Experiment, record: Record, horizon: int, window: int
-    ) -> Float[np.ndarray, "r ny"]:
-        """The outputs from row `window + horizon - 1` on, each `horizon` steps after a window."""
+    ) -> tuple[Float[np.ndarray, "r ny"], Float[np.ndarray, "r ny"]]:
+        """The outputs from row `window + horizon - 1` on, each `horizon` steps after a window; and by physics alone."""
         steps = window + horizon
         inputs = self.form.inputs(experiment, record)
         run = self._follow(self.form, self.numbers, self._start(experiment, "measured", record), inputs)[0]
@@ -268,8 +290,11 @@ class MotionModel(OnRecords):
             settled = settle(
                 self.form, self.numbers, states[padded].T, windows, self.weight, self.loose, _WINDOW_ITERATIONS
             )[0]
-            pieces.append(np.asarray(_last(self.form, self.numbers, settled, windows.inputs)).T[: len(chosen)])
-        return np.concatenate(pieces)
+            ends = [(self.form, self.numbers)]
+            ends += [(self.alone.form, self.alone.numbers)] if self.form.bound is not None else []
+            pieces.append([np.asarray(_last(*end, settled, windows.inputs)).T[: len(chosen)] for end in ends])
+        outputs, physics = (np.concatenate([piece[i] for piece in pieces]) for i in (0, -1))
+        return outputs, physics
 
 
 def _padded(rows: Matrix, size: int) -> Float[np.ndarray, "T n 1"]:

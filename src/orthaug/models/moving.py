@@ -12,11 +12,13 @@ from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import jax, jnp
+from orthaug.data.expressions import Lag
 from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import Differentiated, Numbers, Parts
 from orthaug.models.integrators import UNROLLED, advance, held
 from orthaug.models.motion_field import MotionField
 from orthaug.models.motion_tangents import Slopes, output_slopes, sample_slopes
+from orthaug.physics.motion_layout import layout_of
 from orthaug.physics.starts import guess
 
 
@@ -35,6 +37,11 @@ class Moving(MotionField, Differentiated):
     @property
     def differentiable(self) -> bool:
         return self.bound is None or self.bound.differentiable
+
+    @property
+    def used(self) -> tuple[Lag, ...]:
+        """States and inputs, as measures name them."""
+        return layout_of(self.motion)
 
     @property
     def alone(self) -> Moving:

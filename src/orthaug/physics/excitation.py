@@ -35,7 +35,11 @@ class Excitation:
         return self.rank == self.columns
 
 
-def excitation(r: Matrix, names: Sequence[str]) -> Excitation:
+GRAM_TOLERANCE = 3e-6
+"""`RANK_TOLERANCE` where only a Gram matrix is known: its rounding hides singular values below."""
+
+
+def excitation(r: Matrix, names: Sequence[str], tolerance: float = RANK_TOLERANCE) -> Excitation:
     """Rank and condition of a matrix from its R factor (or itself), columns scaled to unit norm.
 
     The condition number is σmax/σmin of the scaled columns, None where it is infinite. A group holds the columns that
@@ -48,9 +52,17 @@ def excitation(r: Matrix, names: Sequence[str]) -> Excitation:
     scaled = r / np.where(norms > 0, norms, 1.0)
     _, sigma, vt = np.linalg.svd(scaled, full_matrices=True)
     sigma = np.concatenate([sigma, np.zeros(columns - len(sigma))])
-    rank = int(np.sum(sigma > RANK_TOLERANCE * sigma[0])) if sigma[0] > 0 else 0
+    rank = int(np.sum(sigma > tolerance * sigma[0])) if sigma[0] > 0 else 0
     condition = float(sigma[0] / sigma[-1]) if rank == columns else None
     return Excitation(rank, columns, condition, _groups(vt[rank:], names))
+
+
+def of_gram(gram: Matrix, names: Sequence[str]) -> Excitation:
+    """`excitation` from the Gram matrix of the columns."""
+    norms = np.sqrt(np.maximum(np.diag(gram), 0.0))
+    unit = np.where(norms > 0, norms, 1.0)
+    values, vectors = np.linalg.eigh(gram / np.outer(unit, unit))
+    return excitation(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * unit, names, GRAM_TOLERANCE)
 
 
 def _groups(null_space: Matrix, names: Sequence[str]) -> tuple[tuple[str, ...], ...]:

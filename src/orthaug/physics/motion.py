@@ -221,9 +221,10 @@ class Motion:
         if source is not None:
             known = [output.name for output in self.outputs]
             if source[0] not in known:
-                hint = nearest(source[0], known) or "; expected"
+                hint = nearest(source[0], known) or ";"
                 raise InputError(
-                    f"the state '{state.name}' starts from '{start}'{hint} a number, an output ({', '.join(known)}), "
+                    f"the state '{state.name}' starts from '{start}'{hint} expected a number, an output "
+                    f"({', '.join(known)}), "
                     "or 'derivative of' one."
                 )
         elif start is not None and not is_number(start):
@@ -315,6 +316,19 @@ class Motion:
         values = self.values(x, u, p, xp)
         outputs = [expression.value(values, xp) for expression in self._observed]
         return xp.stack([xp.broadcast_to(xp.asarray(output, dtype=float), x.shape[1:]) for output in outputs])
+
+    def term_without_value(self, i: int, x: Vector, u: Vector) -> str:
+        """What is not finite in equation i, outputs after states, at a point (nx,) and (nu,), in words; or nothing."""
+        if self.functions is not None:
+            return ""
+        with np.errstate(all="ignore"):
+            values = self.values(x, u, self.initial, np)
+        definitions = dict(self.definitions)
+        term, names = (*self._expressions.values(), *self._observed)[i].term_without_value(values)
+        while len(names) == 1 and term in definitions:  # a name for what has no value
+            term, names = definitions[term].term_without_value(values)
+        at = ", ".join(f"{name} = {float(values[name]):.4g}" for name in dict.fromkeys(names))
+        return f"{term} at {at}" if at else term
 
     @property
     def initial(self) -> Vector:

@@ -144,9 +144,9 @@ def _check_start(problem: MotionProblem) -> None:
     with np.errstate(all="ignore"):
         rates = np.asarray(motion.rates(x, u, motion.initial, np), dtype=float)
         outputs = np.asarray(motion.observed(x, u, motion.initial, np), dtype=float)
-    for names, values, what in (
-        (motion.names_of_states, rates, "the equation of"),
-        (problem.outputs, outputs, "the output"),
+    for names, values, what, first in (
+        (motion.names_of_states, rates, "the equation of", 0),
+        (problem.outputs, outputs, "the output", len(rates)),
     ):
         if values.shape != (len(names), x.shape[1]):
             raise InputError(f"the motion's functions return shape {values.shape}; expected ({len(names)}, …).")
@@ -155,7 +155,12 @@ def _check_start(problem: MotionProblem) -> None:
                 k = int(np.argmax(~np.isfinite(values[i])))
                 at = zip((*motion.names_of_states, *motion.inputs), (*x[:, k], *u[:, k]), strict=True)
                 where = ", ".join(f"{n} = {v:.4g}" for n, v in at)
-                raise InputError(f"{what} '{name}' is not finite at the start ({where}, initial parameters).")
+                term = motion.term_without_value(first + i, x[:, k], u[:, k])
+                told = f": {term}" if term else ""
+                raise InputError(
+                    f"{what} '{name}' is not finite at the start ({where}, initial parameters){told}; mend it, or "
+                    "start elsewhere."
+                )
     if motion.integrator == "rk4" and problem.substeps > MOST_SUBSTEPS:
         raise InputError(
             f"the sampling time of {problem.record.sampling_time:g} s is too long for the fastest mode of the motion, "

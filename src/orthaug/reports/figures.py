@@ -12,7 +12,7 @@ from orthaug.models.response import Response
 from orthaug.reports.result import CheckResult, CompareResult, FitResult
 
 if TYPE_CHECKING:
-    from orthaug.reports.plots import Figure
+    from orthaug.reports.drawing import Figure
 
 _OF_RESPONSES = ("output", "residual", "components")
 

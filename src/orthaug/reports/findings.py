@@ -245,14 +245,29 @@ class LipschitzResult(Content):
     weights_rows: Whole
 
 
+class ModesResult(Content):
+    """Eigenvalues of a linearised motion along the free run [1/s]."""
+
+    points: Whole
+    rightmost: Number
+    median: Number
+    growing: Number
+    slowest: Number
+    fastest: Number
+    worst: ByName
+
+
 class StabilityResult(Content):
     """Evidence on the free run."""
+
+    absent = frozenset({"modes"})
 
     feedback: FeedbackResult | None
     contraction: ContractionResult | None
     diverges_at: Number
     searched: Number
     lipschitz: LipschitzResult | None
+    modes: ModesResult | None = None
     warnings: list[WarningResult]
     text: str
 
@@ -291,3 +306,34 @@ class ValidationResult(Content):
     ratio: RatioResult | None = None
     trials: list[TrialResult]
     extrapolation: list[ExtrapolationResult]
+
+
+class HoldResult(Content):
+    """What physics alone leaves under a hold, in deviations of the outputs."""
+
+    hold: str
+    residual: Number
+    declared: Flag
+
+
+class MotionCheckResult(Content):
+    """What can be said of a motion before training."""
+
+    states: list[str]
+    integrator: str
+    fastest: Number
+    substeps: Whole | None
+    rows: Whole
+    holds: list[HoldResult]
+    best_hold: str | None
+    text: str
+
+
+class MotionFitResult(Content):
+    """How a fitted motion is integrated, and the rows that a prediction starts from."""
+
+    states: list[str]
+    integrator: str
+    substeps: Whole
+    hold: str
+    window: Whole

@@ -10,10 +10,13 @@ from pydantic import BeforeValidator, Field
 
 from orthaug import __version__
 from orthaug.physics.baseline import Parameter
+from orthaug.physics.parameters import PhysicalParameter
 from orthaug.reports.fields import ByName, Content, Flag, Number, Numbers, WarningResult, Whole
 from orthaug.reports.findings import (
     DiagnosisResult,
     MissingLagsResult,
+    MotionCheckResult,
+    MotionFitResult,
     SharedResult,
     StabilityResult,
     SuspectResult,
@@ -197,6 +200,8 @@ class PartScores(Content):
 class FitResult(_Headed):
     """What `orthaug fit` leaves."""
 
+    absent: ClassVar = frozenset({"motion"})
+
     spec: dict[str, Any]
     data: DataResult
     status: StatusResult
@@ -219,11 +224,14 @@ class FitResult(_Headed):
     missing_lags: MissingLagsResult | None
     stability: StabilityResult | None
     validation: ValidationResult | None
+    motion: MotionFitResult | None = None
     warnings: list[WarningResult]
 
 
 class CheckResult(_Headed):
     """What `orthaug check` tells."""
+
+    absent: ClassVar = frozenset({"motion"})
 
     data: DataResult
     parameters: list[str]
@@ -233,6 +241,7 @@ class CheckResult(_Headed):
     identifiability: IdentifiabilityResult
     shared: SharedResult | None
     bias: list[SuspectResult] | None
+    motion: MotionCheckResult | None = None
     warnings: list[WarningResult]
 
 
@@ -319,7 +328,7 @@ def schema_of(command: str) -> dict[str, Any]:
 
 
 def parameter_rows(
-    parameters: Sequence[Parameter],
+    parameters: Sequence[Parameter] | Sequence[PhysicalParameter],
     values: Any,
     std: Any = None,
     interval: Any = None,

@@ -23,26 +23,27 @@ from orthaug.reports.result import (
 if TYPE_CHECKING:
     from orthaug.analysis.validation import Verdict
     from orthaug.fitting.estimates import Estimate
+    from orthaug.fitting.motion_estimates import MotionEstimate
     from orthaug.models.response import Response
 
 SHOWN = 8  # signals of a design that are listed
 WIDTH = 100  # of wrapped sentences
 
 
-def fit_text(fit: Estimate, result: FitResult) -> str:
+def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
     """Parameters, scores on every part, what the residual says, whether the learner earns its place, warnings."""
-    from orthaug.fitting.estimates import summary_lines
-
     if not fit.status.ok:
         return ""
-    blocks = [list(summary_lines(fit))]
+    blocks = [list(fit.lines())]
     if result.physical_parameters:
         blocks.append(_physical_lines(result))
     blocks.append(_score_lines(fit, result))
     if result.shared is not None and not result.shared.everything:
         blocks.append([result.shared.text])
     blocks.append(_bias_lines(result))
-    told = [finding.text for finding in (result.residuals, result.missing_lags, result.validation) if finding]
+    findings = [result.residuals, result.missing_lags, result.validation]
+    findings += [result.stability] if result.motion is not None else []
+    told = [finding.text for finding in findings if finding]
     blocks += [told, _warning_lines(w for w in dict.fromkeys(result.warnings) if w.text not in told)]
     return "\n\n".join("\n".join(lines) for lines in blocks if lines)
 
@@ -51,12 +52,14 @@ def check_text(result: CheckResult) -> str:
     """Excitation, identifiability, and what would bias the parameters."""
     data, physics = result.excitation, result.identifiability
     condition = f"{data.condition:.4g}" if data.condition is not None else "infinite"
+    moves = result.motion is not None
+    where = "with rich inputs" if moves else "at random points"
     lines = [
         f"parameters       {', '.join(result.parameters) or 'none'}",
-        f"regressor        {', '.join(result.regressor)}",
+        f"{'states, inputs  ' if moves else 'regressor       '} {', '.join(result.regressor)}",
         f"usable rows      {result.rows}",
         f"excitation       rank {data.rank} of {data.columns} on the data, condition {condition}",
-        f"identifiability  rank {physics.rank} of {physics.columns} at random points: "
+        f"identifiability  rank {physics.rank} of {physics.columns} {where}: "
         + ("the parameters can be told apart" if physics.identifiable else "no data can tell the parameters apart"),
     ]
     for group in physics.inseparable:
@@ -64,6 +67,8 @@ def check_text(result: CheckResult) -> str:
     if physics.identifiable:
         for group in data.collinear:
             lines.append(f"  not excited separately by these data: {', '.join(group)}")
+    if result.motion is not None and result.motion.text:
+        lines += ["", *textwrap.wrap(result.motion.text, WIDTH)]
     if result.shared is not None:
         lines += ["", *_shared_lines(result.shared)]
     if result.bias:
@@ -215,7 +220,7 @@ def _limit(value: float | None) -> str:
     return f"{'–':>13}" if value is None else f"{value:13.7g}"
 
 
-def _score_lines(fit: Estimate, result: FitResult) -> list[str]:
+def _score_lines(fit: Estimate | MotionEstimate, result: FitResult) -> list[str]:
     """The scores as a table, one line per part, kind and output."""
     rows = [["part", "horizon", "output", "RMSE", "NRMSE", "FIT %"]]
     for part, scores in result.scores.items():

@@ -1,0 +1,89 @@
+"""Which hold explains the data best: physics alone fitted with each way in which inputs run between samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.errors import InputError
+from orthaug.data.record import Record
+from orthaug.fitting.course import Flight
+from orthaug.fitting.criteria import Criterion
+from orthaug.fitting.motion_course import MotionCourse
+from orthaug.fitting.motion_task import MotionTask
+from orthaug.fitting.structures import Structure
+from orthaug.physics.motion import HOLDS
+from orthaug.physics.motion_problem import MotionProblem
+
+ROWS = 4000  # at most
+_CLEARLY = 0.02  # lower, of the residual
+_REFITTED = 30  # iterations from where the declared hold ended
+
+
+@dataclass(frozen=True)
+class Held:
+    """The residual of physics alone under a hold, RMS in deviations of the outputs; None where it has no run."""
+
+    hold: str
+    residual: float | None
+    declared: bool
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Physics alone on the first rows of the longest experiment: its substeps, and every hold's residual."""
+
+    rows: int
+    substeps: int | None
+    holds: tuple[Held, ...]
+
+    @property
+    def best(self) -> str | None:
+        """The hold that explains the data clearly better than the declared one."""
+        own = next((h.residual for h in self.holds if h.declared), None)
+        known = [h for h in self.holds if h.residual is not None]
+        if own is None or len(known) < 2:
+            return None
+        least = min(known, key=lambda h: h.residual or 0.0)
+        return least.hold if least.residual is not None and least.residual < (1 - _CLEARLY) * own else None
+
+
+def try_holds(problem: MotionProblem, criterion: Criterion, solver: Any, structure: Structure) -> Trial:
+    """Fit physics alone with the declared hold, and go on from there with every other.
+
+    One hold alone is tried where the motion is discrete or has no inputs.
+    """
+    longest = max(problem.record.experiments, key=len)
+    record = replace(problem.record, experiments=(longest.rows(0, ROWS),))
+    task = MotionTask.of(problem.on(record), None, criterion).prepared(solver, structure)
+    motion, flight = problem.motion, task.physics
+    residual = None if flight is None else _residual(task.plan, flight)
+    found = [Held(motion.hold, residual, True)]
+    several = motion.integrator != "discrete" and bool(motion.inputs) and flight is not None
+    for hold in HOLDS if several else ():
+        if hold != motion.hold:
+            found.append(Held(hold, _refitted(task, record, hold, solver), False))
+    substeps = None if flight is None else task.plan.dynamics.substeps
+    return Trial(len(longest.rows(0, ROWS)), substeps, tuple(found))
+
+
+def _refitted(task: MotionTask, record: Record, hold: str, solver: Any) -> float | None:
+    flight, plan = task.physics, task.plan
+    assert flight is not None
+    motion = replace(plan.problem.motion, hold=hold, substeps=plan.dynamics.substeps)
+    try:
+        course = MotionCourse.of(replace(plan.problem, motion=motion, record=record), None, plan.criterion)
+    except InputError:
+        return None
+    course = course.from_states(flight.end.flown.states)
+    again = course.descend(course.objective(), flight.end.flown.theta, solver.at_most(_REFITTED))
+    return _residual(course, again) if again.ending.usable else None
+
+
+def _residual(course: MotionCourse, flight: Flight) -> float | None:
+    """RMS of the errors, in deviations of the outputs."""
+    scaled = flight.end.flown.errors / course.deviation[:, None]
+    value = float(np.sqrt(np.sum(scaled**2) / course.residuals))
+    return value if np.isfinite(value) else None

@@ -1,0 +1,130 @@
+"""Which parameters of a motion can the outputs tell apart: on a record's inputs, and on inputs that excite everything?
+
+The rank of the free run's sensitivities to the parameters' coordinates, the starts of all segments eliminated, at the
+initial parameters and some near them. A direction that only rounding or one particular value hides has full rank there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug.data.record import Record
+from orthaug.fitting.initial_states import Start
+from orthaug.fitting.motion_course import MotionCourse
+from orthaug.physics.excitation import Excitation, excitation, of_gram
+
+_DRAWS = 3  # parameters near the initial ones
+_NEAR = 0.1  # of a logarithm, or of the value
+_SHORTER = (512, 128, 32, 8)  # steps of segments, where physics runs away over longer ones
+_LOOSER = 1e3  # times as free as in training: a start that costs something tells parameters from it
+_WIDE = 2.0  # times the range of the data
+_LONGEST_LEVEL = 60  # steps for which a random input stays
+_SEED = 20_250_117
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """What the record's own inputs tell apart, and what rich ones do; with points of a run at the initial parameters.
+
+    `states` (M, nx) and `inputs` (M, nu) are where physics alone goes on the record.
+    """
+
+    on_data: Excitation
+    by_any: Excitation
+    states: Matrix
+    inputs: Matrix
+
+
+def identified(course: MotionCourse) -> Identified:
+    """Of the physics alone of a course; its segments are taken shorter where they run away."""
+    course = course.alone
+    names = course.problem.motion.names
+    flying, on_data = course, None
+    for steps in (course.segments.steps, *(s for s in _SHORTER if s < course.segments.steps)):
+        flying = course if steps == course.segments.steps else course.over(steps)
+        on_data = _rank(flying)
+        if on_data is not None:
+            break
+    nothing = excitation(np.zeros((1, len(names))), names)
+    by_any = None
+    for wide in (_WIDE, 1.0, 0.5):
+        by_any = _rank(_richly_excited(flying, wide))
+        if by_any is not None:
+            break
+    by_any = on_data if by_any is None else by_any
+    if on_data is not None and by_any is not None and by_any.rank < on_data.rank:
+        by_any = on_data
+    starts = np.asarray(flying.segments.start)
+    x, u = flying.trajectory(course.problem.motion.coordinates.initial, (), starts)
+    finite = np.isfinite(x).all(axis=1)
+    return Identified(on_data or nothing, by_any or nothing, x[finite], u[finite])
+
+
+def _rank(course: MotionCourse) -> Excitation | None:
+    """The highest rank of some points near the initial parameters; None where no run is finite."""
+    best: Excitation | None = None
+    for q in _near(course):
+        gram = information(course, q)
+        if gram is not None:
+            found = of_gram(gram, course.problem.motion.names)
+            if best is None or found.rank > best.rank:
+                best = found
+        if best is not None and best.full_rank:
+            break
+    return best
+
+
+def information(course: MotionCourse, q: Vector) -> Matrix | None:
+    """Gram matrix (np, np) of the outputs' sensitivities to the parameters' coordinates; None where a run diverges."""
+    objective = course.objective()
+    objective = replace(objective, loose=_LOOSER * objective.loose)
+    with np.errstate(all="ignore"):
+        flown = objective.fly(q, Start(np.asarray(course.segments.start)))
+        if not np.isfinite(flown.loss):
+            return None
+        gram = objective.linearise(flown).information
+    return gram if np.isfinite(gram).all() else None
+
+
+def _near(course: MotionCourse) -> Iterator[Vector]:
+    coordinates, random = course.problem.motion.coordinates, np.random.default_rng(_SEED)
+    low, high = coordinates.bounds
+    first = coordinates.initial
+    size = np.where(coordinates.positive, 1.0, np.where(first != 0, np.abs(first), 1.0))
+    yield first
+    for _ in range(_DRAWS):
+        yield np.clip(first + _NEAR * size * random.normal(size=len(first)), low, high)
+
+
+def _richly_excited(course: MotionCourse, wide: float) -> MotionCourse:
+    """The same rows with inputs of random levels, each for a random time, and starts a little off their guesses."""
+    record, random = course.record, np.random.default_rng(_SEED)
+    every = np.concatenate([e.inputs for e in record.experiments])
+    low, high = every.min(axis=0), every.max(axis=0)
+    half = wide * np.where(high > low, (high - low) / 2, 1.0)
+    experiments = []
+    for experiment in record.experiments:
+        inputs = np.empty_like(np.asarray(experiment.inputs, dtype=float))
+        for column in inputs.T:
+            column[:] = _levels(len(column), random)
+        experiments.append(replace(experiment, inputs=(low + high) / 2 + half * inputs))
+    excited = _on(course, replace(record, experiments=tuple(experiments)))
+    start = np.asarray(excited.segments.start)
+    size = np.abs(start).max(axis=(0, 2), keepdims=True)
+    return excited.from_states(start + _NEAR * size * random.normal(size=start.shape))
+
+
+def _on(course: MotionCourse, record: Record) -> MotionCourse:
+    """The same segments on another record."""
+    whole = MotionCourse.of(course.problem.on(record), None, course.criterion)
+    return whole if course.flown == course.criterion.flown else whole.over(course.flown.segment)
+
+
+def _levels(count: int, random: np.random.Generator) -> Vector:
+    """Levels in [-1, 1] that stay for 1 to some steps, short ones as often as long ones."""
+    lengths = np.exp(random.uniform(0, np.log(_LONGEST_LEVEL), count)).astype(int)
+    return np.repeat(random.uniform(-1, 1, count), lengths)[:count]

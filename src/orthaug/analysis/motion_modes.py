@@ -1,0 +1,111 @@
+"""Eigenvalues of the linearised motion along a run, in 1/s: how fast small changes of the state grow or decay there.
+
+They are those of ∂ẋ/∂x with the learner in it; of a discrete motion `ln(λ)/Ts` with those of ∂x⁺/∂x. They are local: a
+run may be bounded where some grow, and need not be where none does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._base.checks import Matrix
+from orthaug._base.jax import Array, jax
+from orthaug._base.warning import Warning
+from orthaug.models.dynamics import Numbers
+from orthaug.models.motion_model import MotionModel
+from orthaug.models.moving import Moving
+
+_POINTS = 2000  # at most
+_OFTEN = 0.01  # of the points: growing modes on more are told as a warning
+_STILL = 1e-9  # of the fastest mode: an integrator's eigenvalue is rounding of zero
+
+
+@dataclass(frozen=True)
+class Modes:
+    """Local eigenvalues over `points` of a run [1/s].
+
+    `rightmost` is the largest real part and `worst` the state and input where it is, `median` that of the largest real
+    part; `growing` is the share of points where it is positive. `slowest` and `fastest` are the least and largest
+    magnitude.
+    """
+
+    points: int
+    rightmost: float
+    median: float
+    growing: float
+    slowest: float
+    fastest: float
+    worst: dict[str, float]
+
+
+@dataclass(frozen=True)
+class MotionStability:
+    """The modes of a motion, in the place that other models have more evidence in."""
+
+    modes: Modes | None
+    warnings: tuple[Warning, ...]
+    text: str
+
+    feedback = contraction = lipschitz = diverges_at = searched = None
+
+
+def motion_stability(model: MotionModel, x: Matrix, u: Matrix) -> MotionStability:
+    """Of the states (N, nx) and inputs (N, nu) of a run; those that are not finite are left out."""
+    found = modes(model, x, u)
+    if found is None:
+        return MotionStability(None, (), "The motion has no finite derivative along its run.")
+    sizes = dict.fromkeys(f"{size:.4g}" for size in (found.slowest, found.fastest))
+    told = f"The linearised motion has modes of {' to '.join(sizes)} 1/s along the free run. "
+    if not found.growing:
+        told += f"All decay everywhere: the largest real part is {found.rightmost:.4g} 1/s."
+        return MotionStability(found, (), told)
+    where = ", ".join(f"{name} = {value:.4g}" for name, value in found.worst.items())
+    told += (
+        f"At {100 * found.growing:.3g} % of its points one grows, by up to {found.rightmost:.4g} 1/s ({where}); median "
+        f"of the largest real part {found.median:.4g} 1/s."
+    )
+    warnings = (Warning("growing_mode", told),) if found.growing > _OFTEN else ()
+    return MotionStability(found, warnings, told)
+
+
+def modes(model: MotionModel, x: Matrix, u: Matrix) -> Modes | None:
+    """The eigenvalues over at most 2000 points, spread evenly; None where no derivative is finite."""
+    finite = np.isfinite(x).all(axis=1)
+    x, u = x[finite], u[finite]
+    rows = np.linspace(0, len(x) - 1, min(len(x), _POINTS)).astype(int) if len(x) else np.zeros(0, dtype=int)
+    slopes = np.asarray(_slopes(model.form, model.numbers, x[rows], u[rows])) if len(rows) else np.zeros((0, 1, 1))
+    kept = np.isfinite(slopes).all(axis=(1, 2))
+    if not kept.any():
+        return None
+    values = np.linalg.eigvals(slopes[kept])
+    if model.form.motion.integrator == "discrete":
+        small = np.abs(values) < 1e-300  # gone in one sample
+        values = np.log(np.where(small, 1e-300, values).astype(complex)) / model.sampling_time
+    size = np.abs(values)
+    largest = values.real.max(axis=1)
+    growing = largest > _STILL * max(size.max(), 1e-300)
+    place = rows[kept][int(np.argmax(largest))]
+    return Modes(
+        points=int(kept.sum()),
+        rightmost=float(largest.max()),
+        median=float(np.median(largest)),
+        growing=float(growing.mean()),
+        slowest=float(size.min()),
+        fastest=float(size.max()),
+        worst=model.form.describe(x[place], u[place]),
+    )
+
+
+@partial(jax.jit, static_argnames="form")
+def _slopes(
+    form: Moving, numbers: Numbers, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
+) -> Float[Array, "m nx nx"]:
+    def rate(x: Any, u: Any) -> Any:
+        return sum(form.rates(numbers, x, u))
+
+    return jax.vmap(jax.jacfwd(rate))(x, u)

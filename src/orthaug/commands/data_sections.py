@@ -1,0 +1,64 @@
+"""The section [data] of a spec: channels, sampling time, and the files of every part."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from orthaug._base.checks import check_label
+from orthaug.commands.sections import Count, Finite, Positive, Section
+
+Range = Annotated[list[Count], Field(min_length=2, max_length=2)]
+
+
+class PartSection(Section):
+    """Files of training or test data; each file, and each row range, is an experiment."""
+
+    files: Annotated[list[str], Field(min_length=1)]
+    rows: Range | Annotated[list[Range], Field(min_length=1)] | None = None
+    every: Positive = 1
+    skip: Count = 0
+    columns: dict[str, str] = {}
+
+
+class ChannelSection(Section):
+    """A channel in files: value = scale * cell + offset of column."""
+
+    column: str = ""
+    unit: str = ""
+    scale: Finite = 1.0
+    offset: Finite = 0.0
+
+
+class Data(Section):
+    """Channels, sampling time and parts."""
+
+    sampling_time: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    time: Annotated[str, Field(min_length=1)] | None = None
+    inputs: list[str] = []
+    outputs: Annotated[list[str], Field(min_length=1)]
+    missing: Literal["error", "skip"] = "error"
+    train: PartSection
+    validation: PartSection | None = None
+    tests: dict[str, PartSection] = {}
+    channels: dict[str, ChannelSection] = {}
+
+    @property
+    def step(self) -> float | None:
+        """Seconds between the rows that are kept of the training data; None where a time column tells."""
+        return None if self.time else (self.sampling_time or 1.0) * self.train.every
+
+    @model_validator(mode="after")
+    def _one_time(self) -> Data:
+        if self.sampling_time is not None and self.time is not None:
+            raise ValueError("`sampling_time` and `time` are both given; expected one of them")
+        for name in self.channels:
+            if name not in (*self.inputs, *self.outputs):
+                known = ", ".join((*self.inputs, *self.outputs))
+                raise ValueError(f"`channels.{name}` is neither an input nor an output; expected one of {known}")
+        for name in self.tests:
+            check_label(name, "the name of a test")
+            if name in ("train", "validation"):
+                raise ValueError(f"`tests.{name}` has the name of another part of the data; expected another name")
+        return self

@@ -1,0 +1,180 @@
+"""Jobs whose physics is linear in θ on lagged signals: opened, and trained."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from orthaug._base.errors import InputError, KeyedError
+from orthaug._base.progress import SILENT, Progress
+from orthaug.commands.job import ALONE, AS_DECLARED, Job, Variant
+from orthaug.commands.parts import load_parts
+from orthaug.commands.spec import Spec
+from orthaug.commands.suspects import check_suspects
+from orthaug.data.expressions import Lag
+from orthaug.data.record import Record, check_channels
+from orthaug.data.regressors import Layout, lag_rows, largest_lag
+from orthaug.fitting.cost import check_cost
+from orthaug.fitting.kinds import STRUCTURES
+from orthaug.fitting.rules import check_scored
+from orthaug.fitting.structures import Structure
+from orthaug.inference.measure_files import MeasurePlace
+from orthaug.inference.measures import Measure
+from orthaug.inference.weighed import Weighed, weigh_problem
+from orthaug.physics.parameters import PhysicsMap, with_initial
+from orthaug.physics.problem import Problem, check_defined, pose, regressor_of
+
+if TYPE_CHECKING:
+    from orthaug.fitting.estimates import Estimate
+    from orthaug.models.model import Model
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class LaggedJob(Job):
+    """A job with a baseline."""
+
+    problem: Problem
+    weighed: Weighed
+    physics: PhysicsMap | None
+
+    @property
+    def physics_in_words(self) -> str:
+        return repr(self.problem.baseline)
+
+    @property
+    def first_row(self) -> int:
+        return self.problem.rows.start
+
+    @property
+    def run_count(self) -> int:
+        return self.spec.runs(linear=self.problem.baseline.linear)
+
+    @property
+    def compared(self) -> tuple[str, ...]:
+        return (ALONE,) if self.spec.declared_learner() is None else (ALONE, *STRUCTURES)
+
+    @property
+    def used(self) -> tuple[Lag, ...]:
+        """The raw lags that the model reads."""
+        return self.problem.used
+
+    @property
+    def measure(self) -> Measure:
+        """The measure that the spec declares."""
+        return self.weighed.measure
+
+    def refusal(self, variant: Variant) -> str | None:
+        baseline = self.problem.baseline
+        try:
+            structure_of(self.spec, variant.structure_kind).penalty(baseline.names, baseline.initial, 1.0)
+        except InputError as error:
+            return str(error)
+        return None
+
+    def reach(self, model: Model, record: Record) -> tuple[np.ndarray, Layout]:
+        own = record is self.train.record
+        return self.problem.rows.x if own else lag_rows(record, self.problem.layout), self.problem.layout
+
+    def posed(self, variant: Variant) -> Problem:
+        """The problem that a variant of the job solves: the job's own, unless its data or lags are others."""
+        if variant.fold is None:
+            return self.problem.physics_alone() if variant.alone else self.problem
+        spec, baseline, weights = self.spec, self.problem.baseline, self.spec.training.output_weights
+        if variant.alone or spec.declared_learner() is None:
+            return pose(variant.fold, baseline, output_weights=weights)
+        return pose(variant.fold, baseline, spec.lag_orders(), spec.learner_inputs(), output_weights=weights)
+
+    def run(self, variant: Variant = AS_DECLARED, progress: Progress = SILENT) -> Estimate:
+        from orthaug.fitting.estimation import fit
+
+        structure = structure_of(self.spec, variant.structure_kind, self.measure)
+        if variant.alone or variant.fold is not None:  # a fold is scored by predictions, which no measure changes
+            structure = structure_of(self.spec, variant.structure_kind)
+        options = self.training_options(variant)
+        options["ensemble"] = self.spec.training.ensemble and variant.fold is None and options["learner"] is not None
+        return fit(self.posed(variant), structure=structure, progress=progress, **options)
+
+
+def open_lagged(path: Path, spec: Spec, *, require_full_rank: bool = True) -> LaggedJob:
+    """Read all data of a spec with a baseline, and pose the problem.
+
+    Raises:
+        InputError: anything wrong with spec, files or physics; one line that names it.
+    """
+    parts, step = None, spec.data.step
+    if step is None:
+        parts = load_parts(path, spec)
+        step = parts[0].record.sampling_time
+    try:
+        baseline, learner_inputs = spec.declared_baseline(), spec.learner_inputs()
+        physics = spec.physics_map(step)
+        if physics is not None:
+            baseline = with_initial(physics, baseline)
+        baseline.check_initial()
+        check_channels(spec.channels(spec.data.inputs), spec.channels(spec.data.outputs))
+        structure_of(spec).penalty(baseline.names, baseline.initial, 1.0)
+        baseline.check_channels(spec.data.outputs, spec.data.inputs)
+    except InputError as error:
+        raise type(error)(f"{path}: {error}") from None
+    train, validation, tests = parts or load_parts(path, spec)
+    lags = spec.lag_orders() if spec.declared_learner() is not None else None
+    try:
+        layout, _ = regressor_of(baseline, lags, learner_inputs, tuple(spec.data.outputs), tuple(spec.data.inputs))
+        first = largest_lag(layout)
+        train, tests = train.without_short(first), tuple(part.without_short(first) for part in tests)
+        validation = validation.without_short(first) if validation else None
+        options = {"output_weights": spec.training.output_weights, "require_full_rank": require_full_rank}
+        problem = pose(train.record, baseline, lags, learner_inputs, **options)
+        problem.feature_rows()
+        _check_scored(spec, problem)
+        _check_cost(spec, problem)
+        weighed = weigh_problem(measure_of(spec, problem, path.parent), problem)
+        _check_measure(weighed, problem)
+        named = {"path": path, "spec": spec, "train": train, "validation": validation, "tests": tests}
+        job = LaggedJob(**named, problem=problem, weighed=weighed, physics=physics)
+        check_suspects(spec.suspects, problem)
+        for part in job.parts:
+            part.check_scorable(problem.rows.start, train.record.sampling_time)
+            if part is not train:  # `pose` has looked at that
+                check_defined(problem, part.record)
+    except InputError as error:
+        raise type(error)(f"{path}: {error}") from None
+    return job
+
+
+def _check_scored(spec: Spec, problem: Problem) -> None:
+    """`check_scored` in the words of the spec."""
+    longest = max(len(e) for e in problem.record.experiments) - problem.rows.start
+    try:
+        check_scored(spec.declared_criterion(), longest)
+    except KeyedError as error:
+        raise InputError(f"'training.{error.key}'{error.words}.") from None
+
+
+def _check_cost(spec: Spec, problem: Problem) -> None:
+    """`check_cost` before JAX is loaded."""
+    sizes = {"rows": len(problem.rows), "features": len(problem.features.entries), "outputs": len(problem.outputs)}
+    runs = spec.runs(linear=problem.baseline.linear)
+    check_cost(spec.declared_learner(), **sizes, iterations=spec.declared_solver().iterations, runs=runs)
+
+
+def structure_of(spec: Spec, kind: str | None = None, measure: Measure | None = None) -> Structure:
+    """The structure that a spec declares, or another kind with its keys."""
+    return spec.declared_structure(kind, measure)
+
+
+def measure_of(spec: Spec, problem: Problem, folder: Path) -> Measure:
+    """The measure that a spec declares for its problem."""
+    lags = [str(lag) for lag in problem.used]
+    return spec.declared_measure(MeasurePlace(folder, lags, problem.record, problem.rows.start))
+
+
+def _check_measure(weighed: Weighed, problem: Problem) -> None:
+    """Raise InputError for a measure under which the physics is rank-deficient, where on the data it is not."""
+    if problem.excitation.full_rank and not weighed.excitation.full_rank:
+        groups = "; ".join(", ".join(group) for group in weighed.excitation.collinear)
+        name = weighed.measure.name
+        raise InputError(f"under the {name} measure the physics cannot tell {groups} apart; widen or move it.")

@@ -1,0 +1,157 @@
+"""Jobs whose physics are equations of motion: opened, and trained."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from orthaug._base.errors import InputError, KeyedError
+from orthaug._base.progress import SILENT, Progress
+from orthaug.commands.job import ALONE, AS_DECLARED, Job, Variant
+from orthaug.commands.parts import Part, load_parts
+from orthaug.commands.spec import Spec
+from orthaug.data.record import Record, check_channels
+from orthaug.data.regressors import Layout
+from orthaug.fitting.cost import check_cost
+from orthaug.fitting.rules import check_motion_choices, check_scored, check_solver, tried
+from orthaug.fitting.structures import Structure
+from orthaug.inference.measure_files import MeasurePlace
+from orthaug.inference.measures import Measure
+from orthaug.inference.motion_support import support_of
+from orthaug.physics.motion import Motion
+from orthaug.physics.motion_layout import layout_of
+from orthaug.physics.motion_problem import MotionProblem, pose_motion
+
+if TYPE_CHECKING:
+    from orthaug.fitting.motion_estimates import MotionEstimate
+    from orthaug.models.motion_model import MotionModel
+
+_SECTIONS = {"learner": "learner", "kind": "structure.kind"}  # of keys that are not in [training]
+WITH_LEARNER = "orthogonal"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class MotionJob(Job):
+    """A job with a motion."""
+
+    problem: MotionProblem
+    measure: Measure
+
+    @property
+    def physics_in_words(self) -> str:
+        return f"motion of {', '.join(self.problem.motion.names_of_states)}"
+
+    @property
+    def first_row(self) -> int:
+        return self.problem.first_row
+
+    @property
+    def compared(self) -> tuple[str, ...]:
+        return (ALONE,) if self.spec.declared_learner() is None else (ALONE, WITH_LEARNER)
+
+    def refusal(self, variant: Variant) -> str | None:
+        return None
+
+    def reach(self, model: MotionModel, record: Record) -> tuple[np.ndarray, Layout]:
+        motion = self.problem.motion
+        states = model.states(record)[list(motion.names_of_states)].to_numpy()
+        points = np.concatenate([states, np.concatenate([e.inputs for e in record.experiments])], axis=1)
+        return points[np.isfinite(points).all(axis=1)], layout_of(motion)
+
+    @property
+    def structure(self) -> Structure:
+        """The structure that the spec declares, under its measure."""
+        return self.spec.declared_structure(None, self.measure)
+
+    def run(self, variant: Variant = AS_DECLARED, progress: Progress = SILENT) -> MotionEstimate:
+        from orthaug.fitting.motion_estimation import fit_motion
+
+        problem = self.problem if variant.fold is None else self.problem.on(variant.fold)
+        structure = self.structure if variant.fold is None else self.spec.declared_structure()
+        return fit_motion(problem, structure=structure, progress=progress, **self.training_options(variant))
+
+
+def open_motion(path: Path, spec: Spec) -> MotionJob:
+    """Read all data of a spec with a motion, and pose the problem.
+
+    Raises:
+        InputError: anything wrong with spec, files or equations; one line that names it.
+    """
+    assert spec.motion is not None
+    try:
+        check_channels(spec.channels(spec.data.inputs), spec.channels(spec.data.outputs))
+        motion = spec.motion.declared(spec.data.inputs, spec.data.outputs)
+        motion.check_channels(spec.data.inputs, spec.data.outputs)
+    except InputError as error:
+        raise InputError(f"{path}: motion: {str(error).removeprefix('motion.')}") from None
+    try:
+        _check_choices(spec, motion)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    least = len(motion.states) + 1  # rows of a run that tell where it starts
+    train, validation, *tests = (p and p.without_short(least) for p in _parts(load_parts(path, spec)))
+    assert train is not None
+    try:
+        inputs = spec.learner_inputs() if spec.declared_learner() is not None else None
+        problem = pose_motion(train.record, motion, inputs, spec.training.output_weights)
+        named = {"path": path, "spec": spec, "train": train, "validation": validation, "tests": tuple(tests)}
+        job = MotionJob(**named, problem=problem, measure=_measure_of(spec, problem, path.parent))
+        for part in job.parts:
+            part.check_scorable(least, train.record.sampling_time)
+        _check_sizes(spec, problem)
+    except InputError as error:
+        raise type(error)(f"{path}: {error}") from None
+    return job
+
+
+def _parts(loaded: tuple[Part, Part | None, tuple[Part, ...]]) -> list[Part | None]:
+    train, validation, tests = loaded
+    return [train, validation, *tests]
+
+
+def _check_choices(spec: Spec, motion: Motion) -> None:
+    """The rules between motion, learner, structure, criterion and solver, in the words of the spec."""
+    try:
+        learner, structure = spec.declared_learner(), spec.declared_structure()
+        solver, criterion = spec.declared_solver(), spec.declared_criterion()
+        check_motion_choices(motion, learner, structure, criterion, solver)
+        given, validated = spec.training.regularization, spec.data.validation is not None
+        choices = tried(given, solver, criterion, structure, linear=False, resident=True, validated=validated)
+        check_solver(solver, criterion, choices)
+    except KeyedError as error:
+        raise InputError(f"'{_place(error)}'{error.words}.") from None
+
+
+def _place(error: KeyedError) -> str:
+    """The key of the spec that an error is about."""
+    return _SECTIONS.get(error.key, f"training.{error.key}")
+
+
+def _check_sizes(spec: Spec, problem: MotionProblem) -> None:
+    """Raise InputError where nothing would be scored, or training would not end."""
+    criterion = spec.declared_criterion()
+    try:
+        check_scored(criterion, max(len(e) for e in problem.record.experiments))
+    except KeyedError as error:
+        raise InputError(f"'{_place(error)}'{error.words}.") from None
+    states, outputs = problem.motion.learned
+    sizes = {
+        "rows": len(problem.record),
+        "features": len(problem.features),
+        "outputs": max(len(states) + len(outputs), 1),
+    }
+    runs = spec.runs(linear=False)
+    check_cost(spec.declared_learner(), **sizes, iterations=spec.declared_solver().iterations, runs=runs)
+
+
+def _measure_of(spec: Spec, problem: MotionProblem, folder: Path) -> Measure:
+    """The measure that a spec declares, tried on the guessed states: names and limits are wrong before any training."""
+    names = [str(lag) for lag in layout_of(problem.motion)]
+    measure = spec.declared_measure(MeasurePlace(folder, names, problem.record, problem.first_row))
+    rows = len(problem.record)  # a measure may weigh each of them
+    x, u = (np.resize(part.T, (rows, len(part))) for part in problem.looked_at)
+    measure.points(support_of(problem.motion, x, u))
+    return measure

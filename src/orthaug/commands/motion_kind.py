@@ -1,0 +1,197 @@
+"""What is told of jobs whose physics are equations of motion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from orthaug._base.errors import InputError, RankError
+from orthaug._base.warning import Warning
+from orthaug.commands.motion_job import MotionJob
+from orthaug.reports.result import CheckResult, FitResult, ParameterResult, parameter_rows
+
+if TYPE_CHECKING:
+    from orthaug.analysis.holds import Trial
+    from orthaug.fitting.motion_estimates import MotionEstimate
+    from orthaug.models.response import Response
+    from orthaug.reports.drawing import Figure
+
+_UNKNOWN = ("physical_parameters", "physical_consistency", "sensitivities", "bias", "residuals", "missing_lags")
+_STIFF = 20  # substeps from which a motion is told to be stiff for its sampling
+_NOT_ANALYSED = Warning(
+    "residual_not_analysed", "the residual is not analysed: its tests read lagged signals, which a motion has none of."
+)
+
+
+def checked(job: MotionJob) -> CheckResult:
+    """What the outputs tell apart, what the learner could imitate, substeps and holds."""
+    from orthaug.analysis.holds import try_holds
+    from orthaug.analysis.motion_identifiability import identified
+    from orthaug.analysis.motion_imitation import imitation_before
+    from orthaug.fitting.motion_course import MotionCourse
+    from orthaug.fitting.motion_estimation import without_learner
+    from orthaug.models.moving import Moving
+
+    problem, spec = job.problem, job.spec
+    motion, criterion = problem.motion, spec.declared_criterion()
+    course = MotionCourse.of(without_learner(problem), None, criterion)
+    told = identified(course)
+    shared = None
+    if spec.declared_learner() is not None and job.structure.shared != "all" and len(told.states):
+        form = Moving(motion, problem.features, None, problem.record.sampling_time, problem.substeps)
+        shared = imitation_before(form, motion.coordinates.initial, told.states, told.inputs)
+    trial = try_holds(without_learner(problem), criterion, spec.declared_solver(), job.structure)
+    text, warnings = _about_steps(job, trial)
+    return CheckResult.model_validate(
+        {
+            "data": job.data,
+            "parameters": motion.names,
+            "regressor": [*motion.names_of_states, *motion.inputs],
+            "rows": len(problem.record),
+            "excitation": told.on_data,
+            "identifiability": told.by_any,
+            "shared": shared,
+            "bias": None,
+            "motion": {
+                "states": motion.names_of_states,
+                "integrator": motion.integrator,
+                "fastest": problem.fastest,
+                "substeps": trial.substeps,
+                "rows": trial.rows,
+                "holds": trial.holds,
+                "best_hold": trial.best,
+                "text": text,
+            },
+            "warnings": [*job.warnings, *warnings],
+        }
+    )
+
+
+def refused(job: MotionJob, result: CheckResult) -> InputError | None:
+    """Parameters that the outputs do not tell apart, after the report."""
+    found = result.excitation
+    if found.rank == found.columns:
+        return None
+    groups = "; ".join(
+        f"{group[0]} changes no output" if len(group) == 1 else f"{', '.join(group)} cannot be told apart"
+        for group in found.collinear
+    )
+    lacking = found.columns - found.rank
+    constants = "one of them as a constant" if lacking == 1 else f"{lacking} of them as constants"
+    remedy = f"give {constants}"
+    if result.identifiability.identifiable:
+        remedy += ", or use data that excite them separately"
+    return RankError(
+        f"the outputs do not determine the parameters (rank {found.rank} of {found.columns}): {groups}; {remedy}."
+    )
+
+
+def content(
+    job: MotionJob,
+    fit: MotionEstimate,
+    responses: Mapping[str, tuple[Response, Response]],
+    warnings: list[Any],
+) -> tuple[MotionEstimate, dict[str, Any]]:
+    """The fit, and what results tell of it; warnings are added."""
+    from orthaug.analysis.motion_imitation import MotionImitation
+    from orthaug.analysis.motion_modes import motion_stability
+    from orthaug.physics.excitation import Excitation, of_gram
+
+    motion, form = job.problem.motion, fit.model.form
+    count, gram = len(motion.names), fit.model.statistics.gram
+    told: dict[str, Any] = dict.fromkeys((*_UNKNOWN, "stability", "shared", "measure_detail"))
+    if fit.status.ok:
+        points = job.reach(fit.model, job.train.record)[0]
+        told["stability"] = motion_stability(fit.model, *np.split(points, [form.states], axis=1))
+        warnings += [_NOT_ANALYSED, *told["stability"].warnings]
+    if fit.status.ok and form.bound is not None:
+        split = fit.split_by
+        told["shared"] = MotionImitation.of([str(entry) for entry in form.features], fit.shared)
+        told["measure_detail"] = {
+            "name": split.name,
+            "points": len(split.field.x),
+            "support": split.support,
+            "condition": None,
+            "price": None,
+        }
+    return fit, told | {
+        "parameters": _parameters(fit),
+        "standard_errors": None if fit.std is None else "plain",
+        "excitation": Excitation(0, count, None, ()) if gram is None else of_gram(gram[:count, :count], motion.names),
+        "motion": {
+            "states": motion.names_of_states,
+            "integrator": motion.integrator,
+            "substeps": form.substeps,
+            "hold": motion.hold,
+            "window": fit.model.window,
+        },
+    }
+
+
+def figures(
+    job: MotionJob, fit: MotionEstimate, result: FitResult, responses: Mapping[str, tuple[Response, Response]]
+) -> dict[str, Figure]:
+    """The figures of a result by their names."""
+    from orthaug.reports import motion_plots, plots
+
+    part = job.parts[-1]
+    one_step, free = responses[part.name]
+    learns = fit.model.form.bound is not None
+    drawn = {
+        "simulation": motion_plots.run_figure(free, f"free run, {part.name}", learns=learns),
+        "residual": plots.residual_figure(free, f"free-run residual, {part.name}"),
+        "states": motion_plots.states_figure(fit.model, part.record, f"states of the free run, {part.name}"),
+    }
+    drawn["prediction"] = plots.output_figure(one_step, f"one-step prediction, {part.name}")
+    if learns:
+        drawn["components"] = motion_plots.parts_figure(fit.model, part.record, f"physics and learner, {part.name}")
+        drawn["learner"] = motion_plots.learner_figure(fit.model, job.train.record, "learned beside the physics")
+    return drawn
+
+
+def _parameters(fit: MotionEstimate) -> list[ParameterResult]:
+    """The parameters with their intervals, and whether the learner could imitate them."""
+    motion = fit.problem.motion
+    values = fit.values if fit.status.ok else np.full(len(motion.names), np.nan)
+    rows = parameter_rows(motion.parameters, values, fit.std, fit.interval)
+    if fit.model.form.bound is None or not fit.status.ok:
+        return rows
+    return [row.told(row.name not in fit.shared.untouched, None) for row in rows]
+
+
+def _about_steps(job: MotionJob, trial: Trial) -> tuple[str, list[Warning]]:
+    """What integrator and hold do to the outputs, in words; with what to be warned of."""
+    motion, problem, warnings = job.problem.motion, job.problem, []
+    step = problem.record.sampling_time
+    if motion.integrator == "discrete":
+        return "The equations give the state one sample later: nothing is integrated.", warnings
+    if trial.substeps is None:
+        told = "physics alone has no finite free run from its initial values, so substeps and holds were not tried."
+        return "", [Warning("physics_runs_away", told)]
+    told = [
+        f"The fastest mode of the initial physics is {problem.fastest:.3g} 1/s, sampled every {step:g} s; "
+        f"{trial.substeps} substep{'s' * (trial.substeps > 1)} of {motion.integrator} in a sample"
+        + (
+            " are as declared."
+            if motion.substeps is not None
+            else ": twice as many move the outputs by less than 1 % of the residual."
+        )
+    ]
+    if trial.substeps >= _STIFF:
+        text = (
+            f'the motion is stiff for its sampling: {trial.substeps} substeps; `integrator = "exact"` may need fewer.'
+        )
+        warnings.append(Warning("stiff", text))
+    if len(trial.holds) > 1:
+        shown = ", ".join(
+            f"{held.hold} {'no run' if held.residual is None else f'{held.residual:.4g}'}" for held in trial.holds
+        )
+        told.append(f"Physics alone leaves, by the hold of its inputs, in deviations of the output: {shown}.")
+        if trial.best is None:
+            told.append("None explains the data clearly better than the declared one.")
+        else:
+            text = f'the data are explained better by hold = "{trial.best}" than by the declared "{motion.hold}".'
+            warnings.append(Warning("other_hold", text))
+    return " ".join(told), warnings

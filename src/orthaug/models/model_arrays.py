@@ -1,0 +1,43 @@
+"""The numbers that every saved model has: those of the model, of its outputs, and what training left of statistics."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from orthaug.models.dynamics import Numbers
+from orthaug.models.statistics import Statistics
+
+
+def arrays_of(model: Any) -> dict[str, np.ndarray]:
+    """By the names that files give them; what is None is left out."""
+    kept = model.statistics
+    arrays = {f"numbers.{name}": value for name, value in model.numbers._asdict().items()}
+    arrays |= {
+        "largest_output": model.largest_output,
+        "deviation": model.deviation,
+        "output_weight": model.weight,
+        "scalars": np.array([0.0 if np.ndim(kept.ridge) else kept.ridge, kept.freedom]),
+        "gram": kept.gram,
+        "noise": kept.noise,
+        "middle": kept.middle,
+        "ridge": kept.ridge if np.ndim(kept.ridge) else None,
+    }
+    return {name: np.asarray(value) for name, value in arrays.items() if value is not None}
+
+
+def numbers_from(arrays: dict[str, np.ndarray]) -> Numbers:
+    """The model's numbers."""
+    return Numbers(**{name: arrays.get(f"numbers.{name}") for name in Numbers._fields})  # type: ignore[arg-type]
+
+
+def statistics_from(arrays: dict[str, np.ndarray]) -> Statistics:
+    """What training left."""
+    return Statistics(
+        gram=arrays.get("gram"),
+        middle=arrays.get("middle"),
+        noise=arrays.get("noise"),
+        ridge=arrays["ridge"] if "ridge" in arrays else float(arrays["scalars"][0]),
+        freedom=float(arrays["scalars"][1]),
+    )

@@ -1,0 +1,131 @@
+"""Saved models whose physics are equations of motion: the equations as text."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.errors import InputError
+from orthaug.data.expressions import parse_named
+from orthaug.data.record import Channel
+from orthaug.models.learner_storage import bound_of, declaration_of
+from orthaug.models.learners import Learner
+from orthaug.models.model_arrays import arrays_of, numbers_from, statistics_from
+from orthaug.models.motion_model import MotionModel, Trained
+from orthaug.models.moving import Moving
+from orthaug.physics.motion import Motion, Output, State
+from orthaug.physics.parameters import PhysicalParameter
+
+_LIMITS = {"min": -math.inf, "max": math.inf}
+
+
+def declare(model: MotionModel) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """What a file says of a model, and its arrays."""
+    form, trained = model.form, model.trained
+    declared = {
+        "kind": "motion",
+        "structure": model.structure,
+        "measure": model.measure,
+        "sampling_time": model.sampling_time,
+        "time_column": model.time_column,
+        "outputs": [asdict(channel) for channel in model.outputs],
+        "inputs": [asdict(channel) for channel in model.inputs],
+        "motion": _declared_motion(form.motion),
+        "features": [entry.text for entry in form.features],
+        "learner": declaration_of(form.bound),
+        "substeps": form.substeps,
+        "window": model.window,
+        "trained": None if trained is None else {"segment": trained.segment, "washout": trained.washout},
+    }
+    arrays = arrays_of(model) | {"loose": np.asarray(model.loose)}
+    if trained is not None:
+        arrays |= {"trained.states": np.asarray(trained.states), "trained.alone": np.asarray(trained.alone)}
+        arrays |= {} if trained.slope is None else {"trained.slope": np.asarray(trained.slope)}
+    return declared, arrays
+
+
+def rebuild(
+    declared: dict[str, Any], arrays: dict[str, np.ndarray], baseline: Any, learner: Learner | None, path: Path
+) -> MotionModel:
+    """The model that a file declares.
+
+    Raises:
+        InputError: a callable is asked for.
+    """
+    motion = _rebuilt_motion(declared["motion"], baseline, path)
+    outputs, inputs = (tuple(Channel(**c) for c in declared[kind]) for kind in ("outputs", "inputs"))
+    form = Moving(
+        motion=motion,
+        features=tuple(parse_named(text, motion.known, "learner input") for text in declared["features"]),
+        bound=bound_of(declared["learner"], arrays.get("numbers.weights", np.zeros(0)), learner, path),
+        sampling_time=float(declared["sampling_time"]),
+        substeps=int(declared["substeps"]),
+    )
+    kept = declared["trained"]
+    trained = None
+    if kept is not None:
+        laid = (int(kept["segment"]), int(kept["washout"]))
+        trained = Trained(*laid, arrays["trained.states"], arrays.get("trained.slope"), arrays["trained.alone"])
+    return MotionModel(
+        form=form,
+        numbers=numbers_from(arrays),
+        outputs=outputs,
+        inputs=inputs,
+        sampling_time=float(declared["sampling_time"]),
+        time_column=declared["time_column"],
+        structure=declared["structure"],
+        measure=declared["measure"],
+        largest_output=arrays["largest_output"],
+        deviation=arrays["deviation"],
+        weight=arrays["output_weight"],
+        loose=arrays["loose"],
+        window=int(declared["window"]),
+        trained=trained,
+        statistics=statistics_from(arrays),
+    )
+
+
+def _declared_motion(motion: Motion) -> dict[str, Any]:
+    parameters = []
+    for parameter in motion.parameters:
+        given = asdict(parameter)
+        parameters.append(given | {k: None for k, limit in _LIMITS.items() if given[k] == limit})
+    return {
+        "kind": "equations" if motion.functions is None else "callable",
+        "states": [asdict(state) for state in motion.states],
+        "outputs": [asdict(output) for output in motion.outputs],
+        "inputs": list(motion.inputs),
+        "parameters": parameters,
+        "constants": dict(motion.constants),
+        "define": {name: expression.text for name, expression in motion.definitions},
+        "integrator": motion.integrator,
+        "substeps": motion.substeps,
+        "hold": motion.hold,
+    }
+
+
+def _rebuilt_motion(kept: dict[str, Any], given: Any, path: Path) -> Motion:
+    """The motion that a file declares. Of functions it is the given one, with the saved parameters."""
+    parameters = [
+        PhysicalParameter(**(p | {k: limit for k, limit in _LIMITS.items() if p[k] is None}))
+        for p in kept["parameters"]
+    ]
+    states, outputs = [State(**s) for s in kept["states"]], [Output(**o) for o in kept["outputs"]]
+    options = {name: kept[name] for name in ("integrator", "substeps", "hold")}
+    if kept["kind"] == "equations":
+        named = {"constants": kept["constants"], "define": kept["define"]}
+        return Motion.from_equations(states, outputs, parameters, kept["inputs"], **named, **options)
+    if not isinstance(given, Motion) or given.functions is None:
+        raise InputError(f"{path}: the motion was two Python functions; give them again, load(…, baseline=Motion…).")
+    if given.names_of_states != tuple(s.name for s in states) or given.names != tuple(p.name for p in parameters):
+        raise InputError(
+            f"{path}: the saved motion has the states {', '.join(s.name for s in states)} and the parameters "
+            f"{', '.join(p.name for p in parameters)}; give the same one."
+        )
+    constants = tuple(kept["constants"].items())
+    kept_parts = {"states": tuple(states), "outputs": tuple(outputs), "inputs": tuple(kept["inputs"])}
+    return replace(given, parameters=tuple(parameters), constants=constants, **kept_parts, **options)

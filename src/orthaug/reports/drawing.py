@@ -1,0 +1,147 @@
+"""The style of all figures: panels at fixed places, labels, colours, and how a figure is written."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from functools import wraps
+from pathlib import Path
+from typing import Any, ParamSpec
+
+import numpy as np
+
+from orthaug._base.errors import InputError
+from orthaug.models.response import Response
+
+try:
+    from matplotlib import rc_context, rcParams, rcParamsDefault
+    from matplotlib.axes import Axes
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+except UnicodeDecodeError:
+    raise InputError("matplotlibrc: found letters that are not UTF-8; mend that file, or remove it.") from None
+
+# Okabe-Ito: told apart by every reader
+BLACK, GREY, BLUE, ORANGE, GREEN = "#000000", "#B8B8B8", "#0072B2", "#E69F00", "#009E73"
+SIZE = (7.0, 2.4)  # inches per panel
+TOP, BOTTOM, RIGHT = 0.6, 0.5, 0.15  # inches around panels
+_LEFT, _GAP = 0.95, 0.32
+_WINDOW = 250  # samples of a long record that are shown, so that single swings can be seen
+_TITLE, _YLABEL, _XLABEL = 0.1, 0.72, 0.26  # inches from the figure's edge or the panel's
+_SHARPNESS = 160  # pixels per inch
+_COLUMNS = round(SIZE[0] * _SHARPNESS)  # more points than these cannot be told apart
+Drawn = ParamSpec("Drawn")
+
+
+def _own_style() -> AbstractContextManager[None]:
+    """Figures look the same whatever the user's own settings of matplotlib are; a `$` in a unit begins no formula."""
+    own: dict[Any, Any] = {key: value for key, value in rcParamsDefault.items() if not key.startswith("backend")}
+    own |= {"text.parse_math": False}
+    return rc_context({key: value for key, value in own.items() if rcParams[key] != value})
+
+
+def plain(draw: Callable[Drawn, Figure]) -> Callable[Drawn, Figure]:
+    """Figures in our own style."""
+
+    @wraps(draw)
+    def drawn(*arguments: Drawn.args, **options: Drawn.kwargs) -> Figure:
+        with _own_style():
+            return draw(*arguments, **options)
+
+    return drawn
+
+
+def panels(response: Response, title: str, heights: tuple[int, ...] = (1,)) -> tuple[Figure, list]:
+    """Stacked axes, `len(heights)` per output."""
+    ratios = heights * len(response.outputs)
+    figure = Figure(figsize=(SIZE[0], TOP + SIZE[1] * sum(ratios) / max(heights)))
+    axes = grid(figure, len(ratios), 1, sharex=True, height_ratios=ratios)[:, 0]
+    headline(figure, title)
+    return figure, list(axes)
+
+
+def grid(
+    figure: Figure,
+    rows: int,
+    columns: int,
+    *,
+    gap: tuple[float, float] = (_GAP, _GAP),
+    left: float = _LEFT,
+    bottom: float = BOTTOM,
+    **options: Any,
+) -> np.ndarray:
+    """Panels (rows, columns) at fixed places; a layout found from the sizes of all texts takes longer than drawing.
+
+    Args:
+        gap: inches between rows and columns; `left` and `bottom` those beside and below them.
+    """
+    width, height = figure.get_size_inches()
+    high, wide = height - TOP - bottom, width - left - RIGHT
+    place = {"left": left / width, "right": 1 - RIGHT / width, "bottom": bottom / height, "top": 1 - TOP / height}
+    place["hspace"] = gap[0] * rows / max(high - gap[0] * (rows - 1), 0.1)
+    place["wspace"] = gap[1] * columns / max(wide - gap[1] * (columns - 1), 0.1)
+    axes = figure.subplots(rows, columns, squeeze=False, gridspec_kw=place, **options)
+    for axis in axes.flat:
+        axis.grid(alpha=0.25)
+        axis.spines[["top", "right"]].set_visible(False)
+    return axes
+
+
+def headline(figure: Figure, title: str) -> None:
+    """The title above all panels."""
+    figure.suptitle(title, fontsize=10, y=1 - _TITLE / figure.get_size_inches()[1], va="top")
+
+
+def label(axis: Axes, *, x: str | None = None, y: str | None = None, title: str | None = None) -> None:
+    """Labels at a fixed distance from the panel."""
+    figure = axis.get_figure(root=True)
+    assert figure is not None
+    wide, high = axis.get_position().size * figure.get_size_inches()
+    if x is not None:
+        axis.set_xlabel(x)
+        axis.xaxis.set_label_coords(0.5, -_XLABEL / high)
+    if y is not None:
+        axis.set_ylabel(y)
+        axis.yaxis.set_label_coords(-_YLABEL / wide, 0.5)
+    if title is not None:
+        axis.set_title(title, fontsize=9, y=1.0)
+
+
+def outline(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A curve to draw: of a long one the least and the largest value in every column of pixels."""
+    if len(values) <= 4 * _COLUMNS:
+        return time, values
+    starts = np.linspace(0, len(values), _COLUMNS, endpoint=False).astype(int)
+    ends = np.stack([ufunc.reduceat(values, starts) for ufunc in (np.fmin, np.fmax)], axis=1)
+    return np.repeat(time[starts], 2), ends.ravel()
+
+
+def extent(response: Response, rows: slice) -> str:
+    """Which samples of the record are drawn, in words."""
+    whole = len(response.trajectories[0].model)
+    text = f"samples {rows.start} to {rows.stop - 1} of {whole}"
+    return text + (f", first of {len(response.trajectories)} experiments" if len(response.trajectories) > 1 else "")
+
+
+def window(response: Response) -> tuple[np.ndarray, slice]:
+    """The instants [s] and the rows that a figure shows of the first experiment."""
+    trajectory = response.trajectories[0]
+    rows = slice(trajectory.start, min(trajectory.start + _WINDOW, len(trajectory.model)))
+    return np.arange(rows.start, rows.stop) * response.sampling_time, rows
+
+
+def legend(axis: Axes) -> None:
+    """What the lines are, above the panel."""
+    axis.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, fontsize=8, frameon=False, ncols=3)
+
+
+def save(figure: Figure, path: Path, kind: str = "png") -> None:
+    """Write a figure that is sharp at column width; `kind` is also pdf or svg."""
+    with warnings.catch_warnings(), _own_style():
+        warnings.simplefilter("ignore")  # such as a unit in letters that the font lacks
+        figure.set_dpi(_SHARPNESS)
+        if kind == "png":
+            FigureCanvasAgg(figure).print_png(path, pil_kwargs={"compress_level": 2})  # `savefig` would draw it twice
+        else:
+            figure.savefig(path, format=kind)
