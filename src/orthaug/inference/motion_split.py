@@ -26,6 +26,7 @@ from orthaug.physics.shared import Shared, agreeing, moves
 _BATCH = 4096  # points at a time
 _ITERATIONS = 30
 _SETTLED = 1e-12  # of a step, relative
+_ROUNDING = 1e-13
 _FLAT = 1e-12  # curvature of the distance along directions of unit length: below it is none
 _FEWEST = 4  # moves that succeed, for each parameter
 
@@ -129,9 +130,10 @@ def nearest(
         along = np.linalg.lstsq(inner + damping * np.eye(len(inner)), downhill, rcond=None)[0]
         trial = np.clip(q + b @ along, *bounds)
         there = _distance(form, numbers, trial, field)
-        if there <= value:
+        if there <= value * (1 + _ROUNDING):  # near the end a step gains less than rounding
+            stays = np.array_equal(trial, q)
             q, value, damping = trial, there, damping / 10
-            if np.abs(along).max() <= _SETTLED * np.sqrt(max(value, 1e-300)) or not (trial != q).any():
+            if stays or np.abs(along).max() <= _SETTLED * np.sqrt(max(value, 1e-300)):
                 break
         else:
             damping = max(damping * 100, 1e-6)

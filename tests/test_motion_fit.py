@@ -1,0 +1,241 @@
+"""Motions fitted to records: what is estimated, what is only shared, what is never worse than physics alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import orthaug as oa
+from orthaug.data.expressions import parse_named
+from orthaug.inference.motion_split import shared_of_motion
+from orthaug.models.learners import Bound
+from orthaug.models.moving import Moving
+
+TS = 0.05
+WHOLE = oa.Simulation(0, 0)
+
+
+def positive(**values: float) -> list[oa.PhysicalParameter]:
+    return [oa.PhysicalParameter(name, value, min=0) for name, value in values.items()]
+
+
+def spring(learned: bool = False, extra: str = "", more=(), **options) -> oa.Motion:
+    return oa.Motion.from_equations(
+        states=[
+            oa.State("x", "v", start="y"),
+            oa.State("v", f"(u - c*v - k*x{extra})/m", start="derivative of y", learned=learned),
+        ],
+        outputs=[oa.Output("y", "x")],
+        inputs=["u"],
+        parameters=[*positive(m=1.2, c=1.2, k=30.0), *more],
+        **options,
+    )
+
+
+def data(rows: int = 300, friction: float = 0.6, noise: float = 0.002, seed: int = 0) -> oa.Record:
+    """m = 1, c = 0.8, k = 25 with friction tanh(v / 0.1) under steps; finely integrated."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-8, 8, rows // 10 + 1), 10)[:rows]
+    state, y = np.zeros(2), []
+
+    def rates(x, u):
+        return np.array([x[1], u - 0.8 * x[1] - 25 * x[0] - friction * np.tanh(x[1] / 0.1)])
+
+    for value in u:
+        y.append(state[0])
+        for _ in range(8):
+            h = TS / 8
+            k1 = rates(state, value)
+            k2 = rates(state + h / 2 * k1, value)
+            k3 = rates(state + h / 2 * k2, value)
+            state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + rates(state + h * k3, value))
+    return oa.Record.from_arrays(u=u, y=np.array(y) + noise * rng.normal(size=rows), sampling_time=TS)
+
+
+@pytest.fixture(scope="module")
+def fitted() -> oa.MotionEstimate:
+    learner = oa.MLP((4,), inputs=("v",))
+    return oa.estimate(data(), spring(learned=True), learner=learner, criterion=WHOLE, blocks=0)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_linear_motion_is_the_output_error_fit_of_the_lagged_form(order: int) -> None:
+    """Held inputs and an exact integrator: the same family of functions of four or two parameters."""
+    rng = np.random.default_rng(5)
+    u, x, y = rng.normal(size=120), np.zeros(2), []
+    for value in u:  # any stable system will do, with sensor noise
+        y.append(x[0])
+        x = np.array([0.9 * x[0] + 0.05 * x[1] + 0.02 * value, -0.4 * x[0] + 0.85 * x[1] + 0.1 * value])
+    record = oa.Record.from_arrays(u=u, y=np.array(y) + 0.01 * rng.normal(size=120), sampling_time=TS)
+    if order == 1:
+        states = [oa.State("x", "-a*x + b*u", start="y")]
+        parameters = [oa.PhysicalParameter("a", 1.0), oa.PhysicalParameter("b", 1.0)]
+    else:
+        states = [oa.State("x", "z + b1*u", start="y"), oa.State("z", "-k*x - c*z + b2*u")]
+        parameters = [oa.PhysicalParameter(n, v) for n, v in (("k", 10.0), ("c", 2.0), ("b1", 0.5), ("b2", 0.5))]
+    motion = oa.Motion.from_equations(
+        states, [oa.Output("y", "x")], parameters, ["u"], integrator="exact", hold="zero-order"
+    )
+    solver = oa.LevenbergMarquardt(200, tolerance=1e-14)
+    ours = oa.estimate(record, motion, learner=None, criterion=WHOLE, solver=solver)
+    terms = [oa.Term(f"a{i}", f"y[k-{i}]") for i in range(1, order + 1)]
+    terms += [oa.Term(f"b{i}", f"u[k-{i}]") for i in range(1, order + 1)]
+    theirs = oa.estimate(record, oa.Baseline.from_terms(terms), learner=None, criterion=WHOLE, solver=solver)
+    # the motion's loss counts the first rows, which the lagged form takes as its starts
+    a = ours.course.objective().errors(ours.theta, np.zeros(0), ours.states, ours.course.segments)[0, order:, 0, 0]
+    root = np.sqrt(np.mean(a**2))
+    noise = float(np.sqrt(theirs.model.statistics.noise[0, 0] * theirs.freedom / len(a)))
+    assert root == pytest.approx(noise, rel=1e-6)
+    if order == 1:
+        assert np.exp(-ours.values[0] * TS) == pytest.approx(theirs.theta[0], rel=1e-6)
+
+
+def test_mass_and_stiffness_are_told_from_a_learner_of_the_velocity(fitted: oa.MotionEstimate) -> None:
+    table = fitted.parameters
+    assert table["shared"].to_dict() == {"m": False, "c": True, "k": False}
+    for name, truth in (("m", 1.0), ("k", 25.0)):
+        assert abs(table["value"][name] - truth) < 3 * table["std"][name]
+        assert table["std"][name] < 0.02 * truth
+    alone = oa.estimate(data(), spring(), learner=None, criterion=WHOLE)
+    assert fitted.status.loss < 0.1 * alone.status.loss and fitted.status.start_loss == alone.status.loss
+    assert fitted.defect is not None and fitted.defect < 1e-8
+
+
+def test_the_damping_is_that_of_the_nearest_physics(fitted: oa.MotionEstimate) -> None:
+    """Linear along the shared direction: c − c_fit is the least-squares slope of −m g on v over the runs."""
+    model = fitted.model
+    x, u = fitted.course.trajectory(model.theta - model.numbers.theta_aux, model.numbers.weights, fitted.states)
+    learned = np.array([model.form.learned(model.numbers, a, b)[0] for a, b in zip(x, u, strict=True)])
+    c = model.form.motion.coordinates.physical(model.theta - model.numbers.theta_aux)
+    v = x[:, 1]
+    assert fitted.values[1] == pytest.approx(c[1] - c[0] * (v @ learned) / (v @ v), rel=1e-8)
+    assert fitted.values[1] == pytest.approx(0.8 + 0.6 * (v @ np.tanh(v / 0.1)) / (v @ v), rel=0.02)
+
+
+def test_a_split_under_another_measure_moves_only_what_is_shared(fitted: oa.MotionEstimate) -> None:
+    wide = fitted.split(oa.Uniform({"v": (-0.5, 0.5)}))
+    np.testing.assert_array_equal(wide.values[[0, 2]], fitted.values[[0, 2]])
+    assert wide.values[1] > 1.05 * fitted.values[1] and wide.model.measure == "uniform"
+    again = wide.split(oa.Training())
+    np.testing.assert_allclose(again.values, fitted.values, rtol=1e-9)
+    np.testing.assert_allclose(again.std, fitted.std, rtol=1e-6)
+    record = data()
+    for one, other in zip(
+        wide.model.simulate(record).trajectories, fitted.model.simulate(record).trajectories, strict=True
+    ):
+        np.testing.assert_allclose(one.model, other.model, rtol=0, atol=1e-12)
+
+
+def test_standard_errors_of_a_split_are_those_of_its_slope(fitted: oa.MotionEstimate) -> None:
+    """∂q̂/∂(c, w) against differences of the whole split, the trajectories moved with the unknowns."""
+    from orthaug.fitting.motion_estimates import fitted_numbers
+    from orthaug.fitting.motion_measures import field_under
+    from orthaug.inference.motion_split import nearest
+
+    course, numbers = fitted.course, fitted_numbers(fitted.model.numbers)
+    unknowns = np.concatenate([numbers.theta, numbers.weights])
+    bounds = fitted.problem.motion.coordinates.bounds
+    size = fitted.split_by.field.size
+
+    def q_at(unknowns: np.ndarray, moved: np.ndarray) -> np.ndarray:
+        own = numbers._replace(theta=unknowns[:3], weights=unknowns[3:])
+        states = fitted.states - np.moveaxis(fitted.slope @ moved, 1, -1)
+        field = field_under(oa.Training(), course, own, states)[0]._replace(size=size)
+        return nearest(course.dynamics, own, fitted.alone, field, bounds)[0]
+
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        moved = 1e-5 * rng.normal(size=len(unknowns)) * np.maximum(np.abs(unknowns), 0.1)
+        change = (q_at(unknowns + moved, moved) - q_at(unknowns - moved, -moved)) / 2
+        np.testing.assert_allclose(fitted.split_by.slope @ moved, change, rtol=2e-3, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("seen", "shared"),
+    [(("v",), 1), (("x", "v"), 2), (("x", "v", "u"), 3), (("v**2",), 0), (("v + 0*x", "x"), 2)],
+)
+def test_shared_directions_of_the_spring(seen: tuple[str, ...], shared: int) -> None:
+    motion = spring(learned=True)
+    features = tuple(parse_named(text, motion.known, "feature") for text in seen)
+    form = Moving(motion, features, Bound(oa.MLP((2,)), len(seen), 1), TS, 1)
+    rng = np.random.default_rng(0)
+    found = shared_of_motion(form, motion.coordinates.initial, rng.normal(size=(200, 2)), rng.normal(size=(200, 1)))
+    assert found.basis.shape[1] == shared
+
+
+@pytest.mark.parametrize(("seen", "shared"), [(("x",), 2), (("x", "v"), 3)])
+def test_shared_directions_of_a_duffing_equation(seen: tuple[str, ...], shared: int) -> None:
+    motion = spring(learned=True, extra=" - k3*x**3", more=[oa.PhysicalParameter("k3", 2.0)])
+    features = tuple(parse_named(text, motion.known, "feature") for text in seen)
+    form = Moving(motion, features, Bound(oa.MLP((2,)), len(seen), 1), TS, 1)
+    rng = np.random.default_rng(0)
+    found = shared_of_motion(form, motion.coordinates.initial, rng.normal(size=(200, 2)), rng.normal(size=(200, 1)))
+    assert found.basis.shape[1] == shared
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_no_learner_ends_above_physics_alone(seed: int) -> None:
+    """Random springs, frictions, noise, regularizations and learners; one shape, so one compilation."""
+    rng = np.random.default_rng(seed)
+    record = data(160, friction=float(rng.uniform(0, 1)), noise=float(10 ** rng.uniform(-4, -1)), seed=seed)
+    regularization = ["none", "evidence", 1e-3][seed % 3]
+    fit = oa.estimate(
+        record,
+        spring(learned=True),
+        learner=oa.MLP((3,), inputs=("x", "v")),
+        criterion=oa.Simulation(80, 0),
+        solver=oa.LevenbergMarquardt(40),
+        regularization=regularization,
+        seed=seed,
+        blocks=0,
+        fallback=False,
+    )
+    assert fit.status.loss <= fit.status.start_loss * (1 + 1e-12)
+
+
+def test_where_the_learner_does_not_help_the_result_is_physics_alone() -> None:
+    fit = oa.estimate(
+        data(160, friction=0.0, noise=0.05),
+        spring(learned=True),
+        learner=oa.MLP((3,), inputs=("x", "v")),
+        criterion=oa.Simulation(80, 0),
+        solver=oa.LevenbergMarquardt(40),
+        blocks=2,
+    )
+    assert fit.model.form.bound is None and fit.held_out is not None
+    assert "physics_alone" in [warning.code for warning in fit.warnings]
+
+
+def test_what_no_output_tells_has_no_interval() -> None:
+    """Only the product b·g enters: a gain before a hidden state and one after it."""
+    rng = np.random.default_rng(0)
+    u, x, y = rng.normal(size=150), 0.0, []
+    for value in u:
+        y.append(x)
+        x += TS * (-2 * x + 3 * value)
+    record = oa.Record.from_arrays(u=u, y=np.array(y) + 0.01 * rng.normal(size=150), sampling_time=TS)
+    motion = oa.Motion.from_equations(
+        [oa.State("z", "-a*z + b*u")], [oa.Output("y", "g*z")], positive(a=1.0, b=1.0, g=1.0), ["u"]
+    )
+    fit = oa.estimate(record, motion, learner=None, criterion=WHOLE)
+    assert fit.unidentified == ("b", "g") and np.isnan(fit.std[1:]).all() and np.isfinite(fit.std[0])
+    decay = 1 - 2 * TS  # of the record's own step; the motion runs between samples
+    assert fit.values[1] * fit.values[2] == pytest.approx(3 * -np.log(decay) / (1 - decay), rel=0.02)
+    assert "not identified: b, g" in fit.summary()
+
+
+def test_a_model_runs_on_other_records(fitted: oa.MotionEstimate) -> None:
+    record, model = data(seed=7), fitted.model
+    free = model.simulate(record)
+    assert free.scores().fit[0] > 90
+    assert model.predict(record).scores().rmse[0] < 1.5 * 0.002 + 0.002
+    (trajectory,) = free.trajectories
+    np.testing.assert_allclose(trajectory.baseline + trajectory.learner, trajectory.model)
+    alone = model.alone.simulate(record, initial=record.experiments[0].outputs).trajectories[0]
+    assert np.abs(trajectory.learner).max() > 0.01 and alone.learner.any() == False  # noqa: E712  (an array)
+    zero = model.simulate(oa.Record.from_arrays(u=record.experiments[0].inputs[:, 0], sampling_time=TS), "zero")
+    assert zero.trajectories[0].model[0, 0] == 0.0
+    with pytest.raises(oa.InputError, match="no measured outputs to start from"):
+        model.simulate(oa.Record.from_arrays(u=np.ones(5), sampling_time=TS))
+    frame = model.states(record)
+    assert list(frame) == ["time", "x", "v", "v_physics", "v_learner"] and len(frame) == len(record)
