@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 from test_cli import run, write_csv
 
+from orthaug.commands.opening import open_job
+
 README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
 
 
-def block(language: str) -> str:
-    (text,) = re.findall(rf"^```{language}\n(.*?)^```", README, flags=re.DOTALL | re.MULTILINE)
-    return text
+def block(language: str, number: int = 0) -> str:
+    return re.findall(rf"^```{language}\n(.*?)^```", README, flags=re.DOTALL | re.MULTILINE)[number]
 
 
 def write_run(path: Path, rows: int, seed: int) -> None:
@@ -54,6 +55,16 @@ def test_the_spec(tmp_path, monkeypatch):
         assert words in done.out
     assert run("fit", "spec.toml", "--out", "result").code == 0
     assert Path("result/result.json").is_file()
+
+
+def test_the_motion(tmp_path):
+    for seed, name in enumerate(("run1", "run2", "steps")):
+        write_run(tmp_path / f"{name}.csv", 200, seed)
+    data = block("toml").partition("[[baseline.terms]]")[0]
+    (tmp_path / "spec.toml").write_text(data + block("toml", 1), encoding="utf-8")
+    job = open_job(tmp_path / "spec.toml")
+    assert job.problem.motion.names_of_states == ("x", "v")
+    assert job.spec.learner_inputs() == ("v",)
 
 
 def test_the_commands_exist():

@@ -1,0 +1,401 @@
+"""Equations of motion from the shell: spec, check, fit, compare, simulate, predict, split, and saved models."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.signal
+
+import orthaug as oa
+from orthaug._base.errors import InputError
+from orthaug._base.jax import jnp
+from orthaug.analysis.motion_modes import motion_stability
+from orthaug.commands import cli
+from orthaug.commands.opening import open_job
+from orthaug.data.readers import read_record
+from orthaug.models.motion_parts import parts_at
+
+SPEC = """
+[data]
+sampling_time = 0.01
+inputs = ["force"]
+outputs = ["position"]
+train = { files = ["run.csv"] }
+tests.steps = { files = ["steps.csv"] }
+channels.position = { unit = "m" }
+[motion.states]
+x = { derivative = "v", start = "position", unit = "m" }
+v = { derivative = "(force - c*v - k*x)/m", start = "derivative of position", learned = true, unit = "m/s" }
+[motion.outputs]
+position = "x"
+[motion.parameters]
+m = { initial = 1.2, unit = "kg", min = 0 }
+c = { initial = 1.2, unit = "N s/m", min = 0 }
+k = { initial = 120.0, unit = "N/m", min = 0 }
+[learner]
+hidden = [3]
+inputs = ["v"]
+[training]
+iterations = 40
+segment = 150
+"""
+M, C, K = 1.0, 2.0, 100.0
+
+
+def friction(rows: int, seed: int) -> np.ndarray:
+    """Force and position of a mass with viscous and Coulomb friction under steps, 40 dB of noise."""
+    random = np.random.default_rng(seed)
+    force = np.repeat(random.uniform(-20, 20, rows // 20 + 1), 20)[:rows]
+    x, found, h = np.zeros(2), [], 0.002
+
+    def rate(x: np.ndarray, u: float) -> np.ndarray:
+        return np.array([x[1], (u - C * x[1] - K * x[0] - 1.5 * np.tanh(x[1] / 0.2)) / M])
+
+    for u in force:
+        found.append(x[0])
+        for _ in range(5):
+            k1 = rate(x, u)
+            k2 = rate(x + h / 2 * k1, u)
+            k3 = rate(x + h / 2 * k2, u)
+            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(x + h * k3, u))
+    position = np.array(found)
+    return np.column_stack([force, position + 0.01 * position.std() * random.normal(size=rows)])
+
+
+def ramps(rows: int) -> np.ndarray:
+    """Force and position of a linear oscillator whose input runs straight between samples, 60 dB of noise."""
+    random = np.random.default_rng(5)
+    force = random.uniform(-20, 20, rows)
+    system = tuple(map(np.array, ([[0, 1], [-K / M, -C / M]], [[0], [1 / M]], [[1, 0]], [[0]])))
+    exact = scipy.signal.cont2discrete(system, 0.01, "foh")
+    position = scipy.signal.dlsim((*exact[:4], 0.01), force)[1][:, 0]
+    return np.column_stack([force, position + 0.001 * position.std() * random.normal(size=rows)])
+
+
+def put(folder: Path, text: str = SPEC) -> Path:
+    spec = folder / "msd.toml"
+    spec.write_text(text)
+    for name, rows, seed in (("run", 300, 1), ("steps", 120, 2)):
+        if not (folder / f"{name}.csv").exists():
+            table = friction(rows, seed)
+            np.savetxt(folder / f"{name}.csv", table, delimiter=",", header="force,position", comments="")
+    return spec
+
+
+def orthaug(*arguments: object) -> tuple[int, str, str]:
+    """Exit code, standard output and standard error of a command, run in this process."""
+    out, err = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        patch.setattr(sys, "argv", ["orthaug", *map(str, arguments)])
+        try:
+            cli.main()
+            code = 0
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+    return code, out.getvalue(), err.getvalue()
+
+
+def strict(text: str) -> dict:
+    """JSON without NaN and Infinity."""
+
+    def refuse(name: str) -> float:
+        raise AssertionError(f"{name} in JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("motion")
+
+
+@pytest.fixture(scope="module")
+def printed(folder):
+    code, out, err = orthaug("fit", put(folder), "--out", folder / "out")
+    assert code == 0, err
+    return out
+
+
+@pytest.fixture(scope="module")
+def result(folder, printed):
+    return strict((folder / "out" / "result.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def model(folder, printed):
+    return oa.load(folder / "out")
+
+
+def test_a_fit_finds_mass_and_stiffness_beside_the_friction(result):
+    rows = {row["name"]: row for row in result["parameters"]}
+    assert [(name, row["unit"], row["shared"]) for name, row in rows.items()] == [
+        ("m", "kg", False),
+        ("c", "N s/m", True),
+        ("k", "N/m", False),
+    ]
+    for name, truth in (("m", M), ("k", K)):
+        assert abs(rows[name]["value"] - truth) < 4 * rows[name]["std"]
+        assert rows[name]["ci95"][0] < rows[name]["value"] < rows[name]["ci95"][1]
+    assert rows["c"]["value"] > C + 5 * rows["c"]["std"]  # the nearest viscous friction has a share of Coulomb's
+
+
+def test_a_result_has_what_a_motion_has_and_null_for_the_rest(result):
+    status = result["status"]
+    assert status["loss"] < 0.5 * status["start_loss"]
+    scores = result["scores"]
+    assert scores["tests.steps"]["simulation"]["nrmse"][0] < 0.05
+    assert scores["tests.steps"]["prediction"]["nrmse"][0] < 0.05
+    assert result["validation"]["verdict"] == "helps"
+    assert result["excitation"]["rank"] == result["excitation"]["columns"] == 3
+    assert result["orthogonality_defect"] < 1e-10
+    assert result["shared"]["inputs"] == ["v"] and result["shared"]["determined"] == ["m", "k"]
+    assert result["motion"] | {"window": 0} == {
+        "states": ["x", "v"],
+        "integrator": "rk4",
+        "substeps": 1,
+        "hold": "zero-order",
+        "window": 0,
+    }
+    for key in ("physical_parameters", "physical_consistency", "sensitivities", "bias", "residuals", "missing_lags"):
+        assert result[key] is None
+    assert "residual_not_analysed" in [warning["code"] for warning in result["warnings"]]
+
+
+def test_the_folder_has_figures_and_a_page(folder, printed, result):
+    figures = {path.stem for path in (folder / "out" / "figures").iterdir()}
+    assert figures == {"simulation", "prediction", "residual", "states", "components", "learner"}
+    page = (folder / "out" / "report.html").read_text()
+    assert result["shared"]["text"] in printed
+    assert all(name in page for name in figures)
+
+
+def test_a_saved_motion_is_the_fitted_one(folder, model, result):
+    values = [row["value"] for row in result["parameters"]]
+    assert list(model.parameters.values()) == pytest.approx(values, rel=1e-14)
+    kept = folder / "again"
+    oa.save(model, kept)
+    again, record = oa.load(kept), read(folder / "steps.csv")
+    assert np.array_equal(again.simulate(record).model, model.simulate(record).model)
+    assert "pickle" not in (kept / "model.json").read_text()
+    altered = (kept / "model.json").read_text().replace("c*v", "m*v")
+    (kept / "model.json").write_text(altered)
+    with pytest.raises(InputError, match="altered"):
+        oa.load(kept)
+
+
+def read(path: Path) -> oa.Record:
+    return read_record(path, inputs=["force"], outputs=["position"], sampling_time=0.01)
+
+
+def test_functions_are_asked_for_again(folder, model):
+    def f(x, u, p):
+        return jnp.stack([x[1], (u[0] - p[1] * x[1] - p[2] * x[0]) / p[0]])
+
+    given = model.form.motion
+    motion = oa.Motion.from_functions(
+        f, lambda x, u, p: x[:1], given.states, ["position"], given.parameters, given.inputs
+    )
+    own = replace(model, form=replace(model.form, motion=motion))
+    oa.save(own, folder / "functions")
+    with pytest.raises(InputError, match="two Python functions; give them again"):
+        oa.load(folder / "functions")
+    other = replace(motion, states=motion.states[:1])
+    with pytest.raises(InputError, match="the saved motion has the states x, v"):
+        oa.load(folder / "functions", baseline=other)
+    again, record = oa.load(folder / "functions", baseline=motion), read(folder / "steps.csv")
+    assert again.simulate(record).model == pytest.approx(model.simulate(record).model, abs=1e-9)
+
+
+def test_a_split_is_the_fits_own_under_its_measure(folder, result):
+    code, out, _ = orthaug("split", folder / "out", folder / "run.csv", "--json")
+    assert code == 0
+    for own, row in zip(result["parameters"], strict(out)["parameters"], strict=True):
+        assert [row["value"], row["std"]] == pytest.approx([own["value"], own["std"]], rel=1e-9)
+
+
+def test_a_split_under_a_box_moves_what_is_shared(folder, result):
+    code, out, _ = orthaug(
+        *("split", folder / "out", folder / "run.csv", "--measure", "uniform", "--box", "v=-1:1", "--json")
+    )
+    assert code == 0
+    before, after = (
+        {r["name"]: r["value"] for r in rows} for rows in (result["parameters"], strict(out)["parameters"])
+    )
+    assert after["m"] == pytest.approx(before["m"], rel=1e-9) and after["k"] == pytest.approx(before["k"], rel=1e-9)
+    assert after["c"] > before["c"] + 0.5  # Coulomb friction counts for more where velocities are small
+
+
+def test_a_split_refuses_what_it_was_not_trained_on(folder, printed):
+    code, _, err = orthaug("split", folder / "out", folder / "steps.csv")
+    assert code == 2 and "the model was trained on other rows" in err
+    code, _, err = orthaug(*("split", folder / "out", folder / "run.csv", "--measure", "uniform", "--box", "w=0:1"))
+    assert code == 2 and "'w' is no state or input that this model reads. It reads x, v, force" in err
+
+
+def test_the_learner_is_orthogonal_to_what_it_could_imitate(folder, model):
+    states = model.states(read(folder / "run.csv"))
+    x, u = states[["x", "v"]].to_numpy(), read(folder / "run.csv").experiments[0].inputs
+    physics, learner = parts_at(model.form, model.numbers, x, u)
+    m, c, k = model.parameters.values()
+    assert physics[:, 0] == pytest.approx((u[:, 0] - c * x[:, 1] - k * x[:, 0]) / m, abs=1e-9)
+    cosine = learner[:, 0] @ x[:, 1] / np.linalg.norm(learner) / np.linalg.norm(x[:, 1])
+    assert abs(cosine) < 0.02  # zero over the runs of the training segments, which start a little elsewhere
+    assert states["v_learner"].to_numpy() == pytest.approx(learner[:, 0])
+
+
+def test_simulate_and_predict_write_what_physics_alone_gives(folder, model):
+    assert orthaug("simulate", folder / "out", folder / "steps.csv", "--out", folder / "sim.csv")[0] == 0
+    run = pd.read_csv(folder / "sim.csv")
+    assert list(run) == [
+        *("time", "position", "position_model", "position_baseline", "position_learner"),
+        "extrapolates",
+    ]
+    assert np.abs(run.position_learner).max() > 1e-3
+    assert run.position_model.to_numpy() == pytest.approx((run.position_baseline + run.position_learner).to_numpy())
+    assert (
+        orthaug(*("predict", folder / "out", folder / "steps.csv", "--horizon", 5, "--out", folder / "ahead.csv"))[0]
+        == 0
+    )
+    ahead = pd.read_csv(folder / "ahead.csv")
+    first = model.window + 4
+    assert ahead.position_model.isna().sum() == first
+    errors = (ahead.position - ahead.position_model)[first:]
+    assert np.sqrt(np.mean(errors**2)) < 0.03 * ahead.position.std()
+    code, _, err = orthaug("predict", folder / "out", folder / "steps.csv", "--initial", "zero")
+    assert code == 2 and "--initial: found with a motion" in err
+
+
+def test_a_short_recording_has_a_prediction(folder, model):
+    record = read(folder / "steps.csv")
+    short = oa.Record(record.inputs, record.outputs, record.sampling_time, (record.experiments[0].rows(0, 6),))
+    response = model.predict(short)
+    assert np.isfinite(response.model[-1]).all() and np.isnan(response.model[:5]).all()
+
+
+def test_modes_are_the_roots_of_the_characteristic_polynomial(model):
+    m, c, k = model.parameters.values()
+    stability = motion_stability(model.alone, np.array([[0.1, 0.0], [0.0, 1.0]]), np.zeros((2, 1)))
+    found = stability.modes
+    assert (found.rightmost, found.fastest) == pytest.approx((-c / (2 * m), np.sqrt(k / m)))
+    assert found.growing == 0 and not stability.warnings
+
+
+def test_compare_has_two_rows(folder, printed, result):
+    code, out, err = orthaug("compare", folder / "msd.toml", "--out", folder / "comparison", "--json")
+    assert code == 0, err
+    alone, learned = strict(out)["comparison"]
+    assert (alone["name"], learned["name"]) == ("physics alone", "orthogonal")
+    values = [row["value"] for row in learned["parameters"]]
+    assert values == pytest.approx([row["value"] for row in result["parameters"]], rel=1e-9)
+    assert alone["weights"] == 0 and learned["validation"]["verdict"] == "helps"
+    assert learned["scores"]["train"]["simulation"]["nrmse"] < alone["scores"]["train"]["simulation"]["nrmse"]
+
+
+def test_check_tells_what_cannot_be_told_apart_and_which_hold_is_right(tmp_path):
+    """A sensor gain scales mass, damper and spring; the input runs straight between samples."""
+    text = SPEC.replace('position = "x"', 'position = "g*x"').replace(
+        "[learner]", "g = { initial = 1.1, min = 0 }\n[learner]"
+    )
+    spec = put(tmp_path, text.replace("tests.steps", "# tests.steps"))
+    np.savetxt(tmp_path / "run.csv", ramps(300), delimiter=",", header="force,position", comments="")
+    code, out, err = orthaug("check", spec, "--json")
+    assert code == 2
+    assert "rank 3 of 4): m, c, k, g cannot be told apart; give one of them as a constant." in err
+    told = strict(out)
+    assert told["excitation"]["rank"] == told["identifiability"]["rank"] == 3
+    assert told["identifiability"]["inseparable"] == [["m", "c", "k", "g"]]
+    assert told["motion"]["best_hold"] == "first-order"
+    residuals = {held["hold"]: held["residual"] for held in told["motion"]["holds"]}
+    assert residuals["first-order"] < 0.1 * residuals["zero-order"]
+    assert [warning["code"] for warning in told["warnings"]] == ["other_hold"]
+    others = {tuple(other["inputs"]): other["shared"] for other in told["shared"]["alternatives"]}
+    assert others == {("x",): 1, ("x", "v"): 2, ("x", "v", "force"): 3}
+    assert told["shared"]["directions"] == [{"c": 1.0}]
+
+
+BAD = {
+    "undefined": ("c*v", "cc*v", "the equation of 'v' = (force - cc*v - k*x)/m: unknown name 'cc', did you mean 'c'?"),
+    "lag": ("(force -", "(force[k] -", "a signal such as y[k-1] is no part of it"),
+    "no derivative": ('derivative = "v", ', "", "`states.x` has no `derivative`; expected its equation"),
+    "no state": ('position = "x"\n', 'position = "3*k"\n', "'position' = 3*k is no expression of a state"),
+    "loop": (
+        "[motion.parameters]",
+        '[motion.define]\na = "b + x"\nb = "a*2"\n[motion.parameters]',
+        "an algebraic loop, a → b → a",
+    ),
+    "not finite": ("k*x)/m", "k*x)/m + log(-1 - x**2)", "'v' is not finite at the start"),
+    "term": ("k*x)/m", "k*x)/m + log(-1 - x**2)", "log(-1 - x ** 2) at x = "),
+    "unused": ("[motion.parameters]", "[motion.parameters]\nq = { initial = 1.0 }", "'q' is in no equation"),
+    "bounds": ('initial = 1.2, unit = "kg"', "initial = -1.2", "the initial value of 'm' is -1.2; its bounds are 0"),
+    "learned": ("[motion.outputs]", "w = { learned = true }\n[motion.outputs]", "`states.w` has no `derivative`"),
+    "start": ('start = "position"', 'start = "positon"', "did you mean 'position'?"),
+    "too long": ("sampling_time = 0.01", "sampling_time = 100.0", "is too long for the fastest mode of the motion"),
+    "focus": ("[training]", '[training]\nfocus = "prediction"', "'training.focus' = prediction; expected simulation"),
+    "solver": ("[training]", '[training]\nsolver = "adam-lbfgs"', "'training.solver' = adam-lbfgs"),
+    "ensemble": ("[training]", "[training]\nensemble = true\nrestarts = 2", "`training.ensemble`: a motion has none"),
+    "structure": ("[training]", '[structure]\nkind = "additive"\n[training]', "'structure.kind' = additive; expected"),
+    "lags": ("[training]", "[lags]\nna = 2\n[training]", "`lags`: found beside [motion]"),
+    "suspects": ("[training]", '[[suspects]]\nkind = "offset"\n[training]', "`suspects`: found beside [motion]"),
+    "design": ("[training]", "[design]\nsamples = 9\namplitude = 1\n[training]", "`design`: found beside [motion]"),
+    "both": (
+        "[training]",
+        '[[baseline.terms]]\nparameter = "a"\nregressor = "position[k-1]"\n[training]',
+        "`baseline`: found beside [motion]",
+    ),
+    "nothing learned": (", learned = true", "", "'learner': no state and no output has `learned = true`"),
+    "learner input": ('inputs = ["v"]', 'inputs = ["w"]', "learner input = w: unknown name 'w'"),
+    "box": (
+        "[training]",
+        '[structure.measure]\nkind = "uniform"\nbox = { "v[k]" = [0, 1] }\n[training]',
+        "'v[k]' is no state or input that this model reads",
+    ),
+    "discrete": ("[motion.states]", '[motion]\nintegrator = "discrete"\n[motion.states]', "reads `next`"),
+    "output": ('position = "x"\n', 'place = "x"\n', "'position'; expected a number, an output (place)"),
+}
+
+
+@pytest.mark.parametrize(("old", "new", "words"), BAD.values(), ids=BAD)
+def test_bad_input_is_one_worded_line(folder, old, new, words):
+    assert old in SPEC
+    put(folder)
+    spec = folder / "bad.toml"
+    spec.write_text(SPEC.replace(old, new, 1))
+    with pytest.raises(InputError) as refused:
+        open_job(spec)
+    message = str(refused.value)
+    assert words in message and message.startswith(str(spec)) and "\n" not in message
+
+
+def test_bad_input_ends_with_code_2(folder):
+    spec = folder / "neither.toml"
+    spec.write_text(SPEC[: SPEC.index("[motion.states]")])
+    code, _, err = orthaug("fit", spec)
+    assert code == 2 and "the key 'baseline' is missing; expected [[baseline.terms]], or a [motion] instead" in err
+
+
+def test_what_a_motion_is_trained_with_unless_asked(folder):
+    spec = put(folder).with_name("plain.toml")
+    spec.write_text(SPEC.replace("segment = 150\n", "").replace('[learner]\nhidden = [3]\ninputs = ["v"]\n', ""))
+    criterion = open_job(spec).spec.declared_criterion()
+    assert (criterion, open_job(spec).spec.declared_learner()) == (oa.Simulation(512, 0), oa.MLP())
+    spec.write_text(spec.read_text().replace(", learned = true", ""))
+    job = open_job(spec)
+    assert job.spec.declared_learner() is None and job.compared == ("physics alone",)
+
+
+def test_opening_a_motion_loads_no_jax(folder):
+    program = (
+        "import sys\nfrom pathlib import Path\nfrom orthaug.commands.opening import open_job\n"
+        f"open_job(Path({str(put(folder))!r}))\nassert 'jax' not in sys.modules\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
