@@ -48,8 +48,8 @@ class Layout(NamedTuple):
     colour: Segments | None
 
     @classmethod
-    def of(cls, record: Record, dynamics: Dynamics, criterion: Criterion) -> Layout:
-        """As a criterion of several steps declares.
+    def of(cls, record: Record, dynamics: Dynamics, criterion: Criterion, like: Course | None = None) -> Layout:
+        """As a criterion of several steps declares; padded to the shapes of another course where that is larger.
 
         Raises:
             InputError: nothing would be scored.
@@ -58,10 +58,11 @@ class Layout(NamedTuple):
         assert flown is not None, "one step ahead is `OneStepTask`'s"
         longest = max(len(e) for e in record.experiments) - dynamics.first_row
         check_scored(criterion, longest)
-        segments = lay_segments(record, dynamics, flown.segment, flown.washout)
+        shapes = (None, None) if like is None else (like.segments, like.whole)
+        segments = lay_segments(record, dynamics, flown.segment, flown.washout, shapes[0])
         if not (criterion.simulates and flown.segment):
             return cls(segments, segments, None)
-        whole, colour = lay_segments(record, dynamics, 0, flown.washout), None
+        whole, colour = lay_segments(record, dynamics, 0, flown.washout, shapes[1]), None
         if segments.steps < _COLOURED_STEPS <= longest:
             first = tuple(e.rows(0, _COLOUR_ROWS) for e in record.experiments)
             colour = lay_segments(replace(record, experiments=first), dynamics, 0, flown.washout)

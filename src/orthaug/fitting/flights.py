@@ -22,7 +22,7 @@ from orthaug.fitting.initial_states import Start
 from orthaug.fitting.learned import ErrorStatistics, Learned
 from orthaug.fitting.objective import FreeRunObjective
 from orthaug.fitting.rules import ridge_of
-from orthaug.fitting.solvers.descent import Descent
+from orthaug.fitting.solvers.descent import LEARNED, Descent
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Structure
 from orthaug.inference.covariance import theta_block
@@ -38,6 +38,11 @@ class Place(NamedTuple):
     states: Any
     loss: float
     silent: bool
+
+
+def _learned(flight: Flight, first_loss: float) -> bool:
+    """Whether the weights lowered the loss: evidence may also have found too early that none are needed."""
+    return bool(flight.end.flown.loss < LEARNED * first_loss)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +129,14 @@ class FlightTask(ABC):
 
         options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "evidence_settled": True}
         flight = plan.descend(objective, best.p, solver, tell, best.states, ceiling=ceiling, **options)
+        if evidence and not _learned(flight, best.loss):
+            free = plan.descend(objective, best.p, solver, tell, best.states, ceiling=ceiling)
+            if _learned(free, best.loss):
+                flown, options = free.end.flown, options | {"evidence_settled": False}
+                again = plan.descend(objective, flown.p, solver, tell, flown.states, ceiling=ceiling, **options)
+                flight = again if _learned(again, best.loss) else flight
+                spent = {"iterations": free.iterations + flight.iterations, "seconds": free.seconds + flight.seconds}
+                flight = flight._replace(**spent)
         return self._below_physics(flight)
 
     def _below_physics(self, flight: Flight) -> Flight:

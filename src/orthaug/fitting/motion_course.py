@@ -47,8 +47,12 @@ class MotionCourse(Course):
     loose: Vector
 
     @classmethod
-    def of(cls, problem: MotionProblem, bound: Bound | None, criterion: Criterion) -> MotionCourse:
+    def of(
+        cls, problem: MotionProblem, bound: Bound | None, criterion: Criterion, like: MotionCourse | None = None
+    ) -> MotionCourse:
         """Lay a record out as a criterion of several steps declares, for the motion with a learner of unit scaling.
+
+        With `like` in the shapes of another course, and with its substeps.
 
         Raises:
             InputError: nothing would be scored.
@@ -56,12 +60,13 @@ class MotionCourse(Course):
         record, flown = problem.record, criterion.flown
         assert flown is not None, "a motion has no criterion one step ahead"
         features = () if bound is None else problem.features
-        dynamics = Moving(problem.motion, features, bound, record.sampling_time, problem.substeps)
+        substeps = problem.substeps if like is None else like.dynamics.substeps
+        dynamics = Moving(problem.motion, features, bound, record.sampling_time, substeps)
         nz, nl = len(features), 0 if bound is None else bound.ny
         return cls(
             record=record,
             dynamics=dynamics,
-            **Layout.of(record, dynamics, criterion)._asdict(),
+            **Layout.of(record, dynamics, criterion, like)._asdict(),
             criterion=criterion,
             flown=flown,
             rms=1.0,

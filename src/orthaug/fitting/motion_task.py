@@ -55,7 +55,7 @@ class MotionTask(FlightTask):
 
     def on(self, record: Record) -> MotionTask:
         """The same motion on another record."""
-        course = MotionCourse.of(self.problem.on(record), self.bound, self.criterion)
+        course = MotionCourse.of(self.problem.on(record), self.bound, self.criterion, self.plan)
         return MotionTask(course)
 
     def physics_alone(self) -> tuple[MotionTask, Learned]:

@@ -40,14 +40,19 @@ class Segments(NamedTuple):
         return self.scored.shape[1]
 
 
-def lay_segments(record: Record, dynamics: Dynamics, segment: int, washout: int) -> Segments:
+def lay_segments(
+    record: Record, dynamics: Dynamics, segment: int, washout: int, like: Segments | None = None
+) -> Segments:
     """Segments of `segment` steps; 0 for whole experiments.
+
+    With `like` they are padded to its shape where they are fewer or shorter, so that the same programs run over them.
 
     The scored steps of a segment begin where those of the segment before it end. So every usable row is scored once,
     except the first `washout` of each experiment.
     """
     usable = [len(experiment) - dynamics.first_row for experiment in record.experiments]
-    steps = min(segment, max(usable)) if segment else max(usable)
+    longest = max(*usable, 0 if like is None else like.steps)
+    steps = min(segment, longest) if segment else longest
     washout = min(washout, steps - 1)
     pieces = []
     for experiment, rows in zip(record.experiments, usable, strict=True):
@@ -58,6 +63,8 @@ def lay_segments(record: Record, dynamics: Dynamics, segment: int, washout: int)
     chunks = -(-count // _CHUNK)
     width = -(-count // chunks)
     width += -width % 8 if width > 8 else 0  # about as many segments run by the same program
+    if like is not None and chunks * width <= like.scored.shape[0] * like.scored.shape[2]:
+        chunks, width = like.scored.shape[0], like.scored.shape[2]
     nothing = Segments(*(np.zeros_like(part) for part in pieces[0]))
     pieces += [nothing] * (chunks * width - count)
     stacked = (np.stack(part, axis=-1) for part in zip(*pieces, strict=True))

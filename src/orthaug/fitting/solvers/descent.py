@@ -22,7 +22,7 @@ from orthaug._base.progress import RunTell, quiet
 from orthaug.fitting.status import Ending
 
 _SETTLED = 0.1  # of the objective: a step that lowers it by less belongs to the end of a run
-_LEARNED = 0.9  # of the first loss: what is lower has learned something
+LEARNED = 0.9  # of the first loss: what is lower has learned something
 _FIRST_STEPS = 5  # accepted ones, before evidence may find that the weights are too many
 _SMALLEST_CURVATURE = 1e-14  # of the largest: it damps a direction that does nothing
 
@@ -166,7 +166,7 @@ def descend(
     while ending is Ending.RUNNING and done < iterations:
         iterate, ending = _trial(objective, iterate, limits, tolerance, damping, ceiling)
         if evidence and not begun:
-            lower = iterate.flown.loss < _LEARNED * first_loss or iterate.small > 0
+            lower = iterate.flown.loss < LEARNED * first_loss or iterate.small > 0
             begun = iterate.settled and lower or ending is Ending.CONVERGED
             if begun and ending is Ending.CONVERGED:  # under the first ridge; not yet under the one that follows
                 iterate, ending, taken = iterate._replace(small=0), Ending.RUNNING, 0
