@@ -74,6 +74,8 @@ def refused(job: MotionJob, result: CheckResult) -> InputError | None:
     found = result.excitation
     if found.rank == found.columns:
         return None
+    if not found.rank and result.motion is not None and result.motion.substeps is None:
+        return InputError("physics alone has no finite free run from its initial values; give others.")
     groups = "; ".join(
         f"{group[0]} changes no output" if len(group) == 1 else f"{', '.join(group)} cannot be told apart"
         for group in found.collinear
