@@ -276,6 +276,18 @@ def test_simulate_and_predict_write_what_physics_alone_gives(folder, model):
     assert code == 2 and "--initial: found with a motion" in err
 
 
+def test_a_run_survives_physics_that_run_away(folder, model):
+    """A split may leave physics that alone have no free run; the model has one all the same."""
+    shift = np.array([-25.0, 0.0, 0.0])  # a mass of 1e-11 kg
+    numbers = model.numbers
+    moved = numbers._replace(theta=numbers.theta + shift, theta_aux=numbers.theta_aux + shift)
+    record = read(folder / "steps.csv")
+    run, usual = replace(model, numbers=moved).simulate(record), model.simulate(record)
+    assert run.model == pytest.approx(usual.model, abs=1e-12) and run.trajectories[0].diverged is None
+    assert np.isnan(run.trajectories[0].baseline[-1]).all() and np.isfinite(usual.trajectories[0].baseline).all()
+    assert (usual.trajectories[0].baseline + usual.trajectories[0].learner) == pytest.approx(usual.model)
+
+
 def test_a_short_recording_has_a_prediction(folder, model):
     record = read(folder / "steps.csv")
     short = oa.Record(record.inputs, record.outputs, record.sampling_time, (record.experiments[0].rows(0, 6),))
