@@ -47,6 +47,8 @@ inputs = ["v"]
 [training]
 iterations = 40
 segment = 150
+[validation]
+blocks = 0
 """
 M, C, K = 1.0, 2.0, 100.0
 
@@ -274,6 +276,18 @@ def test_simulate_and_predict_write_what_physics_alone_gives(folder, model):
     assert code == 2 and "--initial: found with a motion" in err
 
 
+def test_a_run_survives_physics_that_run_away(folder, model):
+    """A split may leave physics that alone have no free run; the model has one all the same."""
+    shift = np.array([-25.0, 0.0, 0.0])  # a mass of 1e-11 kg
+    numbers = model.numbers
+    moved = numbers._replace(theta=numbers.theta + shift, theta_aux=numbers.theta_aux + shift)
+    record = read(folder / "steps.csv")
+    run, usual = replace(model, numbers=moved).simulate(record), model.simulate(record)
+    assert run.model == pytest.approx(usual.model, abs=1e-12) and run.trajectories[0].diverged is None
+    assert np.isnan(run.trajectories[0].baseline[-1]).all() and np.isfinite(usual.trajectories[0].baseline).all()
+    assert (usual.trajectories[0].baseline + usual.trajectories[0].learner) == pytest.approx(usual.model)
+
+
 def test_a_short_recording_has_a_prediction(folder, model):
     record = read(folder / "steps.csv")
     short = oa.Record(record.inputs, record.outputs, record.sampling_time, (record.experiments[0].rows(0, 6),))
@@ -289,11 +303,13 @@ def test_modes_are_the_roots_of_the_characteristic_polynomial(model):
     assert found.growing == 0 and not stability.warnings
 
 
-def test_compare_has_two_rows(folder, printed, result):
-    code, out, err = orthaug("compare", folder / "msd.toml", "--out", folder / "comparison", "--json")
+def test_compare_puts_physics_alone_and_saved_models_beside(folder, printed, result):
+    saved = folder / "out"
+    code, out, err = orthaug("compare", folder / "msd.toml", "--out", folder / "both", "--model", saved, "--json")
     assert code == 0, err
-    alone, learned = strict(out)["comparison"]
-    assert (alone["name"], learned["name"]) == ("physics alone", "orthogonal")
+    alone, learned, kept = strict(out)["comparison"]
+    assert (alone["name"], learned["name"], kept["status"]) == ("physics alone", "orthogonal", "saved")
+    assert kept["scores"] == learned["scores"]
     values = [row["value"] for row in learned["parameters"]]
     assert values == pytest.approx([row["value"] for row in result["parameters"]], rel=1e-9)
     assert alone["weights"] == 0 and learned["validation"]["verdict"] == "helps"
@@ -390,6 +406,21 @@ def test_what_a_motion_is_trained_with_unless_asked(folder):
     spec.write_text(spec.read_text().replace(", learned = true", ""))
     job = open_job(spec)
     assert job.spec.declared_learner() is None and job.compared == ("physics alone",)
+
+
+def test_rows_of_a_motion_are_all_usable(folder):
+    lines = put(folder).with_name("run.csv").read_text().splitlines()
+    gaps = [line.split(",")[0] + "," if k in (50, 52, 120) else line for k, line in enumerate(lines)]
+    (folder / "gaps.csv").write_text("\n".join(gaps))
+    spec = folder / "gaps.toml"
+    spec.write_text(SPEC.replace("run.csv", "gaps.csv").replace("[data]\n", '[data]\nmissing = "skip"\n'))
+    job = open_job(spec)
+    assert [len(e) for e in job.train.record.experiments] == [49, 67, 180]  # one row alone tells no start
+    assert "3 rows have missing cells" in job.warnings[0].text and "296 usable rows remain" in job.warnings[0].text
+    (folder / "short.csv").write_text("\n".join(lines[:3]))
+    spec.write_text(SPEC.replace("steps.csv", "short.csv"))
+    with pytest.raises(InputError, match=r"short.csv: data.tests.steps has 2 rows, too few; at least 3 tell where"):
+        open_job(spec)
 
 
 def test_opening_a_motion_loads_no_jax(folder):

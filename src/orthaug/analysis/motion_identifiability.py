@@ -15,13 +15,13 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug.data.record import Record
 from orthaug.fitting.initial_states import Start
 from orthaug.fitting.motion_course import MotionCourse
-from orthaug.physics.excitation import Excitation, excitation, of_gram
+from orthaug.physics.excitation import Excitation, of_gram
 
 _DRAWS = 3  # parameters near the initial ones
 _NEAR = 0.1  # of a logarithm, or of the value
 _SHORTER = (512, 128, 32, 8)  # steps of segments, where physics runs away over longer ones
 _LOOSER = 1e3  # times as free as in training: a start that costs something tells parameters from it
-_WIDE = 2.0  # times the range of the data
+_WIDTHS = (2.0, 1.0, 0.5)  # times the range of the data, until a run is finite
 _LONGEST_LEVEL = 60  # steps for which a random input stays
 _SEED = 20_250_117
 
@@ -30,52 +30,54 @@ _SEED = 20_250_117
 class Identified:
     """What the record's own inputs tell apart, and what rich ones do; with points of a run at the initial parameters.
 
-    `states` (M, nx) and `inputs` (M, nu) are where physics alone goes on the record.
+    `by_any` is None where no run with rich inputs is finite. `states` (M, nx) and `inputs` (M, nu) are where physics
+    alone goes on the record.
     """
 
     on_data: Excitation
-    by_any: Excitation
+    by_any: Excitation | None
     states: Matrix
     inputs: Matrix
 
 
-def identified(course: MotionCourse) -> Identified:
-    """Of the physics alone of a course; its segments are taken shorter where they run away."""
+def identified(course: MotionCourse) -> Identified | None:
+    """Of the physics alone of a course, over shorter segments where it runs away; None where no run is finite."""
     course = course.alone
-    names = course.problem.motion.names
-    flying, on_data = course, None
-    for steps in (course.segments.steps, *(s for s in _SHORTER if s < course.segments.steps)):
-        flying = course if steps == course.segments.steps else course.over(steps)
+    steps = course.segments.steps
+    for flying in (course, *(course.over(shorter) for shorter in _SHORTER if shorter < steps)):
         on_data = _rank(flying)
         if on_data is not None:
             break
-    nothing = excitation(np.zeros((1, len(names))), names)
-    by_any = None
-    for wide in (_WIDE, 1.0, 0.5):
-        by_any = _rank(_richly_excited(flying, wide))
-        if by_any is not None:
-            break
-    by_any = on_data if by_any is None else by_any
-    if on_data is not None and by_any is not None and by_any.rank < on_data.rank:
+    else:
+        return None
+    tried = (_rank(_richly_excited(flying, wide)) for wide in _WIDTHS)
+    by_any = next((found for found in tried if found is not None), None)
+    if by_any is not None and by_any.rank < on_data.rank:
         by_any = on_data
-    starts = np.asarray(flying.segments.start)
-    x, u = flying.trajectory(course.problem.motion.coordinates.initial, (), starts)
+    initial = course.problem.motion.coordinates.initial
+    x, u = flying.trajectory(initial, (), np.asarray(flying.segments.start))
     finite = np.isfinite(x).all(axis=1)
-    return Identified(on_data or nothing, by_any or nothing, x[finite], u[finite])
+    return Identified(on_data, by_any, x[finite], u[finite])
 
 
 def _rank(course: MotionCourse) -> Excitation | None:
-    """The highest rank of some points near the initial parameters; None where no run is finite."""
+    """The highest rank of some points near the initial parameters; None where no run is finite.
+
+    Of several of that rank the one that ties most: of `a*b` with a = 0 it looks as if b alone were idle.
+    """
     best: Excitation | None = None
     for q in _near(course):
         gram = information(course, q)
         if gram is not None:
             found = of_gram(gram, course.problem.motion.names)
-            if best is None or found.rank > best.rank:
-                best = found
+            best = found if best is None else max(best, found, key=_telling)
         if best is not None and best.full_rank:
             break
     return best
+
+
+def _telling(found: Excitation) -> tuple[int, int]:
+    return found.rank, sum(map(len, found.collinear))
 
 
 def information(course: MotionCourse, q: Vector) -> Matrix | None:

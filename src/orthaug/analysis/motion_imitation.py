@@ -54,7 +54,7 @@ def imitation_before(form: Moving, q: Vector, x: Matrix, u: Matrix) -> MotionImi
     """
     own = tuple(str(entry) for entry in form.features)
     others = []
-    for texts in _choices(form.motion):
+    for texts in dict.fromkeys(_choices(form.motion)):
         if set(texts) != set(own):
             shared = shared_of_motion(_seeing(form, texts), q, x, u)
             others.append(Alternative(texts, shared.basis.shape[1], shared.untouched, None))

@@ -92,7 +92,7 @@ def open_motion(path: Path, spec: Spec) -> MotionJob:
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     least = len(motion.states) + 1  # rows of a run that tell where it starts
-    train, validation, *tests = (p and p.without_short(least) for p in _parts(load_parts(path, spec)))
+    train, validation, *tests = (p and p.without_short(0, least) for p in _parts(load_parts(path, spec)))
     assert train is not None
     try:
         inputs = spec.learner_inputs() if spec.declared_learner() is not None else None
@@ -100,7 +100,7 @@ def open_motion(path: Path, spec: Spec) -> MotionJob:
         named = {"path": path, "spec": spec, "train": train, "validation": validation, "tests": tuple(tests)}
         job = MotionJob(**named, problem=problem, measure=_measure_of(spec, problem, path.parent))
         for part in job.parts:
-            part.check_scorable(least, train.record.sampling_time)
+            part.check_scorable(problem.first_row, train.record.sampling_time, least)
         _check_sizes(spec, problem)
     except InputError as error:
         raise type(error)(f"{path}: {error}") from None

@@ -23,6 +23,10 @@ _STIFF = 20  # substeps from which a motion is told to be stiff for its sampling
 _NOT_ANALYSED = Warning(
     "residual_not_analysed", "the residual is not analysed: its tests read lagged signals, which a motion has none of."
 )
+_NOT_RICH = Warning(
+    "rich_inputs_run_away",
+    "physics alone runs away with rich inputs: what is told of identifiability is that of the record's own.",
+)
 
 
 def checked(job: MotionJob) -> CheckResult:
@@ -38,12 +42,16 @@ def checked(job: MotionJob) -> CheckResult:
     motion, criterion = problem.motion, spec.declared_criterion()
     course = MotionCourse.of(without_learner(problem), None, criterion)
     told = identified(course)
+    if told is None:
+        raise InputError(f"{job.path}: physics alone has no finite free run from its initial values; give others.")
     shared = None
-    if spec.declared_learner() is not None and job.structure.shared != "all" and len(told.states):
+    if spec.declared_learner() is not None and job.structure.shared != "all":
         form = Moving(motion, problem.features, None, problem.record.sampling_time, problem.substeps)
         shared = imitation_before(form, motion.coordinates.initial, told.states, told.inputs)
     trial = try_holds(without_learner(problem), criterion, spec.declared_solver(), job.structure)
     text, warnings = _about_steps(job, trial)
+    if told.by_any is None:
+        warnings.append(_NOT_RICH)
     return CheckResult.model_validate(
         {
             "data": job.data,
@@ -51,7 +59,7 @@ def checked(job: MotionJob) -> CheckResult:
             "regressor": [*motion.names_of_states, *motion.inputs],
             "rows": len(problem.record),
             "excitation": told.on_data,
-            "identifiability": told.by_any,
+            "identifiability": told.by_any or told.on_data,
             "shared": shared,
             "bias": None,
             "motion": {

@@ -26,19 +26,24 @@ class Part:
     warnings: tuple[Warning, ...] = ()
     """Rows that were thinned out, or left out around missing samples."""
 
-    def without_short(self, first: int) -> Part:
-        """Without stretches between missing samples that are too short for a row after the first `first`."""
+    def without_short(self, first: int, least: int = 0) -> Part:
+        """Without stretches between missing samples that are too short for a row after the first `first`.
+
+        Args:
+            least: rows of a stretch that has a use.
+        """
         record = self.record
         if not record.missing:
             return self
         pairs = zip(record.experiments, self.skips, strict=True)
-        long = tuple(e for e, skip in pairs if len(e) > max(first, skip))
+        long = tuple(e for e, skip in pairs if len(e) > max(first, skip) and len(e) >= least)
         if not long:
             most = max(len(e) for e in record.experiments)
+            needed = f"the first {max(first, self.skip)} are lags or skipped"
+            needed = f"at least {least} are needed" if most < least else needed
             raise InputError(
                 f"{record.experiments[0].source}: data.{self.name}: the longest stretch between missing samples has "
-                f"{_count(most, 'row')}, too few: the first "
-                f"{max(first, self.skip)} are lags or skipped."
+                f"{_count(most, 'row')}, too few: {needed}."
             )
         record = replace(record, experiments=long)
         usable = sum(len(experiment) - first for experiment in record.experiments)
@@ -62,8 +67,8 @@ class Part:
         )
         return replace(self.record, experiments=kept)
 
-    def check_scorable(self, start: int, sampling_time: float) -> None:
-        """Raise InputError where an experiment has no row to score, or another sampling time."""
+    def check_scorable(self, start: int, sampling_time: float, least: int = 0) -> None:
+        """Raise InputError where an experiment has no row to score or fewer than `least`, or another sampling time."""
         if not same_step(self.record.sampling_time, sampling_time):
             raise InputError(
                 f"data.{self.name}: sampled every {self.record.sampling_time:g} s, the training data every "
@@ -71,6 +76,11 @@ class Part:
             )
         for experiment, skip in zip(self.record.experiments, self.skips, strict=True):
             first = max(start, skip)
+            if len(experiment) < least:
+                raise InputError(
+                    f"{experiment.source}: data.{self.name} has {len(experiment)} rows, too few; at least {least} tell "
+                    "where a run of this motion starts."
+                )
             if len(experiment) <= first:
                 raise InputError(
                     f"{experiment.source}: data.{self.name} has {len(experiment)} rows, too few; the first {first} are "

@@ -21,7 +21,7 @@ from orthaug.data.record import Channel, Experiment, Record
 from orthaug.models.dynamics import Numbers, Parts
 from orthaug.models.motion_parts import parts_at
 from orthaug.models.moving import Moving
-from orthaug.models.on_records import OnRecords, trajectory
+from orthaug.models.on_records import RUNAWAY, OnRecords, trajectory
 from orthaug.models.response import Response, Trajectory
 from orthaug.models.settling import Windows, settle
 from orthaug.models.statistics import Statistics
@@ -203,19 +203,22 @@ class MotionModel(OnRecords):
         start = self._start(experiment, initial, record)
         inputs = self.form.inputs(experiment, record)
         states, whole = self._follow(self.form, self.numbers, start, inputs)
-        if self.form.bound is None:
-            physics = whole
-        else:
-            alone = self.alone
-            physics = self._follow(alone.form, alone.numbers, start, inputs)[1]
-            physics = np.where(np.isfinite(physics), physics, np.nan)
-        with np.errstate(all="ignore"):
-            parts = Parts(physics, whole - physics, whole - physics)
         measured = experiment.outputs if record.outputs else None
-        bounded = self.bounded(parts, experiment, measured)
-        if bounded.diverged is not None:
+        nothing = np.zeros_like(whole)
+        bounded = self.bounded(Parts(whole, nothing, nothing), experiment, measured)
+        if self.form.bound is None:
             return bounded
-        return replace(bounded, outside=self._outside(states, self.form.now(inputs)))
+        alone = self.alone
+        told = self._with_physics(bounded, self._follow(alone.form, alone.numbers, start, inputs)[1])
+        return told if told.diverged else replace(told, outside=self._outside(states, self.form.now(inputs)))
+
+    def _with_physics(self, run: Trajectory, physics: Matrix) -> Trajectory:
+        """A run of the whole model with the output of the physics alone; no value from where that left all bounds."""
+        with np.errstate(all="ignore"):
+            wild = ~(np.abs(physics) <= RUNAWAY * self.largest_output).all(axis=1)
+        known = np.where(np.logical_or.accumulate(wild)[:, None] | np.isnan(run.model), np.nan, physics)
+        learner = run.model - known
+        return replace(run, baseline=known, learner=learner, learner_before=learner, whole=run.model)
 
     def _follow(self, form: Moving, numbers: Numbers, start: Vector, inputs: Matrix) -> tuple[Matrix, Matrix]:
         rows = len(inputs)
@@ -258,8 +261,12 @@ class MotionModel(OnRecords):
         window = min(self.window, len(experiment) - horizon)  # short recordings have at least one prediction
         first = window + horizon - 1
         outputs, physics = self._predicted(experiment, record, horizon, window)
-        parts = Parts(physics, outputs - physics, outputs - physics)
-        return trajectory(parts, experiment, experiment.outputs, first)
+        nothing = np.zeros_like(outputs)
+        ahead = trajectory(Parts(outputs, nothing, nothing), experiment, experiment.outputs, first)
+        known = np.full(experiment.outputs.shape, np.nan)
+        known[first:] = np.where(np.isfinite(physics), physics, np.nan)
+        learner = ahead.model - known
+        return replace(ahead, baseline=known, learner=learner, learner_before=learner, whole=ahead.model)
 
     def _predicted(
         self, experiment: Experiment, record: Record, horizon: int, window: int

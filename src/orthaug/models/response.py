@@ -55,7 +55,8 @@ class Trajectory:
     `baseline + learner` is the model's output. `learner_before` is f, before θ_aux moved its share in the physics to θ.
     `diverged` is the row and output at which a free run left all bounds; None where it did not. `outside` (N,) marks
     the rows of a free run on which the learner's features lie outside those of training: there it extrapolates. None
-    without a learner, and where the features of training are not known.
+    without a learner, and where the features of training are not known. `whole` (N, ny) is the model's output where its
+    parts may lack a value: a motion whose physics alone runs away; None where it is their sum.
     """
 
     baseline: Matrix
@@ -66,6 +67,7 @@ class Trajectory:
     start_time: float = 0.0
     diverged: tuple[int, str] | None = None
     outside: Bool[np.ndarray, "N"] | None = None
+    whole: Matrix | None = None
 
     def __repr__(self) -> str:
         samples, outputs = self.baseline.shape
@@ -75,7 +77,7 @@ class Trajectory:
 
     @property
     def model(self) -> Matrix:
-        return self.baseline + self.learner
+        return self.baseline + self.learner if self.whole is None else self.whole
 
     @property
     def baseline_before(self) -> Matrix:
