@@ -56,7 +56,7 @@ def record(rows: int = 60) -> oa.Record:
 
 
 def run(form: Moving, made: Numbers, data: oa.Record, start) -> np.ndarray:
-    inputs = form.inputs(data.experiments[0], data)
+    inputs, made = form.inputs(data.experiments[0], data), form.prepared(made)
     return np.asarray(jax.lax.scan(lambda x, row: (form.step(made, x, row)[0], x), np.asarray(start), inputs)[1])
 
 

@@ -201,6 +201,7 @@ def sizes(problem: MotionProblem) -> Vector:
 @partial(jax.jit, static_argnames="form")
 def _states(form: Moving, numbers: Numbers, segments: Segments, states: Float[Array, "k n0 m"]) -> Any:
     """The states (k, T, n0, m) of every segment's run."""
+    numbers = form.prepared(numbers)
     side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row)[0], -1, -1)
 
     def one_chunk(chunk: Any) -> Any:

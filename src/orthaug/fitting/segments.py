@@ -87,6 +87,7 @@ def respond(
     dynamics: Dynamics, numbers: Numbers, segments: Segments, states: Float[Array, "k n0 m"]
 ) -> Float[Array, "k T ny m"]:
     """Outputs of every segment from its state."""
+    numbers = dynamics.prepared(numbers)
     side_by_side = jax.vmap(partial(dynamics.step, numbers), in_axes=-1, out_axes=-1)
 
     def step(state: Any, inputs: Any) -> tuple[Any, Any]:
@@ -114,6 +115,7 @@ def sensitivity(
     weight: Float[Array, "ny ny"],
 ) -> Sensitivity:
     """Gram matrices of the sensitivities `∂ŷ/∂(start, c, w)` and the error, rows multiplied by `weight`."""
+    numbers = dynamics.prepared(numbers)
     _, n0, width = segments.start.shape
     n, ny = dynamics.unknowns, len(dynamics.outputs)
 
@@ -153,6 +155,7 @@ def block_scores(
     Args:
         place: the block of each step, the same in every segment.
     """
+    numbers = dynamics.prepared(numbers)
     _, n0, width = segments.start.shape
     n, ny = dynamics.unknowns, len(dynamics.outputs)
 

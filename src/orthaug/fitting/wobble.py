@@ -55,6 +55,7 @@ def _summed(
     q: Float[Array, "np"],
     size: Float[Array, "nl"],
 ) -> Float[Array, "np n0+n m"]:
+    numbers = form.prepared(numbers)
     c, w = numbers.theta - numbers.theta_aux, numbers.weights
 
     def mixed(x: Any, row: Any) -> Any:

@@ -32,6 +32,8 @@ class Numbers(NamedTuple):
     """Unit of the learner's output, in the outputs' units."""
     tilt: Any = None
     """(members, nθ) of an ensemble: the physics that each member adds. `weights` has a row for each; None otherwise."""
+    scheme: Any = None
+    """What `Dynamics.prepared` makes of them for all steps of a run."""
 
 
 class Parts(NamedTuple):
@@ -122,6 +124,10 @@ class Dynamics(Protocol):
         """A state and the inputs of a step as a user knows them, by names."""
         ...
 
+    def prepared(self, numbers: Numbers) -> Numbers:
+        """The numbers with what all steps of a run need of them, computed once."""
+        ...
+
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
         """The next state (n0,) and the output, from a state and the inputs (nu,) of one row."""
         ...
@@ -145,6 +151,9 @@ class Differentiated:
     """
 
     differentiable = True
+
+    def prepared(self, numbers: Numbers) -> Numbers:
+        return numbers
 
     def scaled_features(self, numbers: Numbers, start: Vector, outputs: Matrix, inputs: Matrix) -> Matrix | None:
         return None

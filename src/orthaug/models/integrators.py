@@ -8,7 +8,7 @@ zero-order or first-order hold. Both take several substeps in a sample.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -58,17 +58,36 @@ def input_at(row: Any, nu: int) -> Callable[[Any, int], Any]:
     return lambda i, halves: points[i]
 
 
-def advance(field: Field, linear: Any, x: Any, row: Any, nu: int, step: float, substeps: int, integrator: str) -> Any:
+class Exponentials(NamedTuple):
+    """Of the linear part A of a motion, over a substep h: e^{Ah}, φ₁ to φ₃ of Ah, and e^{Ah/2}, (h/2) φ₁ of Ah/2."""
+
+    linear: Any
+    whole: Any
+    phi1: Any
+    phi2: Any
+    phi3: Any
+    half: Any
+    half1: Any
+
+    @classmethod
+    def of(cls, linear: Any, h: float) -> Exponentials:
+        """Of A (nx, nx)."""
+        whole, phi1, phi2, phi3 = _phi(linear * h, 3)
+        half, half1 = _phi(linear * h / 2, 1)
+        return cls(linear, whole, phi1, phi2, phi3, half, half1 * h / 2)
+
+
+def advance(field: Field, scheme: Any, x: Any, row: Any, nu: int, step: float, substeps: int, integrator: str) -> Any:
     """x one sample later.
 
     Args:
         field: ẋ = F(x, u).
-        linear: A (nx, nx), its part that goes by the matrix exponential; None for `rk4`.
+        scheme: the `Exponentials` of its linear part; None for `rk4`.
         row: the input as `held` lays it out.
         step: the sampling time.
     """
     at, halves, h = input_at(row, nu), 2 * substeps, step / substeps
-    one = _exponential(field, linear, h) if integrator == "exact" else _runge_kutta(field, h)
+    one = _exponential(field, scheme, h) if integrator == "exact" else _runge_kutta(field, h)
     if substeps <= UNROLLED:
         for j in range(substeps):
             x = one(x, at(2 * j, halves), at(2 * j + 1, halves), at(2 * j + 2, halves))
@@ -88,10 +107,8 @@ def _runge_kutta(field: Field, h: float) -> Callable[..., Any]:
     return one
 
 
-def _exponential(field: Field, linear: Any, h: float) -> Callable[..., Any]:
-    whole, phi1, phi2, phi3 = _phi(linear * h, 3)
-    half, half1 = _phi(linear * h / 2, 1)
-    half1 = half1 * h / 2
+def _exponential(field: Field, scheme: Exponentials, h: float) -> Callable[..., Any]:
+    linear, whole, phi1, phi2, phi3, half, half1 = scheme
 
     def rest(x: Any, u: Any) -> Any:
         return field(x, u) - linear @ x

@@ -131,6 +131,10 @@ class Lagged:
             raw = _learned(self.bound, numbers, z, phi)
         return Parts(known + phi @ numbers.theta, raw - phi @ numbers.theta_aux, raw)
 
+    def prepared(self, numbers: Numbers) -> Numbers:
+        """Nothing is common to all steps."""
+        return numbers
+
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
         parts = self.at(numbers, self.regressor(state, inputs))
         return self._push(state, parts.total), parts

@@ -41,6 +41,7 @@ def _run(
     form: Moving, numbers: Numbers, state: Float[Array, "n0"], inputs: Float[Array, "T nu"]
 ) -> tuple[Float[Array, "T n0"], Float[Array, "T ny"]]:
     """States and outputs of a free run."""
+    numbers = form.prepared(numbers)
 
     def step(state: Any, row: Any) -> tuple[Any, tuple[Any, Any]]:
         following, parts = form.step(numbers, state, row)
@@ -54,6 +55,7 @@ def _last(
     form: Moving, numbers: Numbers, states: Float[Array, "n0 m"], inputs: Float[Array, "T nu m"]
 ) -> Float[Array, "ny m"]:
     """The last output of runs side by side."""
+    numbers = form.prepared(numbers)
     side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row), -1, -1)
 
     def step(state: Any, row: Any) -> tuple[Any, None]:

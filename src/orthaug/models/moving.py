@@ -15,7 +15,7 @@ from orthaug._base.jax import jax, jnp
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import Differentiated, Numbers, Parts
-from orthaug.models.integrators import UNROLLED, advance, held
+from orthaug.models.integrators import UNROLLED, Exponentials, advance, held
 from orthaug.models.motion_field import MotionField
 from orthaug.models.motion_tangents import Slopes, output_slopes, sample_slopes
 from orthaug.physics.motion_layout import layout_of
@@ -76,7 +76,7 @@ class Moving(MotionField, Differentiated):
 
         following = advance(
             field,
-            self.linear_part(numbers) if self.motion.integrator == "exact" else None,
+            self._exponentials(numbers) if numbers.scheme is None else numbers.scheme[0],
             state,
             inputs,
             len(self.motion.inputs),
@@ -86,8 +86,27 @@ class Moving(MotionField, Differentiated):
         )
         return following, parts
 
+    def prepared(self, numbers: Numbers) -> Numbers:
+        """With the exponentials of an exact integrator and their derivatives by the coordinates of p."""
+        if self.motion.integrator != "exact":
+            return numbers
+
+        def of(theta: Any) -> Any:
+            return self._exponentials(numbers._replace(theta=theta))
+
+        theta = jnp.asarray(numbers.theta)
+        return numbers._replace(scheme=(of(theta), jax.jacfwd(of)(theta)))
+
+    def _exponentials(self, numbers: Numbers) -> Exponentials | None:
+        if self.motion.integrator != "exact":
+            return None
+        return Exponentials.of(self.linear_part(numbers), self.sampling_time / self.substeps)
+
     def tangents(self, numbers: Numbers, state: Any, slopes: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
         """Of a few Runge-Kutta substeps by the adjoint of their stages; otherwise by automatic differentiation."""
+        if numbers.scheme is not None:
+            value, slope, output, of_output = super().tangents(numbers, state, slopes, inputs)
+            return value, slope + self._by_scheme(numbers, state, inputs), output, of_output
         if self.motion.integrator != "rk4" or self.substeps > UNROLLED or not self.differentiable:
             return super().tangents(numbers, state, slopes, inputs)
         following = jax.vmap(partial(sample_slopes, self, numbers), -1, -1)(state, inputs)
@@ -99,3 +118,19 @@ class Moving(MotionField, Differentiated):
         own = step.to_c if self.bound is None else jnp.concatenate([step.to_c, step.to_w], axis=1)
         through = sum(step.to_x[:, i, None] * slopes[None, i] for i in range(self.states))
         return through + jnp.pad(own, ((0, 0), (self.states, 0), (0, 0)))
+
+    def _by_scheme(self, numbers: Numbers, state: Any, inputs: Any) -> Any:
+        """How the next states (nx, n0 + n, m) follow p through the exponentials, which a step takes as given."""
+        scheme, by_theta = numbers.scheme
+
+        def following(scheme: Any, state: Any, row: Any) -> Any:
+            return self.step(numbers._replace(scheme=(scheme, None)), state, row)[0]
+
+        def along(moved: Any) -> Any:
+            return jax.vmap(lambda x, row: jax.jvp(lambda s: following(s, x, row), (scheme,), (moved,))[1], -1, -1)(
+                state, inputs
+            )
+
+        moved = jax.vmap(along, -1, 1)(by_theta)  # a tangent for each parameter: (nx, np, m)
+        before, after = self.states, self.unknowns - moved.shape[1]
+        return jnp.pad(moved, ((0, 0), (before, after), (0, 0)))

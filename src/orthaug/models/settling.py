@@ -97,6 +97,7 @@ def _gram(
     weight: Float[Array, "ny ny"],
 ) -> tuple[Float[Array, "n0 n0+1 m"], Float[Array, "m"]]:
     """Gram matrix of the sensitivities to the start with themselves and the error, and the error's square."""
+    numbers = form.prepared(numbers)
     n0, m = states.shape
 
     def both(state: Any, row: Any) -> Any:
