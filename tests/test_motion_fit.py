@@ -239,3 +239,18 @@ def test_a_model_runs_on_other_records(fitted: oa.MotionEstimate) -> None:
         model.simulate(oa.Record.from_arrays(u=np.ones(5), sampling_time=TS))
     frame = model.states(record)
     assert list(frame) == ["time", "x", "v", "v_physics", "v_learner"] and len(frame) == len(record)
+
+
+def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(fitted: oa.MotionEstimate) -> None:
+    from orthaug.analysis.motion_diagnosis import diagnose_motion, robust_motion
+
+    found = diagnose_motion(fitted, fitted.model.simulate(data()))
+    assert found is not None and found.verdict == "white" and "noise on the outputs" in found.text
+    assert robust_motion(fitted) is fitted
+    alone = oa.estimate(data(), spring(), learner=None, criterion=WHOLE)
+    found = diagnose_motion(alone, alone.model.simulate(data()))
+    assert found is not None and found.verdict != "white" and found.predictable[0].own_past > 0.5
+    robust = alone.robust(10)
+    np.testing.assert_array_equal(robust.values, alone.values)
+    np.testing.assert_array_equal(robust.plain_std, alone.std)
+    assert (robust.std > 1.2 * alone.std).all() and robust.freedom < 31

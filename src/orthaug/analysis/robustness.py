@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from orthaug._base.checks import Vector
@@ -26,13 +28,18 @@ def robust_where_coloured(fit: Estimate, response: Response) -> Estimate:
     """
     if not fit.status.ok or fit.covariance is None or fit.at_bound:
         return fit
-    lags = _memory(fit, response) if fit.criterion.flown is None else _block(fit)
-    if lags is None or len(fit.problem.rows) < max(_FEWEST_ROWS, _ROWS_PER_TERM * lags):
+    lags = _memory(fit, response) if fit.criterion.flown is None else block_of(fit)
+    if lags is None or not rows_suffice(len(fit.problem.rows), lags):
         return fit
     try:
         return fit.robust(lags)
     except InputError:  # an ensemble, or a fit without statistics
         return fit
+
+
+def rows_suffice(rows: int, lags: int) -> bool:
+    """Whether so many rows tell a sum of so many autocovariances."""
+    return rows >= max(_FEWEST_ROWS, _ROWS_PER_TERM * lags)
 
 
 def _memory(fit: Estimate, response: Response) -> int | None:
@@ -50,7 +57,7 @@ def _memory(fit: Estimate, response: Response) -> int | None:
     return _MEMORIES * memory or None
 
 
-def _block(fit: Estimate) -> int | None:
+def block_of(fit: Any) -> int | None:
     """Steps of a block for the errors of the free run; None where these are white, or leave too few blocks."""
     if fit.scores is None:
         return None

@@ -18,10 +18,11 @@ if TYPE_CHECKING:
     from orthaug.models.response import Response
     from orthaug.reports.drawing import Figure
 
-_UNKNOWN = ("physical_parameters", "physical_consistency", "sensitivities", "bias", "residuals", "missing_lags")
+_UNKNOWN = ("physical_parameters", "physical_consistency", "sensitivities", "bias", "missing_lags")
 _STIFF = 20  # substeps from which a motion is told to be stiff for its sampling
 _NOT_ANALYSED = Warning(
-    "residual_not_analysed", "the residual is not analysed: its tests read lagged signals, which a motion has none of."
+    "residual_not_analysed",
+    "the residual is not analysed: the free run ran away, has too few rows, or leaves rounding only.",
 )
 _NOT_RICH = Warning(
     "rich_inputs_run_away",
@@ -103,17 +104,21 @@ def content(
     warnings: list[Any],
 ) -> tuple[MotionEstimate, dict[str, Any]]:
     """The fit, and what results tell of it; warnings are added."""
+    from orthaug.analysis.motion_diagnosis import diagnose_motion, robust_motion
     from orthaug.analysis.motion_imitation import MotionImitation
     from orthaug.analysis.motion_modes import motion_stability
     from orthaug.physics.excitation import Excitation, of_gram
 
     motion, form = job.problem.motion, fit.model.form
     count, gram = len(motion.names), fit.model.statistics.gram
-    told: dict[str, Any] = dict.fromkeys((*_UNKNOWN, "stability", "shared", "measure_detail"))
+    told: dict[str, Any] = dict.fromkeys((*_UNKNOWN, "residuals", "stability", "shared", "measure_detail"))
     if fit.status.ok:
+        fit = robust_motion(fit)
+        told["residuals"] = diagnose_motion(fit, responses[job.train.name][1])
+        warnings += [_NOT_ANALYSED] if told["residuals"] is None else told["residuals"].warnings
         points = job.reach(fit.model, job.train.record)[0]
         told["stability"] = motion_stability(fit.model, *np.split(points, [form.states], axis=1))
-        warnings += [_NOT_ANALYSED, *told["stability"].warnings]
+        warnings += told["stability"].warnings
     if fit.status.ok and form.bound is not None:
         split = fit.split_by
         told["shared"] = MotionImitation.of([str(entry) for entry in form.features], fit.shared)
@@ -126,7 +131,7 @@ def content(
         }
     return fit, told | {
         "parameters": _parameters(fit),
-        "standard_errors": None if fit.std is None else "plain",
+        "standard_errors": None if fit.std is None else "plain" if fit.plain_covariance is None else "robust",
         "excitation": Excitation(0, count, None, ()) if gram is None else of_gram(gram[:count, :count], motion.names),
         "motion": {
             "states": motion.names_of_states,
@@ -163,7 +168,7 @@ def _parameters(fit: MotionEstimate) -> list[ParameterResult]:
     """The parameters with their intervals, and whether the learner could imitate them."""
     motion = fit.problem.motion
     values = fit.values if fit.status.ok else np.full(len(motion.names), np.nan)
-    rows = parameter_rows(motion.parameters, values, fit.std, fit.interval)
+    rows = parameter_rows(motion.parameters, values, fit.std, fit.interval, plain_std=fit.plain_std)
     if fit.model.form.bound is None or not fit.status.ok:
         return rows
     return [row.told(row.name not in fit.shared.untouched, None) for row in rows]

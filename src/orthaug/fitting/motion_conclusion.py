@@ -60,6 +60,7 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) ->
         states=states,
         slope=slope,
         alone=alone,
+        scores=learned.scores,
         warnings=_warnings(errors.mean_square),
     )
     return fit.split(structure.measure, getattr(structure, "shared", "auto")) if learned.ending.usable else fit

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_type
+from orthaug._base.errors import InputError
 from orthaug._base.warning import Warning
+from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.estimates import Restart
 from orthaug.fitting.held_out import HeldOut
@@ -58,6 +60,10 @@ class MotionEstimate:
     """How they follow the unknowns (k, m, nx, n), less its sign; None where that is not known."""
     alone: Vector = field(repr=False)
     """The coordinates of physics alone, where the nearest physics is searched from."""
+    scores: FreeRunScores | None = field(default=None, repr=False)
+    """What robust standard errors are made of."""
+    plain_covariance: Matrix | None = None
+    """The covariance for white noise, where `covariance` is robust; None where it is not."""
     at_bound: tuple[str, ...] = ()
     unidentified: tuple[str, ...] = ()
     """Parameters that no output tells beside the learner."""
@@ -85,6 +91,13 @@ class MotionEstimate:
         if self.covariance is None:
             return None
         return np.sqrt(np.diag(self.covariance)) * np.abs(self.problem.motion.coordinates.slopes(self.theta))
+
+    @property
+    def plain_std(self) -> Vector | None:
+        """The standard errors for white noise, where those of `std` are robust; None where they are not."""
+        if self.plain_covariance is None:
+            return None
+        return np.sqrt(np.diag(self.plain_covariance)) * np.abs(self.problem.motion.coordinates.slopes(self.theta))
 
     @property
     def interval(self) -> Matrix | None:
@@ -136,6 +149,30 @@ class MotionEstimate:
         options = {"everything": shared == "all", "wobble": moving}
         split = split_motion(measure.name, form, whole, self.alone, field, bounds, **options)
         return _with_split(self, replace(split, support=support), told)
+
+    def robust(self, steps: int | None = None) -> MotionEstimate:
+        """The same with standard errors that hold for coloured errors: batch means of the scores (`block_scores`).
+
+        Args:
+            steps: of a block; None to choose it by how long the errors remember each other.
+
+        Raises:
+            InputError: no statistics, or errors that remember each other for too long.
+        """
+        statistics = self.model.statistics
+        if self.scores is None or self.covariance is None or statistics.gram is None:
+            raise InputError("the fit has no statistics that robust standard errors could be made of.")
+        steps = self.scores.block() if steps is None else steps
+        if steps is None:
+            raise InputError("the errors of the free run remember each other for too long to take them in blocks.")
+        middle, blocks = self.scores.middle(steps, len(self.theta) + self.effective_weights)
+        freedom = min(self.freedom, blocks - 1.0)
+        statistics = replace(statistics, middle=middle, freedom=freedom)
+        plain = self.covariance if self.plain_covariance is None else self.plain_covariance
+        model = replace(self.model, statistics=statistics)
+        kept = tuple(w for w in self.warnings if w.code == "measure_beyond_data")
+        robust = replace(self, model=model, freedom=freedom, plain_covariance=plain)
+        return _with_split(robust, self.split_by, kept)
 
     def __repr__(self) -> str:
         values = ", ".join(f"{n} = {v:.6g}" for n, v in zip(self.problem.motion.names, self.values, strict=True))

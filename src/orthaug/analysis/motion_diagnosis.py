@@ -1,0 +1,109 @@
+"""What the free run of a motion leaves: noise, or something that a state or an input tells.
+
+The criterion of a motion is right for white noise on its outputs. Coloured errors that follow no input and no state are
+noise within the motion; errors that do are physics that is missing, or that the learner does not see.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from orthaug._base.errors import InputError
+from orthaug._base.parallel import one_blas_thread
+from orthaug._base.warning import Warning
+from orthaug.analysis.diagnosis import Diagnosis
+from orthaug.analysis.predictability import Predictable, from_lags, from_own_past
+from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, errors_of, rms_errors
+from orthaug.analysis.robustness import block_of, rows_suffice
+from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.models.response import Response
+
+_SMALL = 0.05  # of the error's variance: what inputs and states tell below that is a small effect
+_LAGS = 10  # of inputs that may tell the error
+_ROWS_PER_LAG = 20
+_MOST_ROWS = 20_000  # at which the error is set beside states
+
+
+def robust_motion(fit: MotionEstimate) -> MotionEstimate:
+    """The fit with robust standard errors where its free run leaves coloured errors and the rows suffice."""
+    if not fit.status.ok or fit.covariance is None:
+        return fit
+    steps = block_of(fit)
+    if steps is None or not rows_suffice(len(fit.problem.record), steps):
+        return fit
+    try:
+        return fit.robust(steps)
+    except InputError:
+        return fit
+
+
+def diagnose_motion(fit: MotionEstimate, free_run: Response) -> Diagnosis | None:
+    """Analyse what the free run of the training data leaves; None where it ran away, or leaves rounding only.
+
+    Args:
+        free_run: of the training data.
+    """
+    record, motion = fit.problem.record, fit.problem.motion
+    if any(run.diverged for run in free_run.trajectories):
+        return None
+    if np.all(rms_errors(free_run) / fit.problem.deviation < ROUNDING):
+        return None
+    errors, every = errors_of(free_run), -(-len(record) // _MOST_ROWS)
+    inputs = [e.inputs for e in record.experiments]
+    frame = fit.model.states(record)
+    ends = np.cumsum([len(e) for e in record.experiments])[:-1]
+    states = np.split(frame[list(motion.names_of_states)].to_numpy(), ends)
+    if not np.isfinite(np.concatenate(states)).all():
+        return None
+    names = ([c.name for c in record.outputs], list(motion.inputs), list(motion.names_of_states))
+    with one_blas_thread():
+        tests = analyse(errors, inputs, states, *names, lags=LAGS)
+        shares = tuple(_predictable(i, test, errors, inputs, every) for i, test in enumerate(tests))
+    if any(test.white is None for test in tests):
+        return None
+    followed = {test.name: test.follows() for test in tests if test.follows()}
+    curved = {test.name: test.curved_over(_SMALL) for test in tests if test.curved_over(_SMALL)}
+    told = any(share.inputs > _SMALL for share in shares) or bool(curved)
+    white = all(test.practically_white() for test in tests)
+    verdict = "unmodelled" if told else "white" if white else "equation_noise"
+    text = _words(verdict, fit, shares, followed, curved)
+    colour = () if white else (Warning("coloured_residual", _COLOURED),)
+    return Diagnosis(verdict, text, (), tests, None, None, colour, shares, ())
+
+
+_COLOURED = (
+    "the errors of the free run are coloured: held-out errors say how good the model is, and standard errors are "
+    "robust only where there are rows enough."
+)
+
+
+def _predictable(i: int, test: ResidualTest, errors: list, inputs: list, every: int) -> Predictable:
+    """Shares of an output's error that its own past and lagged inputs tell, and its largest share over a state."""
+    signal = [piece[:, i] for piece in errors]
+    longest = min(_LAGS, min(map(len, signal)) // _ROWS_PER_LAG)
+    own = from_own_past(signal, max(longest, 1))
+    tells = [from_lags(signal, [u[:, j] for u in inputs], range(longest + 1)) for j in range(inputs[0].shape[1])]
+    best = max((share.sure for share in tells), default=0.0)
+    return Predictable(test.name, float(test.rms or 0.0), own.sure, best, float(test.largest_share or 0.0))
+
+
+def _words(verdict: str, fit: MotionEstimate, shares: tuple, followed: dict, curved: dict) -> str:
+    units = {c.name: c.unit for c in fit.problem.record.outputs}
+    sizes = ", ".join(f"{s.rms:.3g} {units[s.name]}".strip() + f" of {s.name}" for s in shares)
+    if verdict == "white":
+        return f"What the free run leaves ({sizes}) is white: noise on the outputs, which is what it is trained for."
+    colour = ", ".join(f"{100 * s.own_past:.0f} % of {s.name}" for s in shares)
+    if verdict == "equation_noise":
+        learner = "that the learner does not see" if fit.model.form.bound is not None else "(a learner would tell)"
+        return (
+            f"What the free run leaves ({sizes}) is coloured ({colour} follows from its own past), and follows no "
+            f"input and no state at the same instant: disturbances, or physics missing in an equation {learner}."
+        )
+    what = [f"{name} follows {', '.join(given)}" for name, given in followed.items()]
+    what += [f"{name} is not flat over {', '.join(given)}" for name, given in curved.items()]
+    what = what or [f"{100 * max(s.inputs for s in shares):.0f} % follows from the inputs"]
+    learner = "let the learner see more" if fit.model.form.bound is not None else "add a learner where it acts"
+    return (
+        f"What the free run leaves ({sizes}) holds more than noise: {'; '.join(what)}. Physics is missing; {learner}, "
+        "or try another hold of the inputs."
+    )
