@@ -26,7 +26,7 @@ from orthaug.fitting.estimation import fit
 def job(name: str) -> Job | None:
     """The example with its data; None where these are absent."""
     text = (ROOT / "examples" / f"{name}.toml").read_text(encoding="utf-8")
-    if not (data_folder() / name).is_dir():
+    if not (data_folder() / name.removesuffix("_motion")).is_dir():
         return None
     with tempfile.TemporaryDirectory() as folder:
         spec = Path(folder) / f"{name}.toml"
