@@ -122,7 +122,9 @@ def main(draws: int) -> None:
     began = time.perf_counter()
     found = drawn(draws)
     seconds = (time.perf_counter() - began) / draws
-    print(f"\n{draws} draws, {found.without} without intervals, {seconds:.1f} s a draw; a coverage of 95 % is seen with")
+    print(
+        f"\n{draws} draws, {found.without} without intervals, {seconds:.1f} s a draw; a coverage of 95 % is seen with"
+    )
     print(f"a standard error of {100 * np.sqrt(0.0475 / draws):.1f} %.\n")
     print("| parameter | true | bias / standard error | scatter / standard error | coverage |\n" + 5 * "|---" + "|")
     rows = zip(NAMES, plant().true, found.bias, found.scatter, found.coverage, strict=True)

@@ -71,7 +71,9 @@ def main(starts: int) -> None:
             std = [np.nan if fit.std is None else fit.std[i] for fit in found]
             missing = int(np.isnan(std).sum())
             error = f"{np.nanmedian(std):.2g}" if missing < starts else "none"
-            print(f"  {name:5} {min(values):9.4g} to {max(values):9.4g}, median standard error {error}, without {missing}")
+            print(
+                f"  {name:5} {min(values):9.4g} to {max(values):9.4g}, median standard error {error}, without {missing}"
+            )
 
 
 if __name__ == "__main__":

@@ -112,7 +112,9 @@ SYSTEMS = {
     "dc_motor": System(motor, 2, (1,), ("voltage", "speed"), 0.002, (12.0,), 40, 0.01),
     "two_link_arm": System(arm, 4, (0, 1), ("torque1", "torque2", "angle1", "angle2"), 0.02, (5.0, 1.0), 20, 0.01),
 }
-ROWS = {"train": (1000, 1), "test": (500, 2)}  # and seeds
+SEEDS = {"train": 1, "test": 2}
+TRAINED = {"motion_friction": 1000, "dc_motor": 1000, "two_link_arm": 2000}
+TESTED = 500
 
 
 def write(folder: Path) -> list[Path]:
@@ -120,7 +122,8 @@ def write(folder: Path) -> list[Path]:
     folder.mkdir(exist_ok=True)
     written = []
     for name, system in SYSTEMS.items():
-        for part, (rows, seed) in ROWS.items():
+        for part, seed in SEEDS.items():
+            rows = TRAINED[name] if part == "train" else TESTED
             written.append(folder / f"{name}_{part}.csv")
             header = ",".join(system.names)
             np.savetxt(written[-1], system.record(rows, seed)[0], delimiter=",", header=header, comments="", fmt="%.9g")
