@@ -68,7 +68,7 @@ def motion() -> oa.Motion:
         ],
         outputs=[oa.Output("position", "x")],
         inputs=["force"],
-        parameters=[oa.PhysicalParameter(name, initial, min=0) for name, initial in zip(NAMES, (1.2, 1.2, 120.0))],
+        parameters=[oa.PhysicalParameter(*given, min=0) for given in zip(NAMES, (1.2, 1.2, 120.0), strict=True)],
     )
 
 
