@@ -20,7 +20,7 @@ import orthaug as oa
 M, C, K, COULOMB = 1.0, 2.0, 100.0, 1.5
 TS, ROWS, HELD, FINE = 0.01, 1000, 25, 10
 NOISE = 10**-1.5  # over the output's deviation
-NAMES = ("m", "c", "k")
+NAMES, INITIAL = ("m", "c", "k"), (1.2, 1.2, 120.0)
 DRAWS = 200
 
 
@@ -68,7 +68,7 @@ def motion() -> oa.Motion:
         ],
         outputs=[oa.Output("position", "x")],
         inputs=["force"],
-        parameters=[oa.PhysicalParameter(name, initial, min=0) for name, initial in zip(NAMES, (1.2, 1.2, 120.0))],
+        parameters=[oa.PhysicalParameter(name, initial, min=0) for name, initial in zip(NAMES, INITIAL, strict=True)],
     )
 
 

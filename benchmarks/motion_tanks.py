@@ -1,7 +1,7 @@
 """Cascaded tanks as equations of motion, from ten starts: test error of the free run, and what the parameters become.
 
-By the spec in examples/, and with the upper rim as one more parameter: the upper level was not measured, so its scale is
-then told by nothing but the width of the spill's edge and the prior of the weights.
+By the spec in examples/, and with the upper rim as one more parameter: the upper level was not measured, so its scale
+is then told by nothing but the width of the spill's edge and the prior of the weights.
 The set is read from ORTHAUG_DATA (default ../shared/data beside the project).
 Run: python benchmarks/motion_tanks.py [starts]
 """
