@@ -254,3 +254,16 @@ def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(fitted:
     np.testing.assert_array_equal(robust.values, alone.values)
     np.testing.assert_array_equal(robust.plain_std, alone.std)
     assert (robust.std > 1.2 * alone.std).all() and robust.freedom < 31
+
+
+def test_what_stands_at_a_bound_is_a_constant_to_the_others() -> None:
+    """The spring's own stiffness held down by a bound: mass and damping have the intervals of a fit with it fixed."""
+    low = [oa.PhysicalParameter("m", 1.2, min=0), oa.PhysicalParameter("c", 1.2, min=0)]
+    states = [oa.State("x", "v", start="y"), oa.State("v", "(u - c*v - k*x)/m", start="derivative of y")]
+    given = {"states": states, "outputs": [oa.Output("y", "x")], "inputs": ["u"]}
+    bounded = oa.Motion.from_equations(**given, parameters=[*low, oa.PhysicalParameter("k", 20.0, max=20.0)])
+    fixed = oa.Motion.from_equations(**given, parameters=low, constants={"k": 20.0})
+    one, other = (oa.estimate(data(), made, learner=None, criterion=WHOLE) for made in (bounded, fixed))
+    assert one.at_bound == ("k",) and one.unidentified == () and np.isnan(one.std[2])
+    np.testing.assert_allclose(one.values[:2], other.values, rtol=1e-4)
+    np.testing.assert_allclose(one.std[:2], other.std, rtol=1e-2)

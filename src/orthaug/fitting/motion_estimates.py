@@ -220,18 +220,22 @@ def _covariance(
     fit: MotionEstimate, split: MotionSplit, at_bound: tuple[str, ...]
 ) -> tuple[Matrix | None, tuple[str, ...]]:
     """Cov q̂ = K Cov(c, w) Kᵀ, and which parameters no output tells."""
-    names = fit.problem.motion.names
-    statistics = fit.model.statistics
-    joint = statistics.joint(len(names))
-    if split.slope is None or joint is None:
+    names, numbers, statistics = fit.problem.motion.names, fit.model.numbers, fit.model.statistics
+    if split.slope is None or statistics.gram is None or statistics.middle is None:
         return None, ()
-    gram = np.asarray(statistics.gram)
-    unit = column_units(gram, len(names))
+    c = np.asarray(numbers.theta - numbers.theta_aux)
+    low, high = fit.problem.motion.coordinates.bounds
+    moves = np.concatenate([(low < c) & (c < high), np.ones(len(statistics.gram) - len(c), dtype=bool)])
+    kept = np.ix_(moves, moves)  # what stands at a bound is a constant
+    count, gram, slope = int(moves[: len(c)].sum()), statistics.gram[kept], split.slope[:, moves]
+    joint = replace(statistics, gram=gram, middle=statistics.middle[kept]).joint(count)
+    assert joint is not None
+    unit = column_units(gram, count)
     values, vectors = np.linalg.eigh(gram * np.outer(unit, unit))
     hidden = vectors[:, values <= _ROUNDING * values.max(initial=0.0)]
-    own = split.slope * unit
+    own = slope * unit
     share = np.linalg.norm(own @ hidden, axis=1) / np.maximum(np.linalg.norm(own, axis=1), 1e-300)
-    covariance = joint.of(split.slope)
+    covariance = joint.of(slope)
     vague = np.sqrt(np.diag(covariance)) > np.where(fit.problem.motion.coordinates.positive, _VAGUE, np.inf)
     unseen = tuple(name for name, part, wide in zip(names, share, vague, strict=True) if part > _UNSEEN or wide)
     for i, name in enumerate(names):

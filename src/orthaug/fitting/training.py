@@ -244,12 +244,16 @@ def _errors(fit: Any, record: Record, unit: Any) -> Pieces:
 
 def _fell_back(held_out: HeldOut) -> Warning:
     model, alone = (math.sqrt(mean_square(p)) for p in (held_out.runs[held_out.chosen], held_out.alone))
+    ratio = held_out.ratio
     errors = f"its error is {model:.4g} deviations of the output, that of physics alone {alone:.4g}"
+    surely = "surely " if model < alone else ""
     if math.isinf(model):
         errors = "every one of its starts runs away there"
+    elif surely:
+        errors += f"; {ratio}"
     text = (
-        f"in {held_out.where} the learner is not better than physics alone ({errors}), so the result is physics alone; "
-        "`fallback = false` keeps the learner."
+        f"in {held_out.where} the learner is not {surely}better than physics alone ({errors}), so the result is "
+        "physics alone; `fallback = false` keeps the learner."
     )
     return Warning("physics_alone", text)
 
