@@ -167,9 +167,11 @@ def test_a_result_has_what_a_motion_has_and_null_for_the_rest(result):
         "hold": "zero-order",
         "window": 0,
     }
-    for key in ("physical_parameters", "physical_consistency", "sensitivities", "bias", "residuals", "missing_lags"):
+    for key in ("physical_parameters", "physical_consistency", "sensitivities", "bias", "missing_lags"):
         assert result[key] is None
-    assert "residual_not_analysed" in [warning["code"] for warning in result["warnings"]]
+    found = result["residuals"]
+    assert found["verdict"] == "white" and "white" in found["text"] and found["one_step"] == []
+    assert [test["name"] for test in found["free_run"]] == ["position"] and result["standard_errors"] == "plain"
 
 
 def test_the_folder_has_figures_and_a_page(folder, printed, result):
