@@ -171,7 +171,7 @@ def test_a_result_has_what_a_motion_has_and_null_for_the_rest(result):
         assert result[key] is None
     found = result["residuals"]
     assert found["verdict"] == "white" and "white" in found["text"] and found["one_step"] == []
-    assert [test["name"] for test in found["free_run"]] == ["position"] and result["standard_errors"] == "plain"
+    assert [test["name"] for test in found["free_run"]] == ["position"]
 
 
 def test_the_folder_has_figures_and_a_page(folder, printed, result):
