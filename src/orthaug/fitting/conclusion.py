@@ -147,6 +147,17 @@ def _defect(task: OneStepTask, structure: Structure, learned: Learned, share: Sh
     return float(np.linalg.norm(along @ task.left_share(learned, theta_aux)) / size)
 
 
+def without_loss(mean_square: float) -> list[Warning]:
+    """What is told of a free run whose mean square over whole experiments does not exist."""
+    if np.isfinite(mean_square):
+        return []
+    text = (
+        "the free run diverges over whole experiments of the training data, so it has no loss; train with longer "
+        "segments, or bound what makes it run away."
+    )
+    return [Warning("free_run_diverges", text)]
+
+
 def _warnings(
     problem: Problem, structure: Structure, learned: Learned, identified: bool, noise: Matrix | None, fixed: Fixed
 ) -> list[Warning]:
@@ -164,12 +175,8 @@ def _warnings(
             "physics does not express already. Give it another form or other inputs, or leave it out."
         )
         told.append(Warning("learner_spanned", text))
-    if learned.errors is not None and not np.isfinite(learned.errors.mean_square):
-        text = (
-            "the free run diverges over whole experiments of the training data, so it has no loss; train with longer "
-            "segments, or bound what makes it run away."
-        )
-        told.append(Warning("free_run_diverges", text))
+    if learned.errors is not None:
+        told += without_loss(learned.errors.mean_square)
     if learned.elsewhere:
         told.append(Warning("no_standard_errors", "no standard errors: the function was trained elsewhere."))
     elif not identified:

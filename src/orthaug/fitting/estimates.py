@@ -15,6 +15,7 @@ from orthaug._base.warning import Warning
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.held_out import HeldOut
+from orthaug.fitting.parameter_table import parameter_frame, parameter_lines
 from orthaug.fitting.status import Status
 from orthaug.inference.covariance import interval
 from orthaug.inference.intervals import joint_covariance, robust_covariance, robust_split_covariance
@@ -110,22 +111,7 @@ class Estimate:
     @cached_property
     def parameters(self) -> pd.DataFrame:
         """Table with a row per parameter: unit, initial, value, std, and the 95 % interval."""
-        import pandas as pd
-
-        baseline = self.problem.baseline
-        nothing = np.full(len(baseline.names), np.nan)
-        ci = self.interval if self.interval is not None else np.stack([nothing, nothing], axis=-1)
-        return pd.DataFrame(
-            {
-                "unit": [p.unit for p in baseline.parameters],
-                "initial": baseline.initial,
-                "value": self.theta,
-                "std": self.std if self.std is not None else nothing,
-                "ci95_low": ci[:, 0],
-                "ci95_high": ci[:, 1],
-            },
-            index=pd.Index(baseline.names, name="parameter"),
-        )
+        return parameter_frame(self.problem.baseline.parameters, self.theta, self.std, self.interval)
 
     def split(self, measure: Measure) -> Estimate:
         """The same fitted function with θ, θ_aux, components and intervals under a measure, without training (F2).
@@ -304,16 +290,6 @@ def summary_lines(fit: Estimate) -> Sequence[str]:
     if one_step is not None:
         moved = ", ".join(f"{name} {value:.6g}" for name, value in zip(baseline.names, one_step, strict=True))
         lines.append(f"one step    Φ⁺Y would give {moved}")
-    width = max([9, *(len(name) for name in baseline.names)])
-    lines += ["", f"{'parameter':<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  {'initial':>11}  unit"]
-    std, ci = fit.std, fit.interval
     if fit.plain_covariance is not None:
-        lines.insert(-2, f"std         {ROBUST if fit.criterion.flown is None else ROBUST_FLOWN}")
-    for i, parameter in enumerate(baseline.parameters):
-        spread = f"{std[i]:11.4g}" if std is not None else f"{'–':>11}"
-        reach = f"[{ci[i, 0]:13.7g}, {ci[i, 1]:13.7g}]" if ci is not None else f"{'–':^29}"
-        lines.append(
-            f"{parameter.name:<{width}}  {fit.theta[i]:14.8g}  {spread}  {reach}  "
-            f"{parameter.initial:11.5g}  {parameter.unit}".rstrip()
-        )
-    return lines
+        lines.append(f"std         {ROBUST if fit.criterion.flown is None else ROBUST_FLOWN}")
+    return [*lines, "", *parameter_lines(baseline.parameters, fit.theta, fit.std, fit.interval)]

@@ -7,18 +7,17 @@ from dataclasses import replace
 import numpy as np
 
 from orthaug._base.errors import InputError
-from orthaug._base.warning import Warning
 from orthaug.data.record import Record
+from orthaug.fitting.conclusion import without_loss
 from orthaug.fitting.learned import Learned
 from orthaug.fitting.motion_course import MotionCourse
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.status import Status
 from orthaug.fitting.structures import Structure
-from orthaug.inference.motion_split import Field, MotionSplit
+from orthaug.inference.motion_split import MotionSplit
 from orthaug.models.motion_model import MotionModel, Trained
 from orthaug.models.statistics import Statistics
-from orthaug.physics.shared import Shared
 
 _WINDOWS = (4, 16)  # times (states + 1): rows of a window to predict from
 _TRIED_ROWS = 1000  # on which windows are compared
@@ -26,8 +25,7 @@ _TRIED_ROWS = 1000  # on which windows are compared
 
 def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) -> MotionEstimate:
     """Split the fitted motion and attach statistics."""
-    plan, motion = task.plan, task.problem.motion
-    count = len(motion.names)
+    plan = task.plan
     assert learned.coefficients is not None and learned.errors is not None
     states = plan.segments.start if learned.scores is None else learned.scores.states
     slope = None if learned.scores is None else learned.scores.slope
@@ -35,16 +33,6 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) ->
     alone = np.asarray(learned.coefficients if task.physics is None else task.physics.end.flown.theta)
     trained = Trained(plan.flown.segment, plan.flown.washout, np.asarray(states), slope, alone)
     model = replace(_model(plan, structure, learned), trained=trained)
-    unsplit = MotionSplit(
-        "training",
-        learned.coefficients,
-        Shared(motion.names, np.zeros((count, 0))),
-        None,
-        None,
-        None,
-        1.0,
-        Field(np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0), np.zeros(0)),
-    )
     fit = MotionEstimate(
         model=model,
         status=Status(learned.ending, learned.iterations, learned.seconds, errors.mean_square),
@@ -55,13 +43,13 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) ->
         defect=None,
         problem=task.problem,
         criterion=task.criterion,
-        split_by=unsplit,
+        split_by=MotionSplit.none("training", plan.dynamics, learned.coefficients),
         course=plan,
         states=states,
         slope=slope,
         alone=alone,
         scores=learned.scores,
-        warnings=_warnings(errors.mean_square),
+        warnings=tuple(without_loss(errors.mean_square)),
     )
     return fit.split(structure.measure, getattr(structure, "shared", "auto")) if learned.ending.usable else fit
 
@@ -112,13 +100,3 @@ def _best_window(model: MotionModel, record: Record) -> int:
         if square < 0.98 * least:  # a longer one only where it is clearly better
             best, least = window, square
     return best
-
-
-def _warnings(mean_square: float) -> tuple[Warning, ...]:
-    if np.isfinite(mean_square):
-        return ()
-    text = (
-        "the free run diverges over whole experiments of the training data, so it has no loss; train with longer "
-        "segments, or bound what makes it run away."
-    )
-    return (Warning("free_run_diverges", text),)

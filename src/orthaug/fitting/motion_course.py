@@ -15,7 +15,7 @@ from orthaug.fitting.course import Course, Layout
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.initial_states import InitialStates
 from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, errors_of
-from orthaug.fitting.segments import Segments, lay_segments
+from orthaug.fitting.segments import Segments, begins_of, lay_segments
 from orthaug.fitting.structures import Structure
 from orthaug.models.dynamics import Numbers
 from orthaug.models.learners import Bound, Scaling
@@ -168,9 +168,7 @@ class MotionCourse(Course):
         steps, washout = self.segments.steps, min(self.flown.washout, self.segments.steps - 1)
         for experiment in self.record.experiments:
             own = np.zeros((len(experiment), self.dynamics.states))
-            for begin in range(0, len(experiment), steps - washout):
-                if begin and begin + washout >= len(experiment):
-                    break
+            for begin in begins_of(len(experiment), steps, washout):
                 first = begin + (washout if begin else 0)
                 last = min(begin + steps, len(experiment))
                 own[first:last] = rows[place][first - begin : last - begin]
@@ -183,8 +181,7 @@ class MotionCourse(Course):
         steps, washout = self.segments.steps, min(self.flown.washout, self.segments.steps - 1)
         starts = []
         for experiment, own in zip(self.record.experiments, rows, strict=True):
-            begins = [b for b in range(0, len(experiment), steps - washout) if b == 0 or b + washout < len(experiment)]
-            starts.append(own[begins])
+            starts.append(own[begins_of(len(experiment), steps, washout)])
         flat = np.concatenate(starts)
         k, n0, m = np.asarray(self.segments.start).shape
         padded = np.concatenate([flat, np.zeros((k * m - len(flat), n0))])

@@ -16,6 +16,7 @@ from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.estimates import Restart
 from orthaug.fitting.held_out import HeldOut
 from orthaug.fitting.motion_measures import field_under
+from orthaug.fitting.parameter_table import parameter_frame, parameter_lines
 from orthaug.fitting.status import Status
 from orthaug.fitting.wobble import wobble
 from orthaug.inference.covariance import interval
@@ -110,23 +111,9 @@ class MotionEstimate:
     @cached_property
     def parameters(self) -> pd.DataFrame:
         """Table with a row per parameter: unit, initial, value, std, the 95 % interval, and whether it is shared."""
-        import pandas as pd
-
         motion = self.problem.motion
-        nothing = np.full(len(motion.names), np.nan)
-        ci = self.interval if self.interval is not None else np.stack([nothing, nothing], axis=-1)
-        return pd.DataFrame(
-            {
-                "unit": [p.unit for p in motion.parameters],
-                "initial": motion.initial,
-                "value": self.values,
-                "std": self.std if self.std is not None else nothing,
-                "ci95_low": ci[:, 0],
-                "ci95_high": ci[:, 1],
-                "shared": [name not in self.shared.untouched for name in motion.names],
-            },
-            index=pd.Index(motion.names, name="parameter"),
-        )
+        table = parameter_frame(motion.parameters, self.values, self.std, self.interval)
+        return table.assign(shared=[name not in self.shared.untouched for name in motion.names])
 
     def split(self, measure: Measure, shared: str = "auto") -> MotionEstimate:
         """The same fitted motion with p̂ under another measure over states and inputs, without training.
@@ -290,18 +277,7 @@ def motion_lines(fit: MotionEstimate) -> list[str]:
         told = shared_in_words(fit.shared)
         lines.append(f"shared      {told}")
         lines.append(f"measure     {fit.split_by.name}")
-    width = max([9, *(len(name) for name in motion.names)])
-    lines += ["", f"{'parameter':<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  {'initial':>11}  unit"]
-    std, ci = fit.std, fit.interval
-    for i, parameter in enumerate(motion.parameters):
-        known = std is not None and ci is not None and np.isfinite(std[i])
-        spread = f"{std[i]:11.4g}" if known and std is not None else f"{'–':>11}"
-        reach = f"[{ci[i, 0]:13.7g}, {ci[i, 1]:13.7g}]" if known and ci is not None else f"{'–':^29}"
-        lines.append(
-            f"{parameter.name:<{width}}  {fit.values[i]:14.8g}  {spread}  {reach}  "
-            f"{parameter.initial:11.5g}  {parameter.unit}".rstrip()
-        )
-    return lines
+    return [*lines, "", *parameter_lines(motion.parameters, fit.values, fit.std, fit.interval)]
 
 
 def shared_in_words(shared: Shared) -> str:

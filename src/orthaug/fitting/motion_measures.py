@@ -35,7 +35,7 @@ def field_under(
     support = support_of(motion, x, u)
     points = measure.points(support)
     at, beside = points.x[:, :nx], points.x[:, nx:]
-    size = _sizes(course, c, x, u)
+    size = sizes_learned(course, c, x, u)
     found = np.asarray(motion.rates(at.T, beside.T, motion.coordinates.physical(c), np), dtype=float)
     if not np.isfinite(found).any():
         raise InputError(f"the motion has no value on the {measure.name} measure; narrow it.")
@@ -52,7 +52,7 @@ def field_under(
     return Field(at[finite], beside[finite], weight[finite] / weight.sum(), size), share, told
 
 
-def _sizes(course: MotionCourse, c: Any, x: Any, u: Any) -> Any:
+def sizes_learned(course: MotionCourse, c: Any, x: Any, u: Any) -> Any:
     """The size (nl,) of each learned equation and output over the runs."""
     motion = course.problem.motion
     with np.errstate(all="ignore"):

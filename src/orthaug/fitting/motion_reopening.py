@@ -12,11 +12,10 @@ from orthaug.fitting.criteria import Simulation
 from orthaug.fitting.motion_course import MotionCourse
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.status import Ending, Status
-from orthaug.inference.motion_split import Field, MotionSplit
+from orthaug.inference.motion_split import MotionSplit
 from orthaug.models.learners import Scaling
 from orthaug.models.motion_model import MotionModel
 from orthaug.physics.motion_problem import pose_motion
-from orthaug.physics.shared import Shared
 
 
 def reopened(model: MotionModel, record: Record) -> MotionEstimate:
@@ -29,7 +28,6 @@ def reopened(model: MotionModel, record: Record) -> MotionEstimate:
     if kept is None:
         raise InputError("the model was saved without what a split needs; fit it again.")
     record = model.fitting(record, need_outputs=True)
-    names = form.motion.names
     problem = pose_motion(record, form.motion, [entry.text for entry in form.features] or None)
     problem = replace(problem, weight=replace(problem.weight, matrix=model.weight))
     criterion = Simulation(kept.segment, kept.washout)
@@ -42,8 +40,6 @@ def reopened(model: MotionModel, record: Record) -> MotionEstimate:
             "starts of. Give the files, and --rows, that it was trained on."
         )
     c = np.asarray(numbers.theta - numbers.theta_aux)
-    nothing = Field(np.zeros((0, form.states)), np.zeros((0, len(model.inputs))), np.zeros(0), np.zeros(0))
-    unsplit = MotionSplit(model.measure, c, Shared(names, np.zeros((len(names), 0))), None, None, None, 1.0, nothing)
     return MotionEstimate(
         model=model,
         status=Status(Ending.EXACT, 0, 0.0, np.nan),
@@ -54,7 +50,7 @@ def reopened(model: MotionModel, record: Record) -> MotionEstimate:
         defect=None,
         problem=problem,
         criterion=criterion,
-        split_by=unsplit,
+        split_by=MotionSplit.none(model.measure, form, c),
         course=course,
         states=kept.states,
         slope=kept.slope,

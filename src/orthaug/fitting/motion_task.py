@@ -16,6 +16,7 @@ from orthaug.fitting.flights import FlightTask, Place
 from orthaug.fitting.initial_states import Start
 from orthaug.fitting.learned import ErrorStatistics, Learned
 from orthaug.fitting.motion_course import MotionCourse
+from orthaug.fitting.motion_measures import sizes_learned
 from orthaug.fitting.motion_physics import fly_motion
 from orthaug.fitting.segments import sensitivity
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
@@ -74,14 +75,14 @@ class MotionTask(FlightTask):
 
     def learned(self, run: Flight) -> Learned:
         """The learner as a run left it. The information counts what the outputs tell, hardly what the guesses do."""
-        learned, objective = super().learned(run), run.objective
-        if learned.gram is None:
-            return learned
-        flown = run.end.flown
+        end, objective = run.end, run.objective
+        if end.linear is None:
+            return super().learned(run)
+        flown = end.flown
         numbers, made = objective.numbers(flown.c, flown.w), (objective.segments, flown.states, objective.weight)
         slopes = sensitivity(objective.dynamics, numbers, *made)
         information = objective.initial.eliminate(slopes, flown.states, _LOOSER * objective.start_rows)[0]
-        return replace(learned, gram=information * objective.rms**2)
+        return super().learned(run._replace(end=end._replace(linear=end.linear._replace(information=information))))
 
     def prepared(self, solver: LevenbergMarquardt, structure: Structure, progress: RunTell = quiet) -> MotionTask:
         """The same with physics alone trained. It gives the learner its scaling, and the criterion its unit."""
@@ -123,15 +124,10 @@ class MotionTask(FlightTask):
 
 def _scaled(plan: MotionCourse, physics: Flight) -> tuple[Scaling, Vector]:
     """The learner's features over the runs of physics alone, and the size of what it is added to."""
-    flown, motion = physics.end.flown, plan.problem.motion
+    flown = physics.end.flown
     x, u = (part.T for part in plan.alone.trajectory(flown.c, (), flown.states))
-    p = motion.coordinates.physical(flown.c)
     with np.errstate(all="ignore"):
         features = np.asarray(plan.dynamics.seen(x, u, np)).T
-        rates = np.asarray(motion.rates(x, u, p, np), dtype=float)
-    if motion.integrator == "discrete":
-        rates = rates - x
-    size = np.concatenate([rates[list(motion.learned[0])].std(axis=1), plan.deviation[list(motion.learned[1])]])
     finite = features[np.isfinite(features).all(axis=1)]
     scaling = Scaling.fit(finite if len(finite) else np.zeros((1, features.shape[1])))
-    return scaling, np.where(np.isfinite(size) & (size > 0), size, 1.0)
+    return scaling, sizes_learned(plan, flown.c, x.T, u.T)

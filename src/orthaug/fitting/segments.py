@@ -57,7 +57,7 @@ def lay_segments(
     pieces = []
     for experiment, rows in zip(record.experiments, usable, strict=True):
         inputs = dynamics.inputs(experiment, record)
-        begins = [b for b in range(0, rows, steps - washout) if b == 0 or b + washout < rows]
+        begins = begins_of(rows, steps, washout)
         pieces += [_segment(experiment, inputs, begin, steps, washout, dynamics) for begin in begins]
     count = len(pieces)
     chunks = -(-count // _CHUNK)
@@ -70,6 +70,11 @@ def lay_segments(
     stacked = (np.stack(part, axis=-1) for part in zip(*pieces, strict=True))
     cut = (np.moveaxis(part.reshape(*part.shape[:-1], chunks, width), -2, 0) for part in stacked)
     return Segments(*map(jax.device_put, cut))
+
+
+def begins_of(rows: int, steps: int, washout: int) -> list[int]:
+    """Where the segments of an experiment begin."""
+    return [begin for begin in range(0, rows, steps - washout) if begin == 0 or begin + washout < rows]
 
 
 def _segment(experiment: Experiment, inputs: Any, begin: int, steps: int, washout: int, dynamics: Dynamics) -> Segments:

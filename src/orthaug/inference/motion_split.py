@@ -20,6 +20,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.models.dynamics import Numbers
+from orthaug.models.motion_field import MotionField
 from orthaug.models.moving import Moving
 from orthaug.physics.shared import Shared, agreeing, moves
 
@@ -28,6 +29,7 @@ _ITERATIONS = 30
 _SETTLED = 1e-12  # of a step, relative
 _ROUNDING = 1e-13
 _FLAT = 1e-12  # curvature of the distance along directions of unit length: below it is none
+_POINTS = 400  # at which the slopes of the physics are looked at
 _FEWEST = 4  # moves that succeed, for each parameter
 
 
@@ -57,6 +59,13 @@ class MotionSplit:
     field: Field
     support: float = 1.0
 
+    @classmethod
+    def none(cls, name: str, form: MotionField, c: Vector) -> MotionSplit:
+        """Before any split: c itself, nothing shared, over no points."""
+        nothing = Field(np.zeros((0, form.states)), np.zeros((0, len(form.motion.inputs))), np.zeros(0), np.zeros(0))
+        shared = Shared(form.motion.names, np.zeros((len(c), 0)))
+        return cls(name, c, shared, None, None, None, 1.0, nothing)
+
 
 def shared_of_motion(form: Moving, q: Vector, x: Matrix, u: Matrix) -> Shared:
     """The directions of q that a learner on the form's features could imitate, at q.
@@ -71,15 +80,13 @@ def shared_of_motion(form: Moving, q: Vector, x: Matrix, u: Matrix) -> Shared:
     nx = x.shape[1]
     points = np.concatenate([x, u], axis=1)
     points = points[np.isfinite(points).all(axis=1)]
-    start, end = moves(lambda rows: np.asarray(form.seen(rows[:, :nx].T, rows[:, nx:].T, np)).T, points)
-    if not len(start):  # the learner sees everything
-        start = end = points[np.linspace(0, len(points) - 1, min(len(points), 400)).astype(int)]
-    slopes = [np.asarray(_slopes(form, q, rows[:, :nx], rows[:, nx:])) for rows in (start, end)]
-    kept = np.isfinite(slopes[0]).all(axis=(1, 2)) & np.isfinite(slopes[1]).all(axis=(1, 2))
-    if kept.sum() < _FEWEST * len(names):
-        start = end = points[:: max(1, len(points) // 400)]
-        slopes = [np.asarray(_slopes(form, q, start[:, :nx], start[:, nx:]))] * 2
-        kept = np.isfinite(slopes[0]).all(axis=(1, 2))
+    pairs = moves(lambda rows: np.asarray(form.seen(rows[:, :nx].T, rows[:, nx:].T, np)).T, points)
+    some = points[:: max(1, len(points) // _POINTS)]
+    for start, end in (pairs, (some, some)):  # where hardly any move is not seen, the learner sees everything
+        slopes = [np.asarray(_slopes(form, q, rows[:, :nx], rows[:, nx:])) for rows in (start, end)]
+        kept = np.isfinite(slopes[0]).all(axis=(1, 2)) & np.isfinite(slopes[1]).all(axis=(1, 2))
+        if kept.sum() >= _FEWEST * len(names):
+            break
     before, after = (part[kept] for part in slopes)  # (M, nx + ny, np)
     learned = np.array(
         [i in states for i in range(len(motion.states))] + [i in outputs for i in range(len(motion.outputs))]

@@ -43,11 +43,6 @@ def _stacked(*points: Matrix) -> Matrix:
     return np.stack(points, axis=1).reshape(len(points[0]), -1)
 
 
-def points_of(hold: str, substeps: int) -> int:
-    """At how many points of a sample the steps read the input."""
-    return {"zero-order": 1, "first-order": 2}.get(hold, 2 * substeps + 1)
-
-
 def input_at(row: Any, nu: int) -> Callable[[Any, int], Any]:
     """u (nu,) as a function of the half substep i of a sample and of how many it has."""
     points = row.reshape(-1, nu) if nu else row.reshape(1, 0)

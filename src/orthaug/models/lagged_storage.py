@@ -10,13 +10,12 @@ import numpy as np
 
 from orthaug._base.errors import InputError
 from orthaug.data.expressions import Expression, Lag
-from orthaug.data.record import Channel
 from orthaug.data.regressors import Features
 from orthaug.models.lagged import Lagged
 from orthaug.models.learner_storage import bound_of, declaration_of
 from orthaug.models.learners import Learner
 from orthaug.models.model import Model
-from orthaug.models.model_arrays import arrays_of, numbers_from, statistics_from
+from orthaug.models.model_arrays import arrays_of, fields_from, said_of
 from orthaug.physics.baseline import Baseline, Parameter, Term
 
 
@@ -25,12 +24,7 @@ def declare(model: Model) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     form = model.form
     baseline = form.baseline
     declared = {
-        "structure": model.structure,
-        "measure": model.measure,
-        "sampling_time": model.sampling_time,
-        "time_column": model.time_column,
-        "outputs": [asdict(channel) for channel in model.outputs],
-        "inputs": [asdict(channel) for channel in model.inputs],
+        **said_of(model),
         "layout": [list(lag) for lag in form.layout],
         "features": [{"text": e.text, "constants": dict(e.constants)} for e in form.features.entries],
         "baseline": {
@@ -66,22 +60,12 @@ def rebuild(
         baseline = replace(baseline, parameters=tuple(Parameter(**p) for p in physics["parameters"]))
     bound = bound_of(declared["learner"], arrays.get("numbers.weights", np.zeros(0)), learner, path)
     features = Features(tuple(Expression(e["text"], tuple(e["constants"].items())) for e in declared["features"]))
-    outputs, inputs_ = (tuple(Channel(**c) for c in declared[kind]) for kind in ("outputs", "inputs"))
-    form = Lagged(
-        baseline, features, tuple(Lag(*lag) for lag in declared["layout"]), tuple(c.name for c in outputs), bound
-    )
+    names = tuple(channel["name"] for channel in declared["outputs"])
+    form = Lagged(baseline, features, tuple(Lag(*lag) for lag in declared["layout"]), names, bound)
     return Model(
         form=form,
-        numbers=numbers_from(arrays),
-        outputs=outputs,
-        inputs=inputs_,
-        sampling_time=float(declared["sampling_time"]),
-        time_column=declared["time_column"],
-        structure=declared["structure"],
-        measure=declared["measure"],
-        largest_output=arrays["largest_output"],
+        **fields_from(declared, arrays),
         deviation=arrays["deviation"] if "deviation" in arrays else 1 / arrays["weight"],
         weight=arrays["output_weight"] if "output_weight" in arrays else np.diag(arrays["weight"]),
         shared=arrays.get("shared"),
-        statistics=statistics_from(arrays),
     )

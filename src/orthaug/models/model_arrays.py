@@ -1,13 +1,30 @@
-"""The numbers that every saved model has: those of the model, of its outputs, and what training left of statistics."""
+"""What every saved model has: its channels, its numbers, those of its outputs, and what training left of statistics."""
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
+from orthaug.data.record import Channel
 from orthaug.models.dynamics import Numbers
 from orthaug.models.statistics import Statistics
+
+_SAID = ("structure", "measure", "sampling_time", "time_column")
+
+
+def said_of(model: Any) -> dict[str, Any]:
+    """What a file says of every model, whatever its physics."""
+    channels = {kind: [asdict(channel) for channel in getattr(model, kind)] for kind in ("outputs", "inputs")}
+    return {name: getattr(model, name) for name in _SAID} | channels
+
+
+def fields_from(declared: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    """The fields that every model has, from its file."""
+    channels = {kind: tuple(Channel(**c) for c in declared[kind]) for kind in ("outputs", "inputs")}
+    numbers = {"numbers": numbers_from(arrays), "statistics": statistics_from(arrays)}
+    return {name: declared[name] for name in _SAID} | channels | numbers | {"largest_output": arrays["largest_output"]}
 
 
 def arrays_of(model: Any) -> dict[str, np.ndarray]:

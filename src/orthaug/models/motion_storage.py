@@ -11,10 +11,9 @@ import numpy as np
 
 from orthaug._base.errors import InputError
 from orthaug.data.expressions import parse_named
-from orthaug.data.record import Channel
 from orthaug.models.learner_storage import bound_of, declaration_of
 from orthaug.models.learners import Learner
-from orthaug.models.model_arrays import arrays_of, numbers_from, statistics_from
+from orthaug.models.model_arrays import arrays_of, fields_from, said_of
 from orthaug.models.motion_model import MotionModel, Trained
 from orthaug.models.moving import Moving
 from orthaug.physics.motion import Motion, Output, State
@@ -28,12 +27,7 @@ def declare(model: MotionModel) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     form, trained = model.form, model.trained
     declared = {
         "kind": "motion",
-        "structure": model.structure,
-        "measure": model.measure,
-        "sampling_time": model.sampling_time,
-        "time_column": model.time_column,
-        "outputs": [asdict(channel) for channel in model.outputs],
-        "inputs": [asdict(channel) for channel in model.inputs],
+        **said_of(model),
         "motion": _declared_motion(form.motion),
         "features": [entry.text for entry in form.features],
         "learner": declaration_of(form.bound),
@@ -57,7 +51,6 @@ def rebuild(
         InputError: a callable is asked for.
     """
     motion = _rebuilt_motion(declared["motion"], baseline, path)
-    outputs, inputs = (tuple(Channel(**c) for c in declared[kind]) for kind in ("outputs", "inputs"))
     form = Moving(
         motion=motion,
         features=tuple(parse_named(text, motion.known, "learner input") for text in declared["features"]),
@@ -72,20 +65,12 @@ def rebuild(
         trained = Trained(*laid, arrays["trained.states"], arrays.get("trained.slope"), arrays["trained.alone"])
     return MotionModel(
         form=form,
-        numbers=numbers_from(arrays),
-        outputs=outputs,
-        inputs=inputs,
-        sampling_time=float(declared["sampling_time"]),
-        time_column=declared["time_column"],
-        structure=declared["structure"],
-        measure=declared["measure"],
-        largest_output=arrays["largest_output"],
+        **fields_from(declared, arrays),
         deviation=arrays["deviation"],
         weight=arrays["output_weight"],
         loose=arrays["loose"],
         window=int(declared["window"]),
         trained=trained,
-        statistics=statistics_from(arrays),
     )
 
 
