@@ -25,6 +25,7 @@ ROOMS = (
     "inference",
     "fitting",
     "analysis",
+    "selection",
     "reports",
     "studies",
     "commands",

@@ -33,17 +33,17 @@ pytestmark = pytest.mark.usefixtures("without_figures")
 
 @dataclass(frozen=True)
 class Powers:
-    """A learner: the powers 2 … degree of each feature, each with a coefficient."""
+    """A learner: the powers 2 … highest of each feature, each with a coefficient."""
 
-    degree: Annotated[int, Ge(2)] = 3
+    highest: Annotated[int, Ge(2)] = 3
     centre: tuple[float, ...] = ()
     inputs: tuple[str, ...] | None = None
 
     def init(self, key: Any, nz: int, ny: int) -> Any:
-        return jnp.zeros((ny, nz, self.degree - 1))
+        return jnp.zeros((ny, nz, self.highest - 1))
 
     def apply(self, tree: Any, z: Any) -> Any:
-        powers = jnp.stack([z**p for p in range(2, self.degree + 1)], axis=-1)
+        powers = jnp.stack([z**p for p in range(2, self.highest + 1)], axis=-1)
         return jnp.einsum("ijp,jp->i", tree, powers)
 
 
@@ -96,7 +96,7 @@ def test_a_learner_from_outside(project, tmp_path):
     spec = with_sections(
         project,
         "powers",
-        '[learner]\nkind = "powers"\ndegree = 2\ncentre = [1, 2.5]\nhidden = [9]\ninputs = ["u[k-1]", "y[k-1]"]\n',
+        '[learner]\nkind = "powers"\nhighest = 2\ncentre = [1, 2.5]\nhidden = [9]\ninputs = ["u[k-1]", "y[k-1]"]\n',
     )
     assert run("fit", spec).code == 2
     with LEARNERS.added("powers", Powers):
@@ -117,18 +117,18 @@ def test_a_learner_from_outside(project, tmp_path):
 def test_the_keys_of_a_learner_from_outside_are_checked(project):
     with LEARNERS.added("powers", Powers):
         for key, words in (
-            ("degree = 1", "'learner.degree': found 1; expected greater than or equal to 2"),
-            ("degree = 2.5", "'learner.degree': found 2.5; expected an integer"),
+            ("highest = 1", "'learner.highest': found 1; expected greater than or equal to 2"),
+            ("highest = 2.5", "'learner.highest': found 2.5; expected an integer"),
             ("centre = 3", "'learner.centre': found 3; expected a list"),
             ("centre = [nan]", "'learner.centre[0]': found nan; expected a finite number"),
-            ("degre = 3", "unknown key 'learner.degre', did you mean 'degree'?"),
+            ("highes = 3", "unknown key 'learner.highes', did you mean 'highest'?"),
         ):
             done = run("fit", with_sections(project, "bad", f'[learner]\nkind = "powers"\n{key}\n'))
             assert done.code == 2 and one_line(done.err, words)
         done = run("fit", with_sections(project, "bad", '[learner]\nkind = "power"\n'))
-        assert one_line(done.err, "'learner.kind': found \"power\"; expected 'mlp', 'none' or 'powers'")
-    done = run("fit", with_sections(project, "bad", "[learner]\ndegree = 3\n"))
-    assert done.code == 2 and one_line(done.err, "unknown key 'learner.degree'")
+        assert one_line(done.err, "'learner.kind': found \"power\"; expected 'mlp', 'terms', 'none' or 'powers'")
+    done = run("fit", with_sections(project, "bad", "[learner]\nhighest = 3\n"))
+    assert done.code == 2 and one_line(done.err, "unknown key 'learner.highest'")
 
 
 def test_a_structure_from_outside(project, tmp_path):

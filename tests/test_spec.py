@@ -296,7 +296,7 @@ VALUES = [  # (changed in FULL), the key, what was found, what is expected
     ("initial = 0.61", "initial = nan", "baseline.terms[0].initial", "nan", "finite"),
     ("fixed = true", 'fixed = "yes"', "baseline.terms[2].fixed", '"yes"', "boolean"),
     ("g = 9.81", 'g = "9.81 m/s2"', "baseline.constants.g", '"9.81 m/s2"', "number"),
-    ('kind = "mlp"', 'kind = "gp"', "learner.kind", '"gp"', "'mlp' or 'none'"),
+    ('kind = "mlp"', 'kind = "gp"', "learner.kind", '"gp"', "'mlp', 'terms' or 'none'"),
     ("hidden = [16, 8]", "hidden = 16", "learner.hidden", "16", "list"),
     ("hidden = [16, 8]", "hidden = [16, 0]", "learner.hidden[1]", "0", "greater than or equal to 1"),
     ("hidden = [16, 8]", "hidden = [16.5]", "learner.hidden[0]", "16.5", "integer"),

@@ -61,6 +61,8 @@ class Smoother:
     def _unit(self) -> tuple[Vector, Vector]:
         """Centre and half of the range of z."""
         z = self.problem.feature_rows()
+        if self.problem.features.linear:
+            return np.zeros(z.shape[1]), np.maximum(np.abs(z).max(axis=0), 1e-300)
         low, high = z.min(axis=0), z.max(axis=0)
         return (low + high) / 2, np.where(high > low, (high - low) / 2, 1.0)
 
@@ -84,7 +86,7 @@ class Smoother:
         waves = np.tanh(z @ slopes.T - np.sum(slopes * centres, axis=1))
         phi = np.asarray(problem.baseline.phi(x, problem.layout, problem.outputs, np))
         shared = (phi @ problem.shared.basis).reshape(len(x), -1)
-        functions = np.column_stack([np.ones(len(x)), z, shared, waves])
+        functions = np.column_stack([z, shared] if problem.features.linear else [np.ones(len(x)), z, shared, waves])
         scale = np.sqrt(np.mean(functions**2, axis=0))
         functions = functions / np.where(scale > 0, scale, 1.0)
         with one_blas_thread():

@@ -18,6 +18,7 @@ from orthaug.commands.folder import not_a_result
 from orthaug.commands.job import ALONE, AS_DECLARED, DEFAULT_BLOCKS, Job, Variant
 from orthaug.commands.kinds import kind_of
 from orthaug.commands.parts import Part
+from orthaug.inference.learned_terms import equation, learned_terms
 from orthaug.reports.fields import WarningResult
 from orthaug.reports.result import FitResult, PartScores, ScoreResult
 
@@ -89,6 +90,10 @@ def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitt
         "validation": None,
         "warnings": warnings,
     }
+    terms = learned_terms(fit.model) if fit.status.ok else ()
+    if terms:
+        written = {writing: equation(fit.model, writing) for writing in ("text", "latex")}
+        content |= {"terms": terms, "equation": written}
     return Fitted(job, fit, FitResult.model_validate(content), responses)
 
 

@@ -128,6 +128,8 @@ def open_lagged(path: Path, spec: Spec, *, require_full_rank: bool = True) -> La
         validation = validation.without_short(first) if validation else None
         options = {"output_weights": spec.training.output_weights, "require_full_rank": require_full_rank}
         problem = pose(train.record, baseline, lags, learner_inputs, **options)
+        if getattr(spec.declared_learner(), "linear", False):
+            problem = problem.seen_linearly()
         problem.feature_rows()
         _check_scored(spec, problem)
         _check_cost(spec, problem)

@@ -64,7 +64,7 @@ def content(
         told |= _physical_content(job, fit, warnings)
         told["bias"] = bias_of(job, fit)
         told |= _analysed(fit, one_step, free_run, warnings)
-    shared = shared_of(job, others=False)
+    shared = shared_of(job, fit.problem, others=False)
     told |= {
         "parameters": parameter_rows(
             fit.problem.baseline.parameters,

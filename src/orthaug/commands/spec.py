@@ -35,6 +35,7 @@ from orthaug.inference.measure_files import MeasurePlace
 from orthaug.inference.measures import Measure
 from orthaug.models.kinds import LEARNERS
 from orthaug.models.learners import Learner
+from orthaug.models.terms import over_lags, over_states
 from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.parameters import PhysicsMap
 
@@ -255,7 +256,13 @@ class Spec(Section):
         """The learner; None for physics alone, as of a motion that nothing is added to."""
         if self.motion is not None and not self.motion.learns and "learner" not in self.model_fields_set:
             return None
-        return resolve(self.learner.declared(LEARNERS, self.learner.kind))
+        learner = resolve(self.learner.declared(LEARNERS, self.learner.kind))
+        if not hasattr(learner, "over"):
+            return learner
+        if self.motion is not None:
+            return over_states(learner, self.motion.declared(self.data.inputs, self.data.outputs))
+        channels = tuple(self.data.outputs), tuple(self.data.inputs)
+        return over_lags(learner, self.declared_baseline(), self.lag_orders(), *channels)
 
     def learner_inputs(self) -> tuple[str, ...] | None:
         """What the learner sees; None for all lags."""
@@ -289,8 +296,8 @@ class Spec(Section):
         """Those that every start is run with."""
         given = self.training.regularization
         declared = (self.declared_solver(), self.declared_criterion(), self.declared_structure())
-        conditions = {"linear": linear, "resident": True, "validated": validated, "motion": self.motion is not None}
-        return tried(given, *declared, **conditions)
+        conditions: dict[str, Any] = {"linear": linear, "resident": True, "validated": validated}
+        return tried(given, *declared, **conditions, motion=self.motion is not None, learner=self.declared_learner())
 
     def runs(self, *, linear: bool) -> int:
         """How many runs a fit makes: restarts times regularizations."""

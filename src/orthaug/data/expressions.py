@@ -74,20 +74,21 @@ class Expression:
         return self.text
 
     @cached_property
-    def _tree(self) -> ast.expr:
+    def tree(self) -> ast.expr:
+        """Its syntax, of whitelisted nodes only where `parse` made it."""
         return ast.parse(self.text, mode="eval").body
 
     @cached_property
     def lags(self) -> tuple[Lag, ...]:
         """The raw lags that the expression reads, in order of first appearance."""
-        nodes = [node for node in ast.walk(self._tree) if isinstance(node, ast.Subscript)]
+        nodes = [node for node in ast.walk(self.tree) if isinstance(node, ast.Subscript)]
         nodes.sort(key=lambda node: node.col_offset)  # `walk` goes level by level
         return tuple(dict.fromkeys(_lag(node, self.text) for node in nodes))
 
     @cached_property
     def unsampled(self) -> bool:
         """Whether it reads `Ts`, and has no value for that yet."""
-        named = any(isinstance(node, ast.Name) and node.id == SAMPLING_TIME for node in _free_names(self._tree))
+        named = any(isinstance(node, ast.Name) and node.id == SAMPLING_TIME for node in _free_names(self.tree))
         return named and SAMPLING_TIME not in dict(self.constants)
 
     def sampled(self, sampling_time: float) -> Expression:
@@ -104,7 +105,7 @@ class Expression:
         """
         if self.unsampled:
             raise InputError(f"'{self.text}': {SAMPLING_TIME} has no value here; give it as a constant.")
-        return _evaluate(self._tree, columns, dict(self.constants), xp, self.text)
+        return _evaluate(self.tree, columns, dict(self.constants), xp, self.text)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -113,7 +114,7 @@ class Expression:
 
     def value(self, values: Mapping[str, Any], xp: Any) -> Any:
         """Value where its names stand for `values`; of an expression without channels."""
-        return _evaluate(self._tree, {}, values, xp, self.text)
+        return _evaluate(self.tree, {}, values, xp, self.text)
 
     def term_without_value(self, values: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
         """The smallest term that is not finite although all in it is, and its names."""
@@ -122,7 +123,7 @@ class Expression:
             with np.errstate(all="ignore"):
                 return bool(np.isfinite(_evaluate(node, {}, values, np, self.text)))
 
-        node = self._tree
+        node = self.tree
         while True:
             inner = [child for child in ast.walk(node) if isinstance(child, ast.expr) and child is not node]
             functions = [child.func for child in ast.walk(node) if isinstance(child, ast.Call)]

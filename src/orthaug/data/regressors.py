@@ -135,9 +135,13 @@ def stack_rows(record: Record, layout: Layout) -> UsableRows:
 
 @dataclass(frozen=True)
 class Features:
-    """What the learner sees: expressions of the regressor, most often single raw lags."""
+    """What the learner sees: expressions of the regressor, most often single raw lags.
+
+    `linear` tells that the learner can be their linear combinations only.
+    """
 
     entries: tuple[Expression, ...]
+    linear: bool = False
 
     @classmethod
     def of(cls, layout: Layout) -> Features:
@@ -151,7 +155,7 @@ class Features:
 
     def sampled(self, sampling_time: float) -> Features:
         """The features with this value [s] of `Ts`, where they read it."""
-        return Features(tuple(entry.sampled(sampling_time) for entry in self.entries))
+        return Features(tuple(entry.sampled(sampling_time) for entry in self.entries), self.linear)
 
     def evaluate(self, x: Any, layout: Layout, xp: Any) -> Any:
         """Features (…, nz) of regressors (…, nx), by `xp` (numpy or jax.numpy)."""

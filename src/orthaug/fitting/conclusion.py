@@ -107,7 +107,7 @@ def _one_step_errors(
     if mixed is not None:
         noise = problem.weight.covariance(mixed)
         taken = eliminate(structure, problem).taken
-        if learned.bound is None or not taken.any() or np.array_equal(taken, np.eye(len(c))):
+        if learned.bound is None or np.array_equal(taken, np.eye(len(c))):
             middle = task.physics_middle(mixed) if ny > 1 else mixed[0, 0] * np.eye(len(c))
             covariance = theta_covariance(problem.projection, middle, fixed)
         elif not fixed:

@@ -19,6 +19,7 @@ from orthaug.fitting.parameter_table import parameter_frame, parameter_lines
 from orthaug.fitting.status import Status
 from orthaug.inference.covariance import interval
 from orthaug.inference.intervals import joint_covariance, robust_covariance, robust_split_covariance
+from orthaug.inference.learned_terms import equation, learned_terms, term_frame, term_lines
 from orthaug.inference.measures import Measure, Points, Support, Training
 from orthaug.inference.physical import PhysicalEstimate, profile, solve
 from orthaug.inference.splitting import MeasureSplit, learner_slope, split_under
@@ -112,6 +113,19 @@ class Estimate:
     def parameters(self) -> pd.DataFrame:
         """Table with a row per parameter: unit, initial, value, std, and the 95 % interval."""
         return parameter_frame(self.problem.baseline.parameters, self.theta, self.std, self.interval)
+
+    @cached_property
+    def terms(self) -> pd.DataFrame:
+        """Table with a row per term of a learner of terms: coefficient, unit, std, 95 % interval; else empty."""
+        return term_frame(learned_terms(self.model))
+
+    def equation(self, writing: str = "text") -> str:
+        """The fitted equations with their numbers, where the learner is a sum of terms; as "text", "latex", "python".
+
+        Raises:
+            InputError: another learner, physics that is a Python function, another writing.
+        """
+        return equation(self.model, writing)
 
     def split(self, measure: Measure) -> Estimate:
         """The same fitted function with θ, θ_aux, components and intervals under a measure, without training (F2).
@@ -292,4 +306,5 @@ def summary_lines(fit: Estimate) -> Sequence[str]:
         lines.append(f"one step    Φ⁺Y would give {moved}")
     if fit.plain_covariance is not None:
         lines.append(f"std         {ROBUST if fit.criterion.flown is None else ROBUST_FLOWN}")
-    return [*lines, "", *parameter_lines(baseline.parameters, fit.theta, fit.std, fit.interval)]
+    lines += ["", *parameter_lines(baseline.parameters, fit.theta, fit.std, fit.interval)]
+    return [*lines, *term_lines(learned_terms(fit.model))]

@@ -13,12 +13,13 @@ from orthaug._base.errors import InputError, shown
 from orthaug._base.jax import jax
 from orthaug._base.progress import SILENT, Tell
 from orthaug.data.record import Record
-from orthaug.data.regressors import Features, Lags
+from orthaug.data.regressors import Lags
 from orthaug.fitting.conclusion import conclude
 from orthaug.fitting.cost import check_cost
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.free_run import FreeRunTask
+from orthaug.fitting.independent_terms import independent_terms
 from orthaug.fitting.learned import Learned
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_estimation import DEFAULT, fit_motion, pose_for
@@ -33,6 +34,7 @@ from orthaug.inference.measures import Training
 from orthaug.models.learners import MLP, Bound, External, Function, Learner, Scaling
 from orthaug.models.model import Model
 from orthaug.models.rows import Engine, InMemory
+from orthaug.models.terms import over_lags, over_states
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.motion import Motion
 from orthaug.physics.problem import Problem, pose
@@ -136,6 +138,7 @@ def estimate(
     if isinstance(baseline, Motion):
         if lags is not None or initial is not None or ensemble:
             raise InputError("a motion has no `lags`, no `initial` and no `ensemble`; leave them out.")
+        learner = over_states(learner, baseline)
         problem = pose_for(record, baseline, learner, output_weights)
         options = {"structure": structure, "criterion": criterion or DEFAULT, "solver": solver, "fallback": fallback}
         options |= {"regularization": regularization, "restarts": restarts, "seed": seed, "validation": validation}
@@ -143,6 +146,8 @@ def estimate(
     _check_record(record, baseline, lags, learner, initial)
     criterion = Prediction() if criterion is None else criterion
     model = initial.model if isinstance(initial, Estimate) else initial
+    channels = (tuple(channel.name for channel in group) for group in (record.outputs, record.inputs))
+    learner = over_lags(learner, baseline, lags, *channels)
     inputs = None if learner is None else learner.inputs
     if model is not None:
         inputs = tuple(str(entry) for entry in model.form.features.entries)
@@ -196,19 +201,19 @@ def fit(
     _check_splittable(structure, problem.baseline, learner)
     blocks = _check_blocks(blocks)
     conditions = {"linear": problem.baseline.linear, "resident": engine.resident, "validated": validation is not None}
-    choices = tried(regularization, solver, criterion, structure, **conditions)
+    choices = tried(regularization, solver, criterion, structure, learner=learner, **conditions)
     auto = _check_regularizations(regularization, choices, validation is not None or blocks > 0)
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
     check_starts(restarts if initial is None else 1, seed, ensemble=ensemble)
     check_solver(solver, criterion, () if learner is None else choices)
     if initial is None:
         _check_cost(problem, learner, solver, restarts * len(choices))
-    problem = replace(problem, features=Features(())) if learner is None and initial is None else problem
-    warm = None
+    warm, told = None, ()
     if initial is not None:
         task, weights, warm = _warm_start(problem, initial, engine)
         starts = [PlannedRun(0, weights, choice) for choice in choices]
     else:
+        problem, learner, told = independent_terms(problem, learner)
         task = OneStepTask.of(problem, learner, engine=engine)
         starts = _starts(task.bound, range(seed, seed + restarts), choices)
     solved = criterion.one_step and problem.baseline.linear
@@ -224,6 +229,7 @@ def fit(
         estimate = train(trained, starts, structure, solver, chosen, progress)
         if _splits(structure) and estimate.status.ok and estimate.model.form.bound is not None:
             estimate = estimate.split(structure.measure)
+    estimate = replace(estimate, warnings=(*told, *estimate.warnings))
     if problem.weight.choice != "covariance" or problem.weight.kind == "covariance" or not solved:
         return estimate
 
@@ -328,6 +334,7 @@ def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStep
     if len(problem.outputs) != bound.ny:
         raise InputError(f"`initial` has {bound.ny} outputs, the record {len(problem.outputs)}; fit anew.")
     scaling = Scaling(np.asarray(numbers.centre), np.asarray(numbers.halfwidth))
+    problem = problem.seen_linearly() if model.form.features.linear else problem
     task = OneStepTask.of(problem, bound.learner, scaling, np.asarray(numbers.gain), engine)
     return task, np.asarray(numbers.weights), model.theta - model.theta_aux
 

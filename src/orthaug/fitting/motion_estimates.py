@@ -20,6 +20,7 @@ from orthaug.fitting.parameter_table import parameter_frame, parameter_lines
 from orthaug.fitting.status import Status
 from orthaug.fitting.wobble import wobble
 from orthaug.inference.covariance import interval
+from orthaug.inference.learned_terms import equation, learned_terms, term_frame, term_lines
 from orthaug.inference.measures import Measure, Training
 from orthaug.inference.motion_split import MotionSplit, split_motion
 from orthaug.models.dynamics import Numbers
@@ -114,6 +115,19 @@ class MotionEstimate:
         motion = self.problem.motion
         table = parameter_frame(motion.parameters, self.values, self.std, self.interval)
         return table.assign(shared=[name not in self.shared.untouched for name in motion.names])
+
+    @cached_property
+    def terms(self) -> pd.DataFrame:
+        """Table with a row per term of a learner of terms: coefficient, unit, std, 95 % interval; else empty."""
+        return term_frame(learned_terms(self.model))
+
+    def equation(self, writing: str = "text") -> str:
+        """The fitted equations, where the learner is a sum of terms; as "text", "latex", "python".
+
+        Raises:
+            InputError: another learner, equations that are Python functions, another writing.
+        """
+        return equation(self.model, writing)
 
     def split(self, measure: Measure, shared: str = "auto") -> MotionEstimate:
         """The same fitted motion with p̂ under another measure over states and inputs, without training.
@@ -277,7 +291,8 @@ def motion_lines(fit: MotionEstimate) -> list[str]:
         told = shared_in_words(fit.shared)
         lines.append(f"shared      {told}")
         lines.append(f"measure     {fit.split_by.name}")
-    return [*lines, "", *parameter_lines(motion.parameters, fit.values, fit.std, fit.interval)]
+    lines += ["", *parameter_lines(motion.parameters, fit.values, fit.std, fit.interval)]
+    return [*lines, *term_lines(learned_terms(fit.model))]
 
 
 def shared_in_words(shared: Shared) -> str:

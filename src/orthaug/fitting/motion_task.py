@@ -23,6 +23,7 @@ from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Structure
 from orthaug.models.learners import Bound, Learner, Scaling
+from orthaug.models.terms import scaling_of
 from orthaug.physics.motion_problem import MotionProblem
 
 _LOOSER = 1e-4  # times the weight of the guesses, where it is asked what the outputs tell
@@ -129,5 +130,6 @@ def _scaled(plan: MotionCourse, physics: Flight) -> tuple[Scaling, Vector]:
     with np.errstate(all="ignore"):
         features = np.asarray(plan.dynamics.seen(x, u, np)).T
     finite = features[np.isfinite(features).all(axis=1)]
-    scaling = Scaling.fit(finite if len(finite) else np.zeros((1, features.shape[1])))
+    assert plan.bound is not None
+    scaling = scaling_of(plan.bound.learner, finite if len(finite) else np.zeros((1, features.shape[1])))
     return scaling, sizes_learned(plan, flown.c, x.T, u.T)

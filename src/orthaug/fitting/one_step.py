@@ -30,6 +30,7 @@ from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.inference.covariance import mixing
 from orthaug.models.learners import Bound, Learner, Scaling
 from orthaug.models.rows import Engine, InMemory, MixedGram, Overlap, from_chunks
+from orthaug.models.terms import scaling_of
 from orthaug.physics.problem import Problem
 
 OUTPUT_UNIT = 10.0
@@ -81,7 +82,7 @@ class OneStepTask:
             for rows, least in ((problem.weight.outputs(e), deviation), (e, 1.0))
         )
         rms = float(np.sqrt(np.mean(whitened**2)))
-        scaling = Scaling.fit(z) if scaling is None else scaling
+        scaling = scaling_of(learner, z) if scaling is None else scaling
         unit = np.asarray(OUTPUT_UNIT * spread if unit is None else unit)
         unit = unit if bound is not None else np.zeros_like(unit)
         gain = np.broadcast_to(problem.weight.matrix * unit / rms, (*e.shape, e.shape[1]))
@@ -396,5 +397,4 @@ class OneStepTask:
 
     def physics_middle(self, noise: Matrix) -> Matrix:
         """ΣqᵀΣ_eq (nθ, nθ) of the rows q of Q, for the noise covariance of whitened outputs."""
-        mix = mixing(noise)
-        return np.asarray(self.engine.sum(MixedGram(None), self.rows, np.zeros(0), mix))
+        return np.asarray(self.engine.sum(MixedGram(None), self.rows, np.zeros(0), mixing(noise)))

@@ -81,6 +81,7 @@ def tried(
     resident: bool,
     validated: bool,
     motion: bool = False,
+    learner: Learner | None = None,
 ) -> tuple[Any, ...]:
     """The regularizations of every start: those given, or what "auto" stands for (docs/design.md has the table).
 
@@ -89,9 +90,12 @@ def tried(
         resident: whether the rows are in memory.
         validated: whether a validation part chooses.
         motion: whether the physics are equations of motion.
+        learner: one that is linear in its weights needs none.
     """
     if not isinstance(given, str) or given != "auto":
         return tuple(given) if isinstance(given, list | tuple) else (given,)
+    if getattr(learner, "linear", False):
+        return ("none",)
     if motion:
         return ("evidence",)
     if not solver.gauss_newton or structure.from_initial:

@@ -22,7 +22,7 @@ from orthaug._base.jax import Array, jax, jnp
 from orthaug.models.dynamics import Numbers
 from orthaug.models.motion_field import MotionField
 from orthaug.models.moving import Moving
-from orthaug.physics.shared import Shared, agreeing, moves
+from orthaug.physics.shared import Shared, agreeing, moves, spanned
 
 _BATCH = 4096  # points at a time
 _ITERATIONS = 30
@@ -77,6 +77,8 @@ def shared_of_motion(form: Moving, q: Vector, x: Matrix, u: Matrix) -> Shared:
     states, outputs = motion.learned
     if not states and not outputs:
         return Shared(names, np.zeros((len(names), 0)))
+    if form.bound is not None and getattr(form.bound.learner, "linear", False):
+        return _spanned(form, q, x, u)
     nx = x.shape[1]
     points = np.concatenate([x, u], axis=1)
     points = points[np.isfinite(points).all(axis=1)]
@@ -96,6 +98,17 @@ def shared_of_motion(form: Moving, q: Vector, x: Matrix, u: Matrix) -> Shared:
     size = np.where(size > 0, size, 1.0)
     before, after = (np.concatenate(list(np.moveaxis(part / size, 1, 0))) for part in (before, after))
     return Shared(names, agreeing(before, after))
+
+
+def _spanned(form: Moving, q: Vector, x: Matrix, u: Matrix) -> Shared:
+    """The directions that move what has a learner by linear combinations of its features, and nothing else."""
+    some = slice(None, None, max(1, len(x) // _POINTS))
+    slopes = np.moveaxis(np.asarray(_slopes(form, q, x[some], u[some])), 1, 0)
+    states, outputs = form.motion.learned
+    learned = [i in states for i in range(len(form.motion.states))]
+    learned += [i in outputs for i in range(len(form.motion.outputs))]
+    features = np.asarray(form.seen(x[some].T, u[some].T, np)).T
+    return spanned(form.motion.names, slopes, features, np.array(learned))
 
 
 def nearest(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from orthaug._base.registry import Registry
 from orthaug.models.learners import MLP, PhysicsAlone
+from orthaug.models.terms import Terms
 
-LEARNERS = Registry("learner", {"mlp": MLP, "none": PhysicsAlone}, reserved=("kind", "nz", "ny"))
+LEARNERS = Registry("learner", {"mlp": MLP, "terms": Terms, "none": PhysicsAlone}, reserved=("kind", "nz", "ny"))
 """`nz` and `ny` stand beside a saved learner's own fields."""

@@ -59,7 +59,8 @@ def rebuild(
     else:
         baseline = replace(baseline, parameters=tuple(Parameter(**p) for p in physics["parameters"]))
     bound = bound_of(declared["learner"], arrays.get("numbers.weights", np.zeros(0)), learner, path)
-    features = Features(tuple(Expression(e["text"], tuple(e["constants"].items())) for e in declared["features"]))
+    entries = tuple(Expression(e["text"], tuple(e["constants"].items())) for e in declared["features"])
+    features = Features(entries, bound is not None and getattr(bound.learner, "linear", False))
     names = tuple(channel["name"] for channel in declared["outputs"])
     form = Lagged(baseline, features, tuple(Lag(*lag) for lag in declared["layout"]), names, bound)
     return Model(

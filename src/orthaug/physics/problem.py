@@ -95,6 +95,10 @@ class Problem:
         """Degrees of freedom that the physics uses up in each output (ny,): the output's share `Σ_k ‖Q_ki‖²` of nθ."""
         return np.sum(self.projection.q**2, axis=(0, 2))
 
+    def seen_linearly(self) -> Problem:
+        """The same for a learner that is a linear combination of its features."""
+        return self if self.features.linear else replace(self, features=replace(self.features, linear=True))
+
     def physics_alone(self) -> Problem:
         """The problem without a learner. It is posed anew where the learner's lags took rows from the physics."""
         if self.baseline.function is not None:

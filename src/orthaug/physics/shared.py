@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -26,6 +27,7 @@ _MOVES = 400
 _FEWEST = 4  # moves that succeed, for each parameter
 _TOLERANCE = 1e-6  # change of φa over a move, against the size of φa
 _NEWTON = 30
+_ROUNDING = 1e-12  # of the largest singular value of features of unit size
 _SEED = 20_240_808
 
 
@@ -68,6 +70,11 @@ def shared_directions(
         x: measured regressors, where the moves begin.
     """
     names, everything = baseline.names, Shared(baseline.names, np.eye(len(baseline.names)))
+    if features.linear and names:
+        with np.errstate(all="ignore"):
+            phi = np.asarray(baseline.phi(x, layout, tuple(outputs), np))
+            z = np.asarray(features.evaluate(x, layout, np))
+        return spanned(names, np.moveaxis(phi, 1, 0), z)
     read = set(baseline.lags) if baseline.function is None else set(layout)
     if not names or not features.entries or _sees(features, read):
         return everything
@@ -79,6 +86,26 @@ def shared_directions(
         return everything
     before, after = (part[kept].reshape(-1, len(names)) for part in phi)
     return Shared(names, agreeing(before, after))
+
+
+def spanned(
+    names: tuple[str, ...],
+    slopes: Float[np.ndarray, "k N nt"],
+    features: Float[np.ndarray, "N nz"],
+    learned: Any = True,
+) -> Shared:
+    """The directions along which all slopes are linear combinations of features, on the same points.
+
+    Args:
+        learned: which slopes have a learner; the others must not move at all.
+    """
+    kept = np.isfinite(slopes).all(axis=(0, 2)) & np.isfinite(features).all(axis=1)
+    slopes, q = slopes[:, kept], _basis(features[kept])
+    left = slopes - np.where(np.reshape(learned, (-1, 1, 1)), q @ (q.T @ slopes), 0.0)
+    size = np.sqrt(np.mean(slopes**2, axis=(1, 2), keepdims=True))
+    slopes, left = (part / np.where(size > 0, size, 1.0) for part in (slopes, left))
+    flat, changed = (part.reshape(-1, len(names)) for part in (slopes, slopes + left))
+    return Shared(names, agreeing(flat, changed))
 
 
 def seen(
@@ -93,6 +120,8 @@ def seen(
         x: measured regressors, where the moves begin.
         values: of rows of the regressor, a column for each function in question.
     """
+    if features.linear:
+        return _combined(values(x), _values(features, layout)(x))
     if _sees(features, layout):
         return np.ones(values(x[:1]).shape[1], dtype=bool)
     start, end = moves(_values(features, layout), x)
@@ -103,6 +132,21 @@ def seen(
         size = np.sqrt(np.mean(pairs**2, axis=(0, 1)))
     still = np.abs(pairs[1] - pairs[0]).max(axis=0, initial=0.0) <= _TOLERANCE * size
     return still & (np.sum(there, axis=0) >= _FEWEST)
+
+
+def _combined(values: Float[np.ndarray, "N k"], features: Float[np.ndarray, "N nz"]) -> Bool[np.ndarray, "k"]:
+    """Which columns are linear combinations of features on the same points."""
+    kept = np.isfinite(values).all(axis=1) & np.isfinite(features).all(axis=1)
+    values, q = values[kept], _basis(features[kept])
+    left = np.linalg.norm(values - q @ (q.T @ values), axis=0)
+    return left <= _TOLERANCE * np.linalg.norm(values, axis=0)
+
+
+def _basis(features: Float[np.ndarray, "N nz"]) -> Float[np.ndarray, "N r"]:
+    """An orthonormal basis of what features span."""
+    size = np.sqrt(np.mean(features**2, axis=0))
+    q, sigma, _ = np.linalg.svd(features / np.where(size > 0, size, 1.0), full_matrices=False)
+    return q[:, sigma > _ROUNDING * sigma.max(initial=0.0)]
 
 
 def _sees(features: Features, lags: Iterable[Lag]) -> bool:

@@ -197,10 +197,29 @@ class PartScores(Content):
         return {"prediction": self.prediction, "simulation": self.simulation}
 
 
+class TermResult(Content):
+    """A term of a learner of terms."""
+
+    term: str
+    added_to: str
+    coefficient: Number
+    unit: str | None
+    largest: Number
+    std: Number
+    ci95: Numbers | None
+
+
+class EquationResult(Content):
+    """The fitted equations, one a line."""
+
+    text: str
+    latex: str
+
+
 class FitResult(_Headed):
     """What `orthaug fit` leaves."""
 
-    absent: ClassVar = frozenset({"motion"})
+    absent: ClassVar = frozenset({"motion", "terms", "equation"})
 
     spec: dict[str, Any]
     data: DataResult
@@ -225,6 +244,8 @@ class FitResult(_Headed):
     stability: StabilityResult | None
     validation: ValidationResult | None
     motion: MotionFitResult | None = None
+    terms: list[TermResult] | None = None
+    equation: EquationResult | None = None
     warnings: list[WarningResult]
 
 

@@ -270,7 +270,8 @@ def effective_weights(hessian: Matrix, ridge: float, physics: int) -> float:
         return 0.0
     values = np.linalg.eigvalsh(weights_hessian(hessian, physics))
     floor = len(hessian) * np.finfo(float).eps * np.max(np.diag(hessian)[physics:])
-    return float(np.sum(np.where(values > floor, values / (np.abs(values) + ridge), 0.0)))
+    seen = values[values > floor]
+    return float(np.sum(seen / (seen + ridge)))
 
 
 def _evidence(

@@ -1,0 +1,64 @@
+"""Terms of a learner that say nothing of their own on the data: they are left out, with a sentence."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from orthaug._base.errors import InputError
+from orthaug._base.warning import Warning
+from orthaug.data.regressors import Features
+from orthaug.models.learners import Learner
+from orthaug.models.terms import Terms
+from orthaug.physics.problem import Problem
+
+_LEFT = 3e-5  # of a term's norm: what the physics and the terms before it leave of a dependent one
+_NAMED = 6
+
+
+def independent_terms(problem: Problem, learner: Learner | None) -> tuple[Problem, Learner | None, tuple[Warning, ...]]:
+    """Problem and learner without the terms that the physics or the terms before them express on these rows.
+
+    Another learner is left as it is; without one the problem has no features.
+
+    Raises:
+        InputError: more terms than rows could tell apart.
+    """
+    if learner is None:
+        return replace(problem, features=Features(())), None, ()
+    if not isinstance(learner, Terms):
+        return problem, learner, ()
+    problem = problem.seen_linearly()
+    texts, rows, nt = [str(entry) for entry in problem.features.entries], problem.rows, len(problem.baseline.names)
+    if len(texts) + nt > rows.y.size:
+        raise InputError(
+            f"the learner has {len(texts)} terms beside {nt} parameters, but there are {rows.y.size} usable samples; "
+            "give fewer terms, or let `orthaug select` choose among them."
+        )
+    z = problem.feature_rows()
+    phi = problem.projection.phi[:, 0] if len(problem.outputs) == 1 else np.ones((len(z), 0))
+    columns = np.column_stack([phi, z])
+    size = np.linalg.norm(columns, axis=0)
+    kept, gone = _told_apart(columns / np.where(size > 0, size, 1.0), phi.shape[1])
+    if not gone:
+        return problem, learner, ()
+    told = (_warning([texts[i] for i in gone]),)
+    left = replace(problem, features=Features(tuple(problem.features.entries[i] for i in kept), linear=True))
+    return left, learner.among([texts[i] for i in kept]) if kept else None, told
+
+
+def _told_apart(columns: np.ndarray, first: int) -> tuple[list[int], list[int]]:
+    """Which columns from the `first` on are independent of all before them, and which are not."""
+    r = np.abs(np.diag(np.linalg.qr(columns, mode="r")))
+    left = r[first:] > _LEFT
+    return [int(i) for i in np.flatnonzero(left)], [int(i) for i in np.flatnonzero(~left)]
+
+
+def _warning(gone: list[str]) -> Warning:
+    named = ", ".join(gone[:_NAMED]) + (f" and {len(gone) - _NAMED} more" if len(gone) > _NAMED else "")
+    text = (
+        f"left out of the learner: {named}. On these data the physics, or the terms before, express "
+        f"{'them' if len(gone) > 1 else 'it'} already."
+    )
+    return Warning("terms_left_out", text)

@@ -1,0 +1,140 @@
+"""A learner that can be read: a sum of terms, each with a coefficient."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
+
+import numpy as np
+from annotated_types import Ge
+from jaxtyping import Float
+
+from orthaug._base.checks import Matrix
+from orthaug._base.errors import InputError, shown
+from orthaug._base.jax import Array, jnp
+from orthaug._base.registry import check_fields
+from orthaug.data.regressors import Lags
+from orthaug.data.terms import TermLibrary
+from orthaug.models.learners import Scaling, Tree
+from orthaug.physics.baseline import Baseline
+from orthaug.physics.motion import Motion
+from orthaug.physics.problem import regressor_of
+
+_NAMED = 8  # terms
+Names = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Terms:
+    """`f = Σ w_j t_j`: linear in its weights, so that its training, its intervals and the split are exact.
+
+    Terms given by hand are what it sees. A `degree` adds all products of so many of its inputs, and `functions` of
+    them, when the lags or the states are known (`over`).
+
+    Args:
+        terms: expressions such as `v[k-1]**3`, of a motion of states and inputs.
+        degree: of the products, the constant included; 0 for none.
+        functions: abs, sign, sqrt (of the size), tanh, sin, cos, exp; one in a product, times up to `degree − 1`
+            signals.
+        exclude: terms of the library to leave out.
+        inputs: the signals that the library is made of; None for all lags, or all states and inputs of a motion.
+
+    Examples:
+        >>> Terms(degree=2, exclude=["1"]).over(["x", "v"]).terms
+        ('x', 'v', 'x**2', 'x*v', 'v**2')
+    """
+
+    terms: tuple[str, ...] = ()
+    degree: Annotated[int, Ge(0)] = 0
+    functions: tuple[str, ...] = ()
+    exclude: tuple[str, ...] = ()
+    inputs: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("terms", "functions", "exclude", "inputs"):
+            given = getattr(self, name)
+            if given is None and name == "inputs":
+                continue
+            if isinstance(given, str) or not isinstance(given, Sequence) or any(not isinstance(t, str) for t in given):
+                raise InputError(f"`{name}` must be a tuple of texts, such as ('v[k-1]**3',); got {shown(given)}.")
+            object.__setattr__(self, name, tuple(given))
+        check_fields(self)
+        if self.functions and not self.degree:
+            raise InputError("`functions` are factors of products, so they need a `degree` of 1 or more.")
+        if not self.degree:
+            if not self.terms:
+                raise InputError("a learner of terms needs `terms`, or a `degree` of 1 or more.")
+            library = TermLibrary.of((), 0, (), self.terms, self.exclude)
+            object.__setattr__(self, "terms", library.texts)
+            object.__setattr__(self, "exclude", ())
+            object.__setattr__(self, "inputs", self.terms)
+        TermLibrary.of((), 0, self.functions)  # refuses unknown functions before there are signals
+
+    def __str__(self) -> str:
+        named = ", ".join(self.terms[:_NAMED]) + (f" and {len(self.terms) - _NAMED} more" * (len(self.terms) > _NAMED))
+        return f"terms {named}" if not self.degree else f"all terms to the degree {self.degree}"
+
+    linear = True
+    """Combinations of its features are all that it can be."""
+
+    def over(self, signals: Sequence[str]) -> Terms:
+        """The same with its library written out over signals: `terms` are then all that it sees.
+
+        Raises:
+            InputError: too many terms, or an excluded one that is none.
+        """
+        return self if not self.degree else replace(self, **_written(self.library(signals)))
+
+    def library(self, signals: Sequence[str]) -> TermLibrary:
+        """The terms as products of few factors."""
+        own = signals if self.inputs is None or not self.degree else self.inputs
+        return TermLibrary.of(own, self.degree, self.functions, self.terms, self.exclude)
+
+    def among(self, kept: Sequence[str]) -> Terms:
+        """The same with some of its terms."""
+        return Terms(tuple(kept))
+
+    def scaling(self, features: Matrix) -> Scaling:
+        """Each term by its largest size, without an offset: coefficients stay those of the terms."""
+        size = np.abs(features).max(axis=0, initial=0.0)
+        return Scaling(np.zeros(len(size)), np.where(size > 0, size, 1.0))
+
+    def weights(self, nz: int, ny: int) -> int:
+        """How many weights it has for `nz` features and `ny` outputs."""
+        return nz * ny
+
+    def silent(self, tree: Tree) -> Tree:
+        """All coefficients zero."""
+        return np.zeros_like(tree)
+
+    def groups(self, tree: Tree) -> Tree:
+        """Each term by itself."""
+        return np.broadcast_to(np.arange(np.shape(tree)[1]), np.shape(tree))
+
+    def init(self, key: Array, nz: int, ny: int) -> Tree:
+        return np.zeros((ny, nz))
+
+    def apply(self, tree: Tree, z: Float[Array, "nz"]) -> Float[Array, "ny"]:
+        return jnp.asarray(tree) @ z
+
+
+def _written(library: TermLibrary) -> dict[str, Any]:
+    return {"terms": library.texts, "degree": 0, "functions": (), "exclude": (), "inputs": library.texts}
+
+
+def over_lags(learner: Any, baseline: Baseline, lags: Lags | None, outputs: Names, inputs: Names) -> Any:
+    """A learner whose library waits for the lags, written out; any other as it is."""
+    if not hasattr(learner, "over"):
+        return learner
+    return learner.over([str(lag) for lag in regressor_of(baseline, lags, None, outputs, inputs)[0]])
+
+
+def over_states(learner: Any, motion: Motion) -> Any:
+    """The same for a motion, with its states and inputs."""
+    return learner.over([*motion.names_of_states, *motion.inputs]) if hasattr(learner, "over") else learner
+
+
+def scaling_of(learner: Any, features: Matrix) -> Scaling:
+    """How a learner's features (N, nz) are scaled: its own way, or into [-1, 1]."""
+    return learner.scaling(features) if hasattr(learner, "scaling") else Scaling.fit(features)

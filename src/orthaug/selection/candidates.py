@@ -1,0 +1,147 @@
+"""Which terms of a library can be chosen at all on these data, and of very many those that are worth a closer look."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._base.checks import Vector
+from orthaug._base.errors import InputError
+from orthaug._base.warning import Warning
+from orthaug.data.terms import TermLibrary, products_of
+from orthaug.fitting.criteria import Prediction
+from orthaug.physics.problem import Problem
+from orthaug.selection.forward import DEPENDENT, Equations, forward
+from orthaug.selection.term_runs import TermRuns
+
+SHORTLIST = 400
+"""As many terms are linearised at once; of more the most promising are looked at."""
+_BLOCK = 2000  # terms that are evaluated at once
+_CHUNK = 4096  # rows
+_ROUNDS = 5  # of looking through all terms
+_PICKED = 8  # terms between two rounds
+_NAMED = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Terms that can be chosen, and what is told of the others."""
+
+    library: TermLibrary
+    notes: tuple[Warning, ...]
+
+
+def candidates(problem: Problem, library: TermLibrary) -> Candidates:
+    """The terms that the physics does not express already, of more than `SHORTLIST` the most promising.
+
+    A term is promising by what it lowers the error one step ahead, beside the physics and beside those that are picked
+    between rounds of looking through all (iterated screening). Nothing of the size rows × terms is kept.
+
+    Raises:
+        InputError: no term is left.
+    """
+    runs = TermRuns.of(problem, library, Prediction())
+    known = _Known.of(runs)
+    norms, left, _ = known.weigh(runs)
+    finite = np.isfinite(norms)
+    own = finite & (left > DEPENDENT * norms) & (norms > 0)
+    notes = _notes(library, finite, own)
+    if not own.any():
+        raise InputError("the physics expresses all candidate terms already; give other functions, or a higher degree.")
+    kept = np.flatnonzero(own)
+    if len(kept) > SHORTLIST:
+        kept = _promising(runs, known, kept)
+        text = f"of {own.sum()} terms the {len(kept)} that promise most one step ahead were looked at on the free run."
+        notes.append(Warning("terms_shortlisted", text))
+    return Candidates(library.picked(kept), tuple(notes))
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """What is in the model: an orthonormal basis Q of its columns over the rows, and the error that it leaves."""
+
+    q: Float[np.ndarray, "N k"]
+    left: Vector
+
+    @classmethod
+    def of(cls, runs: TermRuns) -> _Known:
+        """Of the physics alone."""
+        problem, phi, target = runs.problem, [], []
+        for experiment in problem.record.experiments:
+            x = runs.menu.regressors(experiment, problem.record)
+            phi.append(np.asarray(problem.baseline.phi(x, runs.menu.layout, runs.menu.outputs, np))[:, 0])
+            known = np.asarray(problem.baseline.known(x, runs.menu.layout, runs.menu.outputs, np))
+            target.append((experiment.outputs[runs.menu.first_row :] - known)[:, 0])
+        return cls(np.zeros((sum(map(len, target)), 0)), np.concatenate(target)).beside(np.concatenate(phi))
+
+    def beside(self, columns: Float[np.ndarray, "N m"]) -> _Known:
+        """With further columns."""
+        size = np.linalg.norm(columns, axis=0)
+        columns = columns / np.where(size > 0, size, 1.0)
+        for _ in range(2):  # twice is enough
+            columns = columns - self.q @ (self.q.T @ columns)
+        u, sigma, _ = np.linalg.svd(columns, full_matrices=False)
+        u = u[:, sigma > 1e-10]
+        return _Known(np.column_stack([self.q, u]), self.left - u @ (u.T @ self.left))
+
+    def weigh(self, runs: TermRuns, chosen: Sequence[int] | None = None) -> tuple[Vector, Vector, Vector]:
+        """Of each term its squared norm, what of that the model leaves, and its product with the error."""
+        every = np.arange(len(runs.library)) if chosen is None else np.asarray(chosen)
+        norms, left, right = (np.zeros(len(every)) for _ in range(3))
+        for a in range(0, len(every), _BLOCK):
+            block = slice(a, a + _BLOCK)
+            across = np.zeros((self.q.shape[1], len(every[block])))
+            with np.errstate(all="ignore"):
+                for rows, terms in _chunks(runs, every[block]):
+                    norms[block] += np.einsum("kn,kn->k", terms, terms)
+                    across += (terms @ self.q[rows]).T
+                    right[block] += terms @ self.left[rows]
+                left[block] = norms[block] - np.einsum("ik,ik->k", across, across)
+        return norms, left, right
+
+
+def _chunks(runs: TermRuns, chosen: Sequence[int] | np.ndarray) -> Iterator[tuple[slice, Float[np.ndarray, "K m"]]]:
+    """Some terms over all rows, a chunk at a time."""
+    numbers, begin = runs.library.numbers[np.asarray(chosen, dtype=int)], 0
+    for experiment in runs.problem.record.experiments:
+        factors = runs.factors(experiment)
+        for a in range(0, factors.shape[1], _CHUNK):
+            terms = products_of(factors[:, a : a + _CHUNK], numbers, np)
+            yield slice(begin + a, begin + a + terms.shape[1]), terms
+        begin += factors.shape[1]
+
+
+def _promising(runs: TermRuns, known: _Known, among: np.ndarray) -> np.ndarray:
+    """The terms that promise most, in rounds: a look through all, and picks among the best of it."""
+    found: dict[int, None] = {}
+    for _ in range(_ROUNDS):
+        norms, left, right = known.weigh(runs, among)
+        able = left > DEPENDENT * norms
+        gains = np.where(able, right**2 / np.where(able, left, 1.0), 0.0)
+        best = among[np.argsort(-gains)[: SHORTLIST // _ROUNDS + len(found)]]
+        new = [int(i) for i in best if int(i) not in found][: SHORTLIST // _ROUNDS]
+        found |= dict.fromkeys(new)
+        columns = np.concatenate([terms for _, terms in _chunks(runs, new)], axis=1).T
+        rest = columns - known.q @ (known.q.T @ columns)
+        square = float(known.left @ known.left)
+        picks = forward(Equations(rest.T @ rest, rest.T @ known.left, square, len(rest)), (), _PICKED)
+        known = known.beside(columns[:, [pick.column for pick in picks]])
+    return np.array(sorted(found))
+
+
+def _notes(library: TermLibrary, finite: np.ndarray, own: np.ndarray) -> list[Warning]:
+    texts, notes = library.texts, []
+    infinite = [texts[i] for i in np.flatnonzero(~finite)]
+    if infinite:
+        notes.append(Warning("terms_not_finite", f"left out, for they are not finite on these data: {_named(infinite)}."))
+    known = [texts[i] for i in np.flatnonzero(finite & ~own)]
+    if known:
+        notes.append(Warning("terms_are_physics", f"left out, for the physics expresses them already: {_named(known)}."))
+    return notes
+
+
+def _named(texts: list[str]) -> str:
+    return ", ".join(texts[:_NAMED]) + (f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else "")

@@ -1,0 +1,108 @@
+"""Forward orthogonal least squares on normal equations: which column lowers the error most, beside those that are in.
+
+Chen, Billings and Luo (1989), on Gram matrices: each pick is projected out of all others, so what a column would lower
+the squared error by is its right-hand side squared over what is left of its norm (the error-reduction ratio).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from orthaug._base.checks import Matrix, Vector
+
+DEPENDENT = 1e-9
+"""Share of a column's squared norm: where less of it is left beside the others, it is a combination of them."""
+
+
+class Equations(NamedTuple):
+    """Normal equations `H p = b` of `‖y − S p‖²` over some rows: `H = SᵀS`, `b = Sᵀy`, `square = ‖y‖²`."""
+
+    hessian: Matrix
+    right: Vector
+    square: float
+    rows: int
+
+    @classmethod
+    def sum_of(cls, parts: Iterable[Equations]) -> Equations:
+        """Over the rows of all."""
+        hessian, right, square, rows = (sum(part) for part in zip(*parts, strict=True))
+        return cls(np.asarray(hessian), np.asarray(right), float(square), int(rows))
+
+    def of(self, columns: Sequence[int]) -> Equations:
+        """Of some of the columns, in that order."""
+        picked = np.asarray(columns, dtype=int)
+        return self._replace(hessian=self.hessian[np.ix_(picked, picked)], right=self.right[picked])
+
+    def scaled(self) -> Equations:
+        """With columns of unit norm."""
+        size = np.sqrt(np.maximum(np.diag(self.hessian), 0.0))
+        unit = 1 / np.where(size > 0, size, 1.0)
+        return self._replace(hessian=self.hessian * np.outer(unit, unit), right=self.right * unit)
+
+    def solve(self) -> Vector:
+        """p, the shortest where columns depend on each other."""
+        size = np.sqrt(np.maximum(np.diag(self.hessian), 0.0))
+        unit = 1 / np.where(size > 0, size, 1.0)
+        return unit * np.linalg.lstsq(self.hessian * np.outer(unit, unit), unit * self.right, rcond=1e-14)[0]
+
+    def miss(self, p: Vector) -> float:
+        """`‖y − S p‖²`."""
+        return float(self.square - 2 * p @ self.right + p @ self.hessian @ p)
+
+
+class Pick(NamedTuple):
+    """A column that was picked, and the share of the squared error left that it takes away."""
+
+    column: int
+    share: float
+
+
+def forward(equations: Equations, known: Collection[int], most: int, *, least: float = 0.0) -> list[Pick]:
+    """Pick up to `most` columns, one after another, beside those that are `known`.
+
+    Args:
+        least: share of the squared error left that a column must take away.
+    """
+    gram, right, square, _ = equations.scaled()
+    gram, right, square = gram.copy(), right.copy(), float(square)
+    size = np.diag(gram).copy()
+    out = np.zeros(len(gram), dtype=bool)
+
+    def project_out(column: int) -> float:
+        nonlocal gram, right, square
+        out[column] = True
+        left = gram[column, column]
+        if left <= DEPENDENT * size[column] or left <= 0:
+            return 0.0
+        slope, gain = gram[:, column] / left, right[column] ** 2 / left
+        right = right - slope * right[column]
+        gram = gram - np.outer(slope, gram[column])
+        square -= gain
+        return float(gain)
+
+    for column in known:
+        project_out(column)
+    picks: list[Pick] = []
+    while len(picks) < most:
+        left = np.diag(gram)
+        able = (left > DEPENDENT * size) & (left > 0) & ~out
+        gains = np.where(able, right**2 / np.where(able, left, 1.0), 0.0)
+        best, before = int(np.argmax(gains)), max(square, 1e-300)
+        if not able.any() or gains[best] <= least * before or gains[best] <= 0:
+            break
+        picks.append(Pick(best, float(min(project_out(best) / before, 1.0))))
+    return picks
+
+
+def left_of(equations: Equations, known: Collection[int]) -> Vector:
+    """Share of each column's squared norm that the `known` ones leave."""
+    gram = equations.scaled().hessian
+    columns = np.asarray(sorted(known), dtype=int)
+    if not len(columns):
+        return np.diag(gram).copy()
+    inner = np.linalg.pinv(gram[np.ix_(columns, columns)], rcond=1e-13, hermitian=True)
+    across = gram[columns]
+    return np.clip(np.diag(gram) - np.einsum("ij,ij->j", across, inner @ across), 0.0, None)

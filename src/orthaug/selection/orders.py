@@ -1,0 +1,168 @@
+"""Orders and delays: na, nb and nk of linear lags beside the physics, judged by free runs on held-out blocks.
+
+From the orders up to the largest, lags are taken away as long as what is left is as good; also a past output together
+with an input, for pole and zero go in pairs where both are superfluous.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from orthaug._base.parallel import one_blas_thread
+from orthaug.data.record import Record
+from orthaug.data.terms import TermLibrary
+from orthaug.fitting.criteria import Criterion
+from orthaug.physics.problem import Problem
+from orthaug.selection.term_path import Blocks, Judged, Rung, TermPath, Told
+from orthaug.selection.term_runs import TermRuns
+
+_SURE = 1.96  # standard errors of a cross-correlation of white signals
+_WHITENING = 20  # lags of the filter that whitens an input
+
+
+@dataclass(frozen=True)
+class Orders:
+    """na of the output, and nb and nk of every input, as in `Lags`."""
+
+    na: int
+    nb: tuple[int, ...]
+    nk: tuple[int, ...]
+
+    def __str__(self) -> str:
+        several = len(self.nb) != 1
+        nb, nk = (str(list(n)) if several else str(n[0]) for n in (self.nb, self.nk))
+        return f"na {self.na}, nb {nb}, nk {nk}"
+
+    @property
+    def size(self) -> int:
+        """Number of lags."""
+        return self.na + sum(self.nb)
+
+    def smaller(self, least: Orders) -> Iterator[Orders]:
+        """One lag less: the oldest output, the oldest or the newest of an input; or an output and an input at once."""
+        shorter = [replace(self, na=self.na - 1)] if self.na > least.na else []
+        yield from shorter
+        for base in (self, *shorter):
+            for i, nb in enumerate(self.nb):
+                if nb > 0 and self.size - nb + least.nb[i] < self.size:
+                    fewer = tuple(n - (j == i) for j, n in enumerate(self.nb))
+                    if nb > 1 or least.nb[i] == 0:
+                        yield replace(base, nb=fewer)
+                    if nb > 1 and (not least.nb[i] or self.nk[i] < least.nk[i]):
+                        yield replace(base, nb=fewer, nk=tuple(n + (j == i) for j, n in enumerate(self.nk)))
+
+
+@dataclass(frozen=True, eq=False)
+class Delay:
+    """The delay of an input: by its cross-correlation with the output, both filtered until the input is white.
+
+    `correlation` is None where no lag is significant; `fitted` is the first lag that the choice of orders kept.
+    """
+
+    input: str
+    correlation: int | None
+    fitted: int
+
+
+@dataclass(frozen=True, eq=False)
+class OrderSearch:
+    """All orders that were judged, with the choice."""
+
+    orders: tuple[Orders, ...]
+    path: TermPath
+
+    def judged(self) -> tuple[Judged, ...]:
+        """Every one beside the best."""
+        return self.path.judged()
+
+    @property
+    def chosen(self) -> Orders:
+        """The smallest within one standard error of the best."""
+        return next(orders for orders, one in zip(self.orders, self.judged(), strict=True) if one.chosen)
+
+
+def search_orders(
+    problem: Problem, criterion: Criterion, largest: Orders, least: Orders, blocks: int, told: Told = lambda rung: None
+) -> OrderSearch:
+    """Judge orders from `largest` down, never below `least`, what the physics reads already.
+
+    Raises:
+        InputError: too few rows for so many blocks.
+    """
+    output, inputs = problem.outputs[0], [channel.name for channel in problem.record.inputs]
+    lags = [f"{output}[k-{i}]" for i in range(1, largest.na + 1)]
+    place = {(None, i): i - 1 for i in range(1, largest.na + 1)}
+    for name, nb, nk in zip(inputs, largest.nb, largest.nk, strict=True):
+        for i in range(nk, nk + nb):
+            place[name, i] = len(lags)
+            lags.append(f"{name}[k-{i}]" if i else f"{name}[k]")
+    runs = TermRuns.of(problem, TermLibrary(tuple(lags), tuple((i,) for i in range(len(lags)))), criterion)
+    known = {str(lag) for term in problem.baseline.terms for lag in [term.regressor]}
+    found: dict[Orders, Rung] = {}
+    with one_blas_thread():
+        folds = Blocks(runs, blocks)
+
+        def judge(orders: Orders) -> None:
+            if orders in found:
+                return
+            began = time.monotonic()
+            chosen = [place[None, i] for i in range(1, orders.na + 1)]
+            for name, nb, nk in zip(inputs, orders.nb, orders.nk, strict=True):
+                chosen += [place[name, i] for i in range(nk, nk + nb)]
+            point = runs.fit(runs.start(), [i for i in chosen if lags[i] not in known])
+            found[orders] = Rung(point, (str(orders),), folds.judge(point), time.monotonic() - began, orders.size)
+            told(found[orders])
+
+        for n in range(1, max(largest.na, *largest.nb, 1) + 1):
+            reach = Orders(
+                max(min(n, largest.na), least.na),
+                tuple(max(min(n + largest.na, nb), low) for nb, low in zip(largest.nb, least.nb, strict=True)),
+                largest.nk,
+            )
+            judge(reach)
+        _shrink(found, judge, runs, least)
+    return OrderSearch(tuple(found), TermPath(runs, tuple(found.values())))
+
+
+def _shrink(found: dict[Orders, Rung], judge, runs: TermRuns, least: Orders) -> None:  # type: ignore[no-untyped-def]
+    """From the choice on, as long as one lag less is as good."""
+    current = OrderSearch(tuple(found), TermPath(runs, tuple(found.values()))).chosen
+    while True:
+        smaller = list(current.smaller(least))
+        for orders in smaller:
+            judge(orders)
+        within = {orders: one for orders, one in zip(found, TermPath(runs, tuple(found.values())).judged(), strict=True)}
+        able = [orders for orders in smaller if within[orders].within]
+        if not able:
+            return
+        current = min(able, key=lambda orders: found[orders].score)
+
+
+def correlated_delay(record: Record, number: int, most: int) -> int | None:
+    """The first lag at which an input, made white, acts on the output; None where none is significant.
+
+    Both signals go through the filter that makes the input white (Box and Jenkins); a lag counts from 1.96/√N on, for
+    all `most` lags together.
+
+    Args:
+        number: of the input.
+        most: the largest lag that is looked at.
+    """
+    total, rows = np.zeros(most + 1), 0
+    for experiment in record.experiments:
+        u, y = experiment.inputs[:, number], experiment.outputs[:, 0]
+        n = min(_WHITENING, len(u) // 10)
+        u, y = u - u.mean(), y - y.mean()
+        past = np.column_stack([u[n - i : len(u) - i] for i in range(1, n + 1)]) if n else np.zeros((len(u), 0))
+        filtered = np.linalg.lstsq(past, u[n:], rcond=1e-8)[0] if n else np.zeros(0)
+        passed = [part[n:] - sum((w * part[n - i : len(part) - i] for i, w in enumerate(filtered, 1)), 0.0) for part in (u, y)]
+        white, out = (part / max(float(part.std()), 1e-300) for part in passed)
+        total += [float(white[: len(white) - lag] @ out[lag:]) for lag in range(most + 1)]
+        rows += len(white)
+    bound = _SURE * np.sqrt(1 + 2 * np.log(most + 1)) / np.sqrt(rows)
+    over = np.flatnonzero(np.abs(total) / rows > bound)
+    return int(over[0]) if len(over) else None

@@ -1,0 +1,214 @@
+"""How many terms, and which: a path of models, judged by free runs on blocks that were held out.
+
+Forward the terms come by what they lower the error by; from the best model on backward they go, the least missed first.
+The choice is the smallest model that is within one standard error of the best (Breiman et al. 1984), block by block in
+pairs, or worse by less than is worth a term.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import Vector
+from orthaug._base.parallel import one_blas_thread, spread
+from orthaug.fitting.held_out import WORTH, blocked
+from orthaug.fitting.segments import Segments, lay_segments
+from orthaug.selection.forward import Equations, forward
+from orthaug.selection.term_runs import Point, TermRuns
+
+_ONE_BY_ONE = 8  # terms are added singly up to here, later an eighth at a time
+_LEAST = 1e-6  # share of the squared error left below which nothing is worth adding
+_PATIENCE = 5  # additions that did not improve the score by `_BETTER` each, after which the path ends
+_BETTER = 0.005
+_FOLD_ITERATIONS = 10
+_HALVES = 50  # random halves of the data over which terms are chosen again
+_PARTS = 10  # of the training data, that halves are made of
+_SEED = 20_261_122
+
+Told = Callable[["Rung"], None]
+"""Called with every model that was judged."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rung:
+    """A model on the path: its terms, and the mean squared error of its free runs on each held-out block.
+
+    Errors are in units of the output squared; infinite where a free run diverged.
+    """
+
+    point: Point
+    change: tuple[str, ...]
+    """What was added, with a plus, or taken away, with a minus."""
+    held: Vector
+    seconds: float
+    size: int
+    """Number of terms, or of lags."""
+
+    @property
+    def score(self) -> float:
+        """Root of the mean over the blocks."""
+        return float(np.sqrt(np.mean(self.held)))
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A rung beside the best one: the standard error of its score, and whether it is as good within one."""
+
+    rung: Rung
+    error: float
+    within: bool
+    chosen: bool
+
+
+class Blocks:
+    """The folds of blocked cross-validation, laid out once: what is left to fit, and the block's rows to fly over."""
+
+    def __init__(self, runs: TermRuns, blocks: int) -> None:
+        first = runs.menu.first_row
+        self.folds: list[tuple[TermRuns, Segments]] = []
+        held_shape: Segments | None = None
+        for kept, held in blocked(runs.problem.record, blocks, first):
+            laid = lay_segments(held, runs.menu, 0, runs.flown.washout, held_shape)
+            held_shape = laid if held_shape is None else held_shape
+            self.folds.append((runs.on(kept), laid))
+
+    def judge(self, point: Point) -> Vector:
+        """Mean squared errors of free runs on each block of the same terms, fitted without it."""
+
+        def one(fold: tuple[TermRuns, Segments], check: Callable[[], None]) -> float:
+            runs, held = fold
+            own = point._replace(states=None if runs.laid is None else np.asarray(runs.laid.start))
+            return runs.errors(runs.fit(own, point.chosen, _FOLD_ITERATIONS), held)
+
+        return np.array(spread(one, self.folds))
+
+
+@dataclass(frozen=True, eq=False)
+class TermPath:
+    """All models that were judged, with the choice among them."""
+
+    runs: TermRuns
+    rungs: tuple[Rung, ...]
+
+    @property
+    def best(self) -> int:
+        """The number of the model of the lowest score."""
+        return int(np.argmin([rung.score for rung in self.rungs]))
+
+    def judged(self) -> tuple[Judged, ...]:
+        """Every model beside the best, by blocks in pairs."""
+        best = self.rungs[self.best]
+        found = []
+        for rung in self.rungs:
+            worse = rung.held - best.held
+            finite = bool(np.isfinite(worse).all())
+            error = float(worse.std(ddof=1) / np.sqrt(len(worse))) if finite else np.inf
+            within = finite and (float(worse.mean()) <= error or rung.score <= (1 + WORTH) * best.score)
+            spread_of = rung.held.std(ddof=1) / np.sqrt(len(worse)) / (2 * rung.score) if finite and rung.score else 0.0
+            found.append(Judged(rung, float(spread_of) if finite else np.inf, within, False))
+        able = [i for i, one in enumerate(found) if one.within]
+        chosen = min(able, key=lambda i: (self.rungs[i].size, self.rungs[i].score), default=self.best)
+        found[chosen] = replace(found[chosen], chosen=True)
+        return tuple(found)
+
+    @property
+    def chosen(self) -> Rung:
+        """The smallest within one standard error of the best."""
+        return next(one.rung for one in self.judged() if one.chosen)
+
+    def shares(self) -> dict[str, float]:
+        """Of every term of the choice, how often it is chosen over random halves of the data (stability selection).
+
+        As many terms are picked as the choice has, by the equations about the chosen model.
+        """
+        runs, rung = self.runs, self.chosen
+        parts, nt, most = _parts(runs, rung.point), len(rung.point.c), rung.size
+        if not most or len(parts) < 4:
+            return {}
+        rng, count = np.random.default_rng(_SEED), np.zeros(len(runs.library))
+        for _ in range(_HALVES):
+            half = rng.permutation(len(parts))[: len(parts) // 2]
+            picks = forward(Equations.sum_of(parts[i] for i in half), range(nt), most)
+            count[[pick.column - nt for pick in picks]] += 1
+        texts = runs.library.texts
+        return {texts[i]: float(count[i] / _HALVES) for i in rung.point.chosen}
+
+
+def climb(runs: TermRuns, blocks: int, most: int, told: Told = lambda rung: None) -> TermPath:
+    """The path of up to `most` terms forward, and from the best model on backward.
+
+    Raises:
+        InputError: too few rows for so many blocks.
+    """
+    with one_blas_thread():
+        folds, rungs = Blocks(runs, blocks), []
+
+        def judged(point: Point, change: Sequence[str], began: float) -> Rung:
+            rung = Rung(point, tuple(change), folds.judge(point), time.monotonic() - began, len(point.chosen))
+            rungs.append(rung)
+            told(rung)
+            return rung
+
+        try:
+            _forward(runs, most, judged)
+            _backward(TermPath(runs, tuple(rungs)), judged)
+        except KeyboardInterrupt:
+            if not rungs:
+                raise
+    return TermPath(runs, tuple(rungs))
+
+
+def _forward(runs: TermRuns, most: int, judged: Any) -> None:
+    nt, texts = len(runs.problem.baseline.names), runs.library.texts
+    began = time.monotonic()
+    point = runs.fit(runs.start(), ())
+    best, waited = judged(point, (), began).score, 0
+    while len(point.chosen) < most and waited < _PATIENCE and np.isfinite(point.loss):
+        began = time.monotonic()
+        count = 1 if len(point.chosen) < _ONE_BY_ONE else max(1, len(point.chosen) // 8)
+        count = min(count, most - len(point.chosen))
+        known = [*range(nt), *(nt + i for i in point.chosen)]
+        picks = forward(runs.equations(point), known, count, least=_LEAST)
+        new = [pick.column - nt for pick in picks]
+        tried = runs.fit(point, (*point.chosen, *new)) if new else point
+        if not new or not tried.loss < point.loss:
+            break
+        point = tried
+        rung = judged(point, [f"+ {texts[i]}" for i in new], began)
+        waited = 0 if rung.score < (1 - _BETTER) * best else waited + 1
+        best = min(best, rung.score)
+
+
+def _backward(path: TermPath, judged: Any) -> None:
+    """From the choice on, as long as what is left is as good."""
+    runs, rung = path.runs, path.chosen
+    nt, texts = len(rung.point.c), runs.library.texts
+    while rung.size > 1 and path.chosen is rung:
+        began, point = time.monotonic(), rung.point
+        equations = runs.equations(point)
+        own = equations.of([*range(nt), *(nt + i for i in point.chosen)]).scaled()
+        inverse = np.linalg.pinv(own.hessian, rcond=1e-13, hermitian=True)
+        missed = (inverse @ own.right)[nt:] ** 2 / np.maximum(np.diag(inverse)[nt:], 1e-300)
+        gone = point.chosen[int(np.argmin(missed))]
+        left = tuple(i for i in point.chosen if i != gone)
+        p = equations.of([*range(nt), *(nt + i for i in left)]).solve()  # the others take over what it did
+        point = runs.fit(point._replace(chosen=left, c=p[:nt], w=p[nt:]), left)
+        rung = judged(point, [f"− {texts[gone]}"], began)
+        path = replace(path, rungs=(*path.rungs, rung))
+
+
+def _parts(runs: TermRuns, point: Point) -> list[Equations]:
+    """The equations about a point over parts of the data, one after another."""
+    if runs.laid is None:
+        blocks = runs.step_blocks
+        edges = np.linspace(0, len(blocks), min(_PARTS, len(blocks)) + 1).astype(int)
+        return [Equations.sum_of(blocks[a:b]) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    scored = np.asarray(runs.laid.scored)
+    order = np.cumsum(np.moveaxis(scored, 1, -1).reshape(-1)).reshape(*scored.shape[::2], scored.shape[1])
+    place = np.moveaxis((order - 1) * _PARTS // max(int(scored.sum()), 1), -1, 1)
+    return [runs.equations(point, scored & (place == part)) for part in range(_PARTS)]

@@ -1,0 +1,214 @@
+"""Models of chosen terms: fitted one step ahead or on the free run, linearised for all terms, and flown where held out.
+
+One compiled program serves every choice (`models.menu`). On the free run a term is weighed by what it does to the run,
+not to one step: noise in measured lags does not count as structure, and what pays only one step ahead is not picked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._base.checks import Vector
+from orthaug.data.expressions import parse
+from orthaug.data.record import Record
+from orthaug.data.regressors import Features, in_order
+from orthaug.data.terms import TermLibrary, products_of
+from orthaug.fitting.criteria import Criterion, Simulation
+from orthaug.fitting.initial_states import InitialStates, Start
+from orthaug.fitting.objective import RUNAWAY, Flown, FreeRunObjective, LinearisedFreeRun, errors_of
+from orthaug.fitting.segments import Segments, lay_segments
+from orthaug.fitting.solvers.descent import MARQUARDT
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.models.menu import Menu
+from orthaug.physics.problem import Problem
+from orthaug.selection.forward import Equations
+
+_PLACES = 32  # for terms in a compiled program; choices that need more take a multiple
+_CHUNK = 4096  # rows
+_TOLERANCE = 1e-4  # relative change of the loss: models are compared, not published
+
+
+class Point(NamedTuple):
+    """A fitted model: the terms by number, c and w of terms divided by the sizes of their factors."""
+
+    chosen: tuple[int, ...]
+    c: Vector
+    w: Vector
+    states: Any = None
+    """Of the segments' starts, on the free run."""
+    loss: float = np.inf
+    """Mean of squared errors in the output's unit."""
+
+
+@dataclass(frozen=True, eq=False)
+class TermRuns:
+    """A problem of physics, which may be empty, with a library of terms, for a criterion.
+
+    `sizes` are the largest sizes of the factors.
+    """
+
+    problem: Problem
+    library: TermLibrary
+    criterion: Criterion
+    menu: Menu
+    sizes: Vector
+    laid: Segments | None
+
+    @classmethod
+    def of(cls, problem: Problem, library: TermLibrary, criterion: Criterion, like: TermRuns | None = None) -> TermRuns:
+        """Lay a problem out; its segments padded to the shapes of another's."""
+        factors = Features(tuple(parse(text) for text in library.factors)).sampled(problem.record.sampling_time)
+        names = tuple(c.name for c in problem.record.outputs), tuple(c.name for c in problem.record.inputs)
+        layout = in_order((*problem.baseline.lags, *factors.lags), *names)
+        menu = Menu(problem.baseline, factors, layout, names[0], None, width=_PLACES, order=max(library.order, 1))
+        sizes = like.sizes if like is not None else None
+        runs = cls(problem, library, criterion, menu, np.ones(len(library.factors)) if sizes is None else sizes, None)
+        if sizes is None:
+            with np.errstate(all="ignore"):
+                largest = np.abs(np.concatenate([runs.factors(e) for e in problem.record.experiments], axis=1)).max(
+                    axis=1
+                )
+            runs = replace(runs, sizes=np.where(np.isfinite(largest) & (largest > 0), largest, 1.0))
+        if criterion.one_step:
+            return runs
+        flown = criterion.flown
+        assert flown is not None
+        shape = None if like is None else like.laid
+        return replace(runs, laid=lay_segments(problem.record, menu, flown.segment, flown.washout, shape))
+
+    @property
+    def flown(self) -> Simulation:
+        """How the free run is laid out, where held-out blocks are flown too."""
+        return self.criterion.flown or Simulation()
+
+    @cached_property
+    def rms(self) -> float:
+        """Of what least squares leaves one step ahead, in the output's unit."""
+        return max(float(np.sqrt(np.mean(self.problem.unexplained**2))), 1e-10) * float(self.problem.deviation[0])
+
+    def factors(self, experiment: Any) -> Float[np.ndarray, "nf T"]:
+        """The factors along an experiment, over their sizes."""
+        x = self.menu.regressors(experiment, self.problem.record)
+        with np.errstate(all="ignore"):
+            return np.asarray(self.menu.features.evaluate(x, self.menu.layout, np)).T / self.sizes[:, None]
+
+    def on(self, record: Record) -> TermRuns:
+        """The same on another record."""
+        return TermRuns.of(self.problem.on(record), self.library, self.criterion, like=self)
+
+    def start(self) -> Point:
+        """Physics alone, one step ahead."""
+        return Point(
+            (), self.problem.least_squares, np.zeros(0), None if self.laid is None else np.asarray(self.laid.start)
+        )
+
+    def fit(self, point: Point, chosen: Sequence[int], iterations: int = 30) -> Point:
+        """Physics and the chosen terms, from a point with some of them."""
+        before = dict(zip(point.chosen, point.w, strict=True))
+        chosen, w = tuple(chosen), np.array([before.get(i, 0.0) for i in chosen])
+        if self.laid is None:
+            nt = len(point.c)
+            own = self.step_equations.of([*range(nt), *(nt + i for i in chosen)])
+            p = own.solve()
+            return Point(chosen, p[:nt], p[nt:], None, max(own.miss(p), 0.0) / own.rows)
+        objective = _Chosen.of(self, chosen)
+        p = np.concatenate([point.c, w, np.zeros(objective.dynamics.unknowns - len(point.c) - len(w))])
+        states = point.states if point.states is not None else np.asarray(self.laid.start)
+        end = LevenbergMarquardt(iterations, _TOLERANCE).descend(objective, p, Start(states), damping=MARQUARDT)
+        flown = end.flown
+        loss = flown.misfit * self.rms**2 / self.laid.count if np.isfinite(flown.misfit) else np.inf
+        return Point(chosen, flown.c, flown.w[: len(chosen)], flown.states, loss)
+
+    def equations(self, point: Point, scored: Any = None) -> Equations:
+        """The normal equations of physics and all terms about a point, for p itself: its chosen terms are in the error.
+
+        Args:
+            scored: which steps of the segments count; None for all.
+        """
+        if self.laid is None:
+            return self.step_equations
+        everything = range(len(self.library))
+        objective = _Chosen.of(self, tuple(everything), exactly=True)
+        if scored is not None:
+            objective = replace(objective, segments=self.laid._replace(scored=scored))
+        w = np.zeros(len(self.library))
+        w[list(point.chosen)] = point.w
+        p = np.concatenate([point.c, w])
+        flown = objective.fly(p, Start(point.states))
+        linear = objective.linearise(flown)
+        hessian, right = linear.information, linear.gradient
+        bent = hessian @ p
+        square = flown.misfit + 2 * p @ right + p @ bent
+        return Equations(hessian, right + bent, float(square), objective.segments.count)
+
+    @cached_property
+    def step_blocks(self) -> tuple[Equations, ...]:
+        """The normal equations one step ahead of physics and all terms, by chunks of rows, in the output's unit."""
+        problem, found = self.problem, []
+        for experiment in problem.record.experiments:
+            x = self.menu.regressors(experiment, problem.record)
+            y, factors = experiment.outputs[self.menu.first_row :], self.factors(experiment)
+            for a in range(0, len(x), _CHUNK):
+                rows = slice(a, a + _CHUNK)
+                phi = np.asarray(problem.baseline.phi(x[rows], self.menu.layout, self.menu.outputs, np))[:, 0]
+                known = np.asarray(problem.baseline.known(x[rows], self.menu.layout, self.menu.outputs, np))
+                with np.errstate(all="ignore"):
+                    terms = products_of(factors[:, rows], self.library.numbers, np)
+                columns, target = np.concatenate([phi.T, terms]), (y[rows] - known)[:, 0]
+                found.append(Equations(columns @ columns.T, columns @ target, float(target @ target), len(target)))
+        return tuple(found)
+
+    @cached_property
+    def step_equations(self) -> Equations:
+        return Equations.sum_of(self.step_blocks)
+
+    def errors(self, point: Point, held: Segments) -> float:
+        """Mean of squared errors of free runs over held-out segments from measured starts; infinite if one diverges."""
+        objective = _Chosen.of(self, point.chosen)
+        w = np.zeros(objective.dynamics.unknowns - objective.physics)
+        w[: len(point.w)] = point.w
+        numbers = objective.numbers(point.c, w)
+        errors = errors_of(objective.dynamics, numbers, held.start, held)
+        with np.errstate(all="ignore"):
+            mean = float(np.sum(errors**2)) / held.count
+        return mean if mean < RUNAWAY * float(self.problem.deviation[0]) ** 2 else np.inf
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Chosen(FreeRunObjective):
+    """The free run of some terms, in a program with more places: those that are not taken stay zero."""
+
+    taken: int
+
+    @classmethod
+    def of(cls, runs: TermRuns, chosen: tuple[int, ...], *, exactly: bool = False) -> _Chosen:
+        places = len(chosen) if exactly else _PLACES * max(1, -(-len(chosen) // _PLACES))
+        menu, laid = replace(runs.menu, width=places), runs.laid
+        products = np.full((places, runs.menu.order), len(runs.library.factors))
+        products[: len(chosen)] = runs.library.numbers[list(chosen)]
+        nt = len(runs.problem.baseline.names)
+        segments: Any = laid
+        start = None if laid is None else np.asarray(laid.start)
+        return cls(
+            dynamics=menu,
+            numbers=lambda c, w: menu.numbers(c, products, w, runs.sizes),
+            segments=segments,
+            initial=InitialStates(start, start is not None and start.size > 0 and runs.flown.estimates_pasts),  # type: ignore[arg-type]
+            weight=np.eye(1) / runs.rms,
+            rms=runs.rms,
+            deviation=runs.problem.deviation,
+            physics=nt,
+            taken=nt + len(chosen),
+        )
+
+    def linearise(self, flown: Flown) -> LinearisedFreeRun:
+        linear = super().linearise(flown)
+        hessian, gradient = linear.hessian.copy(), linear.gradient.copy()
+        hessian[self.taken :], hessian[:, self.taken :], gradient[self.taken :] = 0.0, 0.0, 0.0
+        return linear._replace(hessian=hessian, gradient=gradient)
