@@ -87,7 +87,7 @@ class _Known:
         u = u[:, sigma > 1e-10]
         return _Known(np.column_stack([self.q, u]), self.left - u @ (u.T @ self.left))
 
-    def weigh(self, runs: TermRuns, chosen: Sequence[int] | None = None) -> tuple[Vector, Vector, Vector]:
+    def weigh(self, runs: TermRuns, chosen: Sequence[int] | np.ndarray | None = None) -> tuple[Vector, Vector, Vector]:
         """Of each term its squared norm, what of that the model leaves, and its product with the error."""
         every = np.arange(len(runs.library)) if chosen is None else np.asarray(chosen)
         norms, left, right = (np.zeros(len(every)) for _ in range(3))
@@ -136,10 +136,12 @@ def _notes(library: TermLibrary, finite: np.ndarray, own: np.ndarray) -> list[Wa
     texts, notes = library.texts, []
     infinite = [texts[i] for i in np.flatnonzero(~finite)]
     if infinite:
-        notes.append(Warning("terms_not_finite", f"left out, for they are not finite on these data: {_named(infinite)}."))
+        text = f"left out, for they are not finite on these data: {_named(infinite)}."
+        notes.append(Warning("terms_not_finite", text))
     known = [texts[i] for i in np.flatnonzero(finite & ~own)]
     if known:
-        notes.append(Warning("terms_are_physics", f"left out, for the physics expresses them already: {_named(known)}."))
+        text = f"left out, for the physics expresses them already: {_named(known)}."
+        notes.append(Warning("terms_are_physics", text))
     return notes
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from orthaug._base.checks import Matrix, Vector
 from orthaug.data.terms import TermLibrary
 from orthaug.fitting.criteria import Prediction
 from orthaug.physics.problem import Problem
@@ -47,7 +48,7 @@ class Nonlinearity:
 
     def __str__(self) -> str:
         if not self.found:
-            return f"nothing nonlinear is found beside physics and linear lags (p = {self.p:.2g}): a learner may not be needed."
+            return f"nothing nonlinear is missing beside physics and linear lags, as far as is seen (p = {self.p:.2g})."
         named = ", ".join(self.matter)
         where = f" in {named}" if named else "; no single regressor shows it"
         return f"something nonlinear is missing (p = {self.p:.2g}){where}."
@@ -88,7 +89,7 @@ def nonlinearity(problem: Problem, lags: Sequence[str], draws: int = _DRAWS) -> 
     return Nonlinearity(p_value(own), {lag: min(1.0, p_value(c) * len(single)) for lag, c in single.items()})
 
 
-def _rows(runs: TermRuns, linear: int) -> tuple[Float[np.ndarray, "N k"], Float[np.ndarray, "N m"], Float[np.ndarray, "N"]]:
+def _rows(runs: TermRuns, linear: int) -> tuple[Matrix, Matrix, Vector]:
     """Physics and linear lags, their functions, and what the fixed terms leave of the output."""
     problem, known, functions, target = runs.problem, [], [], []
     for experiment in problem.record.experiments:

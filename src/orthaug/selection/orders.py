@@ -7,7 +7,7 @@ with an input, for pole and zero go in pairs where both are superfluous.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from orthaug.data.record import Record
 from orthaug.data.terms import TermLibrary
 from orthaug.fitting.criteria import Criterion
 from orthaug.physics.problem import Problem
-from orthaug.selection.term_path import Blocks, Judged, Rung, TermPath, Told
+from orthaug.selection.term_path import Blocks, Judged, Rung, Told, judge_all
 from orthaug.selection.term_runs import TermRuns
 
 _SURE = 1.96  # standard errors of a cross-correlation of white signals
@@ -73,11 +73,11 @@ class OrderSearch:
     """All orders that were judged, with the choice."""
 
     orders: tuple[Orders, ...]
-    path: TermPath
+    rungs: tuple[Rung, ...]
 
     def judged(self) -> tuple[Judged, ...]:
         """Every one beside the best."""
-        return self.path.judged()
+        return judge_all(self.rungs)
 
     @property
     def chosen(self) -> Orders:
@@ -95,7 +95,7 @@ def search_orders(
     """
     output, inputs = problem.outputs[0], [channel.name for channel in problem.record.inputs]
     lags = [f"{output}[k-{i}]" for i in range(1, largest.na + 1)]
-    place = {(None, i): i - 1 for i in range(1, largest.na + 1)}
+    place = {(output, i): i - 1 for i in range(1, largest.na + 1)}
     for name, nb, nk in zip(inputs, largest.nb, largest.nk, strict=True):
         for i in range(nk, nk + nb):
             place[name, i] = len(lags)
@@ -110,7 +110,7 @@ def search_orders(
             if orders in found:
                 return
             began = time.monotonic()
-            chosen = [place[None, i] for i in range(1, orders.na + 1)]
+            chosen = [place[output, i] for i in range(1, orders.na + 1)]
             for name, nb, nk in zip(inputs, orders.nb, orders.nk, strict=True):
                 chosen += [place[name, i] for i in range(nk, nk + nb)]
             point = runs.fit(runs.start(), [i for i in chosen if lags[i] not in known])
@@ -124,18 +124,18 @@ def search_orders(
                 largest.nk,
             )
             judge(reach)
-        _shrink(found, judge, runs, least)
-    return OrderSearch(tuple(found), TermPath(runs, tuple(found.values())))
+        _shrink(found, judge, least)
+    return OrderSearch(tuple(found), tuple(found.values()))
 
 
-def _shrink(found: dict[Orders, Rung], judge, runs: TermRuns, least: Orders) -> None:  # type: ignore[no-untyped-def]
+def _shrink(found: dict[Orders, Rung], judge: Callable[[Orders], None], least: Orders) -> None:
     """From the choice on, as long as one lag less is as good."""
-    current = OrderSearch(tuple(found), TermPath(runs, tuple(found.values()))).chosen
+    current = next(orders for orders, one in zip(found, judge_all(tuple(found.values())), strict=True) if one.chosen)
     while True:
         smaller = list(current.smaller(least))
         for orders in smaller:
             judge(orders)
-        within = {orders: one for orders, one in zip(found, TermPath(runs, tuple(found.values())).judged(), strict=True)}
+        within = dict(zip(found, judge_all(tuple(found.values())), strict=True))
         able = [orders for orders in smaller if within[orders].within]
         if not able:
             return
@@ -159,8 +159,9 @@ def correlated_delay(record: Record, number: int, most: int) -> int | None:
         u, y = u - u.mean(), y - y.mean()
         past = np.column_stack([u[n - i : len(u) - i] for i in range(1, n + 1)]) if n else np.zeros((len(u), 0))
         filtered = np.linalg.lstsq(past, u[n:], rcond=1e-8)[0] if n else np.zeros(0)
-        passed = [part[n:] - sum((w * part[n - i : len(part) - i] for i, w in enumerate(filtered, 1)), 0.0) for part in (u, y)]
-        white, out = (part / max(float(part.std()), 1e-300) for part in passed)
+        taps = np.concatenate([[1.0], -filtered])
+        white, out = (np.convolve(part, taps)[n : len(part)] for part in (u, y))
+        white, out = (part / max(float(part.std()), 1e-300) for part in (white, out))
         total += [float(white[: len(white) - lag] @ out[lag:]) for lag in range(most + 1)]
         rows += len(white)
     bound = _SURE * np.sqrt(1 + 2 * np.log(most + 1)) / np.sqrt(rows)

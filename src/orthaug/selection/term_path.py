@@ -65,6 +65,23 @@ class Judged:
     chosen: bool
 
 
+def judge_all(rungs: Sequence[Rung]) -> tuple[Judged, ...]:
+    """Every model beside the best, block by block in pairs; the choice is the smallest that is as good."""
+    best, found = min(rungs, key=lambda rung: rung.score), []
+    for rung in rungs:
+        count = len(rung.held)
+        finite = bool(np.isfinite(rung.held).all())
+        worse = rung.held - best.held if finite else np.full(count, np.inf)
+        tolerated = worse.std(ddof=1) / np.sqrt(count) if finite else 0.0
+        within = finite and (float(worse.mean()) <= tolerated or rung.score <= (1 + WORTH) * best.score)
+        spread_of = rung.held.std(ddof=1) / np.sqrt(count) / (2 * rung.score) if finite and rung.score else np.inf
+        found.append(Judged(rung, float(spread_of), within, False))
+    able = [i for i, one in enumerate(found) if one.within]
+    chosen = min(able, key=lambda i: (rungs[i].size, rungs[i].score), default=0)
+    found[chosen] = replace(found[chosen], chosen=True)
+    return tuple(found)
+
+
 class Blocks:
     """The folds of blocked cross-validation, laid out once: what is left to fit, and the block's rows to fly over."""
 
@@ -95,26 +112,9 @@ class TermPath:
     runs: TermRuns
     rungs: tuple[Rung, ...]
 
-    @property
-    def best(self) -> int:
-        """The number of the model of the lowest score."""
-        return int(np.argmin([rung.score for rung in self.rungs]))
-
     def judged(self) -> tuple[Judged, ...]:
-        """Every model beside the best, by blocks in pairs."""
-        best = self.rungs[self.best]
-        found = []
-        for rung in self.rungs:
-            worse = rung.held - best.held
-            finite = bool(np.isfinite(worse).all())
-            error = float(worse.std(ddof=1) / np.sqrt(len(worse))) if finite else np.inf
-            within = finite and (float(worse.mean()) <= error or rung.score <= (1 + WORTH) * best.score)
-            spread_of = rung.held.std(ddof=1) / np.sqrt(len(worse)) / (2 * rung.score) if finite and rung.score else 0.0
-            found.append(Judged(rung, float(spread_of) if finite else np.inf, within, False))
-        able = [i for i, one in enumerate(found) if one.within]
-        chosen = min(able, key=lambda i: (self.rungs[i].size, self.rungs[i].score), default=self.best)
-        found[chosen] = replace(found[chosen], chosen=True)
-        return tuple(found)
+        """Every model beside the best."""
+        return judge_all(self.rungs)
 
     @property
     def chosen(self) -> Rung:

@@ -1,0 +1,104 @@
+"""How wide a network, and what it should see: judged by free runs on blocks that were held out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from orthaug._base.errors import InputError
+from orthaug._base.parallel import spread
+from orthaug.data.record import Record
+from orthaug.data.regressors import Lags
+from orthaug.fitting.criteria import Criterion
+from orthaug.fitting.estimation import estimate
+from orthaug.fitting.held_out import blocked, mean_square, squared_errors
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.models.learners import MLP
+from orthaug.physics.problem import Problem
+from orthaug.selection.nonlinearity import Nonlinearity
+from orthaug.selection.term_path import Judged, Rung, Told, judge_all
+from orthaug.selection.term_runs import Point
+
+_ITERATIONS = 40  # of a network on a fold
+
+
+@dataclass(frozen=True, eq=False)
+class LearnerSearch:
+    """All networks that were judged, physics alone first, with the choice."""
+
+    learners: tuple[MLP | None, ...]
+    rungs: tuple[Rung, ...]
+
+    def judged(self) -> tuple[Judged, ...]:
+        """Every one beside the best."""
+        return judge_all(self.rungs)
+
+    @property
+    def chosen(self) -> MLP | None:
+        """The smallest within one standard error of the best; None for physics alone."""
+        return next(learner for learner, one in zip(self.learners, self.judged(), strict=True) if one.chosen)
+
+
+def search_learners(
+    problem: Problem,
+    lags: Lags,
+    tested: Nonlinearity | None,
+    learner: MLP,
+    widths: Sequence[int],
+    criterion: Criterion,
+    blocks: int,
+    told: Told,
+) -> LearnerSearch:
+    """Judge every width on all lags, and on those whose functions matter by themselves.
+
+    Raises:
+        InputError: too few rows for so many blocks.
+    """
+    record, baseline = problem.record, problem.baseline
+    seen: list[tuple[str, ...] | None] = [learner.inputs]
+    if tested is not None and tested.matter and learner.inputs is None:
+        seen.append(tested.matter)
+    tried: list[MLP | None] = [None]
+    tried += [replace(learner, hidden=(width,), inputs=inputs) for inputs in seen for width in widths]
+    folds = blocked(record, blocks, max(problem.first_row, _largest(lags)))
+    names = tuple(channel.name for channel in record.outputs), tuple(channel.name for channel in record.inputs)
+    rungs = []
+    for one in tried:
+        began = time.monotonic()
+        held = _judge(baseline, lags, one, criterion, folds)
+        nz = 0 if one is None else len(one.inputs if one.inputs is not None else lags.layout(*names))
+        size = 0 if one is None else one.weights(nz, 1)
+        words = () if one is None else (f"{one.hidden[0]} neurons of {', '.join(one.inputs or ('all lags',))}",)
+        rungs.append(Rung(Point((), np.zeros(0), np.zeros(0)), words, held, time.monotonic() - began, size))
+        try:
+            told(rungs[-1])
+        except KeyboardInterrupt:
+            break
+    return LearnerSearch(tuple(tried[: len(rungs)]), tuple(rungs))
+
+
+def _largest(lags: Lags) -> int:
+    nb, nk = (np.atleast_1d(part) for part in (lags.nb, lags.nk))
+    return int(max(np.max(lags.na, initial=0), np.max(nb + nk - 1, initial=0)))
+
+
+def _judge(
+    baseline: object, lags: Lags, learner: MLP | None, criterion: Criterion, folds: Sequence[tuple[Record, Record]]
+) -> np.ndarray:
+    """Mean squared errors of free runs on each block, of fits without it."""
+
+    def one(fold: tuple[Record, Record], check: Callable[[], None]) -> float:
+        kept, held = fold
+        options = {"solver": LevenbergMarquardt(_ITERATIONS), "blocks": 0, "fallback": False, "criterion": criterion}
+        if learner is not None:
+            options |= {"lags": lags, "regularization": "evidence"}
+        try:
+            fit = estimate(kept, baseline, learner=learner, **options)  # type: ignore[call-overload]
+        except InputError:  # the block took away what the physics needs
+            return np.inf
+        return mean_square(squared_errors(fit.model.simulate(held), 1.0)) if fit.status.ok else np.inf
+
+    return np.array(spread(one, folds))

@@ -1,0 +1,258 @@
+"""The verb that finds structure: orders and delay, whether anything is nonlinear, and terms or a network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+from orthaug._base.checks import check_count, check_type
+from orthaug._base.errors import InputError
+from orthaug._base.warning import Warning
+from orthaug.data.record import Record
+from orthaug.data.regressors import Lags, in_order
+from orthaug.fitting.criteria import Criterion, Simulation
+from orthaug.fitting.estimation import estimate
+from orthaug.models.learners import MLP, Learner
+from orthaug.models.terms import Terms
+from orthaug.physics.baseline import Baseline
+from orthaug.physics.problem import Problem, pose, regressor_of
+from orthaug.selection.candidates import candidates
+from orthaug.selection.learner_search import LearnerSearch, search_learners
+from orthaug.selection.nonlinearity import Nonlinearity, nonlinearity
+from orthaug.selection.orders import Delay, Orders, OrderSearch, correlated_delay, search_orders
+from orthaug.selection.term_path import Judged, TermPath, climb
+from orthaug.selection.term_runs import TermRuns
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from orthaug.fitting.estimates import Estimate
+
+MOST = 60
+"""Terms on the path forward."""
+LARGEST = (4, 5)
+"""na and nb up to which orders are searched where nothing is said."""
+WIDTHS = (4, 8, 16)
+"""Hidden neurons that are tried where nothing is said."""
+Told = Callable[[str, Any], None]
+"""Called with the stage and each model that was judged; it may raise KeyboardInterrupt to keep what there is."""
+
+
+def _unheard(stage: str, rung: Any) -> None:
+    """Nobody listens."""
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """What `select` returns. Print `selection.summary()`; take `selection.table`; go on with `selection.estimate()`."""
+
+    record: Record = field(repr=False)
+    baseline: Baseline
+    criterion: Criterion
+    delays: tuple[Delay, ...]
+    orders: OrderSearch
+    nonlinearity: Nonlinearity | None
+    terms: TermPath | None
+    learners: LearnerSearch | None
+    notes: tuple[Warning, ...]
+
+    @property
+    def lags(self) -> Lags:
+        """The orders that were chosen."""
+        chosen = self.orders.chosen
+        return Lags(chosen.na, chosen.nb, chosen.nk)
+
+    @cached_property
+    def learner(self) -> Learner | None:
+        """The learner that was chosen, written out; None where nothing helps."""
+        if self.learners is not None:
+            return self.learners.chosen
+        if self.terms is not None:
+            chosen, texts = self.terms.chosen.point.chosen, self.terms.runs.library.texts
+            return Terms(tuple(texts[i] for i in chosen)) if chosen else None
+        linear = [text for text in self._linear if text not in {t.regressor for t in self.baseline.terms}]
+        return Terms(tuple(linear)) if linear else None
+
+    @property
+    def _linear(self) -> list[str]:
+        names = tuple(c.name for c in self.record.outputs), tuple(c.name for c in self.record.inputs)
+        return [str(lag) for lag in self.lags.layout(*names)]
+
+    @cached_property
+    def shares(self) -> dict[str, float]:
+        """Of every chosen term, how often it is chosen over random halves of the data."""
+        return {} if self.terms is None else self.terms.shares()
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """What `estimate` is to be called with, beside record and baseline."""
+        regularization = {"regularization": "none"} if isinstance(self.learner, Terms) else {}
+        lags = None if isinstance(self.learner, Terms | None) else self.lags
+        return {"learner": self.learner, "lags": lags, "criterion": self.criterion} | regularization
+
+    def estimate(self, **options: Any) -> Estimate:
+        """The fit of the choice; `options` of `estimate` beside it."""
+        return estimate(self.record, self.baseline, **(self.options | options))
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """A row for each model that was judged, in order.
+
+        `stage` is orders, terms or learner; `size` the number of lags, terms or weights; `score` the RMS error of free
+        runs on held-out blocks in the output's unit, `standard_error` its own; `within` whether it is as good as the
+        best of its stage; `seconds` what it took.
+        """
+        import pandas as pd
+
+        rows = []
+        for stage, judged in self._stages():
+            for one in judged:
+                rows.append(
+                    {
+                        "stage": stage,
+                        "model": ", ".join(one.rung.change) or "physics alone",
+                        "size": one.rung.size,
+                        "score": one.rung.score,
+                        "standard_error": one.error,
+                        "within": one.within,
+                        "chosen": one.chosen,
+                        "seconds": one.rung.seconds,
+                    }
+                )
+        return pd.DataFrame(rows)
+
+    def _stages(self) -> list[tuple[str, Sequence[Judged]]]:
+        stages: list[tuple[str, Sequence[Judged]]] = [("orders", self.orders.judged())]
+        if self.terms is not None:
+            stages.append(("terms", self.terms.judged()))
+        if self.learners is not None:
+            stages.append(("learner", self.learners.judged()))
+        return stages
+
+    def summary(self) -> str:
+        """A page of text."""
+        lines = [f"orders      {self.orders.chosen}"]
+        for delay in self.delays:
+            seen = "none is significant" if delay.correlation is None else f"{delay.correlation}"
+            lines.append(f"delay       {delay.input}: {seen} by cross-correlation, {delay.fitted} by the fit")
+        if self.nonlinearity is not None:
+            lines.append(f"nonlinear   {self.nonlinearity}")
+        lines.append(f"learner     {self.learner or 'none: nothing helps on the blocks that were held out'}")
+        if self.shares:
+            width = max(len(term) for term in self.shares)
+            lines += ["", f"{'term':<{width}}  chosen over halves of the data"]
+            lines += [f"{term:<{width}}  {100 * share:3.0f} %" for term, share in self.shares.items()]
+        return "\n".join([*lines, *(["", *(f"note: {note}" for note in self.notes)] if self.notes else [])])
+
+
+def select(
+    record: Record,
+    baseline: Baseline | None = None,
+    *,
+    learner: Learner | None = Terms(degree=3),  # noqa: B008  (frozen)
+    lags: Lags | None = None,
+    criterion: Criterion | None = None,
+    widths: Sequence[int] = WIDTHS,
+    most: int = MOST,
+    blocks: int = 5,
+    progress: Told = _unheard,
+) -> Selection:
+    """Choose orders and delay, and terms or a network, by free runs on blocks of the data that are held out.
+
+    Terms are picked by what they lower the error by beside the physics, which is projected out (forward orthogonal
+    regression on the sensitivities of the free run). The choice is the smallest model within one standard error of the
+    best, or within 2 % of its error.
+
+    Args:
+        record: measured inputs and one output.
+        baseline: the physics, which is always in the model; None for none.
+        learner: `Terms(…)`, whose library is chosen from; `MLP(…)`, whose width and inputs are chosen; None to choose
+            linear lags only.
+        lags: the largest orders, and the smallest delay; by default na = 4, nb = 5 from the first lag of an input that
+            the physics reads, or from 1.
+        criterion: what models are trained on; None for the free run.
+        widths: hidden neurons that are tried.
+        most: terms at most.
+        blocks: held out in turn.
+        progress: called with the stage and each model that was judged.
+
+    Raises:
+        InputError: several outputs, too few rows, terms that are none.
+    """
+    check_type(record, Record, "record", "a Record")
+    check_type(learner, Learner | None, "learner", "Terms(…), MLP(…) or None")
+    most, blocks = check_count(most, "most", least=0), check_count(blocks, "blocks", least=2)
+    if len(record.outputs) != 1:
+        raise InputError(f"structure is chosen for one output; the record has {len(record.outputs)}: choose for each.")
+    baseline = Baseline.from_terms([]) if baseline is None else baseline
+    if baseline.function is not None:
+        raise InputError("structure is chosen beside physics that are terms; of a Python function nothing is known.")
+    criterion = Simulation() if criterion is None else criterion
+    problem = pose(record, baseline)
+    largest, least = _reach(problem, lags)
+    notes: list[Warning] = []
+    orders = search_orders(problem, criterion, largest, least, blocks, lambda rung: progress("orders", rung))
+    names = [channel.name for channel in record.inputs]
+    delays = tuple(
+        Delay(name, correlated_delay(record, i, largest.nk[i] + largest.nb[i]), orders.chosen.nk[i])
+        for i, name in enumerate(names)
+    )
+    chosen = Lags(orders.chosen.na, orders.chosen.nb, orders.chosen.nk)
+    linear = [str(lag) for lag in chosen.layout(problem.outputs, names)]
+    tested = nonlinearity(problem, linear) if linear else None
+    path = found = None
+    if isinstance(learner, Terms):
+        path, more = _terms(problem, learner, largest, criterion, most, blocks, progress)
+        notes += more
+        if not path.chosen.point.chosen:
+            notes.append(Warning("nothing_helps", "no term lowers the error on the blocks that were held out."))
+    elif isinstance(learner, MLP):
+        told = lambda rung: progress("learner", rung)  # noqa: E731
+        found = search_learners(problem, chosen, tested, learner, widths, criterion, blocks, told)
+    elif learner is not None:
+        raise InputError("structure is chosen for a learner of terms or an MLP; got another learner.")
+    return Selection(record, baseline, criterion, delays, orders, tested, path, found, tuple(notes))
+
+
+def _terms(
+    problem: Problem, learner: Terms, largest: Orders, criterion: Criterion, most: int, blocks: int, progress: Told
+) -> tuple[TermPath, list[Warning]]:
+    outputs, inputs = problem.outputs, tuple(channel.name for channel in problem.record.inputs)
+    lags = Lags(largest.na, largest.nb, largest.nk).layout(outputs, inputs)
+    known = regressor_of(problem.baseline, None, None, outputs, inputs)[0]
+    library = learner.library([str(lag) for lag in in_order({*lags, *known}, outputs, inputs)])
+    rows = len(problem.rows)
+    able = candidates(problem, library)
+    notes = list(able.notes)
+    if len(library) > rows:
+        text = f"there are {len(library)} candidate terms and {rows} rows; at most a tenth as many terms are chosen."
+        notes.append(Warning("more_terms_than_rows", text))
+    runs = TermRuns.of(problem, able.library, criterion)
+    return climb(runs, blocks, min(most, rows // 10), lambda rung: progress("terms", rung)), notes
+
+
+def _reach(problem: Problem, lags: Lags | None) -> tuple[Orders, Orders]:
+    """The largest orders that are looked at, and those that the physics reads already."""
+    output, inputs = problem.outputs[0], [channel.name for channel in problem.record.inputs]
+    read: dict[str, list[int]] = {name: [] for name in (output, *inputs)}
+    for lag in problem.baseline.lags:
+        read[lag.channel].append(lag.lag)
+    least = Orders(
+        max(read[output], default=0),
+        tuple(max(read[name]) - min(read[name]) + 1 if read[name] else 0 for name in inputs),
+        tuple(min(read[name], default=0) for name in inputs),
+    )
+    if lags is None:
+        nk = tuple(min(read[name], default=1) for name in inputs)
+        largest = Orders(max(LARGEST[0], least.na), tuple(max(LARGEST[1], n) for n in least.nb), nk)
+    else:
+        places = lags.layout((output,), inputs)
+        own = {name: [lag.lag for lag in places if lag.channel == name] for name in (output, *inputs)}
+        own = {name: [*found, *read[name]] for name, found in own.items()}
+        nk = tuple(min(own[name], default=1) for name in inputs)
+        nb = tuple(max(own[name], default=0) - n + 1 if own[name] else 0 for name, n in zip(inputs, nk, strict=True))
+        largest = Orders(max(own[output], default=0), nb, nk)
+    unread = tuple(k if not n else m for k, n, m in zip(largest.nk, least.nb, least.nk, strict=True))
+    return largest, replace(least, nk=unread)
