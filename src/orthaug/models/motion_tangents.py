@@ -8,6 +8,7 @@ and ∂x⁺/∂w = Σ Ψ_i E G_i: the learner is differentiated once in a stage,
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -54,6 +55,7 @@ def sample_slopes(form: MotionField, numbers: Numbers, state: Any, row: Any) -> 
     return Slopes(x, to_x, to_c, to_w)
 
 
+@partial(jax.jit, static_argnames="form")  # for the stages of all substeps it is traced once
 def field_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
     """F at one point; ∂/∂w is that of the learned equations only, (nl, nw)."""
     c = numbers.theta - numbers.theta_aux

@@ -65,17 +65,16 @@ class Moving(MotionField, Differentiated):
         return {name: float(value) for name, value in named}
 
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
+        return _step(self, numbers, state, inputs)
+
+    def _stepped(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
         y = self.observed(numbers, state, self.now(inputs))
         parts = Parts(y, jnp.zeros_like(y), jnp.zeros_like(y))
         if self.motion.integrator == "discrete":
             return sum(self.rates(numbers, state, self.now(inputs))), parts
 
-        def field(x: Any, u: Any) -> Any:
-            physics, learned = self.rates(numbers, x, u)
-            return physics + learned
-
         following = advance(
-            field,
+            partial(_field, self, numbers),
             self._exponentials(numbers) if numbers.scheme is None else numbers.scheme[0],
             state,
             inputs,
@@ -134,3 +133,14 @@ class Moving(MotionField, Differentiated):
         moved = jax.vmap(along, -1, 1)(by_theta)  # a tangent for each parameter: (nx, np, m)
         before, after = self.states, self.unknowns - moved.shape[1]
         return jnp.pad(moved, ((0, 0), (before, after), (0, 0)))
+
+
+@partial(jax.jit, static_argnames="form")
+def _step(form: Moving, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
+    """A step. It is traced once, whatever programs it stands in; so is the field in it."""
+    return form._stepped(numbers, state, inputs)
+
+
+@partial(jax.jit, static_argnames="form")
+def _field(form: Moving, numbers: Numbers, x: Any, u: Any) -> Any:
+    return sum(form.rates(numbers, x, u))
