@@ -64,7 +64,7 @@ def field_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
     def physics(x: Any, c: Any) -> Any:
         return form.motion.rates(x, u, coordinates.physical(c, jnp), jnp)
 
-    value, (to_x, to_c) = physics(x, c), jax.jacfwd(physics, (0, 1))(x, c)
+    value, to_x, to_c = _differentiated(physics, x, c)
     to_x, to_c = _finite(to_x), _finite(to_c)
     states, _ = form.motion.learned
     if form.bound is None or not states:
@@ -100,7 +100,7 @@ def output_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes
     def physics(x: Any, c: Any) -> Any:
         return form.motion.observed(x, u, form.motion.coordinates.physical(c, jnp), jnp)
 
-    value, (to_x, to_c) = physics(x, c), jax.jacfwd(physics, (0, 1))(x, c)
+    value, to_x, to_c = _differentiated(physics, x, c)
     to_w = jnp.zeros((len(value), form.unknowns - len(c)))
     states, outputs = form.motion.learned
     if form.bound is not None and outputs:
@@ -109,6 +109,21 @@ def output_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes
         to_x = to_x.at[rows].add(learner.to_x[count:])
         to_w = to_w.at[rows].set(learner.to_w[count:])
     return Slopes(value, _finite(to_x), _finite(to_c), to_w)
+
+
+def _differentiated(function: Any, x: Any, c: Any) -> tuple[Any, Any, Any]:
+    """Value and slopes by x and c, an entry at a time: what an entry does not touch is then left out of the program."""
+    entries, n0 = [*x, *c], len(x)
+
+    def along(i: int) -> Any:
+        def of(entry: Any) -> Any:
+            moved = [*entries[:i], entry, *entries[i + 1 :]]
+            return function(jnp.stack(moved[:n0]), jnp.stack(moved[n0:]))
+
+        return jax.jvp(of, (entries[i],), (jnp.ones_like(entries[i]),))[1]
+
+    slopes = [along(i) for i in range(len(entries))]
+    return function(x, c), jnp.stack(slopes[:n0], axis=-1), jnp.stack(slopes[n0:], axis=-1)
 
 
 def _finite(slope: Any) -> Any:
