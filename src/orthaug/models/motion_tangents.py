@@ -18,6 +18,8 @@ from orthaug.models.dynamics import Numbers
 from orthaug.models.integrators import input_at
 from orthaug.models.motion_field import MotionField
 
+_FEW = 8  # states and parameters; programs of more are slow to compile
+
 
 class Slopes(NamedTuple):
     """Of a map from (x, c, w): its value, and ∂/∂x, ∂/∂c, ∂/∂w."""
@@ -112,8 +114,10 @@ def output_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes
 
 
 def _differentiated(function: Any, x: Any, c: Any) -> tuple[Any, Any, Any]:
-    """Value and slopes by x and c, an entry at a time: what an entry does not touch is then left out of the program."""
+    """Value and slopes by x and c; of few entries one at a time, which leaves out what an entry does not touch."""
     entries, n0 = [*x, *c], len(x)
+    if len(entries) > _FEW:
+        return function(x, c), *jax.jacfwd(function, (0, 1))(x, c)
 
     def along(i: int) -> Any:
         def of(entry: Any) -> Any:

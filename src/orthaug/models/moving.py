@@ -101,12 +101,19 @@ class Moving(MotionField, Differentiated):
             return None
         return Exponentials.of(self.linear_part(numbers), self.sampling_time / self.substeps)
 
+    @property
+    def _by_stages(self) -> bool:
+        return self.motion.integrator == "rk4" and self.substeps <= UNROLLED and self.differentiable
+
+    def tangents(self, numbers: Numbers, state: Any, slopes: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
+        return self.local(numbers, state, inputs).along(slopes, fused=self._by_stages)
+
     def local(self, numbers: Numbers, states: Any, inputs: Any) -> Local:
         """Of a few Runge-Kutta substeps by the adjoint of their stages; otherwise by automatic differentiation."""
         if numbers.scheme is not None:
             value, to_state, to_unknowns = super().local(numbers, states, inputs)
             return Local(value, to_state, to_unknowns + self._by_scheme(numbers, states, inputs))
-        if self.motion.integrator != "rk4" or self.substeps > UNROLLED or not self.differentiable:
+        if not self._by_stages:
             return super().local(numbers, states, inputs)
         following = jax.vmap(partial(sample_slopes, self, numbers), -1, -1)(states, inputs)
         output = jax.vmap(lambda x, row: output_slopes(self, numbers, x, self.now(row)), -1, -1)(states, inputs)
