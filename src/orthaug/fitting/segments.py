@@ -156,9 +156,7 @@ def _step_by_step(dynamics: Dynamics, numbers: Numbers, carry: Any, rows: Any, w
     return jax.lax.scan(step, carry, tuple(rows))[0][2:]
 
 
-def _steps_at_once(
-    most: int, dynamics: Differentiated, numbers: Numbers, carry: Any, rows: Any, weight: Any
-) -> tuple[Any, Any]:
+def _steps_at_once(most: int, dynamics: Any, numbers: Numbers, carry: Any, rows: Any, weight: Any) -> tuple[Any, Any]:
     """The same a block of steps at a time: it is run, then differentiated at all its points, which are then known.
 
     Only the product of the slopes has to go from step to step. A block is bounded, so nothing has the size of the data.

@@ -205,7 +205,7 @@ class Differentiated:
         # a kink without a derivative, such as sqrt(max(y, 0)) at 0, counts as flat
         return Local(value, *(jnp.where(jnp.isfinite(d), d, 0.0) for d in slopes))
 
-    def tangents(self, numbers: Numbers, state: Any, slopes: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
+    def tangents(self: Any, numbers: Numbers, state: Any, slopes: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
         """`S⁺ = A S + [0 B]` with A = ∂x⁺/∂x and B = ∂x⁺/∂(c, w), and the same for the output."""
         return self.local(numbers, state, inputs).along(slopes)
 

@@ -119,10 +119,12 @@ def _gram(
         inputs, target, there = row
         value, slope = jax.vmap(sloped, -1, -1)(state, inputs)
         slope = jnp.where(jnp.isfinite(slope), slope, 0.0)
-        slope = sum(slope[:, i, None] * slopes[None, i] for i in range(n0))  # products of lanes are no matrix products
+        slope: Any = sum(
+            slope[:, i, None] * slopes[None, i] for i in range(n0)
+        )  # products of lanes are no matrix products
         columns = jnp.concatenate([slope[n0:], (target - value[n0:])[:, None]], axis=1)
         columns = jnp.where(there, columns, 0.0)
-        columns = sum(weight[:, i, None, None] * columns[None, i] for i in range(len(weight)))
+        columns: Any = sum(weight[:, i, None, None] * columns[None, i] for i in range(len(weight)))
         gram = gram + sum(column[:n0, None] * column[None] for column in columns)
         square = square + sum(column[n0] ** 2 for column in columns)
         return (value[:n0], slope[:n0], gram, square), None
