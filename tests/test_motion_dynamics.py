@@ -10,6 +10,7 @@ import scipy.integrate
 import scipy.signal
 
 import orthaug as oa
+import orthaug.fitting.segments as laid
 from orthaug._base.jax import jax
 from orthaug.data.expressions import parse_named
 from orthaug.fitting.segments import lay_segments, respond, sensitivity
@@ -115,9 +116,7 @@ def test_the_adjoint_of_the_stages_gives_the_derivatives(integrator: str, subste
     rng = np.random.default_rng(3)
     points = {"zero-order": 1, "spline": 2 * substeps + 1}[hold]
     state, inputs = rng.normal(size=(2, 5)), rng.normal(size=(points, 5))
-    slopes = rng.normal(size=(2, 2 + form.unknowns, 5))
-    ours = form.tangents(made, state, slopes, inputs)
-    plain = Differentiated.tangents(form, made, state, slopes, inputs)
+    ours, plain = form.local(made, state, inputs), Differentiated.local(form, made, state, inputs)
     for one, other in zip(ours, plain, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-13)
 
@@ -143,6 +142,20 @@ def test_sensitivities_over_segments_are_those_of_forward_differentiation(integr
     jacobian = -np.asarray(jax.jacfwd(errors)(unknowns))
     columns = np.column_stack([jacobian, np.asarray(errors(unknowns))])
     np.testing.assert_allclose(gram, columns.T @ columns, rtol=1e-8, atol=1e-10)
+
+
+def test_sensitivities_of_steps_at_once_are_those_step_by_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    form, made = with_learner(spring(learned=True), 1)
+    segments = lay_segments(record(40), form, 19, 3)
+    given = (form, made, segments, segments.start, np.array([[2.0]]))
+    told = []
+    for block, fewest in ((1 << 15, 1), (8 * 3 * (2 + form.unknowns) * segments.scored.shape[2], 8), (1, 8)):
+        monkeypatch.setattr(laid, "_BLOCK", block)  # one block; three, the last of which is not full; no blocks
+        monkeypatch.setattr(laid, "_FEWEST", fewest)
+        told.append(sensitivity.__wrapped__(*given))
+    for other in told[1:]:
+        np.testing.assert_allclose(other.shared, told[0].shared, rtol=1e-11, atol=1e-12)
+        np.testing.assert_allclose(other.own, told[0].own, rtol=1e-11, atol=1e-12)
 
 
 def test_a_start_is_guessed_and_then_settled() -> None:

@@ -14,10 +14,12 @@ from jaxtyping import Bool, Float, Int
 
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.data.record import Experiment, Record
-from orthaug.models.dynamics import Dynamics, Numbers
+from orthaug.models.dynamics import Differentiated, Dynamics, Numbers
 from orthaug.models.rows import gram
 
 _CHUNK = 256  # segments that run side by side
+_BLOCK = 1 << 15  # numbers: slopes that are known at once
+_FEWEST = 8  # steps for which that pays
 
 
 class Segments(NamedTuple):
@@ -122,7 +124,24 @@ def sensitivity(
     """Gram matrices of the sensitivities `∂ŷ/∂(start, c, w)` and the error, rows multiplied by `weight`."""
     numbers = dynamics.prepared(numbers)
     _, n0, width = segments.start.shape
-    n, ny = dynamics.unknowns, len(dynamics.outputs)
+    n = dynamics.unknowns
+    at_once = _BLOCK // (width * (n0 + len(dynamics.outputs)) * (n0 + n)) if n0 else 0
+    blocks = isinstance(dynamics, Differentiated) and at_once >= _FEWEST
+    advance = partial(_steps_at_once, at_once) if blocks else _step_by_step
+
+    def one_chunk(total: Any, chunk: tuple[Any, ...]) -> tuple[Any, Any]:
+        state, *rows = chunk
+        nothing = (jnp.zeros((n + 1, n + 1)), jnp.zeros((n0, n0 + n + 1, width)))
+        shared, own = advance(dynamics, numbers, (state, dynamics.first_slopes(width), *nothing), rows, weight)
+        return total + shared, own
+
+    rows = (states, segments.inputs, segments.target, segments.scored)
+    return Sensitivity(*jax.lax.scan(one_chunk, jnp.zeros((n + 1, n + 1)), rows))
+
+
+def _step_by_step(dynamics: Dynamics, numbers: Numbers, carry: Any, rows: Any, weight: Any) -> tuple[Any, Any]:
+    """Gram matrices of one chunk, for dynamics that know how to carry slopes."""
+    n0, ny = dynamics.states, len(dynamics.outputs)
 
     def step(carry: tuple[Any, ...], row: tuple[Any, ...]) -> tuple[Any, None]:
         state, slopes, shared, own = carry
@@ -134,15 +153,50 @@ def sensitivity(
         own = own + sum(output[:n0, None] * output[None] for output in columns)
         return (state, slopes, shared, own), None
 
-    def one_chunk(total: Any, chunk: tuple[Any, ...]) -> tuple[Any, Any]:
-        state, inputs, target, scored = chunk
-        nothing = (jnp.zeros((n + 1, n + 1)), jnp.zeros((n0, n0 + n + 1, width)))
-        start = (state, dynamics.first_slopes(width), *nothing)
-        _, _, shared, own = jax.lax.scan(step, start, (inputs, target, scored))[0]
-        return total + shared, own
+    return jax.lax.scan(step, carry, tuple(rows))[0][2:]
 
-    rows = (states, segments.inputs, segments.target, segments.scored)
-    return Sensitivity(*jax.lax.scan(one_chunk, jnp.zeros((n + 1, n + 1)), rows))
+
+def _steps_at_once(most: int, dynamics: Any, numbers: Numbers, carry: Any, rows: Any, weight: Any) -> tuple[Any, Any]:
+    """The same a block of steps at a time: it is run, then differentiated at all its points, which are then known.
+
+    Only the product of the slopes has to go from step to step. A block is bounded, so nothing has the size of the data.
+    """
+    n0, ny, width = dynamics.states, len(dynamics.outputs), carry[0].shape[-1]
+    n, steps = dynamics.unknowns, len(rows[0])
+    count = -(-steps // most)
+    size = -(-steps // count)
+    side_by_side = jax.vmap(lambda state, row: dynamics.step(numbers, state, row)[0], -1, -1)
+
+    def block(carry: tuple[Any, ...], rows: tuple[Any, ...]) -> tuple[Any, None]:
+        state, slopes, shared, own = carry
+        inputs, target, scored = rows
+        state, states = jax.lax.scan(lambda state, row: (side_by_side(state, row), state), state, inputs)
+        steps = dynamics.local(numbers, _flat(states), _flat(inputs))
+        value, to_state, to_unknowns = (part.reshape(*part.shape[:-1], size, width) for part in steps)
+        own_slopes = jnp.pad(to_unknowns, ((0, 0), (n0, 0), (0, 0), (0, 0)))
+        by_step = (jnp.moveaxis(part[:n0], -2, 0) for part in (to_state, own_slopes))
+
+        def follow(slopes: Any, row: Any) -> tuple[Any, Any]:
+            to_state, beside = row
+            return sum(to_state[:, i, None] * slopes[None, i] for i in range(n0)) + beside, slopes
+
+        slopes, before = jax.lax.scan(follow, slopes, tuple(by_step))
+        before = jnp.moveaxis(before, 0, -2)  # (n0, n0 + n, size, width)
+        slope = sum(to_state[n0:, i, None] * before[None, i] for i in range(n0)) + own_slopes[n0:]
+        error = jnp.moveaxis(target, 0, -2) - value[n0:]
+        columns = jnp.where(scored, jnp.concatenate([slope, error[:, None]], axis=1), 0.0)
+        columns = jnp.einsum("oi,in...->on...", weight, columns) if ny > 1 else weight[0, 0] * columns
+        shared = shared + sum(gram(output[n0:].reshape(n + 1, -1)) for output in columns)
+        own = own + sum((output[:n0, None] * output[None]).sum(axis=-2) for output in columns)
+        return (state, slopes, shared, own), None
+
+    rows = [jnp.pad(part, ((0, count * size - steps), *((0, 0),) * (part.ndim - 1))) for part in rows]
+    cut = tuple(part.reshape(count, size, *part.shape[1:]) for part in rows)
+    return jax.lax.scan(block, carry, cut)[0][2:]
+
+
+def _flat(part: Float[Array, "T n m"]) -> Float[Array, "n T*m"]:
+    return jnp.moveaxis(part, 0, 1).reshape(part.shape[1], -1)
 
 
 @partial(jax.jit, static_argnames=("dynamics", "blocks"))

@@ -144,6 +144,26 @@ class Dynamics(Protocol):
         ...
 
 
+class Local(NamedTuple):
+    """Steps by themselves: next states and outputs (n0 + ny, r), and how they follow state and unknowns."""
+
+    value: Any
+    to_state: Any
+    """(n0 + ny, n0, r)."""
+    to_unknowns: Any
+    """(n0 + ny, n, r)."""
+
+    def along(self, slopes: Any, fused: bool = False) -> tuple[Any, Any, Any, Any]:
+        """As `Dynamics.tangents`, of states with the `slopes`. What is cheap to compute twice is better `fused`."""
+        n0 = len(slopes)
+        if fused:
+            through = sum(self.to_state[:, i, None] * slopes[None, i] for i in range(n0))
+        else:
+            through = jnp.einsum("ijm,jnm->inm", self.to_state, slopes)
+        slope = through + jnp.pad(self.to_unknowns, ((0, 0), (n0, 0), (0, 0)))
+        return self.value[:n0], slope[:n0], self.value[n0:], slope[n0:]
+
+
 class Differentiated:
     """What follows from `step`, for dynamics that know no faster way.
 
@@ -170,8 +190,8 @@ class Differentiated:
         n0 = self.states
         return jnp.broadcast_to(jnp.eye(n0, n0 + self.unknowns)[..., None], (n0, n0 + self.unknowns, width))
 
-    def tangents(self: Dynamics, numbers: Numbers, state: Any, slopes: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
-        """`S⁺ = A S + [0 B]` with A = ∂x⁺/∂x and B = ∂x⁺/∂(c, w), and the same for the output."""
+    def local(self: Dynamics, numbers: Numbers, states: Any, inputs: Any) -> Local:
+        """Steps from r states (n0, r) and inputs (nu, r), each by itself."""
         nt = len(numbers.theta)
 
         def both(state: Any, unknowns: Any, inputs: Any) -> Any:
@@ -180,14 +200,14 @@ class Differentiated:
             return jnp.concatenate([following, parts.total])
 
         unknowns = jnp.concatenate([jnp.asarray(numbers.theta), jnp.asarray(numbers.weights)])
-        value = jax.vmap(both, (-1, None, -1), -1)(state, unknowns, inputs)
-        to_state, to_unknowns = jax.vmap(jax.jacrev(both, (0, 1)), (-1, None, -1), -1)(state, unknowns, inputs)
+        value = jax.vmap(both, (-1, None, -1), -1)(states, unknowns, inputs)
+        slopes = jax.vmap(jax.jacrev(both, (0, 1)), (-1, None, -1), -1)(states, unknowns, inputs)
         # a kink without a derivative, such as sqrt(max(y, 0)) at 0, counts as flat
-        to_state, to_unknowns = (jnp.where(jnp.isfinite(d), d, 0.0) for d in (to_state, to_unknowns))
-        n0 = self.states
-        slope = jnp.einsum("ijm,jnm->inm", to_state, slopes)
-        slope = slope + jnp.pad(to_unknowns, ((0, 0), (n0, 0), (0, 0)))
-        return value[:n0], slope[:n0], value[n0:], slope[n0:]
+        return Local(value, *(jnp.where(jnp.isfinite(d), d, 0.0) for d in slopes))
+
+    def tangents(self: Any, numbers: Numbers, state: Any, slopes: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
+        """`S⁺ = A S + [0 B]` with A = ∂x⁺/∂x and B = ∂x⁺/∂(c, w), and the same for the output."""
+        return self.local(numbers, state, inputs).along(slopes)
 
 
 @partial(jax.jit, static_argnames="form")

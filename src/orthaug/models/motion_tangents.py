@@ -8,6 +8,7 @@ and ∂x⁺/∂w = Σ Ψ_i E G_i: the learner is differentiated once in a stage,
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +17,8 @@ from orthaug._base.jax import jax, jnp
 from orthaug.models.dynamics import Numbers
 from orthaug.models.integrators import input_at
 from orthaug.models.motion_field import MotionField
+
+_FEW = 8  # states and parameters; programs of more are slow to compile
 
 
 class Slopes(NamedTuple):
@@ -54,6 +57,7 @@ def sample_slopes(form: MotionField, numbers: Numbers, state: Any, row: Any) -> 
     return Slopes(x, to_x, to_c, to_w)
 
 
+@partial(jax.jit, static_argnames="form")  # for the stages of all substeps it is traced once
 def field_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
     """F at one point; ∂/∂w is that of the learned equations only, (nl, nw)."""
     c = numbers.theta - numbers.theta_aux
@@ -62,7 +66,7 @@ def field_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
     def physics(x: Any, c: Any) -> Any:
         return form.motion.rates(x, u, coordinates.physical(c, jnp), jnp)
 
-    value, (to_x, to_c) = physics(x, c), jax.jacfwd(physics, (0, 1))(x, c)
+    value, to_x, to_c = _differentiated(physics, x, c)
     to_x, to_c = _finite(to_x), _finite(to_c)
     states, _ = form.motion.learned
     if form.bound is None or not states:
@@ -98,7 +102,7 @@ def output_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes
     def physics(x: Any, c: Any) -> Any:
         return form.motion.observed(x, u, form.motion.coordinates.physical(c, jnp), jnp)
 
-    value, (to_x, to_c) = physics(x, c), jax.jacfwd(physics, (0, 1))(x, c)
+    value, to_x, to_c = _differentiated(physics, x, c)
     to_w = jnp.zeros((len(value), form.unknowns - len(c)))
     states, outputs = form.motion.learned
     if form.bound is not None and outputs:
@@ -107,6 +111,23 @@ def output_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes
         to_x = to_x.at[rows].add(learner.to_x[count:])
         to_w = to_w.at[rows].set(learner.to_w[count:])
     return Slopes(value, _finite(to_x), _finite(to_c), to_w)
+
+
+def _differentiated(function: Any, x: Any, c: Any) -> tuple[Any, Any, Any]:
+    """Value and slopes by x and c; of few entries one at a time, which leaves out what an entry does not touch."""
+    entries, n0 = [*x, *c], len(x)
+    if len(entries) > _FEW:
+        return function(x, c), *jax.jacfwd(function, (0, 1))(x, c)
+
+    def along(i: int) -> Any:
+        def of(entry: Any) -> Any:
+            moved = [*entries[:i], entry, *entries[i + 1 :]]
+            return function(jnp.stack(moved[:n0]), jnp.stack(moved[n0:]))
+
+        return jax.jvp(of, (entries[i],), (jnp.ones_like(entries[i]),))[1]
+
+    slopes = [along(i) for i in range(len(entries))]
+    return function(x, c), jnp.stack(slopes[:n0], axis=-1), jnp.stack(slopes[n0:], axis=-1)
 
 
 def _finite(slope: Any) -> Any:

@@ -14,10 +14,10 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import jax, jnp
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Experiment, Record
-from orthaug.models.dynamics import Differentiated, Numbers, Parts
+from orthaug.models.dynamics import Differentiated, Local, Numbers, Parts
 from orthaug.models.integrators import UNROLLED, Exponentials, advance, held
 from orthaug.models.motion_field import MotionField
-from orthaug.models.motion_tangents import Slopes, output_slopes, sample_slopes
+from orthaug.models.motion_tangents import output_slopes, sample_slopes
 from orthaug.physics.motion_layout import layout_of
 from orthaug.physics.starts import guess
 
@@ -65,17 +65,16 @@ class Moving(MotionField, Differentiated):
         return {name: float(value) for name, value in named}
 
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
+        return _step(self, numbers, state, inputs)
+
+    def _stepped(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
         y = self.observed(numbers, state, self.now(inputs))
         parts = Parts(y, jnp.zeros_like(y), jnp.zeros_like(y))
         if self.motion.integrator == "discrete":
             return sum(self.rates(numbers, state, self.now(inputs))), parts
 
-        def field(x: Any, u: Any) -> Any:
-            physics, learned = self.rates(numbers, x, u)
-            return physics + learned
-
         following = advance(
-            field,
+            partial(_field, self, numbers),
             self._exponentials(numbers) if numbers.scheme is None else numbers.scheme[0],
             state,
             inputs,
@@ -102,25 +101,28 @@ class Moving(MotionField, Differentiated):
             return None
         return Exponentials.of(self.linear_part(numbers), self.sampling_time / self.substeps)
 
+    @property
+    def _by_stages(self) -> bool:
+        return self.motion.integrator == "rk4" and self.substeps <= UNROLLED and self.differentiable
+
     def tangents(self, numbers: Numbers, state: Any, slopes: Any, inputs: Any) -> tuple[Any, Any, Any, Any]:
+        return self.local(numbers, state, inputs).along(slopes, fused=self._by_stages)
+
+    def local(self, numbers: Numbers, states: Any, inputs: Any) -> Local:
         """Of a few Runge-Kutta substeps by the adjoint of their stages; otherwise by automatic differentiation."""
         if numbers.scheme is not None:
-            value, slope, output, of_output = super().tangents(numbers, state, slopes, inputs)
-            return value, slope + self._by_scheme(numbers, state, inputs), output, of_output
-        if self.motion.integrator != "rk4" or self.substeps > UNROLLED or not self.differentiable:
-            return super().tangents(numbers, state, slopes, inputs)
-        following = jax.vmap(partial(sample_slopes, self, numbers), -1, -1)(state, inputs)
-        output = jax.vmap(lambda x, row: output_slopes(self, numbers, x, self.now(row)), -1, -1)(state, inputs)
-        return following.value, self._followed(following, slopes), output.value, self._followed(output, slopes)
-
-    def _followed(self, step: Slopes, slopes: Any) -> Any:
-        """∂/∂(start, c, w) of a map of (x, c, w), where x has the `slopes`."""
-        own = step.to_c if self.bound is None else jnp.concatenate([step.to_c, step.to_w], axis=1)
-        through = sum(step.to_x[:, i, None] * slopes[None, i] for i in range(self.states))
-        return through + jnp.pad(own, ((0, 0), (self.states, 0), (0, 0)))
+            value, to_state, to_unknowns = super().local(numbers, states, inputs)
+            return Local(value, to_state, to_unknowns + self._by_scheme(numbers, states, inputs))
+        if not self._by_stages:
+            return super().local(numbers, states, inputs)
+        following = jax.vmap(partial(sample_slopes, self, numbers), -1, -1)(states, inputs)
+        output = jax.vmap(lambda x, row: output_slopes(self, numbers, x, self.now(row)), -1, -1)(states, inputs)
+        known = 4 if self.bound is not None else 3  # there are no weights otherwise
+        value, to_x, *own = (jnp.concatenate(both) for both in zip(following[:known], output[:known], strict=True))
+        return Local(value, to_x, jnp.concatenate(own, axis=1))
 
     def _by_scheme(self, numbers: Numbers, state: Any, inputs: Any) -> Any:
-        """How the next states (nx, n0 + n, m) follow p through the exponentials, which a step takes as given."""
+        """How states and outputs (n0 + ny, n, r) follow p through the exponentials, which a step takes as given."""
         scheme, by_theta = numbers.scheme
 
         def following(scheme: Any, state: Any, row: Any) -> Any:
@@ -132,5 +134,16 @@ class Moving(MotionField, Differentiated):
             )
 
         moved = jax.vmap(along, -1, 1)(by_theta)  # a tangent for each parameter: (nx, np, m)
-        before, after = self.states, self.unknowns - moved.shape[1]
-        return jnp.pad(moved, ((0, 0), (before, after), (0, 0)))
+        after = self.unknowns - moved.shape[1]
+        return jnp.pad(moved, ((0, len(self.outputs)), (0, after), (0, 0)))
+
+
+@partial(jax.jit, static_argnames="form")
+def _step(form: Moving, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
+    """A step. It is traced once, whatever programs it stands in; so is the field in it."""
+    return form._stepped(numbers, state, inputs)
+
+
+@partial(jax.jit, static_argnames="form")
+def _field(form: Moving, numbers: Numbers, x: Any, u: Any) -> Any:
+    return sum(form.rates(numbers, x, u))

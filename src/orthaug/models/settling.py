@@ -16,7 +16,7 @@ from orthaug._base.jax import Array, jax, jnp
 from orthaug.models.dynamics import Dynamics, Numbers
 
 _FIRST_DAMPING = 1e-3
-_SETTLED = 1e-10  # relative decrease that ends the iteration
+_SETTLED = 1e-10  # relative decrease that is not worth a step
 
 
 class Windows(NamedTuple):
@@ -39,26 +39,30 @@ def settle(
 ) -> tuple[Float[np.ndarray, "n0 m"], Vector]:
     """The states at the windows' first rows that lower `‖weight e‖²` most, and its value (m,).
 
+    A window ends where a step promises to lower it by less than a 10⁻¹⁰th part: that is a 10⁻⁵th of its own noise.
+
     Args:
         states: where to begin.
         loose: (n0,) how far a state may be from there before that counts as much as one error.
     """
     begun = np.asarray(states, dtype=float)
     prior = 1 / np.asarray(loose, dtype=float) ** 2
+    windows = Windows(*map(jax.device_put, windows))  # once for all iterations
     best, damping = begun, np.full(begun.shape[1], _FIRST_DAMPING)
     matrix, right, misfit = _linearised(form, numbers, begun, windows, weight, begun, prior)
     for _ in range(iterations):
-        trial = best + _steps(matrix, right, damping)
-        there = _linearised(form, numbers, trial, windows, weight, begun, prior)
+        step = _steps(matrix, right, damping)
         with np.errstate(all="ignore"):
-            lower = there[2] < misfit
-            gained = np.where(lower, (misfit - there[2]) / misfit, 0.0)
+            ended = (step * right.T).sum(axis=0) <= _SETTLED * misfit
+        if ended.all():
+            break
+        trial = np.where(ended, best, best + step)
+        there = _linearised(form, numbers, trial, windows, weight, begun, prior)
+        lower = there[2] < misfit
         best = np.where(lower, trial, best)
         matrix = np.where(lower[:, None, None], there[0], matrix)
         right, misfit = np.where(lower[:, None], there[1], right), np.where(lower, there[2], misfit)
         damping = np.where(lower, damping / 8, damping * 8)
-        if not (gained > _SETTLED).any() and (damping.min(initial=1.0) > 1 or not lower.any()):
-            break
     return best, misfit
 
 
@@ -99,21 +103,30 @@ def _gram(
     """Gram matrix of the sensitivities to the start with themselves and the error, and the error's square."""
     numbers = form.prepared(numbers)
     n0, m = states.shape
+    directions = jnp.eye(n0)
 
     def both(state: Any, row: Any) -> Any:
         following, parts = form.step(numbers, state, row)
         return jnp.concatenate([following, parts.total])
 
+    def sloped(state: Any, row: Any) -> tuple[Any, Any]:
+        """A step and its slopes (n0 + ny, n0)."""
+        along = jax.vmap(lambda moved: jax.jvp(lambda x: both(x, row), (state,), (moved,)), out_axes=(None, -1))
+        return along(directions)
+
     def step(carry: tuple[Any, ...], row: tuple[Any, ...]) -> tuple[Any, None]:
         state, slopes, gram, square = carry
         inputs, target, there = row
-        value = jax.vmap(both, -1, -1)(state, inputs)
-        slope = jax.vmap(jax.jacfwd(both), -1, -1)(state, inputs)
-        slope = jnp.einsum("ijm,jnm->inm", jnp.where(jnp.isfinite(slope), slope, 0.0), slopes)
+        value, slope = jax.vmap(sloped, -1, -1)(state, inputs)
+        slope = jnp.where(jnp.isfinite(slope), slope, 0.0)
+        slope: Any = sum(
+            slope[:, i, None] * slopes[None, i] for i in range(n0)
+        )  # products of lanes are no matrix products
         columns = jnp.concatenate([slope[n0:], (target - value[n0:])[:, None]], axis=1)
-        columns = jnp.einsum("oi,inm->onm", weight, jnp.where(there, columns, 0.0))
-        gram = gram + jnp.einsum("oim,ojm->ijm", columns[:, :n0], columns)
-        square = square + jnp.sum(columns[:, n0] ** 2, axis=0)
+        columns = jnp.where(there, columns, 0.0)
+        columns: Any = sum(weight[:, i, None, None] * columns[None, i] for i in range(len(weight)))
+        gram = gram + sum(column[:n0, None] * column[None] for column in columns)
+        square = square + sum(column[n0] ** 2 for column in columns)
         return (value[:n0], slope[:n0], gram, square), None
 
     first = jnp.broadcast_to(jnp.eye(n0)[..., None], (n0, n0, m))

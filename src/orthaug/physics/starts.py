@@ -7,6 +7,7 @@ at zero. Training and simulation go on from there: a start is an unknown.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -27,10 +28,8 @@ def guess(
     begin = np.clip(rows - width // 2, 0, len(outputs) - width)
     level = np.zeros((2, len(rows), outputs.shape[1]))
     if width:
-        offset = np.arange(width)[None, :] - (rows - begin)[:, None]
-        powers = offset[..., None] ** np.arange(min(_DEGREE, width - 1) + 1)
         there = outputs[begin[:, None] + np.arange(width)]
-        fitted = np.linalg.pinv(powers) @ there  # (r, degree + 1, ny)
+        fitted = _polynomials(width)[rows - begin] @ there  # (r, degree + 1, ny)
         level[: fitted.shape[1]] = np.moveaxis(fitted[:, :2], 1, 0)
     names = [output.name for output in motion.outputs]
     states = np.zeros((len(rows), len(motion.states)))
@@ -41,3 +40,10 @@ def guess(
         elif state.start is not None:
             states[:, i] = float(state.start)
     return states
+
+
+@cache
+def _polynomials(width: int) -> Float[np.ndarray, "width degree+1 width"]:
+    """What gives the coefficients of a local polynomial about each of its rows from the values of all."""
+    offset = np.arange(width)[None, :] - np.arange(width)[:, None]
+    return np.linalg.pinv(offset[..., None] ** np.arange(min(_DEGREE, width - 1) + 1))
