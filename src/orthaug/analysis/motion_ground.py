@@ -1,0 +1,43 @@
+"""Where biases of a motion are computed: about physics alone before a fit, about the fitted motion after it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from orthaug.analysis.motion_bias import MotionGround
+from orthaug.analysis.motion_response import Place, place_of
+from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.fitting.motion_measures import field_under
+from orthaug.fitting.motion_task import MotionTask
+from orthaug.fitting.structures import Structure
+from orthaug.inference.motion_split import MotionSplit, shared_of_motion
+from orthaug.models.motion_parts import parts_at
+from orthaug.physics.shared import Shared
+
+
+def ground_after(fit: MotionEstimate) -> MotionGround | None:
+    """Of a fitted motion under the measure that it was split under; None where it has no normal equations."""
+    if not fit.status.ok or fit.scores is None:
+        return None
+    place, field, learned = place_of(fit.model, fit.course, fit.states, fit.scores.weight), fit.split_by.field, None
+    if fit.model.form.bound is not None:
+        learned = parts_at(fit.model.form, fit.model.numbers, field.x, field.u)[1]
+        learned = np.where(np.isfinite(learned), learned, 0.0)
+    return MotionGround(place, fit.theta, fit.shared, field, learned, (*fit.unidentified, *fit.at_bound))
+
+
+def ground_before(task: MotionTask, structure: Structure) -> MotionGround | None:
+    """Of physics alone, with what a learner of the task's features could hold; None where it has no run."""
+    if task.physics is None:
+        return None
+    course, flown = task.plan, task.physics.end.flown
+    form, names = course.dynamics, course.problem.motion.names
+    weights = np.zeros(0)
+    place = Place(course, flown.theta, weights, flown.states, task.physics.objective.weight)
+    none = MotionSplit.none("training", form, flown.theta)
+    if course.bound is None:
+        return MotionGround(place, flown.theta, none.shared, none.field)
+    field = field_under(structure.measure, course.alone, course.alone.numbers(flown.theta, weights), flown.states)[0]
+    if structure.shared == "all":
+        return MotionGround(place, flown.theta, Shared(names, np.eye(len(names))), field)
+    return MotionGround(place, flown.theta, shared_of_motion(form, flown.theta, field.x, field.u), field)
