@@ -244,5 +244,6 @@ def _warning(ground: Ground, budget: Budget, rival: SuspectedBias | None) -> War
 
 
 def told_bias(entry: ParameterBias) -> str:
+    """A bias in words."""
     share = "" if entry.relative is None else f", {100 * entry.relative:+.2g} %"
     return f"{entry.name} by {entry.value:+.2g} ({entry.errors:.2g} standard errors{share})"

@@ -15,7 +15,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug.analysis.absorbed import completing
@@ -35,13 +34,14 @@ CERTIFIED_POINTS = 20_000  # of a measure at most, over which certificates are s
 class Told:
     """What the free run's residual tells of a term beside all that was fitted: one Gauss-Newton step.
 
-    `share` is by how much of the residual's squares it falls.
+    `share` is by how much of the residual's squares it falls, `left` what stays of them beyond white noise.
     """
 
     coefficient: float
     std: float | None
     t: float | None
     share: float
+    left: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ class TermBias:
     """The same of p̂, to first order."""
     value: Vector
     expected: Vector | None
-    """p̂ less p without the term, of the guessed coefficient."""
+    """The same times the guessed coefficient."""
     cosine: float | None
     size: float
     seen: bool | None
@@ -113,6 +113,8 @@ class MotionGround:
     field: Field
     learned: Matrix | None = None
     unknown: tuple[str, ...] = ()
+    slope: Matrix | None = None
+    """How p̂ follows (c, w) of a fit (np, np + nw); None where that is not known."""
 
     @property
     def motion(self) -> Motion:
@@ -126,9 +128,8 @@ class MotionGround:
     @cached_property
     def phi(self) -> Projection:
         """∂f/∂q of the learned equations over the points, rows times the root of their weights over their sizes."""
-        states, outputs = self.motion.learned
-        rows = [*states, *(len(self.motion.states) + i for i in outputs)]
-        slopes = np.asarray(slopes_at(self.place.course.dynamics.alone, self.q, self.field.x, self.field.u))[:, rows]
+        slopes = np.asarray(slopes_at(self.place.course.dynamics.alone, self.q, self.field.x, self.field.u))
+        slopes = slopes[:, self._learned]
         return Projection.factor(self._weighed(np.moveaxis(slopes, 2, 0)).transpose(1, 2, 0))
 
     def _weighed(self, rows: np.ndarray) -> np.ndarray:
@@ -147,46 +148,52 @@ class MotionGround:
         response = respond_to(self.place, added)
         if not np.isfinite(response.information).all() or not np.isfinite(response.gradient).all():
             return []
-        residuals = [None] * len(added) if used is None else told_by_residual(response, used, steps)
-        return [self._entry(response, k, suspect, residuals[k]) for k, suspect in enumerate(suspects)]
+        seen = [self._seen(suspect) if self.learns else None for suspect in suspects]
+        residuals: list[Told | None] = [None] * len(added)
+        if used is not None and not all(seen):  # what the learner sees it has taken from the residual
+            residuals = told_by_residual(response, used, steps)
+        rows = enumerate(zip(suspects, seen, residuals, strict=True))
+        return [self._entry(response, k, *row) for k, row in rows]
 
-    def _entry(self, response: TermsResponse, k: int, suspect: MotionSuspect, residual: Told | None) -> TermBias:
+    def _entry(
+        self, response: TermsResponse, k: int, suspect: MotionSuspect, seen: bool | None, residual: Told | None
+    ) -> TermBias:
         motion, names = self.motion, self.motion.names
         place = suspect.place(motion)
         basis, certificate, explained, found = self.shared.basis, None, None, None
-        seen = self._seen(suspect, place) if self.learns else None
-        apart = ~np.isin(np.arange(len(names)), completing(basis))
-        moved, unknowns = response.moved(k, apart)
+        trained = bool(len(self.place.w))  # a learner that is not may hold all along shared directions
+        apart = np.zeros(len(names), dtype=bool) if trained else ~np.isin(np.arange(len(names)), completing(basis))
+        moved, dw = response.moved(k, apart)
         if self.learns:
             delta = self._rows(suspect, place)
-            held = delta if seen else response.held(unknowns, self.field.x, self.field.u)
+            held = delta if seen else response.held(dw, self.field.x, self.field.u)
             held = self._weighed(held)
-            moved = np.zeros(len(names)) if seen else moved
-            if basis.shape[1]:
-                moved = moved + self.phi.solve_along(held, basis)
-                if len(held) <= CERTIFIED_POINTS and np.any(delta):
-                    certificate = find_certificate(self.phi, self._weighed(delta), basis)
+            if not seen and trained and self.slope is not None:
+                moved = self.slope @ np.concatenate([moved, dw])
+            elif basis.shape[1]:
+                moved = (0.0 if seen else moved) + self.phi.solve_along(held, basis)
+            elif seen:
+                moved = np.zeros(len(names))
+            if basis.shape[1] and len(held) <= CERTIFIED_POINTS and np.any(delta):
+                certificate = find_certificate(self.phi, self._weighed(delta), basis)
             explained, found = self._explained(held)
         moved = np.where(np.isin(names, self.unknown), np.nan, moved)
         coordinates = motion.coordinates
-        value = coordinates.physical(self.q)
+        value, per_unit = coordinates.physical(self.q), coordinates.slopes(self.q) * moved
         expected = None
         if suspect.coefficient is not None:
-            expected = value - coordinates.physical(self.q - suspect.coefficient * moved)
+            expected = suspect.coefficient * per_unit
         known = (*motion.names_of_states, *(output.name for output in motion.outputs))
-        per_unit = coordinates.slopes(self.q) * moved
         own = (suspect, known[place], names, moved, per_unit, value, expected)
         told = (response.cosine(k), response.size(k), seen, explained, found, certificate)
         return TermBias(*own, *told, None if seen else residual)
 
     def _rows(self, suspect: MotionSuspect, place: int) -> Matrix:
         """The term (M, nl) in the learned equations, 0 where it acts elsewhere."""
-        states, outputs = self.motion.learned
-        places = [*states, *(len(self.motion.states) + i for i in outputs)]
-        rows = np.zeros((len(self.field.x), len(places)))
-        if place in places:
+        rows = np.zeros((len(self.field.x), len(self._learned)))
+        if place in self._learned:
             p = self.motion.coordinates.physical(self.q)
-            rows[:, places.index(place)] = suspect.values(self.motion, p, self.field.x, self.field.u)
+            rows[:, self._learned.index(place)] = suspect.values(self.motion, p, self.field.x, self.field.u)
         return np.where(np.isfinite(rows), rows, 0.0)
 
     def _explained(self, held: Matrix) -> tuple[float | None, float | None]:
@@ -205,15 +212,20 @@ class MotionGround:
         product = float(np.vdot(rest, tilde)) / norm
         return float(min((product / np.linalg.norm(tilde)) ** 2, 1.0)), float(product / norm)
 
-    def _seen(self, suspect: MotionSuspect, place: int) -> bool:
-        """Whether the learner is added where the term acts, and the term is a function of what the learner sees."""
+    @property
+    def _learned(self) -> list[int]:
+        """The numbers of the learned equations, outputs after states."""
         states, outputs = self.motion.learned
-        if place not in (*states, *(len(self.motion.states) + i for i in outputs)):
+        return [*states, *(len(self.motion.states) + i for i in outputs)]
+
+    def _seen(self, suspect: MotionSuspect) -> bool:
+        """Whether the learner is added where the term acts, and the term is a function of what the learner sees."""
+        if suspect.place(self.motion) not in self._learned:
             return False
         start, end = self._moves
         p, nx = self.motion.coordinates.physical(self.q), len(self.motion.states)
         pairs = np.stack([suspect.values(self.motion, p, x[:, :nx], x[:, nx:]) for x in (start, end)])
-        there: Bool[np.ndarray, "M"] = np.isfinite(pairs).all(axis=0)
+        there: Any = np.isfinite(pairs).all(axis=0)
         pairs = pairs[:, there]
         size = np.sqrt(np.mean(pairs**2)) if pairs.size else 0.0
         return bool(np.abs(pairs[1] - pairs[0]).max(initial=0.0) <= _SAME * size)
@@ -232,13 +244,9 @@ def told_by_residual(response: TermsResponse, used: float, steps: int | None) ->
     Args:
         used: weights that the fit used.
     """
-    place, parameters = response.place, response.parameters
-    course = place.course
-    with np.errstate(all="ignore"):
-        errors = course.objective().errors(place.c, place.w, place.states, course.segments)
-        whole = float(np.sum(np.einsum("oi,ktim->ktom", place.weight, errors) ** 2))
-    white = whole / max(course.residuals - parameters - used, 1.0)
-    middle = None if steps is None else response.scores().middle(steps, parameters + used)[0]
+    whole, noise = response.squares()
+    free = max(response.place.course.residuals - response.parameters - used, 1.0)
+    middle = None if steps is None else response.scores().middle(steps, response.parameters + used)[0]
     found: list[Told | None] = []
     for k in range(response.terms):
         step = response.step(k)
@@ -246,8 +254,8 @@ def told_by_residual(response: TermsResponse, used: float, steps: int | None) ->
             found.append(None)
             continue
         coefficient, fall, row = step
-        alone = white * float(row @ response.information @ row)
-        variance = alone if middle is None else float(row @ middle @ row)
+        variance = whole / free * float(row @ response.information @ row) if middle is None else row @ middle @ row
         std = float(np.sqrt(variance)) if variance > 0 else None
-        found.append(Told(coefficient, std, None if std is None else coefficient / std, min(fall / whole, 1.0)))
+        shares = min(fall / whole, 1.0), float(np.clip((whole - noise - fall) / whole, 0.0, 1.0))
+        found.append(Told(coefficient, std, None if std is None else coefficient / std, *shares))
     return found

@@ -46,16 +46,14 @@ def motion_budget(fit: MotionEstimate, table: Sequence[TermBias]) -> MotionBudge
     if named is None:
         return None
     cause, coefficient, share, spread = named
-    coordinates, dq = fit.problem.motion.coordinates, coefficient * cause.moved
-    rest = np.abs(spread * cause.moved)
-    std = np.full(len(dq), np.nan) if fit.covariance is None else np.sqrt(np.diag(fit.covariance))
-    value = fit.values
-    bias = value - coordinates.physical(fit.theta - dq)
-    ends = np.stack([coordinates.physical(end) for end in with_bias(fit.theta, std, fit.freedom, dq, rest).T], axis=-1)
+    bias, value = coefficient * cause.per_unit, fit.values
+    std = np.full(len(value), np.nan) if fit.std is None else fit.std
+    ends = with_bias(value, std, fit.freedom, bias, spread * cause.per_unit)
+    ends = np.clip(ends, *([[getattr(p, end)] for p in fit.problem.motion.parameters] for end in ("min", "max")))
     rows = []
     for i, name in enumerate(cause.names):
         if np.isfinite(bias[i]):
-            errors = float(abs(dq[i]) / std[i]) if std[i] > 0 else None
+            errors = float(abs(bias[i]) / std[i]) if std[i] > 0 else None
             limits = (float(ends[i, 0]), float(ends[i, 1])) if np.isfinite(ends[i]).all() else None
             relative = float(bias[i] / value[i]) if value[i] else None
             rows.append(ParameterBias(name, float(bias[i]), cause.suspect.name, share, relative, errors, limits))
@@ -65,7 +63,7 @@ def motion_budget(fit: MotionEstimate, table: Sequence[TermBias]) -> MotionBudge
 
 
 def _of_learner(table: Sequence[TermBias]) -> tuple[TermBias, float, float, float] | None:
-    """The term that explains most of the learner, with its coefficient, its share, and how unsure the coefficient is."""
+    """The term that explains most of the learner: its coefficient, share, and how unsure the coefficient is."""
     best = max(table, key=lambda entry: entry.explained or 0.0, default=None)
     if best is None or best.explained is None or best.explained < LEAST_SHARE or best.coefficient_found is None:
         return None
@@ -74,12 +72,17 @@ def _of_learner(table: Sequence[TermBias]) -> tuple[TermBias, float, float, floa
 
 
 def _of_residual(table: Sequence[TermBias]) -> tuple[TermBias, float, float, float] | None:
-    """The term that lowers the residual most, where that is no chance."""
+    """The term that lowers the residual most, where that is no chance.
+
+    What stays beyond white noise counts as biased by as much for its size, of unknown sign.
+    """
     sure = [entry for entry in table if entry.residual is not None and abs(entry.residual.t or 0.0) >= _SURE]
     best = max(sure, key=lambda entry: entry.residual.share if entry.residual else 0.0, default=None)
     if best is None or best.residual is None or best.residual.std is None:
         return None
-    return best, best.residual.coefficient, best.residual.share, best.residual.std
+    told, std = best.residual, best.residual.std
+    unsure = np.hypot(std, told.coefficient * np.sqrt(told.left / told.share))
+    return best, told.coefficient, told.share, float(unsure)
 
 
 def _warning(budget: MotionBudget, *, learns: bool) -> Warning | None:

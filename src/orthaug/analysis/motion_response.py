@@ -1,26 +1,29 @@
 """How a motion's estimate answers to further terms in its equations: normal equations of the free run with them in it.
 
-With S the sensitivities of the free run to the parameters' coordinates c, the terms' coefficients κ and what a learner
-could hold h, the starts eliminated, a term of size κ that the fit does not know moves (c, h) by `(SᵀS)⁻¹ Sᵀ S_κ κ`:
+With S the sensitivities of the free run to the parameters' coordinates c, the terms' coefficients κ and a learner's
+weights w, the starts eliminated, a term of size κ that the fit does not know moves (c, w) by `(SᵀS + ridge)⁻¹SᵀS_κ κ`:
 estimate less truth. What the free run leaves, r, tells κ itself by one Gauss-Newton step, beside all that was fitted.
+
+Before any training waves stand for the learner. They can be any function of what it sees.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.analysis.waves import Waves, functions_of
+from orthaug._base.jax import Array, jax, jnp
+from orthaug.analysis.waves import Waves
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.motion_course import MotionCourse
 from orthaug.fitting.segments import sensitivity
 from orthaug.models.dynamics import Numbers
 from orthaug.models.learners import Bound
-from orthaug.models.motion_model import MotionModel
 from orthaug.models.moving import Moving
 from orthaug.physics.suspected_motion import AddedTerm, SuspectedMotion
 
@@ -31,7 +34,7 @@ ALIKE = 1e-6  # of a term's effect on the outputs: less than this beside what wa
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """Where a free run is linearised: a course with its coordinates, its learner's weights, and its segments' starts."""
+    """Where a free run is linearised: a course with its coordinates, its learner's weights and its segments' starts."""
 
     course: MotionCourse
     c: Vector
@@ -39,13 +42,15 @@ class Place:
     states: Any
     weight: Matrix
     """(ny, ny), multiplies errors."""
+    ridge: float = 0.0
+    """On the weights, in the unit of the weighted errors."""
 
 
 @dataclass(frozen=True, eq=False)
 class TermsResponse:
-    """Normal equations of (c, κ, w, h), the starts eliminated; `fitted` are those that a fit has, κ left out.
+    """Normal equations of (c, κ, w), the starts eliminated; `fitted` are those that a fit has, κ left out.
 
-    `form` and `numbers` are of the motion with the terms, and a learner of h beside its own.
+    `form` and `numbers` are of the motion with the terms, with waves for a learner that is not trained yet.
     """
 
     place: Place
@@ -61,8 +66,8 @@ class TermsResponse:
     def parameters(self) -> int:
         return len(self.place.c)
 
-    def moved(self, k: int, apart: Bool[np.ndarray, "np"]) -> tuple[Vector, Float[np.ndarray, "n"]]:
-        """What a unit of term k adds to c (np,), and to all unknowns; parameters in `apart` stay.
+    def moved(self, k: int, apart: Bool[np.ndarray, "np"]) -> tuple[Vector, Float[np.ndarray, "nw"]]:
+        """What a unit of term k adds to c (np,), and to the weights; parameters in `apart` stay.
 
         Args:
             apart: those whose change the learner could undo, so that it holds it instead.
@@ -70,15 +75,19 @@ class TermsResponse:
         free = self.fitted.copy()
         free[: self.parameters] &= ~apart
         found = np.zeros(len(free))
-        found[free] = _solved(self.information[np.ix_(free, free)], self.information[free, self.parameters + k])
-        return found[: self.parameters], found
+        found[free] = _solved(self.penalised[np.ix_(free, free)], self.information[free, self.parameters + k])
+        return found[: self.parameters], found[self.parameters + self.terms :]
 
-    def held(self, found: Vector, x: Matrix, u: Matrix) -> Matrix:
-        """What the learner holds (M, nl) at states (M, nx) and inputs (M, nu), of what a term adds to all unknowns."""
-        numbers, ny = self.numbers, self.form.bound.ny if self.form.bound else 0
-        weights = found[len(found) - int(self.fitted[self.parameters :].sum()) :].reshape(ny, -1)
-        z = (self.form.seen(x.T, u.T, np).T - numbers.centre) / numbers.halfwidth
-        return numbers.gain * (weights @ functions_of(z.T, np)).T
+    @property
+    def penalised(self) -> Matrix:
+        """The information with the ridge."""
+        first = self.parameters + self.terms
+        ridge = np.where(np.arange(len(self.fitted)) >= first, self.place.ridge, 0.0)
+        return self.information + np.diag(ridge)
+
+    def held(self, dw: Vector, x: Matrix, u: Matrix) -> Matrix:
+        """What a change of the weights adds to the learner (M, nl) at states (M, nx) and inputs (M, nu)."""
+        return np.asarray(_along(self.form, self.numbers, dw, x, u))
 
     def cosine(self, k: int) -> float | None:
         """How much of the term's effect on the outputs the fit takes up, in [0, 1]; None where it has none."""
@@ -99,8 +108,25 @@ class TermsResponse:
         row, left = self._beside(k)
         if not left > ALIKE * self.information[self.parameters + k, self.parameters + k]:
             return None
-        coefficient = float(row @ self.gradient / left)
+        pulled = np.zeros(len(row))
+        pulled[self.parameters + self.terms :] = self.place.ridge * np.asarray(self.numbers.weights)
+        coefficient = float(row @ (self.gradient - pulled) / left)
         return coefficient, coefficient**2 * left, row / left
+
+    def squares(self) -> tuple[float, float]:
+        """The sum of squares that the free run leaves, and as much of it as neighbouring steps do not share.
+
+        The second is half the sum of squared differences (von Neumann 1941): all of white noise, little of what physics
+        leaves out.
+        """
+        place = self.place
+        errors = place.course.objective().errors(place.c, place.w, place.states, place.course.segments)
+        errors = np.einsum("oi,ktim->ktom", place.weight, errors)
+        scored = np.asarray(place.course.segments.scored)[:, :, None]
+        pairs = scored[:, 1:] & scored[:, :-1]
+        apart = float(np.sum(np.where(pairs, np.diff(errors, axis=1), 0.0) ** 2)) / 2
+        whole = float(np.sum(errors**2))
+        return whole, min(apart * float(scored.sum() / max(pairs.sum(), 1)), whole)
 
     def scores(self) -> FreeRunScores:
         """The scores of all unknowns, for standard errors that hold for coloured errors."""
@@ -116,7 +142,7 @@ class TermsResponse:
         row = np.zeros(len(self.fitted))
         row[i] = 1.0
         across = self.information[self.fitted, i]
-        row[self.fitted] = -_solved(self.information[np.ix_(self.fitted, self.fitted)], across)
+        row[self.fitted] = -_solved(self.penalised[np.ix_(self.fitted, self.fitted)], across)
         return row, float(self.information[i, i] + across @ row[self.fitted])
 
 
@@ -124,22 +150,19 @@ def respond_to(place: Place, added: tuple[AddedTerm, ...]) -> TermsResponse:
     """Linearise a free run with further terms, and with all that its learner could hold."""
     course, motion = place.course, place.course.problem.motion
     suspected = SuspectedMotion.of(motion, added)
-    bound, features = None, course.problem.features
-    if course.bound is not None:
-        inner = course.bound.learner if len(place.w) else None
-        bound = Bound(Waves(inner), len(features), sum(map(len, motion.learned)))
-    form = replace(course.dynamics, motion=suspected, bound=bound, features=features if bound else ())
-    held = 0 if bound is None else bound.size - len(place.w)
-    c, w = np.concatenate([place.c, np.zeros(len(added))]), np.concatenate([place.w, np.zeros(held)])
-    numbers = course.numbers(c, w)
+    bound, w = course.bound, place.w
+    if bound is not None and not len(w):
+        bound = Bound(Waves(), bound.nz, bound.ny)
+        w = np.zeros(bound.size)
+    form = replace(course.dynamics, motion=suspected, bound=bound)
+    numbers = course.numbers(np.concatenate([place.c, np.zeros(len(added))]), w)
     slopes = sensitivity(form, numbers, course.segments, place.states, place.weight)
     objective = course.objective()
     rows = LOOSER * objective.start_rows
     information, gradient, _, slope = objective.initial.eliminate(slopes, place.states, rows)
     low, high = motion.coordinates.bounds
-    fitted = np.concatenate(
-        [(low < place.c) & (place.c < high), np.zeros(len(added) + len(place.w), dtype=bool), np.ones(held, dtype=bool)]
-    )
+    inside = (low < place.c) & (place.c < high)
+    fitted = np.concatenate([inside, np.zeros(len(added), dtype=bool), np.ones(len(w), dtype=bool)])
     return TermsResponse(place, form, numbers, information, gradient, slope, fitted, len(added))
 
 
@@ -154,7 +177,11 @@ def _solved(matrix: Matrix, right: Vector) -> Vector:
     return scale * (vectors @ ((vectors.T @ (scale * right)) / values[kept]))
 
 
-def place_of(model: MotionModel, course: MotionCourse, states: Any, weight: Matrix) -> Place:
-    """Where a fitted model is."""
-    c = np.asarray(model.numbers.theta - model.numbers.theta_aux)
-    return Place(course, c, np.asarray(model.numbers.weights), states, weight)
+@partial(jax.jit, static_argnames="form")
+def _along(
+    form: Moving, numbers: Numbers, dw: Float[Array, "nw"], x: Float[Array, "m nx"], u: Float[Array, "m nu"]
+) -> Float[Array, "m nl"]:
+    def learned(w: Any) -> Any:
+        return jax.vmap(lambda x, u: form.learned(numbers._replace(weights=w), x, u))(x, u)
+
+    return jax.jvp(learned, (jnp.asarray(numbers.weights),), (jnp.asarray(dw),))[1]

@@ -25,7 +25,7 @@ _OF_INPUTS = ("cubic", "dead_zone", "saturation")
 
 @dataclass(frozen=True)
 class MotionSuspect:
-    """A term `coefficient * expression` of the equation of a state, or of an output; make one of a known kind with `of`.
+    """A term `coefficient * expression` of a state's equation, or of an output; make one of a known kind with `of`.
 
     `coefficient` is a guess of its size, None where there is none; `unit` is its unit. `equation` may be left out where
     one state is learned, or only one equation has parameters.

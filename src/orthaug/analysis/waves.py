@@ -10,7 +10,6 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import jnp
-from orthaug.models.learners import Learner
 
 WAVES = 24  # tanh functions
 _STEEPEST = 30.0  # of their slopes, in units of 1 / range of z
@@ -19,18 +18,15 @@ _SEED = 20_241_122
 
 @dataclass(frozen=True)
 class Waves:
-    """A constant, the features z in [-1, 1] and tanh waves of them, each with a weight; added to `beside`."""
+    """A constant, the features z in [-1, 1] and tanh waves of them, each with a weight."""
 
-    beside: Learner | None = None
     inputs: tuple[str, ...] | None = None
 
     def init(self, key: Any, nz: int, ny: int) -> Any:
-        own = jnp.zeros((ny, 1 + nz + WAVES))
-        return (() if self.beside is None else self.beside.init(key, nz, ny)), own
+        return jnp.zeros((ny, 1 + nz + WAVES))
 
     def apply(self, tree: Any, z: Any) -> Any:
-        value = tree[1] @ functions_of(z, jnp)
-        return value if self.beside is None else value + self.beside.apply(tree[0], z)
+        return tree @ functions_of(z, jnp)
 
 
 def functions_of(z: Any, xp: Any) -> Any:

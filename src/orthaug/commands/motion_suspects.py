@@ -56,10 +56,6 @@ def bias_before(job: MotionJob, task: MotionTask) -> list[dict[str, Any]] | None
 
 def table_after(job: MotionJob, fit: MotionEstimate) -> list[TermBias]:
     """What the declared suspects do to a fit, and what tells of them."""
-    from orthaug.analysis.motion_ground import ground_after
-    from orthaug.analysis.robustness import block_of
+    from orthaug.analysis.motion_ground import suspected_bias
 
-    ground = ground_after(fit) if job.suspects else None
-    if ground is None:
-        return []
-    return ground.table(job.suspects, fit.effective_weights, block_of(fit) if fit.plain_covariance is not None else None)
+    return suspected_bias(fit, job.suspects) if job.suspects else []

@@ -206,11 +206,11 @@ class Spec(Section):
         for name in ("baseline", "lags", "physics", "design") if self.motion is not None else ():
             if name in self.model_fields_set:
                 raise ValueError(f"`{name}`: found beside [motion]; {_BESIDE_MOTION[name]}")
-        for i, key in ((i, key) for i, section in enumerate(self.suspects) for key in section.model_fields_set):
-            if self.motion is not None and key == "output":
-                raise ValueError(f"`suspects[{i}].output`: found beside [motion]; expected `equation`, a state or output")
-            if self.motion is None and key in ("equation", "factor", "unit"):
-                raise ValueError(f"`suspects[{i}].{key}`: found without [motion]; expected none, for it is a motion's key")
+        wrong = {"output"} if self.motion is not None else {"equation", "factor", "unit"}
+        for i, section in enumerate(self.suspects):
+            for key in sorted(section.model_fields_set & wrong):
+                told = "beside [motion]; expected `equation`" if self.motion else "without [motion], whose key it is"
+                raise ValueError(f"`suspects[{i}].{key}`: found {told}")
         if self.motion is not None and self.training.ensemble:
             raise ValueError("`training.ensemble`: a motion has none, for medians of runs follow no equations")
         return self

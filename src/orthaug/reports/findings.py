@@ -55,6 +55,7 @@ class ToldResult(Content):
     std: Number
     t: Number
     share: Number
+    left: Number
 
 
 class SuspectResult(Content):
