@@ -49,7 +49,8 @@ def motion_budget(fit: MotionEstimate, table: Sequence[TermBias]) -> MotionBudge
     bias, value = coefficient * cause.per_unit, fit.values
     std = np.full(len(value), np.nan) if fit.std is None else fit.std
     ends = with_bias(value, std, fit.freedom, bias, spread * cause.per_unit)
-    ends = np.clip(ends, *([[getattr(p, end)] for p in fit.problem.motion.parameters] for end in ("min", "max")))
+    parameters = fit.problem.motion.parameters
+    ends = np.clip(ends, [[p.min] for p in parameters], [[p.max] for p in parameters])
     rows = []
     for i, name in enumerate(cause.names):
         if np.isfinite(bias[i]):

@@ -42,7 +42,7 @@ class Place:
     states: Any
     weight: Matrix
     """(ny, ny), multiplies errors."""
-    ridge: float = 0.0
+    ridge: float | Vector = 0.0
     """On the weights, in the unit of the weighted errors."""
 
 
@@ -81,8 +81,8 @@ class TermsResponse:
     @property
     def penalised(self) -> Matrix:
         """The information with the ridge."""
-        first = self.parameters + self.terms
-        ridge = np.where(np.arange(len(self.fitted)) >= first, self.place.ridge, 0.0)
+        ridge = np.zeros(len(self.fitted))
+        ridge[self.parameters + self.terms :] = self.place.ridge
         return self.information + np.diag(ridge)
 
     def held(self, dw: Vector, x: Matrix, u: Matrix) -> Matrix:

@@ -10,7 +10,7 @@ import numpy as np
 from orthaug._base.errors import InputError, RankError
 from orthaug._base.warning import Warning
 from orthaug.commands.motion_job import MotionJob
-from orthaug.commands.motion_suspects import bias_before, table_after
+from orthaug.commands.motion_suspects import bias_before
 from orthaug.reports.result import CheckResult, FitResult, ParameterResult, parameter_rows
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def checked(job: MotionJob) -> CheckResult:
             "excitation": told.on_data,
             "identifiability": told.by_any or told.on_data,
             "shared": shared,
-            "bias": bias_before(job, trial.task) if told.on_data.full_rank else None,
+            "bias": _biases(job, trial) if told.on_data.full_rank else None,
             "motion": {
                 "states": motion.names_of_states,
                 "integrator": motion.integrator,
@@ -80,6 +80,10 @@ def checked(job: MotionJob) -> CheckResult:
             "warnings": [*job.warnings, *warnings],
         }
     )
+
+
+def _biases(job: MotionJob, trial: Trial) -> list[dict[str, Any]] | None:
+    return bias_before(job.suspects, job.problem, job.structure, trial.task)
 
 
 def refused(job: MotionJob, result: CheckResult) -> InputError | None:
@@ -110,6 +114,7 @@ def content(
     """The fit, and what results tell of it; warnings are added."""
     from orthaug.analysis.motion_budget import motion_budget
     from orthaug.analysis.motion_diagnosis import diagnose_motion, robust_motion
+    from orthaug.analysis.motion_ground import suspected_bias
     from orthaug.analysis.motion_imitation import MotionImitation
     from orthaug.analysis.motion_modes import motion_stability
     from orthaug.physics.excitation import Excitation, of_gram
@@ -125,7 +130,7 @@ def content(
         points = job.reach(fit.model, job.train.record)[0]
         told["stability"] = motion_stability(fit.model, *np.split(points, [form.states], axis=1))
         warnings += told["stability"].warnings
-        table = table_after(job, fit)
+        table = suspected_bias(fit, job.suspects) if job.suspects else []
         told["bias"], budget = [entry.as_dict() for entry in table] or None, motion_budget(fit, table)
         warnings += budget.warnings if budget else ()
     if fit.status.ok and form.bound is not None:

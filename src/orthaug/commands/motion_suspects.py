@@ -16,10 +16,8 @@ from orthaug.commands.spec import SuspectSection
 from orthaug.physics.motion_problem import MotionProblem
 
 if TYPE_CHECKING:
-    from orthaug.analysis.motion_bias import TermBias
-    from orthaug.commands.motion_job import MotionJob
-    from orthaug.fitting.motion_estimates import MotionEstimate
     from orthaug.fitting.motion_task import MotionTask
+    from orthaug.fitting.structures import Structure
 
 
 def declared_terms(sections: Sequence[SuspectSection], problem: MotionProblem) -> tuple[MotionSuspect, ...]:
@@ -40,22 +38,17 @@ def declared_terms(sections: Sequence[SuspectSection], problem: MotionProblem) -
     return tuple(suspects)
 
 
-def bias_before(job: MotionJob, task: MotionTask) -> list[dict[str, Any]] | None:
+def bias_before(
+    suspects: Sequence[MotionSuspect], problem: MotionProblem, structure: Structure, task: MotionTask
+) -> list[dict[str, Any]] | None:
     """What every suspect would do, about physics alone; of the usual ones those that do anything, where none is named.
 
     None where physics alone has no run.
     """
     from orthaug.analysis.motion_ground import ground_before
 
-    ground = ground_before(task, job.structure)
+    ground = ground_before(task, structure)
     if ground is None:
         return None
-    table = ground.table(job.suspects or usual_motion_suspects(job.problem))
-    return [entry.as_dict() for entry in table if job.suspects or entry.size]
-
-
-def table_after(job: MotionJob, fit: MotionEstimate) -> list[TermBias]:
-    """What the declared suspects do to a fit, and what tells of them."""
-    from orthaug.analysis.motion_ground import suspected_bias
-
-    return suspected_bias(fit, job.suspects) if job.suspects else []
+    table = ground.table(suspects or usual_motion_suspects(problem))
+    return [entry.as_dict() for entry in table if suspects or entry.size]
