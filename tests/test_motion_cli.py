@@ -219,6 +219,21 @@ def test_functions_are_asked_for_again(folder, model):
     assert again.simulate(record).model == pytest.approx(model.simulate(record).model, abs=1e-9)
 
 
+def test_an_input_is_designed_for_the_motion(folder):
+    spec = put(folder).with_name("design.toml")
+    spec.write_text(SPEC.replace("[training]", "[design]\nsamples = 300\namplitude = 20\nseed = 3\n[training]"))
+    code, out, err = orthaug("design", spec, "--out", folder / "u.csv", "--json")
+    assert code == 0, err
+    told, table = strict(out), pd.read_csv(folder / "u.csv")
+    assert list(table) == ["time", "force"] and len(table) == 300 and table.force.abs().max() <= 20
+    assert set(told["std"]) == {"m", "c", "k"} and told["relative_error"] ** 2 == pytest.approx(told["cost"])
+    errors = {row["name"]: row["std"] for row in told["candidates"]}
+    assert told["relative_error"] < 0.5 * errors["white binary, hold 1"]
+    spec.write_text(spec.read_text().replace("samples = 300", "samples = 9"))
+    code, _, err = orthaug("design", spec, "--out", folder / "v.csv")
+    assert code == 2 and "design: `samples` must be" in err and not (folder / "v.csv").exists()
+
+
 def test_a_split_is_the_fits_own_under_its_measure(folder, result):
     code, out, _ = orthaug("split", folder / "out", folder / "run.csv", "--json")
     assert code == 0
@@ -408,13 +423,16 @@ BAD = {
     "ensemble": ("[training]", "[training]\nensemble = true\nrestarts = 2", "`training.ensemble`: a motion has none"),
     "structure": ("[training]", '[structure]\nkind = "additive"\n[training]', "'structure.kind' = additive; expected"),
     "lags": ("[training]", "[lags]\nna = 2\n[training]", "`lags`: found beside [motion]"),
-    "suspect": ("[training]", '[[suspects]]\nkind = "cubic"\non = "w"\n[training]', "'cubic(w)': unknown name 'w'"),
+    "suspect": (
+        "[training]",
+        '[[suspects]]\nkind = "cubic"\non = "w"\n[training]',
+        "suspect 'cubic(w)' = (w)**3: unknown name 'w'",
+    ),
     "suspect's output": (
         "[training]",
         '[[suspects]]\nkind = "offset"\noutput = "position"\n[training]',
         "`suspects[0].output`: found beside [motion]; expected `equation`",
     ),
-    "design": ("[training]", "[design]\nsamples = 9\namplitude = 1\n[training]", "`design`: found beside [motion]"),
     "both": (
         "[training]",
         '[[baseline.terms]]\nparameter = "a"\nregressor = "position[k-1]"\n[training]',

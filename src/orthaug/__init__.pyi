@@ -5,6 +5,7 @@ from .analysis import MotionSuspect as MotionSuspect
 from .analysis import Suspect as Suspect
 from .analysis import bias_budget as bias_budget
 from .analysis import design_input as design_input
+from .analysis import design_motion_input as design_motion_input
 from .analysis import diagnose as diagnose
 from .analysis import stability as stability
 from .analysis import suspected_bias as suspected_bias

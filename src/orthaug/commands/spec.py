@@ -45,7 +45,6 @@ _BESIDE_MOTION = {
     "baseline": "expected one of them, for both are the physics",
     "lags": "expected none, for a motion has states instead; `learner.inputs` says what its learner sees",
     "physics": "expected none, for the parameters of a motion are physical: [motion.parameters]",
-    "design": "expected none, for experiments are designed on lagged signals only",
 }
 
 
@@ -203,7 +202,7 @@ class Spec(Section):
     def _one_physics(self) -> Spec:
         if self.motion is None and self.baseline is None:
             raise ValueError("the key 'baseline' is missing; expected [[baseline.terms]], or a [motion] instead")
-        for name in ("baseline", "lags", "physics", "design") if self.motion is not None else ():
+        for name in ("baseline", "lags", "physics") if self.motion is not None else ():
             if name in self.model_fields_set:
                 raise ValueError(f"`{name}`: found beside [motion]; {_BESIDE_MOTION[name]}")
         wrong = {"output"} if self.motion is not None else {"equation", "factor", "unit"}
