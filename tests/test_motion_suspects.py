@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_motion_fit import WHOLE, data, positive, spring
@@ -91,6 +93,9 @@ def test_the_budget_covers_the_truth_where_the_interval_does_not(
         (warning,) = budget.warnings
         assert warning.code == "biased" and "friction of size" in warning.text and "c by +" in warning.text
     assert motion_budget(clean, oa.suspected_bias(clean, SUSPECTS)) is None
+    friction = oa.suspected_bias(alone, SUSPECTS)[0]
+    among_more = replace(friction, residual=replace(friction.residual, left=1.5 * friction.residual.share))
+    assert motion_budget(alone, [among_more]) is None  # something else is missing: no one knows what
 
 
 def test_a_function_has_suspects_too(alone: oa.MotionEstimate) -> None:

@@ -73,7 +73,7 @@ def _of_learner(table: Sequence[TermBias]) -> tuple[TermBias, float, float, floa
 
 
 def _of_residual(table: Sequence[TermBias]) -> tuple[TermBias, float, float, float] | None:
-    """The term that lowers the residual most, where that is no chance.
+    """The term that lowers the residual most, where that is no chance and most of what is no white noise.
 
     What stays beyond white noise counts as biased by as much for its size, of unknown sign.
     """
@@ -82,6 +82,8 @@ def _of_residual(table: Sequence[TermBias]) -> tuple[TermBias, float, float, flo
     if best is None or best.residual is None or best.residual.std is None:
         return None
     told, std = best.residual, best.residual.std
+    if told.share < LEAST_SHARE * (told.share + told.left):
+        return None
     unsure = np.hypot(std, told.coefficient * np.sqrt(told.left / told.share))
     return best, told.coefficient, told.share, float(unsure)
 
