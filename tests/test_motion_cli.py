@@ -219,6 +219,21 @@ def test_functions_are_asked_for_again(folder, model):
     assert again.simulate(record).model == pytest.approx(model.simulate(record).model, abs=1e-9)
 
 
+def test_an_input_is_designed_for_the_motion(folder):
+    spec = put(folder).with_name("design.toml")
+    spec.write_text(SPEC.replace("[training]", "[design]\nsamples = 300\namplitude = 20\nseed = 3\n[training]"))
+    code, out, err = orthaug("design", spec, "--out", folder / "u.csv", "--json")
+    assert code == 0, err
+    told, table = strict(out), pd.read_csv(folder / "u.csv")
+    assert list(table) == ["time", "force"] and len(table) == 300 and table.force.abs().max() <= 20
+    assert set(told["std"]) == {"m", "c", "k"} and told["relative_error"] ** 2 == pytest.approx(told["cost"])
+    errors = {row["name"]: row["std"] for row in told["candidates"]}
+    assert told["relative_error"] < 0.5 * errors["white binary, hold 1"]
+    spec.write_text(spec.read_text().replace("samples = 300", "samples = 9"))
+    code, _, err = orthaug("design", spec, "--out", folder / "v.csv")
+    assert code == 2 and "design: `samples` must be" in err and not (folder / "v.csv").exists()
+
+
 def test_a_split_is_the_fits_own_under_its_measure(folder, result):
     code, out, _ = orthaug("split", folder / "out", folder / "run.csv", "--json")
     assert code == 0
@@ -340,6 +355,52 @@ def test_check_tells_what_cannot_be_told_apart_and_which_hold_is_right(tmp_path)
     assert told["shared"]["directions"] == [{"c": 1.0}]
 
 
+SUSPECTS = """
+[[suspects]]
+on = "tanh(v/0.2)"
+factor = "-1/m"
+coefficient = 1.5
+unit = "N"
+name = "friction"
+[[suspects]]
+kind = "dead_zone"
+on = "force"
+equation = "v"
+[training]
+"""
+
+
+def test_suspects_are_weighed_before_a_fit_and_after_it(folder, result):
+    """Friction of 1.5 N is there; the learner sees it, so that the damper alone is biased: by 0.73 N s/m of 2.73."""
+    spec = put(folder).with_name("suspects.toml")
+    spec.write_text(SPEC.replace("[training]", SUSPECTS))
+    code, out, err = orthaug("check", spec, "--json")
+    assert code == 0, err
+    before = strict(out)["bias"]
+    code, out, err = orthaug("fit", spec, "--out", folder / "suspects")
+    assert code == 0, err
+    told = strict((folder / "suspects" / "result.json").read_text())
+    for table in (before, told["bias"]):
+        friction, zone = table
+        assert (friction["name"], friction["equation"], friction["unit"], friction["seen"]) == (
+            "friction",
+            "v",
+            "N",
+            True,
+        )
+        assert friction["removed_by"] == "learner in part" and zone["removed_by"] == "nothing" and not zone["seen"]
+        assert friction["expected_bias"]["c"] == pytest.approx(0.73, rel=0.1)
+        assert [friction["bias"][name] for name in "mk"] == pytest.approx([0, 0], abs=1e-9)
+    found = told["bias"][0]
+    assert found["coefficient_found"] == pytest.approx(1.5, rel=0.1) and found["explained"] > 0.9
+    rows = {row["name"]: row for row in told["parameters"]}
+    assert rows["c"]["ci95_with_bias"][0] < C < rows["c"]["ci95_with_bias"][1] < rows["c"]["ci95"][0]
+    assert rows["c"]["bias"]["cause"] == "friction"
+    assert rows["m"]["ci95_with_bias"] == pytest.approx(rows["m"]["ci95"], rel=1e-3)
+    assert "of what the learner found is friction" in out and "biased" in [w["code"] for w in told["warnings"]]
+    assert (folder / "suspects" / "figures" / "bias.png").exists()
+
+
 BAD = {
     "undefined": ("c*v", "cc*v", "the equation of 'v' = (force - cc*v - k*x)/m: unknown name 'cc', did you mean 'c'?"),
     "lag": ("(force -", "(force[k] -", "a signal such as y[k-1] is no part of it"),
@@ -362,8 +423,16 @@ BAD = {
     "ensemble": ("[training]", "[training]\nensemble = true\nrestarts = 2", "`training.ensemble`: a motion has none"),
     "structure": ("[training]", '[structure]\nkind = "additive"\n[training]', "'structure.kind' = additive; expected"),
     "lags": ("[training]", "[lags]\nna = 2\n[training]", "`lags`: found beside [motion]"),
-    "suspects": ("[training]", '[[suspects]]\nkind = "offset"\n[training]', "`suspects`: found beside [motion]"),
-    "design": ("[training]", "[design]\nsamples = 9\namplitude = 1\n[training]", "`design`: found beside [motion]"),
+    "suspect": (
+        "[training]",
+        '[[suspects]]\nkind = "cubic"\non = "w"\n[training]',
+        "suspect 'cubic(w)' = (w)**3: unknown name 'w'",
+    ),
+    "suspect's output": (
+        "[training]",
+        '[[suspects]]\nkind = "offset"\noutput = "position"\n[training]',
+        "`suspects[0].output`: found beside [motion]; expected `equation`",
+    ),
     "both": (
         "[training]",
         '[[baseline.terms]]\nparameter = "a"\nregressor = "position[k-1]"\n[training]',

@@ -32,14 +32,16 @@ def spring(learned: bool = False, extra: str = "", more=(), **options) -> oa.Mot
     )
 
 
-def data(rows: int = 300, friction: float = 0.6, noise: float = 0.002, seed: int = 0) -> oa.Record:
-    """m = 1, c = 0.8, k = 25 with friction tanh(v / 0.1) under steps; finely integrated."""
+def data(
+    rows: int = 300, friction: float = 0.6, noise: float = 0.002, seed: int = 0, hardening: float = 0.0
+) -> oa.Record:
+    """m = 1, c = 0.8, k = 25 with friction tanh(v / 0.1) and a spring x³ under steps; finely integrated."""
     rng = np.random.default_rng(seed)
     u = np.repeat(rng.uniform(-8, 8, rows // 10 + 1), 10)[:rows]
     state, y = np.zeros(2), []
 
     def rates(x, u):
-        return np.array([x[1], u - 0.8 * x[1] - 25 * x[0] - friction * np.tanh(x[1] / 0.1)])
+        return np.array([x[1], u - 0.8 * x[1] - 25 * x[0] - friction * np.tanh(x[1] / 0.1) - hardening * x[0] ** 3])
 
     for value in u:
         y.append(state[0])

@@ -141,7 +141,7 @@ def _unseen(smoother: Smoother, term: Callable[[Matrix], Matrix], x: Matrix) -> 
     phi = np.asarray(problem.baseline.phi(rows, problem.layout, problem.outputs, np))
     delta, gain = term(rows), problem.weight.matrix
     left, target = smoother.left(times(gain, phi)), smoother.left(times(gain, delta))
-    others = _others(problem.shared.basis)
+    others = completing(problem.shared.basis)
     moved = np.zeros(len(problem.baseline.names))
     if others:
         columns = left[..., others].reshape(-1, len(others))
@@ -151,7 +151,7 @@ def _unseen(smoother: Smoother, term: Callable[[Matrix], Matrix], x: Matrix) -> 
     return Absorbed(moved, smoother.mean(delta - phi @ moved, x), False)
 
 
-def _others(basis: Matrix) -> list[int]:
+def completing(basis: Matrix) -> list[int]:
     """Parameters whose directions complete the shared ones."""
     if not basis.shape[1]:
         return list(range(len(basis)))

@@ -232,7 +232,7 @@ def _warning(ground: Ground, budget: Budget, rival: SuspectedBias | None) -> War
     if not large:
         return None
     shown = sorted(large, key=lambda entry: -(entry.errors or 0.0))[:_TOLD]
-    listed = ", ".join(_told(entry) for entry in shown)
+    listed = ", ".join(told_bias(entry) for entry in shown)
     more = f" and {len(large) - len(shown)} more" if len(large) > len(shown) else ""
     cures = remedies(ground, budget.cause, [entry.name for entry in large])
     other = "" if rival is None else f" ({rival.suspect.name} explains as much and would move them elsewhere)"
@@ -243,6 +243,7 @@ def _warning(ground: Ground, budget: Budget, rival: SuspectedBias | None) -> War
     )
 
 
-def _told(entry: ParameterBias) -> str:
+def told_bias(entry: ParameterBias) -> str:
+    """A bias in words."""
     share = "" if entry.relative is None else f", {100 * entry.relative:+.2g} %"
     return f"{entry.name} by {entry.value:+.2g} ({entry.errors:.2g} standard errors{share})"

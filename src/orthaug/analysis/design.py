@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -40,6 +40,20 @@ _SIGNALS = 120  # of N samples that are held at once
 BATCH = 2_000_000  # samples that are simulated side by side
 
 Factors = Float[np.ndarray, "M 2 n n"]  # per candidate the R of rows [Φ Δ] and of σ[Φ Δ], n = nt + 1
+
+
+class DesignPlant(Protocol):
+    """What is simulated for inputs side by side: `Plant`, or that of a motion. `theta` are the parameters."""
+
+    names: tuple[str, ...]
+    theta: Vector
+    outputs: Sequence[str]
+    start: int
+    """The first row that is simulated."""
+
+    def rows(self, u: Float[np.ndarray, "N M"]) -> tuple[Float[np.ndarray, "M R ny nt+1"], np.ndarray]:
+        """Rows `[Φ Δ]`, zero where they run away, and the weights of the outputs (M, 1, ny, 1)."""
+        ...
 
 
 class Candidate(NamedTuple):
@@ -112,29 +126,61 @@ def design_input(
         InputError: numbers out of range, unknown channels, a suspect without coefficient, θ of 0 without `weights`,
             a simulated output that runs away, no candidate within the cap on the condition number.
     """
-    low, high = input_limits(amplitude, minimum, maximum)
     sampling_time = check_number(sampling_time, "sampling_time", positive=True)
-    step = math.inf if rate is None else check_number(rate, "rate", positive=True) * sampling_time
-    iterations, seed, suspects = check_count(iterations, "iterations", 0), check_count(seed, "seed", 0), tuple(suspects)
+    limits = input_limits(amplitude, minimum, maximum), rate, condition
+    suspects = tuple(suspects)
     if baseline.function is not None or not baseline.names:
         raise InputError("a design needs physics that is made of terms, with one parameter or more.")
     theta = _numbers(baseline.initial if theta is None else theta, (len(baseline.names),), "theta")
     known = [suspect.sampled(sampling_time) for suspect in suspects]
     plant = Plant(baseline.sampled(sampling_time), (tuple(outputs), tuple(inputs)), known, theta, channel)
-    samples = check_count(samples, "samples", plant.start + 4 * len(theta) + 16)
-    if samples > MOST_SAMPLES:
-        raise InputError(f"`samples` is {shown(samples)}; at most {MOST_SAMPLES} are simulated.")
-    check_memory(8.0 * samples * (_SIGNALS + 4 * len(outputs) * (len(theta) + 2)), f"a design of {samples} samples")
+    samples = check_samples(samples, plant)
     for name, values in (known_inputs or {}).items():
         check_choice(name, plant.others, "a channel of `known_inputs`")
         plant.others[name] = _numbers(values, (samples,), f"known_inputs['{name}']")[:, None]
     plant.before = _numbers(initial_outputs, (plant.start, len(outputs)), "initial_outputs")
-    sigma = np.array([check_number(value, "noise") for value in _numbers(noise, (len(outputs),), "noise")])
-    sigma = (sigma if suspects or sigma.any() else np.ones(len(outputs))) / math.sqrt(samples - plant.start)
-    limits = low, high, step, check_number(condition, "condition", positive=True), samples
+    return searched(plant, limits, sampling_time, samples, noise, bool(suspects), weights, (seed, iterations))
+
+
+def check_samples(samples: Any, plant: DesignPlant) -> int:
+    """How many samples are designed; raises InputError for too few, too many, or more than fit into memory."""
+    nt, ny = len(plant.theta), len(plant.outputs)
+    samples = check_count(samples, "samples", plant.start + 4 * nt + 16)
+    if samples > MOST_SAMPLES:
+        raise InputError(f"`samples` is {shown(samples)}; at most {MOST_SAMPLES} are simulated.")
+    check_memory(8.0 * samples * (_SIGNALS + 4 * ny * (nt + 2)), f"a design of {samples} samples")
+    return samples
+
+
+def searched(
+    plant: DesignPlant,
+    limits: tuple[tuple[float, float], float | None, float],
+    sampling_time: float,
+    samples: int,
+    noise: float | Sequence[float],
+    suspected: bool,
+    weights: Vector | Matrix | None,
+    effort: tuple[int, int],
+) -> Design:
+    """The best input of a plant; the arguments as in `design_input`.
+
+    Args:
+        limits: of the input, its rate, and the cap on the condition number.
+        effort: seed and iterations.
+
+    Raises:
+        InputError: numbers out of range, no candidate within the cap.
+    """
+    (low, high), rate, cap = limits
+    step = math.inf if rate is None else check_number(rate, "rate", positive=True) * sampling_time
+    seed, iterations = check_count(effort[0], "seed", 0), check_count(effort[1], "iterations", 0)
+    ny = len(plant.outputs)
+    sigma = np.array([check_number(value, "noise") for value in _numbers(noise, (ny,), "noise")])
+    sigma = (sigma if suspected or sigma.any() else np.ones(ny)) / math.sqrt(samples - plant.start)
+    bounds = low, high, step, check_number(cap, "condition", positive=True), samples
     try:
         with np.errstate(all="ignore"):
-            return _Search(plant, _weights(weights, plant), sigma, *limits).run(seed, iterations)
+            return _Search(plant, _weights(weights, plant), sigma, *bounds).run(seed, iterations)
     except np.linalg.LinAlgError:
         raise InputError(
             "the simulated rows are too large or too small for double precision; change the limits or the units."
@@ -174,7 +220,7 @@ def _numbers(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
     return numbers
 
 
-def _weights(weights: Any, plant: Plant) -> Matrix:
+def _weights(weights: Any, plant: DesignPlant) -> Matrix:
     """W, (m, nt)."""
     nt = len(plant.theta)
     if weights is None:
@@ -208,7 +254,7 @@ class _Scores(NamedTuple):
 class _Search:
     """What is asked for; see `design_input`."""
 
-    plant: Plant
+    plant: DesignPlant
     weights: Matrix
     sigma: Vector  # of the noise, over the square root of the number of rows
     low: float

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.motion_course import MotionCourse
 from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.structures import Structure
+from orthaug.models.learners import Learner
 from orthaug.physics.motion import HOLDS
 from orthaug.physics.motion_problem import MotionProblem
 
@@ -29,6 +30,8 @@ class Held:
     hold: str
     residual: float | None
     declared: bool
+    parameters: dict[str, float] | None = None
+    """What physics alone is fitted with under it."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,8 @@ class Trial:
     rows: int
     substeps: int | None
     holds: tuple[Held, ...]
+    task: MotionTask = field(repr=False, compare=False)
+    """With physics alone trained."""
 
     @property
     def best(self) -> str | None:
@@ -50,40 +55,49 @@ class Trial:
         return least.hold if least.residual is not None and least.residual < (1 - _CLEARLY) * own else None
 
 
-def try_holds(problem: MotionProblem, criterion: Criterion, solver: Any, structure: Structure) -> Trial:
+def try_holds(
+    problem: MotionProblem, criterion: Criterion, solver: Any, structure: Structure, learner: Learner | None = None
+) -> Trial:
     """Fit physics alone with the declared hold, and go on from there with every other.
 
     One hold alone is tried where the motion is discrete or has no inputs.
+
+    Args:
+        learner: what the trial's task has beside the physics; it is not trained.
     """
     longest = max(problem.record.experiments, key=len)
     record = replace(problem.record, experiments=(longest.rows(0, ROWS),))
-    task = MotionTask.of(problem.on(record), None, criterion).prepared(solver, structure)
+    task = MotionTask.of(problem.on(record), learner, criterion).prepared(solver, structure)
     motion, flight = problem.motion, task.physics
-    residual = None if flight is None else _residual(task.plan, flight)
-    found = [Held(motion.hold, residual, True)]
+    found = [_held(task.plan, flight, declared=True)]
     several = motion.integrator != "discrete" and bool(motion.inputs) and flight is not None
     for hold in HOLDS if several else ():
         if hold != motion.hold:
-            found.append(Held(hold, _refitted(task, record, hold, solver), False))
+            found.append(_refitted(task, record, hold, solver))
     substeps = None if flight is None else task.plan.dynamics.substeps
-    return Trial(len(longest.rows(0, ROWS)), substeps, tuple(found))
+    return Trial(len(longest.rows(0, ROWS)), substeps, tuple(found), task)
 
 
-def _refitted(task: MotionTask, record: Record, hold: str, solver: Any) -> float | None:
+def _refitted(task: MotionTask, record: Record, hold: str, solver: Any) -> Held:
     flight, plan = task.physics, task.plan
     assert flight is not None
     motion = replace(plan.problem.motion, hold=hold, substeps=plan.dynamics.substeps)
     try:
         course = MotionCourse.of(replace(plan.problem, motion=motion, record=record), None, plan.criterion)
     except InputError:
-        return None
+        return Held(hold, None, False)
     course = course.from_states(flight.end.flown.states)
     again = course.descend(course.objective(), flight.end.flown.theta, solver.at_most(_REFITTED))
-    return _residual(course, again) if again.ending.usable else None
+    return _held(course, again if again.ending.usable else None, declared=False)
 
 
-def _residual(course: MotionCourse, flight: Flight) -> float | None:
-    """RMS of the errors, in deviations of the outputs."""
+def _held(course: MotionCourse, flight: Flight | None, *, declared: bool) -> Held:
+    """The residual of a flight, RMS in deviations of the outputs, and its parameters."""
+    motion = course.problem.motion
+    if flight is None:
+        return Held(motion.hold, None, declared)
     scaled = flight.end.flown.errors / course.deviation[:, None]
     value = float(np.sqrt(np.sum(scaled**2) / course.residuals))
-    return value if np.isfinite(value) else None
+    p = motion.coordinates.physical(flight.end.flown.theta)
+    named = dict(zip(motion.names, map(float, p), strict=True))
+    return Held(motion.hold, value, declared, named) if np.isfinite(value) else Held(motion.hold, None, declared)

@@ -28,7 +28,8 @@ class Plant:
         self.channel = inputs[0] if channel is None else check_choice(channel, inputs, "`channel`")
         baseline.check_channels(outputs, inputs)
         check_unique((suspect.name for suspect in suspects), "suspect")
-        self.names, self.theta, self.outputs = baseline.names, theta, outputs
+        self.names, self.theta = baseline.names, theta
+        self.outputs: Sequence[str] = outputs
         self.others = {name: np.zeros((1, 1)) for name in inputs if name != self.channel}
         self.before = np.zeros((0, 0))
         self.tape, nt = Tape(), len(theta)

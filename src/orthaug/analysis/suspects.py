@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -127,25 +127,7 @@ class Suspect:
             >>> Suspect.of("dead_zone", on="u[k-1]", width=0.5).expression
             '(u[k-1]) - max(min(u[k-1], 0.5), -0.5)'
         """
-        if kind not in _KINDS:
-            raise InputError(
-                f"unknown kind of suspect '{kind}'{nearest(str(kind), KINDS)}; known are {', '.join(KINDS)}."
-            )
-        if kind == "offset" and on is not None:
-            raise InputError(f"an offset is the same everywhere and takes no `on`; got {on!r}.")
-        if kind != "offset":
-            if on is None:
-                raise InputError(f"a suspect of kind {kind} needs `on`, an expression such as v[k-1].")
-            parse(on, constants)  # alone, so that a stray parenthesis cannot change what the kind wraps around it
-            on = " ".join(on.split())
-        if _KINDS[kind].width and width is None:
-            raise InputError(f"a suspect of kind {kind} needs `width`, in the unit of {on}; data_width suggests one.")
-        if width is not None and not _KINDS[kind].width:
-            raise InputError(f"a suspect of kind {kind} takes no `width`; got {width!r}.")
-        w = "" if width is None else repr(check_number(width, "width", positive=True))
-        text = _KINDS[kind].text(on or "", w)
-        arguments = ", ".join(part for part in (on, w) if part)
-        label = text if kind == "expression" else f"{kind}({arguments})" if arguments else kind
+        text, label, on = written(kind, on, width, lambda text: parse(text, constants), "v[k-1]")
         return cls(label if name is None else name, text, output, coefficient, constants or (), on)
 
     @property
@@ -203,6 +185,37 @@ class Suspect:
             hint = nearest(self.output, outputs)
             raise InputError(f"suspect '{self.name}': unknown output '{self.output}'{hint}; known are {known}.")
         return list(outputs).index(self.output)
+
+
+def written(
+    kind: str, on: str | None, width: float | None, read: Callable[[str], Any], example: str
+) -> tuple[str, str, str | None]:
+    """Expression and label of a known kind, and what it acts on in plain spaces.
+
+    Args:
+        read: raises for what is no expression.
+        example: of what a kind may act on.
+
+    Raises:
+        InputError: an unknown kind, an argument that is missing, or that the kind does not take.
+    """
+    if kind not in _KINDS:
+        raise InputError(f"unknown kind of suspect '{kind}'{nearest(str(kind), KINDS)}; known are {', '.join(KINDS)}.")
+    if kind == "offset" and on is not None:
+        raise InputError(f"an offset is the same everywhere and takes no `on`; got {on!r}.")
+    if kind != "offset":
+        if on is None:
+            raise InputError(f"a suspect of kind {kind} needs `on`, an expression such as {example}.")
+        read(on)  # alone, so that a stray parenthesis cannot change what the kind wraps around it
+        on = " ".join(on.split())
+    if _KINDS[kind].width and width is None:
+        raise InputError(f"a suspect of kind {kind} needs `width`, in the unit of {on}; data_width suggests one.")
+    if width is not None and not _KINDS[kind].width:
+        raise InputError(f"a suspect of kind {kind} takes no `width`; got {width!r}.")
+    w = "" if width is None else repr(check_number(width, "width", positive=True))
+    text = _KINDS[kind].text(on or "", w)
+    arguments = ", ".join(part for part in (on, w) if part)
+    return text, text if kind == "expression" else f"{kind}({arguments})" if arguments else kind, on
 
 
 def suspect_columns(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_file
 from orthaug.analysis.design import Design, design_input
 from orthaug.commands.job import Job
+from orthaug.commands.motion_job import MotionJob
 from orthaug.commands.suspects import declared
 
 
@@ -18,41 +20,61 @@ def design_for(job: Job) -> Design:
     """The input that the spec's `[design]` asks for.
 
     θ is the spec's initial value, or least squares on the training data where none is given; the noise, where the spec
-    states none, is what physics alone leaves of these data.
+    states none, is what physics alone leaves of these data. The parameters of a motion are those of physics alone.
 
     Raises:
         InputError: no `[design]` section, limits that cannot be met, suspects without a coefficient.
     """
-    section, problem = job.spec.design, job.problem
-    if job.spec.motion is not None:
-        raise InputError(f"{job.path}: experiments are designed on lagged signals; a [motion] has no design.")
+    section = job.spec.design
     if section is None:
         raise InputError(
             f"{job.path}: the section [design] is missing; it needs `samples` and limits, such as `amplitude`."
         )
+    limits = ("samples", "amplitude", "minimum", "maximum", "rate", "condition", "seed")
+    asked = {name: getattr(section, name) for name in limits}
+    try:
+        asked["channel"] = _input(section.input, [channel.name for channel in job.problem.record.inputs])
+        asked["sampling_time"] = job.problem.record.sampling_time
+        if isinstance(job, MotionJob):
+            return _of_motion(job, asked, section.noise)
+        return _of_lags(job, asked, section.noise)
+    except InputError as error:
+        raise InputError(f"{job.path}: design: {error}") from None
+
+
+def _of_lags(job: Job, asked: dict[str, Any], noise: float | None) -> Design:
+    problem = job.problem
     theta = problem.projection.solve(problem.whitened_target)
     residual = problem.weight.outputs(problem.whitened_target - problem.projection.phi @ theta)
     given = problem.baseline.initial
-    try:
-        return design_input(
-            problem.baseline,
-            outputs=problem.outputs,
-            inputs=[channel.name for channel in problem.record.inputs],
-            sampling_time=problem.record.sampling_time,
-            samples=section.samples,
-            amplitude=section.amplitude,
-            minimum=section.minimum,
-            maximum=section.maximum,
-            rate=section.rate,
-            suspects=declared(job.spec.suspects, problem),
-            noise=tuple(residual.std(axis=0)) if section.noise is None else section.noise,
-            theta=given if np.all(given) else theta,
-            condition=section.condition,
-            channel=_input(section.input, [channel.name for channel in problem.record.inputs]),
-            seed=section.seed,
-        )
-    except InputError as error:
-        raise InputError(f"{job.path}: design: {error}") from None
+    return design_input(
+        problem.baseline,
+        outputs=problem.outputs,
+        inputs=[channel.name for channel in problem.record.inputs],
+        suspects=declared(job.spec.suspects, problem),
+        noise=tuple(residual.std(axis=0)) if noise is None else noise,
+        theta=given if np.all(given) else theta,
+        **asked,
+    )
+
+
+def _of_motion(job: MotionJob, asked: dict[str, Any], noise: float | None) -> Design:
+    from orthaug.analysis.motion_design import design_motion_input
+    from orthaug.fitting.motion_estimation import without_learner
+    from orthaug.fitting.motion_task import MotionTask
+
+    spec, motion = job.spec, job.problem.motion
+    task = MotionTask.of(without_learner(job.problem), None, spec.declared_criterion())
+    solver: Any = spec.declared_solver()
+    task = task.prepared(solver, job.structure)
+    if task.physics is None:
+        raise InputError("physics alone has no finite free run from its initial values; give others.")
+    left: Any = noise
+    if noise is None:
+        left = tuple(np.sqrt(np.sum(task.physics.end.flown.errors**2, axis=(0, 1, 3)) / task.plan.segments.count))
+    p = motion.coordinates.physical(task.physics.end.flown.theta)
+    own = {"parameters": p, "noise": left, "substeps": task.plan.dynamics.substeps}
+    return design_motion_input(motion, suspects=job.suspects, **own, **asked)
 
 
 def _input(name: str | None, known: list[str]) -> str | None:

@@ -10,7 +10,9 @@ import numpy as np
 
 from orthaug._base.errors import InputError, KeyedError
 from orthaug._base.progress import SILENT, Progress
+from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.commands.job import ALONE, AS_DECLARED, Job, Variant
+from orthaug.commands.motion_suspects import declared_terms
 from orthaug.commands.parts import Part, load_parts
 from orthaug.commands.spec import Spec
 from orthaug.data.record import Record, check_channels
@@ -39,6 +41,7 @@ class MotionJob(Job):
 
     problem: MotionProblem
     measure: Measure
+    suspects: tuple[MotionSuspect, ...] = ()
 
     @property
     def physics_in_words(self) -> str:
@@ -98,7 +101,8 @@ def open_motion(path: Path, spec: Spec) -> MotionJob:
         inputs = spec.learner_inputs() if spec.declared_learner() is not None else None
         problem = pose_motion(train.record, motion, inputs, spec.training.output_weights)
         named = {"path": path, "spec": spec, "train": train, "validation": validation, "tests": tuple(tests)}
-        job = MotionJob(**named, problem=problem, measure=_measure_of(spec, problem, path.parent))
+        own = {"measure": _measure_of(spec, problem, path.parent), "suspects": declared_terms(spec.suspects, problem)}
+        job = MotionJob(**named, problem=problem, **own)
         for part in job.parts:
             part.check_scorable(problem.first_row, train.record.sampling_time, least)
         _check_sizes(spec, problem)

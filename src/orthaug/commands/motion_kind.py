@@ -10,10 +10,12 @@ import numpy as np
 from orthaug._base.errors import InputError, RankError
 from orthaug._base.warning import Warning
 from orthaug.commands.motion_job import MotionJob
+from orthaug.commands.motion_suspects import bias_before
 from orthaug.reports.result import CheckResult, FitResult, ParameterResult, parameter_rows
 
 if TYPE_CHECKING:
     from orthaug.analysis.holds import Trial
+    from orthaug.analysis.motion_budget import MotionBudget
     from orthaug.fitting.motion_estimates import MotionEstimate
     from orthaug.models.response import Response
     from orthaug.reports.drawing import Figure
@@ -35,6 +37,7 @@ def checked(job: MotionJob) -> CheckResult:
     from orthaug.analysis.holds import try_holds
     from orthaug.analysis.motion_identifiability import identified
     from orthaug.analysis.motion_imitation import imitation_before
+    from orthaug.analysis.waves import Waves
     from orthaug.fitting.motion_course import MotionCourse
     from orthaug.fitting.motion_estimation import without_learner
     from orthaug.models.moving import Moving
@@ -49,7 +52,8 @@ def checked(job: MotionJob) -> CheckResult:
     if spec.declared_learner() is not None and job.structure.shared != "all":
         form = Moving(motion, problem.features, None, problem.record.sampling_time, problem.substeps)
         shared = imitation_before(form, motion.coordinates.initial, told.states, told.inputs)
-    trial = try_holds(without_learner(problem), criterion, spec.declared_solver(), job.structure)
+    posed, waves = (problem, Waves()) if spec.declared_learner() is not None else (without_learner(problem), None)
+    trial = try_holds(posed, criterion, spec.declared_solver(), job.structure, waves)
     text, warnings = _about_steps(job, trial)
     if told.by_any is None:
         warnings.append(_NOT_RICH)
@@ -62,7 +66,7 @@ def checked(job: MotionJob) -> CheckResult:
             "excitation": told.on_data,
             "identifiability": told.by_any or told.on_data,
             "shared": shared,
-            "bias": None,
+            "bias": _biases(job, trial) if told.on_data.full_rank else None,
             "motion": {
                 "states": motion.names_of_states,
                 "integrator": motion.integrator,
@@ -76,6 +80,10 @@ def checked(job: MotionJob) -> CheckResult:
             "warnings": [*job.warnings, *warnings],
         }
     )
+
+
+def _biases(job: MotionJob, trial: Trial) -> list[dict[str, Any]] | None:
+    return bias_before(job.suspects, job.problem, job.structure, trial.task)
 
 
 def refused(job: MotionJob, result: CheckResult) -> InputError | None:
@@ -104,13 +112,16 @@ def content(
     warnings: list[Any],
 ) -> tuple[MotionEstimate, dict[str, Any]]:
     """The fit, and what results tell of it; warnings are added."""
+    from orthaug.analysis.motion_budget import motion_budget
     from orthaug.analysis.motion_diagnosis import diagnose_motion, robust_motion
+    from orthaug.analysis.motion_ground import suspected_bias
     from orthaug.analysis.motion_imitation import MotionImitation
     from orthaug.analysis.motion_modes import motion_stability
     from orthaug.physics.excitation import Excitation, of_gram
 
     motion, form = job.problem.motion, fit.model.form
     count, gram = len(motion.names), fit.model.statistics.gram
+    budget = None
     told: dict[str, Any] = dict.fromkeys((*_UNKNOWN, "residuals", "stability", "shared", "measure_detail"))
     if fit.status.ok:
         fit = robust_motion(fit)
@@ -119,6 +130,9 @@ def content(
         points = job.reach(fit.model, job.train.record)[0]
         told["stability"] = motion_stability(fit.model, *np.split(points, [form.states], axis=1))
         warnings += told["stability"].warnings
+        table = suspected_bias(fit, job.suspects) if job.suspects else []
+        told["bias"], budget = [entry.as_dict() for entry in table] or None, motion_budget(fit, table)
+        warnings += budget.warnings if budget else ()
     if fit.status.ok and form.bound is not None:
         split = fit.split_by
         told["shared"] = MotionImitation.of([str(entry) for entry in form.features], fit.shared)
@@ -130,7 +144,7 @@ def content(
             "price": None,
         }
     return fit, told | {
-        "parameters": _parameters(fit),
+        "parameters": _parameters(fit, budget),
         "standard_errors": None if fit.std is None else "plain" if fit.plain_covariance is None else "robust",
         "excitation": Excitation(0, count, None, ()) if gram is None else of_gram(gram[:count, :count], motion.names),
         "motion": {
@@ -157,6 +171,8 @@ def figures(
         "residual": plots.residual_figure(free, f"free-run residual, {part.name}"),
         "states": motion_plots.states_figure(fit.model, part.record, f"states of the free run, {part.name}"),
     }
+    if result.bias:
+        drawn["bias"] = plots.bias_figure(result.bias)
     drawn["prediction"] = plots.output_figure(one_step, f"one-step prediction, {part.name}")
     if learns:
         drawn["components"] = motion_plots.parts_figure(fit.model, part.record, f"physics and learner, {part.name}")
@@ -164,14 +180,15 @@ def figures(
     return drawn
 
 
-def _parameters(fit: MotionEstimate) -> list[ParameterResult]:
-    """The parameters with their intervals, and whether the learner could imitate them."""
+def _parameters(fit: MotionEstimate, budget: MotionBudget | None) -> list[ParameterResult]:
+    """The parameters with their intervals, whether the learner could imitate them, and what biases them."""
     motion = fit.problem.motion
     values = fit.values if fit.status.ok else np.full(len(motion.names), np.nan)
     rows = parameter_rows(motion.parameters, values, fit.std, fit.interval, plain_std=fit.plain_std)
-    if fit.model.form.bound is None or not fit.status.ok:
-        return rows
-    return [row.told(row.name not in fit.shared.untouched, None) for row in rows]
+    learns = fit.model.form.bound is not None and fit.status.ok
+    told = [row.name not in fit.shared.untouched if learns else None for row in rows]
+    biases = [budget.of(row.name) if budget else None for row in rows]
+    return [row.told(shared, bias) for row, shared, bias in zip(rows, told, biases, strict=True)]
 
 
 def _about_steps(job: MotionJob, trial: Trial) -> tuple[str, list[Warning]]:

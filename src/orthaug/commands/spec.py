@@ -46,8 +46,6 @@ _BESIDE_MOTION = {
     "baseline": "expected one of them, for both are the physics",
     "lags": "expected none, for a motion has states instead; `learner.inputs` says what its learner sees",
     "physics": "expected none, for the parameters of a motion are physical: [motion.parameters]",
-    "suspects": "expected none, for suspected terms are weighed on lagged signals only",
-    "design": "expected none, for experiments are designed on lagged signals only",
 }
 
 
@@ -100,6 +98,9 @@ class SuspectSection(Section):
     output: str | None = None
     coefficient: Finite | None = None
     name: str | None = None
+    equation: str | None = None
+    factor: str | None = None
+    unit: str = ""
 
 
 class DesignSection(Section):
@@ -202,9 +203,14 @@ class Spec(Section):
     def _one_physics(self) -> Spec:
         if self.motion is None and self.baseline is None:
             raise ValueError("the key 'baseline' is missing; expected [[baseline.terms]], or a [motion] instead")
-        for name in ("baseline", "lags", "physics", "suspects", "design") if self.motion is not None else ():
+        for name in ("baseline", "lags", "physics") if self.motion is not None else ():
             if name in self.model_fields_set:
                 raise ValueError(f"`{name}`: found beside [motion]; {_BESIDE_MOTION[name]}")
+        wrong = {"output"} if self.motion is not None else {"equation", "factor", "unit"}
+        for i, section in enumerate(self.suspects):
+            for key in sorted(section.model_fields_set & wrong):
+                told = "beside [motion]; expected `equation`" if self.motion else "without [motion], whose key it is"
+                raise ValueError(f"`suspects[{i}].{key}`: found {told}")
         if self.motion is not None and self.training.ensemble:
             raise ValueError("`training.ensemble`: a motion has none, for medians of runs follow no equations")
         return self

@@ -85,7 +85,7 @@ def shared_of_motion(form: Moving, q: Vector, x: Matrix, u: Matrix) -> Shared:
     pairs = moves(lambda rows: np.asarray(form.seen(rows[:, :nx].T, rows[:, nx:].T, np)).T, points)
     some = points[:: max(1, len(points) // _POINTS)]
     for start, end in (pairs, (some, some)):  # where hardly any move is not seen, the learner sees everything
-        slopes = [np.asarray(_slopes(form, q, rows[:, :nx], rows[:, nx:])) for rows in (start, end)]
+        slopes = [np.asarray(slopes_at(form, q, rows[:, :nx], rows[:, nx:])) for rows in (start, end)]
         kept = np.isfinite(slopes[0]).all(axis=(1, 2)) & np.isfinite(slopes[1]).all(axis=(1, 2))
         if kept.sum() >= _FEWEST * len(names):
             break
@@ -233,7 +233,7 @@ def rest_of(form: Moving, numbers: Numbers, q: Any, c: Any, w: Any, x: Any, u: A
 
 
 @partial(jax.jit, static_argnames="form")
-def _slopes(form: Moving, q: Any, x: Float[Array, "m nx"], u: Float[Array, "m nu"]) -> Float[Array, "m r np"]:
+def slopes_at(form: Moving, q: Any, x: Float[Array, "m nx"], u: Float[Array, "m nu"]) -> Float[Array, "m r np"]:
     """∂(f, h)/∂q at points."""
 
     def both(q: Any, x: Any, u: Any) -> Any:

@@ -232,19 +232,11 @@ class Motion:
 
     def _check_used(self) -> None:
         """Every parameter is used, and every output follows from a state."""
-        reach = {name: set(expression.names) for name, expression in self.definitions}
-        for name, expression in self.definitions:  # each after those that it uses
-            for other in expression.names:
-                reach[name] |= reach.get(other, set())
-
-        def names_in(expression: Expression) -> set[str]:
-            return set(expression.names).union(*(reach.get(name, set()) for name in expression.names))
-
         used: set[str] = set()
         for state in self.states:
-            used |= names_in(self._expressions[state.name])
+            used |= self._names_in(self._expressions[state.name])
         for output, expression in zip(self.outputs, self._observed, strict=True):
-            there = names_in(expression)
+            there = self._names_in(expression)
             used |= there
             if not there & set(self.names_of_states):
                 raise InputError(
@@ -254,6 +246,19 @@ class Motion:
         for name in self.names:
             if name not in used:
                 raise InputError(f"the parameter '{name}' is in no equation and no output; use or remove it.")
+
+    def _names_in(self, expression: Expression) -> set[str]:
+        """The names of an expression, and those of the definitions that it uses."""
+        reach = {name: set(given.names) for name, given in self.definitions}
+        for name, given in self.definitions:  # each after those that it uses
+            for other in given.names:
+                reach[name] |= reach.get(other, set())
+        return set(expression.names).union(*(reach.get(name, set()) for name in expression.names))
+
+    def parameters_in(self, state: str) -> tuple[str, ...]:
+        """The parameters of a state's equation; of a motion that has expressions."""
+        there = self._names_in(self._expressions[state])
+        return tuple(name for name in self.names if name in there)
 
     @property
     def names_of_states(self) -> tuple[str, ...]:

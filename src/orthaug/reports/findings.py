@@ -48,8 +48,20 @@ class PhysicalBias(Content):
     relative: Number
 
 
+class ToldResult(Content):
+    """What the residual of a motion's free run tells of a term."""
+
+    coefficient: Number
+    std: Number
+    t: Number
+    share: Number
+    left: Number
+
+
 class SuspectResult(Content):
     """What a term that may be missing does to θ."""
+
+    absent = frozenset({"equation", "unit", "residual"})
 
     name: str
     expression: str
@@ -68,6 +80,9 @@ class SuspectResult(Content):
     relative_physical_bias: ByName | None
     size: Number
     expected_physical_bias: dict[str, PhysicalBias] | None
+    equation: str | None = None
+    unit: str | None = None
+    residual: ToldResult | None = None
 
     @property
     def percent(self) -> dict[str, float | None]:
@@ -314,6 +329,7 @@ class HoldResult(Content):
     hold: str
     residual: Number
     declared: Flag
+    parameters: ByName | None
 
 
 class MotionCheckResult(Content):

@@ -174,7 +174,8 @@ def _bias_lines(result: FitResult) -> list[str]:
     if not rows or rows[0].bias is None:
         return []
     cause, share, width = rows[0].bias.cause, rows[0].bias.share or 0.0, _width(rows)
-    lines = [f"{100 * share:.0f} % of what the learner found is {cause}. The bias that implies:"]
+    what = "learner found" if result.motion is None or result.shared is not None else "free run leaves"
+    lines = [f"{100 * share:.0f} % of what the {what} is {cause}. The bias that implies:"]
     lines.append(f"{'parameter':<{width}}  {'bias':>11}  {'of std':>7}  {'of value':>9}  {'95 % interval with it':^29}")
     for row in rows:
         bias = row.bias.value if row.bias else None

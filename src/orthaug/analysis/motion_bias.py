@@ -1,0 +1,261 @@
+"""What terms that a motion's equations may lack do to its parameters, and what tells of them.
+
+The free run answers for what the fit determines: a term moves these parameters as `motion_response` says. Along the
+directions that the learner could imitate the nearest physics decides, so that there a term moves p̂ by what the measure
+makes of it: `d + B(Φ_μB)⁺G_μ` with d what the term moves c by, Φ the slopes ∂f/∂q of the learned equations over the
+measure's points, and G what the learner holds of the term: all of it, and d = 0, where it is a function of what the
+learner sees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug.analysis.absorbed import completing
+from orthaug.analysis.bias import IN_SPAN, Certificate, SuspectedBias, find_certificate
+from orthaug.analysis.motion_response import Place, TermsResponse, respond_to
+from orthaug.analysis.motion_suspects import MotionSuspect
+from orthaug.inference.motion_split import Field, slopes_at
+from orthaug.physics.motion import Motion
+from orthaug.physics.projection import Projection
+from orthaug.physics.shared import Shared, moves
+
+_SAME = 1e-6  # of its size: what a term may change over a move that the learner does not see
+CERTIFIED_POINTS = 20_000  # of a measure at most, over which certificates are sought
+
+
+@dataclass(frozen=True)
+class Told:
+    """What the free run's residual tells of a term beside all that was fitted: one Gauss-Newton step.
+
+    `share` is by how much of the residual's squares it falls, `left` what stays of them beyond white noise.
+    """
+
+    coefficient: float
+    std: float | None
+    t: float | None
+    share: float
+    left: float
+
+
+@dataclass(frozen=True, eq=False)
+class TermBias:
+    """What a term of a motion does to its parameters if it is there.
+
+    `moved` (np,) are the coordinates of p̂ less those without the term, per unit of its coefficient.
+    """
+
+    suspect: MotionSuspect
+    equation: str
+    names: tuple[str, ...]
+    moved: Vector
+    per_unit: Vector
+    """The same of p̂, to first order."""
+    value: Vector
+    expected: Vector | None
+    """The same times the guessed coefficient."""
+    cosine: float | None
+    size: float
+    seen: bool | None
+    explained: float | None
+    coefficient_found: float | None
+    certificate: Certificate | None
+    residual: Told | None
+
+    @property
+    def removed_by(self) -> str | None:
+        """What leaves the parameters unbiased by it; None where that is not known, or nothing is to remove."""
+        if self.seen is None:
+            return "nothing" if self.moved.any() else None
+        return self._told.removed_by
+
+    @property
+    def _told(self) -> SuspectedBias:
+        relative = [b / v if v else None for b, v in zip(self.per_unit, self.value, strict=True)]
+        shown: Any = self.suspect
+        own = (self.names, tuple(self.per_unit), tuple(relative), None if self.expected is None else (*self.expected,))
+        found = (self.cosine, self.explained, self.coefficient_found, self.certificate, self.seen)
+        return SuspectedBias(shown, *own, None, *found)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain numbers, text and None, for JSON."""
+        return self._told.as_dict() | {
+            "removed_by": self.removed_by,
+            "equation": self.equation,
+            "unit": self.suspect.unit,
+            "size": self.size,
+            "relative_physical_bias": None,
+            "expected_physical_bias": None,
+            "residual": self.residual,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class MotionGround:
+    """What biases of a motion are computed on: where it is linearised, and the points that p̂ was split over.
+
+    Args:
+        q: coordinates of p̂; those in `shared` directions are told by the nearest physics.
+        field: the measure's points.
+        learned: the learner (M, nl) there beside p̂; None before a fit, and without one.
+        unknown: parameters that no output tells: a term does anything to them.
+    """
+
+    place: Place
+    q: Vector
+    shared: Shared
+    field: Field
+    learned: Matrix | None = None
+    unknown: tuple[str, ...] = ()
+    slope: Matrix | None = None
+    """How p̂ follows (c, w) of a fit (np, np + nw); None where that is not known."""
+
+    @property
+    def motion(self) -> Motion:
+        return self.place.course.problem.motion
+
+    @property
+    def learns(self) -> bool:
+        """Whether there is a learner."""
+        return self.place.course.bound is not None
+
+    @cached_property
+    def phi(self) -> Projection:
+        """∂f/∂q of the learned equations over the points, rows times the root of their weights over their sizes."""
+        slopes = np.asarray(slopes_at(self.place.course.dynamics.alone, self.q, self.field.x, self.field.u))
+        slopes = slopes[:, self._learned]
+        return Projection.factor(self._weighed(np.moveaxis(slopes, 2, 0)).transpose(1, 2, 0))
+
+    def _weighed(self, rows: np.ndarray) -> np.ndarray:
+        return rows * np.sqrt(self.field.weight)[:, None] / self.field.size
+
+    def table(
+        self, suspects: Sequence[MotionSuspect], used: float | None = None, steps: int | None = None
+    ) -> list[TermBias]:
+        """What every suspect does; nothing where the free run has no sensitivities.
+
+        Args:
+            used: weights that a fit used, where it is asked what its residual tells; `steps` of a block, where its
+                errors are coloured.
+        """
+        added = tuple(suspect.term(self.motion) for suspect in suspects)
+        response = respond_to(self.place, added)
+        if not np.isfinite(response.information).all() or not np.isfinite(response.gradient).all():
+            return []
+        seen = [self._seen(suspect) if self.learns else None for suspect in suspects]
+        residuals: list[Told | None] = [None] * len(added)
+        if used is not None and not all(seen):  # what the learner sees it has taken from the residual
+            residuals = told_by_residual(response, used, steps)
+        rows = enumerate(zip(suspects, seen, residuals, strict=True))
+        return [self._entry(response, k, *row) for k, row in rows]
+
+    def _entry(
+        self, response: TermsResponse, k: int, suspect: MotionSuspect, seen: bool | None, residual: Told | None
+    ) -> TermBias:
+        motion, names = self.motion, self.motion.names
+        place = suspect.place(motion)
+        basis, certificate, explained, found = self.shared.basis, None, None, None
+        trained = bool(len(self.place.w))  # a learner that is not may hold all along shared directions
+        apart = np.zeros(len(names), dtype=bool) if trained else ~np.isin(np.arange(len(names)), completing(basis))
+        moved, dw = response.moved(k, apart)
+        if self.learns:
+            delta = self._rows(suspect, place)
+            held = delta if seen else response.held(dw, self.field.x, self.field.u)
+            held = self._weighed(held)
+            if not seen and trained and self.slope is not None:
+                moved = self.slope @ np.concatenate([moved, dw])
+            elif basis.shape[1]:
+                moved = (0.0 if seen else moved) + self.phi.solve_along(held, basis)
+            elif seen:
+                moved = np.zeros(len(names))
+            if basis.shape[1] and len(held) <= CERTIFIED_POINTS and np.any(delta):
+                certificate = find_certificate(self.phi, self._weighed(delta), basis)
+            explained, found = self._explained(held)
+        moved = np.where(np.isin(names, self.unknown), np.nan, moved)
+        coordinates = motion.coordinates
+        value, per_unit = coordinates.physical(self.q), coordinates.slopes(self.q) * moved
+        expected = None
+        if suspect.coefficient is not None:
+            expected = suspect.coefficient * per_unit
+        known = (*motion.names_of_states, *(output.name for output in motion.outputs))
+        own = (suspect, known[place], names, moved, per_unit, value, expected)
+        told = (response.cosine(k), response.size(k), seen, explained, found, certificate)
+        return TermBias(*own, *told, None if seen else residual)
+
+    def _rows(self, suspect: MotionSuspect, place: int) -> Matrix:
+        """The term (M, nl) in the learned equations, 0 where it acts elsewhere."""
+        rows = np.zeros((len(self.field.x), len(self._learned)))
+        if place in self._learned:
+            p = self.motion.coordinates.physical(self.q)
+            rows[:, self._learned.index(place)] = suspect.values(self.motion, p, self.field.x, self.field.u)
+        return np.where(np.isfinite(rows), rows, 0.0)
+
+    def _explained(self, held: Matrix) -> tuple[float | None, float | None]:
+        """How much of the learner a term explains, and with which coefficient, beside the shared directions."""
+        if self.learned is None:
+            return None, None
+
+        def left(values: Matrix) -> Matrix:
+            basis = self.shared.basis
+            return values - self.phi.phi @ self.phi.solve_along(values, basis) if basis.shape[1] else values
+
+        rest, tilde, size = left(held), left(self._weighed(self.learned)), np.linalg.norm(held)
+        norm = np.linalg.norm(rest)
+        if not np.any(tilde) or norm <= IN_SPAN * size:
+            return None, None
+        product = float(np.vdot(rest, tilde)) / norm
+        return float(min((product / np.linalg.norm(tilde)) ** 2, 1.0)), float(product / norm)
+
+    @property
+    def _learned(self) -> list[int]:
+        """The numbers of the learned equations, outputs after states."""
+        states, outputs = self.motion.learned
+        return [*states, *(len(self.motion.states) + i for i in outputs)]
+
+    def _seen(self, suspect: MotionSuspect) -> bool:
+        """Whether the learner is added where the term acts, and the term is a function of what the learner sees."""
+        if suspect.place(self.motion) not in self._learned:
+            return False
+        start, end = self._moves
+        p, nx = self.motion.coordinates.physical(self.q), len(self.motion.states)
+        pairs = np.stack([suspect.values(self.motion, p, x[:, :nx], x[:, nx:]) for x in (start, end)])
+        there: Any = np.isfinite(pairs).all(axis=0)
+        pairs = pairs[:, there]
+        size = np.sqrt(np.mean(pairs**2)) if pairs.size else 0.0
+        return bool(np.abs(pairs[1] - pairs[0]).max(initial=0.0) <= _SAME * size)
+
+    @cached_property
+    def _moves(self) -> tuple[Matrix, Matrix]:
+        """Pairs of points that the learner does not tell apart."""
+        form, nx = self.place.course.dynamics, len(self.motion.states)
+        points = np.concatenate([self.field.x, self.field.u], axis=1)
+        return moves(lambda rows: np.asarray(form.seen(rows[:, :nx].T, rows[:, nx:].T, np)).T, points)
+
+
+def told_by_residual(response: TermsResponse, used: float, steps: int | None) -> list[Told | None]:
+    """What the residual tells of every term, with standard errors that hold for coloured errors where `steps` is given.
+
+    Args:
+        used: weights that the fit used.
+    """
+    whole, noise = response.squares()
+    free = max(response.place.course.residuals - response.parameters - used, 1.0)
+    middle = None if steps is None else response.scores().middle(steps, response.parameters + used)[0]
+    found: list[Told | None] = []
+    for k in range(response.terms):
+        step = response.step(k)
+        if step is None or not whole > 0:
+            found.append(None)
+            continue
+        coefficient, fall, row = step
+        variance = whole / free * float(row @ response.information @ row) if middle is None else row @ middle @ row
+        std = float(np.sqrt(variance)) if variance > 0 else None
+        shares = min(fall / whole, 1.0), float(np.clip((whole - noise - fall) / whole, 0.0, 1.0))
+        found.append(Told(coefficient, std, None if std is None else coefficient / std, *shares))
+    return found

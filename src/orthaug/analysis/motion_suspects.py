@@ -1,0 +1,181 @@
+"""Suspected terms of a motion: what its equations may lack, as expressions of states, inputs and parameters.
+
+A suspect adds `coefficient * expression` to the derivative of a state, or to an output. With a `factor` such as -1/m
+the coefficient is a force in N though the equation is one of m/s².
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthaug._base.checks import Matrix, Vector, check_label, check_unique, is_number, nearest
+from orthaug._base.errors import InputError
+from orthaug.analysis.suspects import WIDTHS, written
+from orthaug.data.expressions import Expression, parse_named
+from orthaug.physics.motion import Motion
+from orthaug.physics.motion_problem import MotionProblem
+from orthaug.physics.suspected_motion import AddedTerm
+
+_OF_STATES = ("coulomb", "quadratic_drag", "cubic")
+_OF_INPUTS = ("cubic", "dead_zone", "saturation")
+
+
+@dataclass(frozen=True)
+class MotionSuspect:
+    """A term `coefficient * expression` of a state's equation, or of an output; make one of a known kind with `of`.
+
+    `coefficient` is a guess of its size, None where there is none; `unit` is its unit. `equation` may be left out where
+    one state is learned, or only one equation has parameters.
+
+    Examples:
+        >>> MotionSuspect.of("coulomb", "v", factor="-1/m", equation="v", coefficient=1.5, unit="N").expression
+        '(-1/m)*(sign(v))'
+    """
+
+    name: str
+    expression: str
+    equation: str | None = None
+    coefficient: float | None = None
+    unit: str = ""
+
+    output = None  # in the words of lagged suspects
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name.strip() or not self.name.isprintable():
+            raise InputError(f"{self.name!r} cannot name a suspect; use visible characters on one line.")
+        if self.coefficient is not None and not is_number(self.coefficient):
+            raise InputError(f"suspect '{self.name}': `coefficient` must be a finite number; got {self.coefficient!r}.")
+        check_label(self.unit, f"the unit of suspect '{self.name}'")
+
+    @classmethod
+    def of(
+        cls,
+        kind: str,
+        on: str | None = None,
+        *,
+        width: float | None = None,
+        factor: str | None = None,
+        equation: str | None = None,
+        coefficient: float | None = None,
+        unit: str = "",
+        name: str | None = None,
+    ) -> MotionSuspect:
+        """A suspect of a known kind (those of `Suspect.of`), times a factor.
+
+        Args:
+            on: an expression of states, inputs, parameters and definitions, such as `"v"`.
+            width: in the unit of `on`.
+            factor: an expression that multiplies the kind's.
+
+        Raises:
+            InputError: an unknown kind, an argument that is missing, or that the kind does not take.
+        """
+        text, label, _ = written(kind, on, width, _balanced, "v")
+        if factor is not None:
+            _balanced(factor)
+            text, label = f"({factor})*({text})", f"{factor} * {label}"
+        return cls(label if name is None else name, text, equation, coefficient, unit)
+
+    def parsed(self, motion: Motion) -> Expression:
+        """The expression on the motion's names.
+
+        Raises:
+            InputError: names that the motion does not have, what is no arithmetic.
+        """
+        return parse_named(self.expression, motion.known, f"suspect '{self.name}'")
+
+    def place(self, motion: Motion) -> int:
+        """The number of its equation, outputs after states.
+
+        Raises:
+            InputError: an unknown equation, or none where there are several.
+        """
+        known = (*motion.names_of_states, *(output.name for output in motion.outputs))
+        if self.equation is not None:
+            if self.equation not in known:
+                hint = nearest(self.equation, known) or f"; known are {', '.join(known)}"
+                raise InputError(f"suspect '{self.name}': no equation is that of '{self.equation}'{hint}.")
+            return known.index(self.equation)
+        likely = usual_places(motion)
+        if len(likely) != 1:
+            raise InputError(f"suspect '{self.name}': `equation` is missing; one of {', '.join(known)}.")
+        return likely[0]
+
+    def term(self, motion: Motion) -> AddedTerm:
+        """It as a term of the motion."""
+        return AddedTerm(self.name, self.place(motion), self.parsed(motion))
+
+    def values(self, motion: Motion, p: Vector, x: Matrix, u: Matrix) -> Vector:
+        """The expression (M,) at states (M, nx) and inputs (M, nu), also where it is not finite."""
+        with np.errstate(all="ignore"):
+            found = self.parsed(motion).value(motion.values(x.T, u.T, p, np), np)
+        return np.broadcast_to(np.asarray(found, dtype=float), (len(x),))
+
+
+def usual_places(motion: Motion) -> tuple[int, ...]:
+    """The equations of states that a term is likely to lack in: the learned ones, else those that have parameters."""
+    if motion.learned[0]:
+        return motion.learned[0]
+    if motion.functions is not None:
+        return tuple(range(len(motion.states)))
+    return tuple(i for i, state in enumerate(motion.states) if motion.parameters_in(state.name))
+
+
+def check_motion_suspects(suspects: Sequence[MotionSuspect], problem: MotionProblem) -> None:
+    """Raise InputError for suspects that the motion cannot have, or that have no value at some guessed state."""
+    motion, (x, u) = problem.motion, problem.looked_at
+    check_unique((suspect.name for suspect in suspects), "suspect")
+    for suspect in suspects:
+        suspect.place(motion)
+        values = suspect.values(motion, motion.initial, x.T, u.T)
+        if not np.isfinite(values).all():
+            k = int(np.argmax(~np.isfinite(values)))
+            at = zip((*motion.names_of_states, *motion.inputs), (*x[:, k], *u[:, k]), strict=True)
+            where = ", ".join(f"{name} = {value:.4g}" for name, value in at)
+            raise InputError(f"suspect '{suspect.name}' = {suspect.expression} is not finite at {where}.")
+
+
+def motion_width(on: str, problem: MotionProblem) -> float:
+    """A width from the data's own scale: the median of |on| where it is not zero, over guessed states and inputs.
+
+    Raises:
+        InputError: an expression that cannot be read, that is not finite, or zero everywhere.
+    """
+    motion, (x, u) = problem.motion, problem.looked_at
+    size = np.abs(MotionSuspect(on, on).values(motion, motion.initial, x.T, u.T))
+    if not np.isfinite(size).all() or not np.any(size > 0):
+        raise InputError(f"'{on}' is zero or not finite over the guessed states; the data give no `width`. State one.")
+    return float(np.median(size[size > 0]))
+
+
+def _balanced(text: str) -> None:
+    """Raise InputError where parentheses are no pairs: names are checked with the motion."""
+    depth = 0
+    for letter in text:
+        depth += (letter == "(") - (letter == ")")
+        if depth < 0:
+            break
+    if depth or not text.strip():
+        raise InputError(f"'{text}' is no expression: its parentheses are no pairs, or it is empty.")
+
+
+def usual_motion_suspects(problem: MotionProblem) -> tuple[MotionSuspect, ...]:
+    """What is often missing: friction, drag and hardening of every state, what bends an input, an offset."""
+    motion, (x, u) = problem.motion, problem.looked_at
+    moving = [(name, True) for name, row in zip(motion.names_of_states, x, strict=True) if np.ptp(row) > 0]
+    moving += [(name, False) for name, row in zip(motion.inputs, u, strict=True) if np.ptp(row) > 0]
+    places = usual_places(motion)
+    found = []
+    for place in places:
+        equation = motion.states[place].name
+        where = f" in {equation}" if len(places) > 1 else ""
+        for name, is_state in moving:
+            for kind in _OF_STATES if is_state else _OF_INPUTS:
+                width = motion_width(name, problem) if kind in WIDTHS else None
+                label = f"{kind} of {name}{where}"
+                found.append(MotionSuspect.of(kind, name, width=width, equation=equation, name=label))
+        found.append(MotionSuspect.of("offset", equation=equation, name=f"offset{where}"))
+    return tuple(found)

@@ -1,0 +1,148 @@
+"""Terms that a motion's equations lack: what they do to its parameters, and what tells of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_motion_fit import WHOLE, data, positive, spring
+
+import orthaug as oa
+from orthaug._base.errors import InputError
+from orthaug._base.jax import jnp
+from orthaug.analysis.motion_budget import motion_budget
+from orthaug.analysis.motion_suspects import check_motion_suspects, usual_motion_suspects
+from orthaug.physics.motion_problem import pose_motion
+
+FRICTION = oa.MotionSuspect.of("expression", "tanh(v/0.1)", factor="-1/m", unit="N", name="friction")
+HARDENING = oa.MotionSuspect.of("cubic", "x", factor="-1/m", equation="v", coefficient=0.2, name="hardening")
+SUSPECTS = (FRICTION, HARDENING)
+TRUTH = np.array([1.0, 0.8, 25.0])
+
+
+@pytest.fixture(scope="module")
+def alone() -> oa.MotionEstimate:
+    return oa.estimate(data(friction=0.1), spring(), learner=None, criterion=WHOLE)
+
+
+@pytest.fixture(scope="module")
+def clean() -> oa.MotionEstimate:
+    return oa.estimate(data(friction=0.0), spring(), learner=None, criterion=WHOLE)
+
+
+@pytest.fixture(scope="module")
+def learned() -> oa.MotionEstimate:
+    learner = oa.MLP((4,), inputs=("v",))
+    return oa.estimate(data(), spring(learned=True), learner=learner, criterion=WHOLE, blocks=0)
+
+
+def test_physics_alone_is_biased_as_the_term_says_and_the_residual_tells_its_size(alone: oa.MotionEstimate) -> None:
+    friction, hardening = oa.suspected_bias(alone, SUSPECTS)
+    moved = friction.per_unit * 0.1
+    assert moved[1] == pytest.approx(alone.values[1] - TRUTH[1], rel=0.03)
+    assert moved[1] > 50 * 0.0004  # of many standard errors of a fit without friction
+    assert (np.abs(alone.values - moved - TRUTH) < [9e-4, 1.2e-3, 0.025]).all()  # three such standard errors
+    assert friction.removed_by == "nothing" and friction.seen is None and friction.explained is None
+    told = friction.residual
+    assert told.coefficient == pytest.approx(0.1, abs=3 * told.std) and told.coefficient == pytest.approx(0.1, rel=0.05)
+    assert told.t > 5 and told.share > 5 * hardening.residual.share
+    assert 0.9 < friction.cosine < 1.0
+
+
+def refitted(fit: oa.MotionEstimate, friction: float, size: float) -> np.ndarray:
+    """By how much a unit of a spring that hardens moves the estimates, of data with one and with a softening one."""
+    learner = oa.MLP((4,), inputs=("v",)) if fit.model.form.bound is not None else None
+    options = {"learner": learner, "criterion": WHOLE, "blocks": 0}
+    records = [data(friction=friction, hardening=sign * size) for sign in (1, -1)]
+    ends = [oa.estimate(record, spring(learned=learner is not None), **options).values for record in records]
+    return (ends[0] - ends[1]) / (2 * size)
+
+
+def test_the_bias_is_that_of_data_with_the_term(clean: oa.MotionEstimate) -> None:
+    _, hardening = oa.suspected_bias(clean, SUSPECTS)
+    assert refitted(clean, 0.0, 0.2) == pytest.approx(hardening.per_unit, rel=0.01)
+    assert hardening.expected == pytest.approx(0.2 * hardening.per_unit)
+
+
+def test_a_term_that_the_learner_sees_moves_what_it_could_imitate_alone(learned: oa.MotionEstimate) -> None:
+    friction, hardening = oa.suspected_bias(learned, SUSPECTS)
+    assert friction.seen and friction.moved[[0, 2]] == pytest.approx([0, 0], abs=1e-12)
+    assert friction.coefficient_found == pytest.approx(0.6, rel=0.03) and friction.explained > 0.98
+    assert learned.values[1] - 0.6 * friction.per_unit[1] == pytest.approx(TRUTH[1], rel=0.02)
+    assert friction.removed_by == "learner in part" and friction.residual is None  # v tanh(v) is never negative
+    assert hardening.seen is False and hardening.removed_by == "nothing"
+    assert abs(hardening.residual.t) < 3  # nothing of it is there
+    assert hardening.explained < 0.1
+
+
+def test_what_the_learner_does_not_see_biases_as_data_with_it(learned: oa.MotionEstimate) -> None:
+    _, hardening = oa.suspected_bias(learned, SUSPECTS)
+    assert refitted(learned, 0.6, 0.05) == pytest.approx(hardening.per_unit, rel=0.05)
+
+
+def test_the_budget_covers_the_truth_where_the_interval_does_not(
+    alone: oa.MotionEstimate, learned: oa.MotionEstimate, clean: oa.MotionEstimate
+) -> None:
+    for fit in (alone, learned):
+        budget = motion_budget(fit, oa.suspected_bias(fit, SUSPECTS))
+        c = budget.of("c")
+        assert budget.cause.suspect is FRICTION
+        assert fit.interval[1, 0] > TRUTH[1] and c.ci95[0] < TRUTH[1] < c.ci95[1]
+        assert c.ci95[1] - c.ci95[0] < 0.35 * c.value  # the bias is told, not only admitted
+        (warning,) = budget.warnings
+        assert warning.code == "biased" and "friction of size" in warning.text and "c by +" in warning.text
+    assert motion_budget(clean, oa.suspected_bias(clean, SUSPECTS)) is None
+    friction = oa.suspected_bias(alone, SUSPECTS)[0]
+    among_more = replace(friction, residual=replace(friction.residual, left=1.5 * friction.residual.share))
+    assert motion_budget(alone, [among_more]) is None  # something else is missing: no one knows what
+
+
+def test_a_function_has_suspects_too(alone: oa.MotionEstimate) -> None:
+    given = spring()
+
+    def f(x, u, p):
+        return jnp.stack([x[1], (u[0] - p[1] * x[1] - p[2] * x[0]) / p[0]])
+
+    motion = oa.Motion.from_functions(f, lambda x, u, p: x[:1], given.states, ["y"], given.parameters, given.inputs)
+    fit = oa.estimate(data(friction=0.1), motion, learner=None, criterion=WHOLE)
+    suspect = oa.MotionSuspect.of("expression", "tanh(v/0.1)", factor="-1/m", equation="v")
+    (theirs,), ours = oa.suspected_bias(fit, [suspect]), oa.suspected_bias(alone, SUSPECTS)[0]
+    assert theirs.per_unit == pytest.approx(ours.per_unit, rel=1e-6)
+
+
+def test_a_sensor_may_lack_a_term() -> None:
+    """An offset of the sensor moves nothing that the start does not; it is found, within its standard error."""
+    record = data(friction=0.0)
+    shifted = oa.Record.from_arrays(
+        u=record.experiments[0].inputs[:, 0], y=record.experiments[0].outputs[:, 0] + 0.05, sampling_time=0.05
+    )
+    fit = oa.estimate(shifted, spring(), learner=None, criterion=WHOLE)
+    (offset,) = oa.suspected_bias(fit, [oa.MotionSuspect.of("offset", equation="y")])
+    assert offset.residual.coefficient == pytest.approx(0.05, rel=0.02) and offset.residual.t > 10
+
+
+def test_suspects_that_the_motion_cannot_have_are_refused() -> None:
+    problem = pose_motion(data(40), spring())
+
+    def refused(match: str, *arguments: str, **options: str) -> None:
+        with pytest.raises(InputError, match=match):
+            check_motion_suspects([oa.MotionSuspect.of(*arguments, **options)], problem)
+
+    refused("unknown kind of suspect 'culomb', did you mean 'coulomb'", "culomb", "v")
+    refused("needs `on`, an expression such as v", "coulomb")
+    refused("unknown name 'w'", "coulomb", "w")
+    refused("its parentheses are no pairs", "coulomb", "v) + (v")
+    refused("no equation is that of 'w'; known are x, v, y", "coulomb", "v", equation="w")
+    refused("is not finite at", "expression", "1/(x - x)")
+    refused("a signal such as y", "cubic", "y[k-1]")
+    two = oa.Motion.from_equations(
+        [oa.State("a", "-k*a"), oa.State("b", "k*a - b*c")], [oa.Output("y", "b")], positive(k=1.0, c=1.0)
+    )
+    with pytest.raises(InputError, match="`equation` is missing; one of a, b, y"):
+        oa.MotionSuspect.of("offset").place(two)
+    assert [s.name for s in usual_motion_suspects(problem)] == [
+        *(f"{kind} of {name}" for name in "xv" for kind in ("coulomb", "quadratic_drag", "cubic")),
+        *(f"{kind} of u" for kind in ("cubic", "dead_zone", "saturation")),
+        "offset",
+    ]
