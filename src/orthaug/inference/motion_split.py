@@ -103,7 +103,7 @@ def shared_of_motion(form: Moving, q: Vector, x: Matrix, u: Matrix) -> Shared:
 def _spanned(form: Moving, q: Vector, x: Matrix, u: Matrix) -> Shared:
     """The directions that move what has a learner by linear combinations of its features, and nothing else."""
     some = slice(None, None, max(1, len(x) // _POINTS))
-    slopes = np.moveaxis(np.asarray(_slopes(form, q, x[some], u[some])), 1, 0)
+    slopes = np.moveaxis(np.asarray(slopes_at(form, q, x[some], u[some])), 1, 0)
     states, outputs = form.motion.learned
     learned = [i in states for i in range(len(form.motion.states))]
     learned += [i in outputs for i in range(len(form.motion.outputs))]
