@@ -81,9 +81,7 @@ def motion(learned: bool) -> oa.Motion:
         ],
         outputs=[oa.Output("y", "x")],
         inputs=["u"],
-        parameters=[
-            oa.PhysicalParameter(*given, min=0) for given in zip("mck", (1.2, 1.2, 30.0), strict=True)
-        ],
+        parameters=[oa.PhysicalParameter(*given, min=0) for given in zip("mck", (1.2, 1.2, 30.0), strict=True)],
     )
 
 
@@ -117,7 +115,7 @@ def outcome(case: Case, draws: int) -> Outcome:
 
 
 def table(draws: int = DRAWS) -> list[list[float]]:
-    """Of each case: told at 5 %, at 1 %, right equation and variable, right shape, share; as in benchmarks/README.md."""
+    """Of each case: told at 5 and 1 %, right equation and variable, right shape, share; as in benchmarks/README.md."""
     found = [outcome(case, draws) for case in CASES]
     return [[*one.told, one.equation_and_variable, one.shape, one.share] for one in found]
 

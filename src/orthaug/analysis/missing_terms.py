@@ -3,9 +3,10 @@
 What the free run leaves is regressed on its sensitivities to simple functions of every state and input, added to one
 equation each, beside the sensitivities to all that was estimated: parameters, weights and the segments' starts. That
 is the score test of Rao (1948) of `b = 0`. To first order the errors are `S_p δ + S_b b + e`, so that the F-test of b
-is right whatever the parameters' own errors δ are. Coloured errors are `e = H ε` with the autoregression `H = 1/A`: rows
-and columns are filtered by A, which is found from what is left beside *all* columns (Cochrane and Orcutt 1949, under
-the alternative), so that what a missing term leaves does not pass for colour.
+is right whatever the parameters' own errors δ are. Coloured errors are `e = H ε` with the autoregression `H = 1/A`:
+rows and columns are filtered by A (Cochrane and Orcutt 1949). For the test A is that of the errors beside what was
+estimated; beside all terms it would be found too white, and the test would reject too often. To tell terms from each
+other it is that beside all terms, so that what the missing one leaves does not pass for colour.
 """
 
 from __future__ import annotations
@@ -172,28 +173,24 @@ def _term(
 def _tested(found: Sensitivities) -> tuple[float, tuple[int, int], float, Vector, Vector, Vector] | None:
     """p, degrees of freedom and share of all terms; of each its gain in filtered rows, its share and coefficient."""
     plain = _regression(found, None)
-    if plain is None:
+    null = None if plain is None else _regression(found, _filters(found, plain.errors))
+    if plain is None or null is None:
         return None
-    basis, kept = _basis(plain)
-    if not kept.any():
-        return None
-    filters = _filters(found, basis @ (basis.T @ plain.errors), plain)
-    white = _regression(found, filters)
-    if white is None:
-        return None
-    basis, kept = _basis(white)
-    rank, freedom = basis.shape[1], white.left - basis.shape[1]
-    total = float(white.errors @ white.errors)
-    explained = float(np.sum((basis.T @ white.errors) ** 2))
+    basis, _ = _basis(null)
+    rank, freedom = basis.shape[1], null.left - basis.shape[1]
+    total = float(null.errors @ null.errors)
     if rank == 0 or freedom < _ROWS_PER_COLUMN * rank or not total > 0:
         return None
+    explained = float(np.sum((basis.T @ null.errors) ** 2))
     rest = max(total - explained, np.finfo(float).eps * total)
     p = float(scipy.special.fdtrc(rank, freedom, explained / rank / (rest / freedom)))
-    size = np.einsum("rj,rj->j", white.terms, white.terms)
-    along = white.terms.T @ white.errors
-    gains = np.where(kept, along**2 / np.where(kept, size, 1.0), 0.0) / total
-    coefficients = np.where(kept, along / np.where(kept, size, 1.0), 0.0)
-    return p, (rank, freedom), _share(plain), gains, _shares(plain), coefficients
+    basis, _ = _basis(plain)
+    beside = _regression(found, _filters(found, plain.errors - basis @ (basis.T @ plain.errors)))
+    rows = null if beside is None else beside
+    size = np.einsum("rj,rj->j", rows.terms, rows.terms)
+    size = np.where(size > 0, size, np.inf)
+    along = rows.terms.T @ rows.errors
+    return p, (rank, freedom), _share(plain), along**2 / size, _shares(plain), along / size
 
 
 def _share(plain: _Regression) -> float:
@@ -275,9 +272,9 @@ def _filtered(found: Sensitivities, segment: int, filters: tuple[list[Vector], V
     return np.concatenate(filtered)
 
 
-def _filters(found: Sensitivities, explained: Vector, plain: _Regression) -> tuple[list[Vector], Vector]:
-    """The autoregression of each output's errors beside all columns, and the size of what it leaves."""
-    ny, left = found.errors.shape[2], plain.errors - explained
+def _filters(found: Sensitivities, left: Vector) -> tuple[list[Vector], Vector]:
+    """The autoregression of what is left of each output's errors, and the size of its innovations."""
+    ny = found.errors.shape[2]
     pieces: list[list[Vector]] = [[] for _ in range(ny)]
     for one in _cut(found, left):
         for o, part in enumerate(one.reshape(ny, -1)):
