@@ -246,6 +246,8 @@ def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(fitted:
 
     found = diagnose_motion(fitted, fitted.model.simulate(data()))
     assert found is not None and found.verdict == "white" and "noise on the outputs" in found.text
+    again = oa.diagnose(fitted)
+    assert again is not None and again.text == found.text
     assert robust_motion(fitted) is fitted
     assert found.missing is not None and not found.missing.found(0.01, 0.05)
     alone = oa.estimate(data(), spring(), learner=None, criterion=WHOLE)
@@ -256,6 +258,10 @@ def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(fitted:
     assert (term.equation, term.variable, term.shape) == ("v", "v", "jump") and term.share > 0.5
     assert term.coefficient == pytest.approx(-0.6, rel=0.15)
     assert "the equation of v lacks something odd in v" in found.text and "that may see v" in found.text
+    helps = oa.verdict(fitted, alone, {"other": data(seed=9)})
+    assert helps.code == "helps" and helps.trials[0].model < 0.5 * helps.trials[0].alone
+    assert {e.lag for e in helps.extrapolation} <= {"x", "v", "u"}
+    assert oa.stability(fitted.model, data()).diverges_at is None
     robust = alone.robust(10)
     np.testing.assert_array_equal(robust.values, alone.values)
     np.testing.assert_array_equal(robust.plain_std, alone.std)

@@ -117,7 +117,9 @@ def content(
         told["residuals"] = diagnose_motion(fit, responses[job.train.name][1])
         warnings += [_NOT_ANALYSED] if told["residuals"] is None else told["residuals"].warnings
         points = job.reach(fit.model, job.train.record)[0]
-        told["stability"] = motion_stability(fit.model, *np.split(points, [form.states], axis=1))
+        told["stability"] = motion_stability(
+            fit.model, *np.split(points, [form.states], axis=1), record=job.train.record
+        )
         warnings += told["stability"].warnings
     if fit.status.ok and form.bound is not None:
         split = fit.split_by
