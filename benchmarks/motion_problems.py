@@ -2,8 +2,9 @@
 
 Springs with friction, some with a hardening spring, noise of any size and colour; three kinds of regularization,
 learners of v or of (x, v). Every fit has to end at or below the training loss of physics alone, and what is returned
-must not be worse on the held-out blocks. Free runs of 400 new rows tell whether learner or physics alone was the right choice, for
-the rule of the fits (the learner is surely better on the blocks) and for a milder one (it is better there by 2 %).
+must not be worse on the held-out blocks. Free runs of 400 new rows tell whether learner or physics alone was the
+right choice, for the rule of the fits (the learner is surely better on the blocks) and for a milder one (it is better
+there by 2 %).
 Run: python benchmarks/motion_problems.py [problems, default 60]
 """
 
