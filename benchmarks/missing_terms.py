@@ -2,7 +2,7 @@
 
 A mass on a spring and a damper under steps of force, 400 rows of 50 ms: the equations are right (white and coloured
 noise; with a learner that is not needed), or lack Coulomb friction or a cubic spring.
-Run: python benchmarks/missing_terms.py [draws, default 200]
+Run: python benchmarks/missing_terms.py [draws, default 100]
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from orthaug.analysis.missing_terms import missing_terms
 TS, ROWS, FINE, HELD = 0.05, 400, 8, 10
 M, C, K = 1.0, 0.8, 25.0
 NOISE = 0.02  # of the output's deviation
-DRAWS = 200
+DRAWS = 100
 LEVELS = (0.05, 0.01)
 
 
