@@ -248,14 +248,42 @@ def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(fitted:
 
     found = diagnose_motion(fitted, fitted.model.simulate(data()))
     assert found is not None and found.verdict == "white" and "noise on the outputs" in found.text
+    again = oa.diagnose(fitted)
+    assert again is not None and again.text == found.text
     assert robust_motion(fitted) is fitted
+    assert found.missing is not None and not found.missing.found(0.01, 0.05)
     alone = oa.estimate(data(), spring(), learner=None, criterion=WHOLE)
     found = diagnose_motion(alone, alone.model.simulate(data()))
-    assert found is not None and found.verdict != "white" and found.predictable[0].own_past > 0.5
+    assert found is not None and found.verdict == "unmodelled" and found.predictable[0].own_past > 0.5
+    assert found.missing is not None and found.missing.p < 1e-4
+    term = found.missing.terms[0]
+    assert (term.equation, term.variable, term.shape) == ("v", "v", "jump") and term.share > 0.5
+    assert term.coefficient == pytest.approx(-0.6, rel=0.15)
+    assert "the equation of v lacks something odd in v" in found.text and "that may see v" in found.text
+    helps = oa.verdict(fitted, alone, {"other": data(seed=9)})
+    assert helps.code == "helps" and helps.trials[0].model < 0.5 * helps.trials[0].alone
+    assert {e.lag for e in helps.extrapolation} <= {"x", "v", "u"}
+    assert oa.stability(fitted.model, data()).diverges_at is None
     robust = alone.robust(10)
     np.testing.assert_array_equal(robust.values, alone.values)
     np.testing.assert_array_equal(robust.plain_std, alone.std)
     assert (robust.std > 1.2 * alone.std).all() and robust.freedom < 31
+
+
+def test_a_term_that_is_there_already_moves_the_run_as_its_parameter_does() -> None:
+    """Linear in x, added to the equation of v: the spring's own column, −k/m of it by the logarithm of k."""
+    from orthaug.analysis.missing_terms import doubted
+    from orthaug.analysis.motion_sensitivities import sensitivities
+
+    fit = oa.estimate(data(), spring(), learner=None, criterion=WHOLE)
+    assert doubted(fit) == (1,)  # ẋ = v only says what v is
+    found = sensitivities(fit, (1,), lambda points: lambda rows: rows[:1], 1)
+    assert found is not None and (found.starts, found.nuisance) == (2, 5)
+    own, added = found.columns[..., 4], found.columns[..., 5]
+    m, _, k = fit.values
+    np.testing.assert_allclose(-k / m * added, own, rtol=0, atol=0.02 * np.abs(own).max())
+    errors = fit.course.objective().errors(fit.theta, np.zeros(0), fit.states, fit.course.segments)
+    np.testing.assert_allclose(np.ravel(errors), np.ravel(found.errors), rtol=1e-9)
 
 
 def test_what_stands_at_a_bound_is_a_constant_to_the_others() -> None:

@@ -1,10 +1,10 @@
 from . import signals as signals
 from .budget import bias_budget as bias_budget
 from .design import design_input as design_input
-from .diagnosis import diagnose as diagnose
 from .free_run_stability import stability as stability
 from .motion_design import design_motion_input as design_motion_input
 from .motion_ground import suspected_bias as suspected_bias
 from .motion_suspects import MotionSuspect as MotionSuspect
 from .suspects import Suspect as Suspect
 from .verdict_on_parts import verdict as verdict
+from .verdict_on_residuals import diagnose as diagnose

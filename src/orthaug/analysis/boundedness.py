@@ -17,6 +17,7 @@ from orthaug.analysis.visited import MOST_STEPS, usable
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.model import Model
+from orthaug.models.motion_model import MotionModel
 from orthaug.models.on_records import RUNAWAY
 
 _LARGEST_FACTOR = 1e4  # outputs of a stable linear model grow with its inputs, and 10⁶ times the largest is "diverged"
@@ -26,7 +27,7 @@ _CLOSE = 1.05  # ratio of two factors at which the bisection ends
 Diverging = Callable[[list[float]], np.ndarray]
 
 
-def divergence_scaling(model: Model, record: Record, largest: float = 1024.0) -> float | None:
+def divergence_scaling(model: Model | MotionModel, record: Record, largest: float = 1024.0) -> float | None:
     """Factor on the inputs from which the free run leaves all bounds (10⁶ times the largest training output).
 
     It scales each input's deviation from its mean over the record; the measured outputs that the run starts from stay.
@@ -96,7 +97,7 @@ def _middle(low: float, high: float) -> float:
     return float(np.sqrt(low * high))
 
 
-def _diverging(model: Model, record: Record, factors: Sequence[float]) -> Bool[np.ndarray, "f"]:
+def _diverging(model: Model | MotionModel, record: Record, factors: Sequence[float]) -> Bool[np.ndarray, "f"]:
     """Whether the free run diverges with the inputs' deviations from their means times each of up to 16 factors.
 
     The runs start from the measured outputs of each experiment and go side by side.

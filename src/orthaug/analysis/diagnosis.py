@@ -14,6 +14,7 @@ import numpy as np
 from orthaug._base.parallel import one_blas_thread
 from orthaug._base.warning import Warning
 from orthaug.analysis.changes import Change, fall_of, model_changes, own_share
+from orthaug.analysis.missing_terms import MissingTest
 from orthaug.analysis.predictability import Predictable, predictable
 from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, rms_errors
 from orthaug.analysis.verdict_text import SHARE, Finding, words
@@ -39,7 +40,8 @@ class Diagnosis:
     `one_step` and `free_run` are the tests of the two residuals per output. `ratio` is the free run's RMS error against
     the one-step error, `noise_in_lags` the share of noise in the least excited direction of the lagged outputs.
     `predictable` is what could be predicted of the error that was minimised, per output. `changes` are predicted to
-    lower it, the first of them by most; there is none where it is noise.
+    lower it, the first of them by most; there is none where it is noise. `missing` is the test of terms that the
+    equations of a motion could lack; None for other models.
     """
 
     verdict: str
@@ -51,6 +53,7 @@ class Diagnosis:
     warnings: tuple[Warning, ...]
     predictable: tuple[Predictable, ...] = ()
     changes: tuple[Change, ...] = ()
+    missing: MissingTest | None = None
 
     def __repr__(self) -> str:
         return f"Diagnosis({self.verdict}: {self.text})"

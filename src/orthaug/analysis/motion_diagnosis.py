@@ -1,7 +1,8 @@
 """What the free run of a motion leaves: noise, or something that a state or an input tells.
 
 The criterion of a motion is right for white noise on its outputs. Coloured errors that follow no input and no state are
-noise within the motion; errors that do are physics that is missing, or that the learner does not see.
+noise within the motion; errors that do are physics that is missing, or that the learner does not see. Simple terms,
+each tried in each equation, tell what it is (`missing_terms`).
 """
 
 from __future__ import annotations
@@ -12,12 +13,14 @@ from orthaug._base.errors import InputError
 from orthaug._base.parallel import one_blas_thread
 from orthaug._base.warning import Warning
 from orthaug.analysis.diagnosis import Diagnosis
+from orthaug.analysis.missing_terms import MissingTest, missing_terms
 from orthaug.analysis.predictability import Predictable, from_lags, from_own_past
 from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, errors_of, rms_errors
 from orthaug.analysis.robustness import block_of, rows_suffice
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.models.response import Response
 
+_LEVEL = 0.01  # of the test of missing terms
 _SMALL = 0.05  # of the error's variance: what inputs and states tell below that is a small effect
 _LAGS = 10  # of inputs that may tell the error
 _ROWS_PER_LAG = 20
@@ -59,16 +62,18 @@ def diagnose_motion(fit: MotionEstimate, free_run: Response) -> Diagnosis | None
     with one_blas_thread():
         tests = analyse(errors, inputs, states, *names, lags=LAGS)
         shares = tuple(_predictable(i, test, errors, inputs, every) for i, test in enumerate(tests))
+        missing = missing_terms(fit)
     if any(test.white is None for test in tests):
         return None
     followed = {test.name: test.follows() for test in tests if test.follows()}
     curved = {test.name: test.curved_over(_SMALL) for test in tests if test.curved_over(_SMALL)}
-    told = any(share.inputs > _SMALL for share in shares) or bool(curved)
+    lacks = missing if missing is not None and missing.found(_LEVEL, _SMALL) else None
+    told = any(share.inputs > _SMALL for share in shares) or bool(curved) or lacks is not None
     white = all(test.practically_white() for test in tests)
     verdict = "unmodelled" if told else "white" if white else "equation_noise"
-    text = _words(verdict, fit, shares, followed, curved)
+    text = _words(verdict, fit, shares, followed, curved, lacks)
     colour = () if white else (Warning("coloured_residual", _COLOURED),)
-    return Diagnosis(verdict, text, (), tests, None, None, colour, shares, ())
+    return Diagnosis(verdict, text, (), tests, None, None, colour, shares, (), missing)
 
 
 _COLOURED = (
@@ -87,7 +92,14 @@ def _predictable(i: int, test: ResidualTest, errors: list, inputs: list, every: 
     return Predictable(test.name, float(test.rms or 0.0), own.sure, best, float(test.largest_share or 0.0))
 
 
-def _words(verdict: str, fit: MotionEstimate, shares: tuple, followed: dict, curved: dict) -> str:
+def _words(
+    verdict: str,
+    fit: MotionEstimate,
+    shares: tuple,
+    followed: dict,
+    curved: dict,
+    lacks: MissingTest | None,
+) -> str:
     units = {c.name: c.unit for c in fit.problem.record.outputs}
     sizes = ", ".join(f"{s.rms:.3g} {units[s.name]}".strip() + f" of {s.name}" for s in shares)
     if verdict == "white":
@@ -97,8 +109,11 @@ def _words(verdict: str, fit: MotionEstimate, shares: tuple, followed: dict, cur
         learner = "that the learner does not see" if fit.model.form.bound is not None else "(a learner would tell)"
         return (
             f"What the free run leaves ({sizes}) is coloured ({colour} follows from its own past), and follows no "
-            f"input and no state at the same instant: disturbances, or physics missing in an equation {learner}."
+            "input, no state at the same instant, and no simple term that an equation could lack: disturbances, or "
+            f"physics missing in an equation {learner}."
         )
+    if lacks is not None:
+        return f"What the free run leaves ({sizes}) holds more than noise. {_named(lacks, fit)}"
     what = [f"{name} follows {', '.join(given)}" for name, given in followed.items()]
     what += [f"{name} is not flat over {', '.join(given)}" for name, given in curved.items()]
     what = what or [f"{100 * max(s.inputs for s in shares):.0f} % follows from the inputs"]
@@ -107,3 +122,16 @@ def _words(verdict: str, fit: MotionEstimate, shares: tuple, followed: dict, cur
         f"What the free run leaves ({sizes}) holds more than noise: {'; '.join(what)}. Physics is missing; {learner}, "
         "or try another hold of the inputs."
     )
+
+
+def _named(lacks: MissingTest, fit: MotionEstimate) -> str:
+    """What is most likely missing, and where to put it."""
+    best, *others = lacks.terms
+    text = f"Most likely {best} would explain {100 * best.share:.2g} % of its square"
+    if others:
+        text += f", as would {' or '.join(f'{term.expression} in that of {term.equation}' for term in others[:2])}"
+    learned = {fit.problem.motion.names_of_states[i] for i in fit.problem.motion.learned[0]}
+    seen = fit.model.form.bound is not None and best.equation in learned
+    sees = f"see {best.variable}" if best.variable else "stand there"
+    remedy = f"let the learner {sees}" if seen else f"add a learner to the equation of {best.equation} that may {sees}"
+    return f"{text}. Give the physics such a term, or {remedy}."

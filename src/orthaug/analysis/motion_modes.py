@@ -6,7 +6,7 @@ run may be bounded where some grow, and need not be where none does.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -16,10 +16,14 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import Array, jax
 from orthaug._base.warning import Warning
+from orthaug.analysis.boundedness import divergence_scaling
+from orthaug.data.record import Record
 from orthaug.models.dynamics import Numbers
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.moving import Moving
 
+_LARGEST = 1024.0  # factor on the inputs that is tried
+_MARGIN = 1.5  # a factor below is told as a warning
 _POINTS = 2000  # at most
 _OFTEN = 0.01  # of the points: growing modes on more are told as a warning
 _STILL = 1e-9  # of the fastest mode: an integrator's eigenvalue is rounding of zero
@@ -50,12 +54,30 @@ class MotionStability:
     modes: Modes | None
     warnings: tuple[Warning, ...]
     text: str
+    diverges_at: float | None = None
+    """Factor on the inputs from which the free run leaves all bounds, searched up to `searched`; None: nowhere."""
+    searched: float | None = None
 
-    feedback = contraction = lipschitz = diverges_at = searched = None
+    feedback = contraction = lipschitz = None
 
 
-def motion_stability(model: MotionModel, x: Matrix, u: Matrix) -> MotionStability:
-    """Of the states (N, nx) and inputs (N, nu) of a run; those that are not finite are left out."""
+def motion_stability(model: MotionModel, x: Matrix, u: Matrix, record: Record | None = None) -> MotionStability:
+    """Of the states (N, nx) and inputs (N, nu) of a run; those that are not finite are left out.
+
+    With a `record` its free run is tried on larger and larger inputs.
+    """
+    checks = _of_modes(model, x, u)
+    if record is None or not record.inputs:
+        return checks
+    factor = divergence_scaling(model, record, _LARGEST)
+    stays, times = ("stays within", _LARGEST) if factor is None else ("leaves", factor)
+    told = f"The free run {stays} all bounds with the inputs' deviations from their means {times:.4g} times as large."
+    small = (Warning("small_margin", told),) if factor is not None and factor < _MARGIN else ()
+    text, warnings = f"{checks.text}\n{told}", (*checks.warnings, *small)
+    return replace(checks, text=text, warnings=warnings, diverges_at=factor, searched=_LARGEST)
+
+
+def _of_modes(model: MotionModel, x: Matrix, u: Matrix) -> MotionStability:
     found = modes(model, x, u)
     if found is None:
         return MotionStability(None, (), "The motion has no finite derivative along its run.")

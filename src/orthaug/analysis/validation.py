@@ -18,6 +18,7 @@ from orthaug.data.regressors import Layout
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.held_out import HeldOut, Pieces, Ratio, blocked, mean_square, squared_errors
 from orthaug.models.model import Model
+from orthaug.models.motion_model import MotionModel
 from orthaug.models.response import Response
 
 
@@ -80,7 +81,7 @@ class Verdict:
 
 
 def free_run_error(
-    model: Model,
+    model: Model | MotionModel,
     record: Record,
     skip: int | tuple[int, ...] = 0,
     unit: Any = None,
@@ -104,8 +105,8 @@ def trial_on(
     where: str,
     record: Record,
     skip: tuple[int, ...],
-    alone: Model,
-    model: Model,
+    alone: Model | MotionModel,
+    model: Model | MotionModel,
     *,
     alone_response: Response | None = None,
     response: Response | None = None,

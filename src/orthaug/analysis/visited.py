@@ -13,6 +13,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import Dynamics
 from orthaug.models.model import Model
+from orthaug.models.motion_model import MotionModel
 from orthaug.models.response import Response
 
 Describe = Callable[[Vector, Vector], dict[str, float]]
@@ -124,7 +125,7 @@ class Visits:
     diverged: tuple[str, ...] = ()
 
 
-def usable(model: Model, record: Record) -> Record:
+def usable(model: Model | MotionModel, record: Record) -> Record:
     """The record's channels in the model's order.
 
     Raises:

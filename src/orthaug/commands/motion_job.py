@@ -59,10 +59,7 @@ class MotionJob(Job):
         return None
 
     def reach(self, model: MotionModel, record: Record) -> tuple[np.ndarray, Layout]:
-        motion = self.problem.motion
-        states = model.states(record)[list(motion.names_of_states)].to_numpy()
-        points = np.concatenate([states, np.concatenate([e.inputs for e in record.experiments])], axis=1)
-        return points[np.isfinite(points).all(axis=1)], layout_of(motion)
+        return model.reach(record), layout_of(self.problem.motion)
 
     @property
     def structure(self) -> Structure:

@@ -128,7 +128,9 @@ def content(
         told["residuals"] = diagnose_motion(fit, responses[job.train.name][1])
         warnings += [_NOT_ANALYSED] if told["residuals"] is None else told["residuals"].warnings
         points = job.reach(fit.model, job.train.record)[0]
-        told["stability"] = motion_stability(fit.model, *np.split(points, [form.states], axis=1))
+        told["stability"] = motion_stability(
+            fit.model, *np.split(points, [form.states], axis=1), record=job.train.record
+        )
         warnings += told["stability"].warnings
         table = suspected_bias(fit, job.suspects) if job.suspects else []
         told["bias"], budget = [entry.as_dict() for entry in table] or None, motion_budget(fit, table)

@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_count, check_type
 from orthaug._base.errors import InputError
 from orthaug._base.warning import Warning
+from orthaug.data.record import Record
+from orthaug.data.regressors import Layout, lag_rows
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.held_out import HeldOut
@@ -85,6 +87,18 @@ class Estimate:
     """What robust standard errors of a free run are made of; None one step ahead."""
     plain_statistics: Statistics | None = field(default=None, repr=False)
     """The model's statistics for white noise, where they are robust; None where they are not."""
+
+    lagged: ClassVar[bool] = True
+    """Whether the model predicts from lagged signals, so that it has a residual one step ahead."""
+
+    @property
+    def layout(self) -> Layout:
+        """What the entries of `reach` are called."""
+        return self.problem.layout
+
+    def reach(self, record: Record) -> Matrix:
+        """The regressors (N, nx) of a record in the model's order of channels."""
+        return lag_rows(record, self.problem.layout)
 
     @property
     def theta(self) -> Vector:

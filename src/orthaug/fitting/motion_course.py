@@ -154,16 +154,20 @@ class MotionCourse(Course):
             mean = float(np.sum(scaled**2)) / (self.whole.count * len(self.dynamics.outputs))
         return mean if mean < RUNAWAY else np.nan
 
+    def runs(self, c: Vector, w: Any, states: Any) -> Float[np.ndarray, "k T n0 m"]:
+        """The states along every segment from these starts."""
+        return np.asarray(_states(self.dynamics, self.numbers(c, w), self.segments, states))
+
     def trajectory(self, c: Vector, w: Any, states: Any) -> tuple[Matrix, Matrix]:
         """States (N, nx) and inputs (N, nu) of the segments' runs from these starts, on the rows that are scored."""
-        runs = np.asarray(_states(self.dynamics, self.numbers(c, w), self.segments, states))  # (k, T, n0, m)
+        runs = self.runs(c, w, states)
         scored = np.moveaxis(np.asarray(self.segments.scored), -1, 1)
         inputs = np.moveaxis(np.asarray(self.segments.inputs), -1, 1)[scored]
         return np.moveaxis(runs, -1, 1)[scored], self.dynamics.now(inputs)
 
     def states_by_row(self, c: Vector, w: Any, states: Any) -> list[Matrix]:
         """The states (N, nx) of every experiment, put together from the segments' runs."""
-        runs = np.moveaxis(np.asarray(_states(self.dynamics, self.numbers(c, w), self.segments, states)), -1, 1)
+        runs = np.moveaxis(self.runs(c, w, states), -1, 1)
         rows, place, found = runs.reshape(-1, *runs.shape[2:]), 0, []
         steps, washout = self.segments.steps, min(self.flown.washout, self.segments.steps - 1)
         for experiment in self.record.experiments:

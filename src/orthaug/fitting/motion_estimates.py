@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError
 from orthaug._base.warning import Warning
+from orthaug.data.record import Record
+from orthaug.data.regressors import Layout
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.estimates import Restart
@@ -26,6 +28,7 @@ from orthaug.inference.motion_split import MotionSplit, split_motion
 from orthaug.models.dynamics import Numbers
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.statistics import column_units
+from orthaug.physics.motion_layout import layout_of
 from orthaug.physics.motion_problem import MotionProblem
 from orthaug.physics.shared import Shared
 
@@ -71,6 +74,17 @@ class MotionEstimate:
     """Parameters that no output tells beside the learner."""
     held_out: HeldOut | None = None
     warnings: tuple[Warning, ...] = ()
+
+    lagged: ClassVar[bool] = False
+
+    @property
+    def layout(self) -> Layout:
+        """What the entries of `reach` are called."""
+        return layout_of(self.problem.motion)
+
+    def reach(self, record: Record) -> Matrix:
+        """The states and inputs (N, nx + nu) of the free run on a record, where they are finite."""
+        return self.model.reach(record)
 
     @property
     def theta(self) -> Vector:

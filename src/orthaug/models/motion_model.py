@@ -188,6 +188,13 @@ class MotionModel(OnRecords):
             frames.append(pd.DataFrame(columns))
         return pd.concat(frames, ignore_index=True)
 
+    def reach(self, record: Record) -> Matrix:
+        """The states and inputs (N, nx + nu) of the free run on a record, where they are finite."""
+        states = self.states(record)[list(self.form.motion.names_of_states)].to_numpy()
+        inputs = [e.inputs for e in self.fitting(record, need_outputs=False).experiments]
+        points = np.concatenate([states, np.concatenate(inputs)], axis=1)
+        return points[np.isfinite(points).all(axis=1)]
+
     def check_initial(self, initial: Any) -> Matrix:
         """Outputs of the first rows (rows, ny).
 

@@ -181,6 +181,26 @@ class ChangeResult(Content):
     output: str | None
 
 
+class MissingTermResult(Content):
+    """A term that an equation of a motion could lack."""
+
+    equation: str
+    variable: str | None
+    shape: str
+    coefficient: Number
+    share: Number
+    expression: str
+
+
+class MissingResult(Content):
+    """The test of terms that the equations of a motion could lack."""
+
+    p: Number
+    freedom: list[int]
+    share: Number
+    terms: list[MissingTermResult]
+
+
 class DiagnosisResult(Content):
     """What the residuals say about the noise, and which change would help."""
 
@@ -192,6 +212,7 @@ class DiagnosisResult(Content):
     noise_in_lags: Number
     predictable: list[PredictableResult]
     changes: list[ChangeResult]
+    missing: MissingResult | None = None
 
 
 class LagResult(Content):

@@ -1,0 +1,299 @@
+"""Which equation of a motion lacks what: a test of terms that could be added, of which each is tried at weight 0.
+
+What the free run leaves is regressed on its sensitivities to simple functions of every state and input, added to one
+equation each, beside the sensitivities to all that was estimated: parameters, weights and the segments' starts. That
+is the score test of Rao (1948) of `b = 0`. To first order the errors are `S_p δ + S_b b + e`, so that the F-test of b
+is right whatever the parameters' own errors δ are. Coloured errors are `e = H ε` with the autoregression `H = 1/A`:
+rows and columns are filtered by A (Cochrane and Orcutt 1949). For the test A is that of the errors beside what was
+estimated; beside all terms it would be found too white, and the test would reject too often. To tell terms from each
+other it is that beside all terms, so that what the missing one leaves does not pass for colour.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.special
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug.analysis.motion_sensitivities import Sensitivities, Terms, sensitivities
+from orthaug.analysis.whiteness import whitening
+from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.physics.motion import Motion
+
+SHAPES = ("linear", "jump", "absolute", "square", "cube")
+_EDGE = 0.05  # of the largest value: over which a jump at zero is smoothed
+_EXPRESSIONS = ("{}", "sign({})", "|{}|", "{}**2", "{}**3")
+_MEANINGS = (
+    "linear in {}",
+    "odd in {} with a jump at 0, as dry friction",
+    "even in {}, with a kink at 0",
+    "even in {}, without a kink",
+    "odd in {} and growing faster than it, as a hardening spring",
+)
+_OWN = 0.02  # of a column's size: what remains of it beside all that was estimated, so that it is one of its own
+_RANK = 1e-6  # of the largest singular value of such columns, each of size 1
+_ROWS_PER_COLUMN = 5
+_PROBED = 20  # points at which an equation is looked at
+_MOVED = 1e-3  # of a parameter, to see whether an equation has it
+_RIVAL = 0.9  # of the best term's share, with which another one is named beside it
+
+
+@dataclass(frozen=True)
+class MissingTerm:
+    """A term that could be added: to which equation, of which state or input, its shape, and what it would explain.
+
+    `coefficient` is in the units of equation and variable, `share` that of the errors' variance, less what chance
+    explains.
+    """
+
+    equation: str
+    variable: str | None
+    """None for a constant."""
+    shape: str
+    coefficient: float
+    share: float
+
+    @property
+    def expression(self) -> str:
+        """The term in the equation's own names."""
+        if self.variable is None:
+            return f"{self.coefficient:.3g}"
+        return f"{self.coefficient:.3g}*{_EXPRESSIONS[SHAPES.index(self.shape)].format(self.variable)}"
+
+    @property
+    def meaning(self) -> str:
+        """Its kind in words."""
+        return "constant" if self.variable is None else _MEANINGS[SHAPES.index(self.shape)].format(self.variable)
+
+    def __str__(self) -> str:
+        return f"the equation of {self.equation} lacks something {self.meaning}: {self.expression}"
+
+
+@dataclass(frozen=True)
+class MissingTest:
+    """Whether terms that could be added explain the errors of a free run: `p` of none, F-distributed.
+
+    `share` is what all of them together explain of the variance, `terms` the best single one and its near rivals.
+    """
+
+    p: float
+    freedom: tuple[int, int]
+    share: float
+    terms: tuple[MissingTerm, ...]
+
+    def found(self, level: float, share: float) -> bool:
+        """Whether a term is surely missing and explains more than a share."""
+        return bool(self.p < level and self.terms and self.terms[0].share > share)
+
+
+class _Regression(NamedTuple):
+    """Rows of terms and errors beside what was estimated; `left` counts rows less what that used."""
+
+    terms: Matrix
+    errors: Vector
+    left: int
+
+
+def missing_terms(fit: MotionEstimate) -> MissingTest | None:
+    """Try terms of every state and input in every equation that has parameters or a learner.
+
+    None where the runs have no slopes, or there are too few rows.
+    """
+    motion = fit.problem.motion
+    if not fit.course.dynamics.differentiable:
+        return None
+    names = (*motion.names_of_states, *motion.inputs)
+    equations = doubted(fit)
+    count = 1 + len(SHAPES) * len(names)
+    sizes: list[Vector] = []
+
+    def terms(points: Matrix) -> Terms:
+        size = np.abs(points).max(axis=1, initial=0.0)
+        sizes.append(np.where(size > 0, size, 1.0))
+        return lambda rows: _values(rows / sizes[0][:, None])
+
+    found = sensitivities(fit, equations, terms, count)
+    if found is None:
+        return None
+    tested = _tested(found)
+    if tested is None:
+        return None
+    p, freedom, share, gains, shares, coefficients = tested
+    order = [int(j) for j in np.argsort(-gains) if gains[j] > _RIVAL * gains.max()]
+    listed = [_term(motion, equations, names, j, coefficients, shares, sizes[0]) for j in order]
+    return MissingTest(p, freedom, share, tuple(listed))
+
+
+def doubted(fit: MotionEstimate) -> tuple[int, ...]:
+    """Equations with a parameter or a learner; others, such as ẋ = v, say what a state is. All, if there is none."""
+    motion, course = fit.problem.motion, fit.course
+    c = np.asarray(fit.model.numbers.theta - fit.model.numbers.theta_aux)
+    p = motion.coordinates.physical(c)
+    x, u = course.trajectory(c, fit.model.numbers.weights, fit.states)
+    every = np.unique(np.linspace(0, len(x) - 1, _PROBED).astype(int))
+    moved = set(motion.learned[0])
+    with np.errstate(all="ignore"):
+        for point, row in zip(x[every], u[every], strict=True):
+            here = np.asarray(motion.rates(point, row, p, np))
+            for i in range(len(p)):
+                there = p + _MOVED * np.where(p != 0, np.abs(p), 1.0) * (np.arange(len(p)) == i)
+                moved |= set(np.flatnonzero(np.asarray(motion.rates(point, row, there, np)) != here).tolist())
+    return tuple(sorted(moved)) or tuple(range(len(motion.states)))
+
+
+def _values(z: Matrix) -> Any:
+    """A constant, then the shapes of each variable: (1 + 5 n, r) of z (n, r)."""
+    shaped = [[one, np.tanh(one / _EDGE), np.abs(one), one**2, one**3] for one in z]
+    return np.stack([np.ones(z.shape[1]), *(values for own in shaped for values in own)])
+
+
+def _term(
+    motion: Motion,
+    equations: tuple[int, ...],
+    names: tuple[str, ...],
+    j: int,
+    coefficients: Vector,
+    shares: Vector,
+    sizes: Vector,
+) -> MissingTerm:
+    count = 1 + len(SHAPES) * len(names)
+    equation, number = motion.names_of_states[equations[j // count]], j % count
+    coefficient, share = float(coefficients[j]), float(shares[j])
+    if number == 0:
+        return MissingTerm(equation, None, "constant", coefficient, share)
+    variable, shape = divmod(number - 1, len(SHAPES))
+    power = (1, 0, 1, 2, 3)[shape]
+    return MissingTerm(equation, names[variable], SHAPES[shape], coefficient / float(sizes[variable]) ** power, share)
+
+
+def _tested(found: Sensitivities) -> tuple[float, tuple[int, int], float, Vector, Vector, Vector] | None:
+    """p, degrees of freedom and share of all terms; of each its gain in filtered rows, its share and coefficient."""
+    plain = _regression(found, None)
+    null = None if plain is None else _regression(found, _filters(found, plain.errors))
+    if plain is None or null is None:
+        return None
+    basis, _ = _basis(null)
+    rank, freedom = basis.shape[1], null.left - basis.shape[1]
+    total = float(null.errors @ null.errors)
+    if rank == 0 or freedom < _ROWS_PER_COLUMN * rank or not total > 0:
+        return None
+    explained = float(np.sum((basis.T @ null.errors) ** 2))
+    rest = max(total - explained, np.finfo(float).eps * total)
+    p = float(scipy.special.fdtrc(rank, freedom, explained / rank / (rest / freedom)))
+    basis, _ = _basis(plain)
+    beside = _regression(found, _filters(found, plain.errors - basis @ (basis.T @ plain.errors)))
+    rows = null if beside is None else beside
+    size = np.einsum("rj,rj->j", rows.terms, rows.terms)
+    size = np.where(size > 0, size, np.inf)
+    along = rows.terms.T @ rows.errors
+    return p, (rank, freedom), _share(plain), along**2 / size, _shares(plain), along / size
+
+
+def _share(plain: _Regression) -> float:
+    """Of the errors' variance that all terms explain, less what chance does."""
+    basis, _ = _basis(plain)
+    total = float(plain.errors @ plain.errors)
+    rest = total - float(np.sum((basis.T @ plain.errors) ** 2))
+    return max(1 - rest / max(plain.left - basis.shape[1], 1) / (total / plain.left), 0.0)
+
+
+def _shares(plain: _Regression) -> Vector:
+    """The same of each term by itself."""
+    total, size = float(plain.errors @ plain.errors), np.einsum("rj,rj->j", plain.terms, plain.terms)
+    explained = (plain.terms.T @ plain.errors) ** 2 / np.where(size > 0, size, np.inf) / total
+    return np.maximum(1 - (1 - explained) * plain.left / max(plain.left - 1, 1), 0.0)
+
+
+def _basis(rows: _Regression) -> tuple[Matrix, Any]:
+    """An orthonormal basis of the terms, and which of them have something of their own."""
+    size = np.linalg.norm(rows.terms, axis=0)
+    kept = size > 0
+    if not kept.any():
+        return np.zeros((len(rows.terms), 0)), kept
+    u, s, _ = np.linalg.svd(rows.terms[:, kept] / size[kept], full_matrices=False)
+    return u[:, s > _RANK * s[0]], kept
+
+
+def _regression(found: Sensitivities, filters: tuple[list[Vector], Vector] | None) -> _Regression | None:
+    """Terms and errors with starts and all unknowns projected out, of rows that are filtered first."""
+    rows = [_filtered(found, i, filters) for i in range(len(found.scored))]
+    parts, used = [], 0
+    for block in rows:  # the starts move their own segment only
+        starts, rest = block[:, : found.starts], block[:, found.starts :]
+        q = _range(starts)
+        used += q.shape[1]
+        parts.append(rest - q @ (q.T @ rest))
+    whole = np.concatenate(parts)
+    unknowns = found.nuisance - found.starts
+    q = _range(whole[:, :unknowns])
+    rest = whole[:, unknowns:]
+    before = np.linalg.norm(np.concatenate(rows)[:, found.nuisance : -1], axis=0)
+    rest = rest - q @ (q.T @ rest)
+    terms, errors = rest[:, :-1], rest[:, -1]
+    terms = np.where(np.linalg.norm(terms, axis=0) > _OWN * before, terms, 0.0)
+    left = len(whole) - used - q.shape[1]
+    if left < _ROWS_PER_COLUMN * terms.shape[1] or not np.isfinite(whole).all():
+        return None
+    return _Regression(terms, errors, left)
+
+
+def _range(columns: Matrix) -> Matrix:
+    """An orthonormal basis of what columns span, each taken as of size 1."""
+    size = np.linalg.norm(columns, axis=0)
+    columns = columns[:, size > 0] / size[size > 0]
+    if not columns.size:
+        return np.zeros((len(columns), 0))
+    u, s, _ = np.linalg.svd(columns, full_matrices=False)
+    return u[:, s > 1e-10 * s[0]]
+
+
+def _filtered(found: Sensitivities, segment: int, filters: tuple[list[Vector], Vector] | None) -> Matrix:
+    """Columns and errors of one segment, all outputs below each other, filtered by their autoregressions."""
+    there = found.scored[segment]
+    both = np.concatenate([found.columns[segment], found.errors[segment][..., None]], axis=-1)[there]  # (r, ny, K + 1)
+    ny = both.shape[1]
+    if filters is None:
+        size = np.sqrt(np.mean(found.errors[found.scored] ** 2, axis=0))
+        return np.moveaxis(both / np.where(size > 0, size, 1.0)[:, None], 1, 0).reshape(ny * len(both), -1)
+    coefficients, unit = filters
+    memory = max(map(len, coefficients)) - 1
+    filtered = []
+    for o, a in enumerate(coefficients):
+        series = both[:, o]
+        if len(series) <= memory:
+            return np.zeros((0, both.shape[2]))
+        filtered.append(
+            sum(c * series[memory - lag : len(series) - lag] for lag, c in enumerate(a)) / unit[o]  # type: ignore[arg-type]
+        )
+    return np.concatenate(filtered)
+
+
+def _filters(found: Sensitivities, left: Vector) -> tuple[list[Vector], Vector]:
+    """The autoregression of what is left of each output's errors, and the size of its innovations."""
+    ny = found.errors.shape[2]
+    pieces: list[list[Vector]] = [[] for _ in range(ny)]
+    for one in _cut(found, left):
+        for o, part in enumerate(one.reshape(ny, -1)):
+            pieces[o].append(part)
+    coefficients = [whitening(own) for own in pieces]
+    known = [np.ones(1) if a is None else a for a in coefficients]
+    unit = []
+    for own, a in zip(pieces, known, strict=True):
+        innovations = np.concatenate([np.convolve(part, a, "valid") for part in own if len(part) >= len(a)])
+        size = float(np.sqrt(np.mean(innovations**2)))
+        unit.append(size if size > 0 else 1.0)
+    scale = np.sqrt(np.mean(found.errors[found.scored] ** 2, axis=0))
+    return known, np.array(unit) * np.where(scale > 0, scale, 1.0)
+
+
+def _cut(found: Sensitivities, whole: Vector) -> Iterator[Vector]:
+    """A vector over all rows in the pieces of its segments."""
+    ny, place = found.errors.shape[2], 0
+    for there in found.scored:
+        count = int(there.sum()) * ny
+        yield whole[place : place + count]
+        place += count
