@@ -15,7 +15,8 @@ from test_cli import MLP, SPEC, make_project, run
 
 from orthaug._base.warning import Warning
 from orthaug.reports.fields import Content, Flag, Number, Numbers, WarningResult, Whole
-from orthaug.reports.result import RESULTS, DataResult, FitResult, ParameterResult, ScoreResult, schema_of
+from orthaug.reports.result import DataResult, FitResult, ParameterResult, ScoreResult
+from orthaug.reports.schemas import RESULTS, schema_of
 
 DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "spec.md"
 

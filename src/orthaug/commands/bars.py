@@ -11,6 +11,8 @@ from typing import Any
 from orthaug._base.progress import SILENT, Progress
 from orthaug.commands.signals import WATCH
 
+_SEEN = 3  # models after which the time of the rest is told: the first ones compile
+
 
 @contextmanager
 def training_bar(runs: int, iterations: int, wanted: bool = True) -> Iterator[Progress]:
@@ -76,6 +78,53 @@ def study_bars() -> Iterator[Callable[[str, int, int], None]]:
                 raise KeyboardInterrupt(reached)
 
         yield tell
+
+
+@contextmanager
+def selection_bar(most: int) -> Iterator[Callable[[str, Any], None]]:
+    """A bar of the models that were judged, on standard error; Ctrl-C keeps what there is, a second one ends at once.
+
+    Once terms have been judged for a while, it says what the rest takes at most, also where there is no terminal.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    console = Console(stderr=True)
+    times = (TimeElapsedColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *times)
+    with (
+        _asked_to_stop() as asked,
+        Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar,
+        WATCH.telling(lambda: "the selection of a structure", bar.stop),
+    ):
+        tasks: dict[str, Any] = {}
+        judged: dict[str, list[float]] = {}
+
+        def tell(stage: str, rung: Any) -> None:
+            done = judged.setdefault(stage, [])
+            done.append(rung.seconds)
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=most if stage == "terms" else None)
+            bar.update(tasks[stage], advance=1)
+            if stage == "terms" and len(done) == _SEEN and not console.is_terminal:
+                whole = done[-1] * most
+                console.print(f"note: a model takes {done[-1]:.1f} s; at most {most} are judged, {whole:.0f} s.")
+            if asked.is_set():
+                raise KeyboardInterrupt
+
+        yield tell
+
+
+@contextmanager
+def _asked_to_stop() -> Iterator[threading.Event]:
+    """An event that the first Ctrl-C sets."""
+    if WATCH.active:
+        with WATCH.asking() as event:
+            yield event
+    else:
+        with _deferred_interrupt() as event:
+            yield event
 
 
 @contextmanager

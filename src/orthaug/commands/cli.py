@@ -302,11 +302,36 @@ def design(
 
 
 @app.command()
+def select(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force: Force = False) -> None:
+    """Choose orders, delay and terms (or a network's width and inputs), and write a spec with the choice."""
+    from orthaug.commands.bars import selection_bar
+    from orthaug.commands.folder import check_folder, check_inputs_kept
+    from orthaug.commands.select import open_select, select_for, steps_at_most, write_selected
+    from orthaug.reports.selection import selection_text
+
+    folder = out or Path("orthaug-out") / f"{spec.stem}-selected"
+    check_folder(folder, force=force)
+    job, given = open_select(spec)
+    check_inputs_kept(job, folder)
+    _prepare_jax()
+    with selection_bar(steps_at_most(given.selection.terms)) as told:
+        selected = select_for(job, given, folder, told)
+    write_selected(selected, folder, force=force)
+    if as_json:
+        streams.echo(selected.result.to_json())
+    else:
+        streams.echo(selection_text(selected.result))
+        streams.echo(f"\nwritten to {folder}; next: orthaug fit {folder / 'spec.toml'}")
+
+
+@app.command()
 def schema(
-    command: Annotated[str, typer.Argument(metavar="[COMMAND]", help="fit, check, compare, split or design.")] = "fit",
+    command: Annotated[
+        str, typer.Argument(metavar="[COMMAND]", help="fit, check, compare, split, design or select.")
+    ] = "fit",
 ) -> None:
     """The JSON schema of what a command writes."""
-    from orthaug.reports.result import RESULTS, schema_of
+    from orthaug.reports.schemas import RESULTS, schema_of
 
     streams.echo(_json(schema_of(check_choice(command, RESULTS, "COMMAND"))))
 

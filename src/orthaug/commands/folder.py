@@ -13,7 +13,7 @@ from orthaug.commands.job import Job
 
 _MODEL = r"(model\.json|arrays\.safetensors)"
 _KNOWN = re.compile(
-    rf"result\.json|report\.html|spec\.toml|(train|test)\.csv|figures/[a-z_]+\.png|model/{_MODEL}|models/[a-z-]+/{_MODEL}"
+    rf"result\.json|report\.html|spec\.toml|table\.csv|(train|test)\.csv|figures/[a-z_]+\.png|model/{_MODEL}|models/[a-z-]+/{_MODEL}"
 )
 
 

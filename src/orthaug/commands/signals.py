@@ -16,7 +16,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import threading
 
 _WORDS = {"SIGINT": "interrupted", "SIGTERM": "terminated", "SIGHUP": "ended with its terminal"}
 _PATIENCE = 0.5  # s for a progress bar to leave the terminal as it was
@@ -33,6 +36,7 @@ class Watch:
         self.active = self.ending = False
         self._during: Callable[[], str] = _nothing
         self._stop: Callable[[], Any] = _nothing
+        self._asked: threading.Event | None = None
 
     def start(self) -> None:
         """Wait for signals from now on. Those that the program is to ignore, as `nohup` asks, are ignored."""
@@ -57,6 +61,17 @@ class Watch:
         finally:
             self._during = self._stop = _nothing
 
+    @contextmanager
+    def asking(self) -> Iterator[threading.Event]:
+        """The first Ctrl-C sets the event, for whoever can stop with what there is; the next ends the program."""
+        import threading
+
+        self._asked = threading.Event()
+        try:
+            yield self._asked
+        finally:
+            self._asked = None
+
     def hold(self) -> None:
         """Do not go on where the program is about to end: what fails then fails because of that."""
         while self.ending:
@@ -66,7 +81,9 @@ class Watch:
         known = {getattr(signal, name): words for name, words in _WORDS.items()}
         while True:
             number = os.read(reader, 1)[0]
-            if number in known:
+            if number == signal.SIGINT and self._asked is not None and not self._asked.is_set():
+                self._asked.set()
+            elif number in known:
                 self.ending = True
                 self._end(number, known[number])
 

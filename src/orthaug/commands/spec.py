@@ -178,6 +178,17 @@ class TrainingSection(KindSection):
         return self
 
 
+class SelectionSection(Section):
+    """What `orthaug select` looks through: the largest orders, terms at most, widths, and blocks held out."""
+
+    na: Count | None = None
+    nb: Orders | None = None
+    nk: Orders | None = None
+    terms: Count | None = None
+    hidden: Annotated[list[Positive], Field(min_length=1)] | None = None
+    blocks: Annotated[int, Field(ge=2, strict=True)] = 5
+
+
 class ValidationSection(Section):
     """Blocked cross-validation; absent: 4 blocks, for a verdict only where no part is held out."""
 
@@ -198,6 +209,7 @@ class Spec(Section):
     structure: StructureSection = StructureSection()
     training: TrainingSection = TrainingSection()
     validation: ValidationSection = ValidationSection()
+    selection: SelectionSection = SelectionSection()
 
     @model_validator(mode="after")
     def _one_physics(self) -> Spec:

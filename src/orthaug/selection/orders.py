@@ -117,14 +117,13 @@ def search_orders(
             found[orders] = Rung(point, (str(orders),), folds.judge(point), time.monotonic() - began, orders.size)
             told(found[orders])
 
-        for n in range(1, max(largest.na, *largest.nb, 1) + 1):
-            reach = Orders(
-                max(min(n, largest.na), least.na),
-                tuple(max(min(n + largest.na, nb), low) for nb, low in zip(largest.nb, least.nb, strict=True)),
-                largest.nk,
-            )
-            judge(reach)
-        _shrink(found, judge, least)
+        try:
+            for na in range(max(least.na, min(1, largest.na)), largest.na + 1):
+                judge(Orders(na, largest.nb, largest.nk))
+            _shrink(found, judge, least)
+        except KeyboardInterrupt:
+            if not found:
+                raise
     return OrderSearch(tuple(found), tuple(found.values()))
 
 

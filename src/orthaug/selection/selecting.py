@@ -57,6 +57,8 @@ class Selection:
     terms: TermPath | None
     learners: LearnerSearch | None
     notes: tuple[Warning, ...]
+    stopped: bool = False
+    """Whether the search was stopped before its end; what it had found by then was chosen from."""
 
     @property
     def lags(self) -> Lags:
@@ -182,18 +184,17 @@ def select(
         InputError: several outputs, too few rows, terms that are none.
     """
     check_type(record, Record, "record", "a Record")
-    check_type(learner, Learner | None, "learner", "Terms(…), MLP(…) or None")
+    check_type(learner, Terms | MLP | None, "learner", "Terms(…), MLP(…) or None")
     most, blocks = check_count(most, "most", least=0), check_count(blocks, "blocks", least=2)
     if len(record.outputs) != 1:
         raise InputError(f"structure is chosen for one output; the record has {len(record.outputs)}: choose for each.")
-    baseline = Baseline.from_terms([]) if baseline is None else baseline
+    baseline = Baseline(()) if baseline is None else baseline
     if baseline.function is not None:
         raise InputError("structure is chosen beside physics that are terms; of a Python function nothing is known.")
     criterion = Simulation() if criterion is None else criterion
-    problem = pose(record, baseline)
+    problem, heard = pose(record, baseline), _Listener(progress)
     largest, least = _reach(problem, lags)
-    notes: list[Warning] = []
-    orders = search_orders(problem, criterion, largest, least, blocks, lambda rung: progress("orders", rung))
+    orders = search_orders(problem, criterion, largest, least, blocks, heard.of("orders"))
     names = [channel.name for channel in record.inputs]
     delays = tuple(
         Delay(name, correlated_delay(record, i, largest.nk[i] + largest.nb[i]), orders.chosen.nk[i])
@@ -203,21 +204,43 @@ def select(
     linear = [str(lag) for lag in chosen.layout(problem.outputs, names)]
     tested = nonlinearity(problem, linear) if linear else None
     path = found = None
-    if isinstance(learner, Terms):
-        path, more = _terms(problem, learner, largest, criterion, most, blocks, progress)
-        notes += more
+    notes: list[Warning] = []
+    if isinstance(learner, Terms) and not heard.stopped:
+        path, notes = _terms(problem, learner, largest, criterion, most, blocks, heard.of("terms"))
         if not path.chosen.point.chosen:
             notes.append(Warning("nothing_helps", "no term lowers the error on the blocks that were held out."))
-    elif isinstance(learner, MLP):
-        told = lambda rung: progress("learner", rung)  # noqa: E731
-        found = search_learners(problem, chosen, tested, learner, widths, criterion, blocks, told)
-    elif learner is not None:
-        raise InputError("structure is chosen for a learner of terms or an MLP; got another learner.")
-    return Selection(record, baseline, criterion, delays, orders, tested, path, found, tuple(notes))
+    elif isinstance(learner, MLP) and not heard.stopped:
+        found = search_learners(problem, chosen, tested, learner, widths, criterion, blocks, heard.of("learner"))
+    if heard.stopped:
+        notes.append(Warning("stopped", "the search was stopped; the choice is among the models judged by then."))
+    return Selection(record, baseline, criterion, delays, orders, tested, path, found, tuple(notes), heard.stopped)
+
+
+class _Listener:
+    """Hands on what was judged, and remembers whether it was asked to stop."""
+
+    def __init__(self, progress: Told) -> None:
+        self.progress, self.stopped = progress, False
+
+    def of(self, stage: str) -> Callable[[Any], None]:
+        def told(rung: Any) -> None:
+            try:
+                self.progress(stage, rung)
+            except KeyboardInterrupt:
+                self.stopped = True
+                raise
+
+        return told
 
 
 def _terms(
-    problem: Problem, learner: Terms, largest: Orders, criterion: Criterion, most: int, blocks: int, progress: Told
+    problem: Problem,
+    learner: Terms,
+    largest: Orders,
+    criterion: Criterion,
+    most: int,
+    blocks: int,
+    told: Callable[[Any], None],
 ) -> tuple[TermPath, list[Warning]]:
     outputs, inputs = problem.outputs, tuple(channel.name for channel in problem.record.inputs)
     lags = Lags(largest.na, largest.nb, largest.nk).layout(outputs, inputs)
@@ -230,7 +253,7 @@ def _terms(
         text = f"there are {len(library)} candidate terms and {rows} rows; at most a tenth as many terms are chosen."
         notes.append(Warning("more_terms_than_rows", text))
     runs = TermRuns.of(problem, able.library, criterion)
-    return climb(runs, blocks, min(most, rows // 10), lambda rung: progress("terms", rung)), notes
+    return climb(runs, blocks, min(most, rows // 10), told), notes
 
 
 def _reach(problem: Problem, lags: Lags | None) -> tuple[Orders, Orders]:

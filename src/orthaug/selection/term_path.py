@@ -163,6 +163,19 @@ def climb(runs: TermRuns, blocks: int, most: int, told: Told = lambda rung: None
     return TermPath(runs, tuple(rungs))
 
 
+def steps(most: int) -> int:
+    """How many models the path forward has at most, physics alone among them."""
+    count, size = 1, 0
+    while size < most:
+        count, size = count + 1, size + _added_to(size)
+    return count
+
+
+def _added_to(size: int) -> int:
+    """How many terms are added at once to a model of so many."""
+    return 1 if size < _ONE_BY_ONE else max(1, size // 8)
+
+
 def _forward(runs: TermRuns, most: int, judged: Any) -> None:
     nt, texts = len(runs.problem.baseline.names), runs.library.texts
     began = time.monotonic()
@@ -170,8 +183,7 @@ def _forward(runs: TermRuns, most: int, judged: Any) -> None:
     best, waited = judged(point, (), began).score, 0
     while len(point.chosen) < most and waited < _PATIENCE and np.isfinite(point.loss):
         began = time.monotonic()
-        count = 1 if len(point.chosen) < _ONE_BY_ONE else max(1, len(point.chosen) // 8)
-        count = min(count, most - len(point.chosen))
+        count = min(_added_to(len(point.chosen)), most - len(point.chosen))
         known = [*range(nt), *(nt + i for i in point.chosen)]
         picks = forward(runs.equations(point), known, count, least=_LEAST)
         new = [pick.column - nt for pick in picks]

@@ -1,0 +1,205 @@
+"""The structure for a spec: what `orthaug select` does."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import tomlkit
+
+from orthaug._base.errors import InputError
+from orthaug._base.folders import whole_folder
+from orthaug.commands.folder import not_a_result
+from orthaug.commands.lagged_job import LaggedJob, open_lagged
+from orthaug.commands.spec import LearnerSection, Spec, load_spec
+from orthaug.data.regressors import Lags
+from orthaug.fitting.criteria import Criterion
+from orthaug.fitting.kinds import CRITERIA
+from orthaug.models.kinds import LEARNERS
+from orthaug.models.learners import Learner
+from orthaug.models.terms import Terms
+from orthaug.reports.selection import SelectResult
+
+if TYPE_CHECKING:
+    from orthaug.selection.selecting import Selection, Told
+
+_DEGREE = 3  # of the terms that a spec without [learner] is searched with
+
+
+@dataclass(frozen=True, eq=False)
+class Selected:
+    """A job, what was selected for it, and the result that is written."""
+
+    job: LaggedJob
+    selection: Selection
+    result: SelectResult
+    spec: str
+    """The spec with the choice, for its folder."""
+
+
+def open_select(path: Path) -> tuple[LaggedJob, Spec]:
+    """The job of a spec's physics alone, and the spec as it was given.
+
+    Raises:
+        InputError: a motion, and anything wrong with spec, files or physics.
+    """
+    spec = load_spec(path)
+    if spec.motion is not None:
+        raise InputError(
+            f"{path}: structure is selected for lagged signals; for a motion declare a learner of terms "
+            '(kind = "terms"), or a network, and ask `orthaug explain` what it found.'
+        )
+    alone = spec.model_copy(update={"learner": LearnerSection(kind="none"), "lags": None})
+    return open_lagged(path, alone), spec
+
+
+def select_for(job: LaggedJob, spec: Spec, folder: Path, told: Told) -> Selected:
+    """Select, and write the choice into the spec.
+
+    Args:
+        folder: where the new spec will be; its paths are relative to that.
+        told: called with the stage and each model that was judged.
+
+    Raises:
+        InputError: what cannot be selected from.
+    """
+    from orthaug.selection.selecting import MOST, WIDTHS, select
+
+    section, began = spec.selection, time.monotonic()
+    options: dict[str, Any] = {
+        "learner": _learner(spec),
+        "lags": _largest(spec),
+        "criterion": _criterion(spec),
+        "widths": section.hidden or WIDTHS,
+        "most": MOST if section.terms is None else section.terms,
+        "blocks": section.blocks,
+    }
+    try:
+        selection = select(job.train.record, job.problem.baseline, **options, progress=told)
+    except InputError as error:
+        raise InputError(f"{job.path}: {error}") from None
+    result = _result(job, selection, time.monotonic() - began)
+    return Selected(job, selection, result, _new_spec(job.path, folder, selection))
+
+
+def steps_at_most(terms: int | None) -> int:
+    """How many models the path of terms has at most, forward."""
+    from orthaug.selection.selecting import MOST
+    from orthaug.selection.term_path import steps
+
+    return steps(MOST if terms is None else terms)
+
+
+def write_selected(selected: Selected, folder: Path, *, force: bool = False) -> None:
+    """result.json, spec.toml, table.csv and the figure, whole or not at all."""
+    from orthaug.reports.drawing import save
+    from orthaug.reports.selection_plot import selection_figure
+
+    with whole_folder(folder, not_a_result, force=force) as partial:
+        (partial / "result.json").write_text(selected.result.to_json() + "\n", encoding="utf-8")
+        (partial / "spec.toml").write_text(selected.spec, encoding="utf-8")
+        selected.selection.table.to_csv(partial / "table.csv", index=False)
+        (partial / "figures").mkdir()
+        unit = selected.job.train.record.outputs[0].unit
+        save(selection_figure(selected.result, unit), partial / "figures" / "selection.png")
+
+
+def _learner(spec: Spec) -> Learner | None:
+    """What is searched: the declared learner, or terms where none is declared."""
+    if "learner" not in spec.model_fields_set:
+        return Terms(degree=_DEGREE)
+    declared = spec.learner.declared(LEARNERS, spec.learner.kind)
+    return declared.resolve(None) if hasattr(declared, "resolve") else declared
+
+
+def _largest(spec: Spec) -> Lags | None:
+    """The largest orders: of [selection], or of [lags]."""
+    section, lags = spec.selection, spec.lags
+    if section.na is None and section.nb is None and section.nk is None:
+        return spec.lag_orders()
+    from orthaug.selection.selecting import LARGEST
+
+    first = (section.na, lags.na if lags else None, LARGEST[0])
+    second = (section.nb, lags.nb if lags else None, LARGEST[1])
+    third = (section.nk, lags.nk if lags else None, 1)
+    chosen = [next(n for n in each if n is not None) for each in (first, second, third)]
+    return Lags(*(tuple(n) if isinstance(n, list) else n for n in chosen))
+
+
+def _criterion(spec: Spec) -> Criterion:
+    """The declared one; the free run where the spec does not say."""
+    focus = spec.training.focus if "focus" in spec.training.model_fields_set else "simulation"
+    return spec.training.declared(CRITERIA, focus)
+
+
+def _result(job: LaggedJob, selection: Selection, seconds: float) -> SelectResult:
+    orders, test, learner = selection.orders.chosen, selection.nonlinearity, selection.learner
+    shares = selection.shares
+    terms = learner.terms if isinstance(learner, Terms) else ()
+    content = {
+        "data": job.data,
+        "orders": {"na": orders.na, "nb": list(orders.nb), "nk": list(orders.nk)},
+        "delays": selection.delays,
+        "nonlinearity": None
+        if test is None
+        else {"p": test.p, "regressors": test.regressors, "matter": list(test.matter), "text": str(test)},
+        "learner": _declared(learner),
+        "focus": CRITERIA.kind_of(selection.criterion),
+        "terms": [{"term": term, "chosen": shares.get(term)} for term in terms] or None,
+        "models": selection.table.to_dict("records"),
+        "seconds": seconds,
+        "stopped": selection.stopped,
+        "warnings": list(selection.notes),
+    }
+    return SelectResult.model_validate(content)
+
+
+def _declared(learner: Learner | None) -> dict[str, Any] | None:
+    """The section [learner] of a choice."""
+    if learner is None:
+        return None
+    if isinstance(learner, Terms):
+        return {"kind": "terms", "terms": list(learner.terms)}
+    seen = {} if learner.inputs is None else {"inputs": list(learner.inputs)}
+    return {"kind": "mlp", "hidden": list(learner.hidden), "activation": learner.activation} | seen  # type: ignore[attr-defined]
+
+
+def _new_spec(path: Path, folder: Path, selection: Selection) -> str:
+    """The spec with the choice in it; comments and order are kept, paths made relative to the new folder."""
+    document: Any = tomlkit.parse(path.read_text(encoding="utf-8-sig"))
+    _rebase(document, path.parent, folder)
+    learner, orders = _declared(selection.learner), selection.orders.chosen
+    document["lags"] = tomlkit.item({"na": orders.na, "nb": list(orders.nb), "nk": list(orders.nk)})
+    document["learner"] = tomlkit.item(learner or {"kind": "none"})
+    if learner is not None and "terms" in learner:
+        document["learner"]["terms"].multiline(True)
+    training = document.setdefault("training", tomlkit.table())
+    training["focus"] = CRITERIA.kind_of(selection.criterion)
+    if learner is None or learner["kind"] == "terms":  # linear in its weights: one start, and no prior
+        training["regularization"] = "none"
+        training["restarts"] = 1
+    elif training.get("regularization") is None:
+        training["regularization"] = "evidence"
+    head = f"# Selected by orthaug from {path.name}: {orders}. The other models are in table.csv.\n"
+    return head + tomlkit.dumps(document)
+
+
+def _rebase(table: Any, old: Path, new: Path) -> None:
+    """Make every list `files` relative to another folder."""
+    for key, value in table.items():
+        if isinstance(value, dict):
+            _rebase(value, old, new)
+        elif key == "files" and isinstance(value, list):
+            table[key] = [_moved(file, old, new) for file in value]
+
+
+def _moved(file: str, old: Path, new: Path) -> str:
+    if Path(file).is_absolute():
+        return file
+    try:
+        return Path(os.path.relpath((old / file).resolve(), new.resolve())).as_posix()
+    except ValueError:  # on another drive
+        return (old / file).resolve().as_posix()
