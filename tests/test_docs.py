@@ -129,10 +129,10 @@ def test_the_learner_of_the_example_is_one_file_and_one_entry(tmp_path):
     exec(compile(text, "CONTRIBUTING.md", "exec", dont_inherit=True), names)
     polynomial = names["Polynomial"]
     spec = make_project(tmp_path)
-    section = '[learner]\nkind = "polynomial"\ndegree = 2\n'
+    section = '[learner]\nkind = "polynomial"\nhighest = 2\n'
     spec.write_text(re.sub(r"^\[learner\]\n(?:\w.*\n)*", section, spec.read_text(), flags=re.MULTILINE))
     with LEARNERS.added("polynomial", polynomial):
-        assert load_spec(spec).declared_learner() == polynomial(degree=2)
+        assert load_spec(spec).declared_learner() == polynomial(highest=2)
     assert Bound(polynomial(), nz=2, ny=1).size == 4
-    with pytest.raises(orthaug.InputError, match="`degree` must be a whole number, 2 or more; got 1"):
-        polynomial(degree=1)
+    with pytest.raises(orthaug.InputError, match="`highest` must be a whole number, 2 or more; got 1"):
+        polynomial(highest=1)

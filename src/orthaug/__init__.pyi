@@ -44,6 +44,7 @@ from .models import Function as Function
 from .models import Model as Model
 from .models import MotionModel as MotionModel
 from .models import Response as Response
+from .models import Terms as Terms
 from .models import Trajectory as Trajectory
 from .models import load as load
 from .models import save as save
@@ -58,6 +59,8 @@ from .physics import State as State
 from .physics import Term as Term
 from .physics import identifiability as identifiability
 from .reports import plot as plot
+from .selection import Selection as Selection
+from .selection import select as select
 from .studies import synthetic as synthetic
 
 __version__: str

@@ -47,7 +47,8 @@ class Absorbed:
 class Smoother:
     """The mean given the learner's features, over the training rows: least squares on many functions of these.
 
-    The functions are tanh waves with centres on the data, and the shared part of the physics.
+    The functions are tanh waves with centres on the data, and the shared part of the physics. Of a learner that is
+    linear in its features they are these.
     """
 
     problem: Problem
@@ -79,14 +80,17 @@ class Smoother:
         problem, rng = self.problem, np.random.default_rng(_SEED)
         x = problem.rows.x[self.every]
         z = self._z(x)
-        count = min(_WAVES, len(z) // _ROWS_PER_WAVE)
-        slopes = rng.normal(size=(count, z.shape[1]))
-        slopes *= np.exp(rng.uniform(0.0, np.log(_STEEPEST), size=(count, 1))) / np.linalg.norm(slopes, axis=1)[:, None]
-        centres = z[rng.integers(len(z), size=count)]
-        waves = np.tanh(z @ slopes.T - np.sum(slopes * centres, axis=1))
-        phi = np.asarray(problem.baseline.phi(x, problem.layout, problem.outputs, np))
-        shared = (phi @ problem.shared.basis).reshape(len(x), -1)
-        functions = np.column_stack([z, shared] if problem.features.linear else [np.ones(len(x)), z, shared, waves])
+        functions = z
+        if not problem.features.linear:
+            count = min(_WAVES, len(z) // _ROWS_PER_WAVE)
+            slopes = rng.normal(size=(count, z.shape[1]))
+            steep = np.exp(rng.uniform(0.0, np.log(_STEEPEST), size=(count, 1)))
+            slopes *= steep / np.linalg.norm(slopes, axis=1)[:, None]
+            centres = z[rng.integers(len(z), size=count)]
+            waves = np.tanh(z @ slopes.T - np.sum(slopes * centres, axis=1))
+            phi = np.asarray(problem.baseline.phi(x, problem.layout, problem.outputs, np))
+            shared = (phi @ problem.shared.basis).reshape(len(x), -1)
+            functions = np.column_stack([np.ones(len(x)), z, shared, waves])
         scale = np.sqrt(np.mean(functions**2, axis=0))
         functions = functions / np.where(scale > 0, scale, 1.0)
         with one_blas_thread():
@@ -105,7 +109,12 @@ class Smoother:
         return (flat - self._basis @ (self._basis.T @ flat)).reshape(values.shape)
 
     def mean(self, values: Float[np.ndarray, "n ny"], x: Matrix) -> Matrix:
-        """Mv at rows of the regressor, of values on the training rows that are used: that at the nearest z of these."""
+        """Mv at rows of the regressor, of values on the training rows that are used: that at the nearest z of these.
+
+        Of a linear combination of the features it is that combination.
+        """
+        if self.problem.features.linear:
+            return self._z(x) @ np.linalg.lstsq(self.inputs, values, rcond=1e-10)[0]
         known = self._basis @ (self._basis.T @ values)
         if x is self.problem.rows.x and len(known) == len(x):
             return known

@@ -76,13 +76,16 @@ def select_for(job: LaggedJob, spec: Spec, folder: Path, told: Told) -> Selected
         "widths": section.hidden or WIDTHS,
         "most": MOST if section.terms is None else section.terms,
         "blocks": section.blocks,
+        "halves": section.halves,
     }
+    if section.halves and len(job.train.record.experiments) != 1:
+        raise InputError(f"{job.path}: 'selection.halves' needs training data of one experiment, to be cut in two.")
     try:
         selection = select(job.train.record, job.problem.baseline, **options, progress=told)
     except InputError as error:
         raise InputError(f"{job.path}: {error}") from None
     result = _result(job, selection, time.monotonic() - began)
-    return Selected(job, selection, result, _new_spec(job.path, folder, selection))
+    return Selected(job, selection, result, _new_spec(job, folder, selection, halved=section.halves))
 
 
 def steps_at_most(terms: int | None) -> int:
@@ -167,10 +170,17 @@ def _declared(learner: Learner | None) -> dict[str, Any] | None:
     return {"kind": "mlp", "hidden": list(learner.hidden), "activation": learner.activation} | seen  # type: ignore[attr-defined]
 
 
-def _new_spec(path: Path, folder: Path, selection: Selection) -> str:
+def _new_spec(job: LaggedJob, folder: Path, selection: Selection, *, halved: bool) -> str:
     """The spec with the choice in it; comments and order are kept, paths made relative to the new folder."""
+    path = job.path
     document: Any = tomlkit.parse(path.read_text(encoding="utf-8-sig"))
     _rebase(document, path.parent, folder)
+    if halved:  # the half that the choice was not made on
+        train = document["data"]["train"]
+        every, rows = train.get("every", 1), train.get("rows") or [0]
+        first = rows[0][0] if isinstance(rows[0], list) else rows[0]
+        cut = first + every * (len(job.train.record) - len(selection.record))
+        train["rows"] = [cut, first + every * len(job.train.record)]
     learner, orders = _declared(selection.learner), selection.orders.chosen
     document["lags"] = tomlkit.item({"na": orders.na, "nb": list(orders.nb), "nk": list(orders.nk)})
     document["learner"] = tomlkit.item(learner or {"kind": "none"})

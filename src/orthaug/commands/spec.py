@@ -179,7 +179,7 @@ class TrainingSection(KindSection):
 
 
 class SelectionSection(Section):
-    """What `orthaug select` looks through: the largest orders, terms at most, widths, and blocks held out."""
+    """What `orthaug select` looks through: the largest orders, terms at most, widths, blocks held out; and on what."""
 
     na: Count | None = None
     nb: Orders | None = None
@@ -187,6 +187,7 @@ class SelectionSection(Section):
     terms: Count | None = None
     hidden: Annotated[list[Positive], Field(min_length=1)] | None = None
     blocks: Annotated[int, Field(ge=2, strict=True)] = 5
+    halves: bool = False
 
 
 class ValidationSection(Section):

@@ -216,8 +216,7 @@ def fit(
         problem, learner, told = independent_terms(problem, learner)
         task = OneStepTask.of(problem, learner, engine=engine)
         starts = _starts(task.bound, range(seed, seed + restarts), choices)
-    solved = criterion.one_step and problem.baseline.linear
-    ensemble = ensemble and task.bound is not None
+    solved, ensemble = criterion.one_step and problem.baseline.linear, ensemble and task.bound is not None
     _check_ensemble(ensemble, problem)
     if task.bound is None and solved:
         estimate = conclude(task, structure, task.physics_learned())

@@ -9,3 +9,4 @@ from .response import Trajectory as Trajectory
 from .response import scores as scores
 from .storage import load as load
 from .storage import save as save
+from .terms import Terms as Terms

@@ -1,1 +1,2 @@
-
+from .selecting import Selection as Selection
+from .selecting import select as select

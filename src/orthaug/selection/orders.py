@@ -119,7 +119,9 @@ def search_orders(
 
         try:
             for na in range(max(least.na, min(1, largest.na)), largest.na + 1):
-                judge(Orders(na, largest.nb, largest.nk))
+                fewer = largest.na - na
+                nb = tuple(max(n - fewer, low, min(n, 1)) for n, low in zip(largest.nb, least.nb, strict=True))
+                judge(Orders(na, nb, largest.nk))
             _shrink(found, judge, least)
         except KeyboardInterrupt:
             if not found:
@@ -128,8 +130,8 @@ def search_orders(
 
 
 def _shrink(found: dict[Orders, Rung], judge: Callable[[Orders], None], least: Orders) -> None:
-    """From the choice on, as long as one lag less is as good."""
-    current = next(orders for orders, one in zip(found, judge_all(tuple(found.values())), strict=True) if one.chosen)
+    """From the best on, as long as one lag less is as good as the best."""
+    current = min(found, key=lambda orders: found[orders].score)
     while True:
         smaller = list(current.smaller(least))
         for orders in smaller:

@@ -36,6 +36,10 @@ LARGEST = (4, 5)
 """na and nb up to which orders are searched where nothing is said."""
 WIDTHS = (4, 8, 16)
 """Hidden neurons that are tried where nothing is said."""
+_CONDITIONAL = (
+    "intervals of a fit on these data are conditional on the choice, which was made on them; with `halves` one half of "
+    "the data chooses and the other is fitted."
+)
 Told = Callable[[str, Any], None]
 """Called with the stage and each model that was judged; it may raise KeyboardInterrupt to keep what there is."""
 
@@ -49,6 +53,7 @@ class Selection:
     """What `select` returns. Print `selection.summary()`; take `selection.table`; go on with `selection.estimate()`."""
 
     record: Record = field(repr=False)
+    """What `estimate` fits: the record, or the half that the choice was not made on."""
     baseline: Baseline
     criterion: Criterion
     delays: tuple[Delay, ...]
@@ -159,6 +164,7 @@ def select(
     widths: Sequence[int] = WIDTHS,
     most: int = MOST,
     blocks: int = 5,
+    halves: bool = False,
     progress: Told = _unheard,
 ) -> Selection:
     """Choose orders and delay, and terms or a network, by free runs on blocks of the data that are held out.
@@ -178,6 +184,8 @@ def select(
         widths: hidden neurons that are tried.
         most: terms at most.
         blocks: held out in turn.
+        halves: choose on the first half of the record, and keep the other for the fit (`Selection.estimate`), whose
+            intervals are then not conditional on the choice.
         progress: called with the stage and each model that was judged.
 
     Raises:
@@ -192,6 +200,7 @@ def select(
     if baseline.function is not None:
         raise InputError("structure is chosen beside physics that are terms; of a Python function nothing is known.")
     criterion = Simulation() if criterion is None else criterion
+    record, kept = record.split(0.5) if halves else (record, record)
     problem, heard = pose(record, baseline), _Listener(progress)
     largest, least = _reach(problem, lags)
     orders = search_orders(problem, criterion, largest, least, blocks, heard.of("orders"))
@@ -213,7 +222,9 @@ def select(
         found = search_learners(problem, chosen, tested, learner, widths, criterion, blocks, heard.of("learner"))
     if heard.stopped:
         notes.append(Warning("stopped", "the search was stopped; the choice is among the models judged by then."))
-    return Selection(record, baseline, criterion, delays, orders, tested, path, found, tuple(notes), heard.stopped)
+    if not halves:
+        notes.append(Warning("conditional_on_selection", _CONDITIONAL))
+    return Selection(kept, baseline, criterion, delays, orders, tested, path, found, tuple(notes), heard.stopped)
 
 
 class _Listener:
