@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import tomlkit
 
 from orthaug._base.errors import InputError
@@ -177,8 +178,8 @@ def _new_spec(job: LaggedJob, folder: Path, selection: Selection, *, halved: boo
     _rebase(document, path.parent, folder)
     if halved:  # the half that the choice was not made on
         train = document["data"]["train"]
-        every, rows = train.get("every", 1), train.get("rows") or [0]
-        first = rows[0][0] if isinstance(rows[0], list) else rows[0]
+        every, rows = train.get("every", 1), np.ravel(train.get("rows") or [0])
+        first = int(rows[0])
         cut = first + every * (len(job.train.record) - len(selection.record))
         train["rows"] = [cut, first + every * len(job.train.record)]
     learner, orders = _declared(selection.learner), selection.orders.chosen

@@ -92,7 +92,7 @@ def _latex(node: ast.AST) -> str:
     if isinstance(node, ast.Name):
         return _symbol(node.id)
     if isinstance(node, ast.Subscript):
-        return f"{_symbol(getattr(node.value, 'id', ''))}_{{{ast.unparse(node.slice).replace(' ', '')}}}"
+        return _symbol(getattr(node.value, "id", ""), ast.unparse(node.slice).replace(" ", ""))
     if isinstance(node, ast.UnaryOp):
         return ("-" if isinstance(node.op, ast.USub) else "") + _tight(node.operand)
     if isinstance(node, ast.Call):
@@ -121,10 +121,12 @@ def _tight(node: ast.AST) -> str:
     return f"({_latex(node)})" if loose else _latex(node)
 
 
-def _symbol(name: str) -> str:
+def _symbol(name: str, index: str = "") -> str:
     """A name: one letter as it stands, with digits behind it as an index, words upright."""
     letters = name.rstrip("0123456789")
-    if len(letters) == 1 and letters != name:
-        return f"{letters}_{{{name[1:]}}}"
-    upright = name.replace("_", r"\_")
-    return name if len(name) == 1 else rf"\mathrm{{{upright}}}"
+    if len(letters) == 1:
+        base, below = letters, ",".join(filter(None, (name[1:], index)))
+    else:
+        upright = name.replace("_", r"\_")
+        base, below = rf"\mathrm{{{upright}}}", index
+    return f"{base}_{{{below}}}" if below else base

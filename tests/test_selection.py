@@ -1,0 +1,334 @@
+"""Structure is found: terms on the free run, orders and delay, what is nonlinear; nothing where there is nothing."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.signal
+from test_cli import finite_json, one_line, run
+
+import orthaug as oa
+from orthaug.data.terms import TermLibrary
+from orthaug.physics.problem import pose
+from orthaug.selection.candidates import SHORTLIST, candidates
+from orthaug.selection.forward import Equations, forward, left_of
+from orthaug.selection.nonlinearity import nonlinearity
+from orthaug.selection.term_path import climb
+from orthaug.selection.term_runs import TermRuns
+
+PHYSICS = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")])
+LAGS, FLOWN = oa.Lags(2, 2, 1), oa.Simulation(128, 20)
+TRUE = {"y[k-2]**3", "u[k-1]*u[k-2]"}
+MOST = 5
+
+
+def plant(rows: int = 600, noise: float = 0.02, *, terms: bool = True, seed: int = 3) -> oa.Record:
+    """Sensor noise on y = 0.6 y1 + u1 − 0.2 y2³ + 0.4 u1 u2."""
+    rng = np.random.default_rng(seed)
+    u, y = rng.uniform(-1, 1, rows), np.zeros(rows)
+    for k in range(2, rows):
+        y[k] = 0.6 * y[k - 1] + u[k - 1]
+        y[k] += terms * (0.4 * u[k - 1] * u[k - 2] - 0.2 * y[k - 2] ** 3)
+    return oa.Record.from_arrays(u=u, y=y + noise * rng.normal(size=rows))
+
+
+def linear(b: list[float], a: list[float], noise: float = 0.02, rows: int = 600) -> oa.Record:
+    rng = np.random.default_rng(1)
+    u = rng.normal(size=rows)
+    return oa.Record.from_arrays(u=u, y=scipy.signal.lfilter(b, a, u) + noise * rng.normal(size=rows))
+
+
+@pytest.fixture(scope="module")
+def selected() -> oa.Selection:
+    return oa.select(plant(), PHYSICS, lags=LAGS, criterion=FLOWN, most=MOST)
+
+
+def test_forward_picks_what_lowers_the_error_most():
+    rng = np.random.default_rng(0)
+    columns = rng.normal(size=(60, 9)) @ rng.normal(size=(9, 9))
+    y = columns @ rng.normal(size=9) + rng.normal(size=60)
+    equations = Equations(columns.T @ columns, columns.T @ y, float(y @ y), 60)
+
+    def left(chosen):
+        return y - columns[:, chosen] @ np.linalg.lstsq(columns[:, chosen], y, rcond=None)[0]
+
+    chosen, before = [4], float(np.sum(left([4]) ** 2))
+    for pick in forward(equations, [4], 5):
+        best = min(set(range(9)) - set(chosen), key=lambda j: np.sum(left([*chosen, j]) ** 2))
+        assert pick.column == best
+        chosen.append(best)
+        after = float(np.sum(left(chosen) ** 2))
+        assert pick.share == pytest.approx(1 - after / before, abs=1e-9)
+        before = after
+    p = equations.of(chosen).solve()
+    assert equations.of(chosen).miss(p) == pytest.approx(before, rel=1e-9)
+
+
+def test_forward_picks_no_combination_of_what_is_in():
+    rng = np.random.default_rng(1)
+    base = rng.normal(size=(50, 3))
+    columns = np.column_stack([base, base @ [1.0, 2.0, -1.0], rng.normal(size=50)])
+    y = rng.normal(size=50)
+    equations = Equations(columns.T @ columns, columns.T @ y, float(y @ y), 50)
+    assert [pick.column for pick in forward(equations, [0, 1, 2], 5)] == [4]
+    assert left_of(equations, [0, 1, 2])[3] < 1e-12 < left_of(equations, [0, 1, 2])[4]
+
+
+def test_the_true_terms_are_found_through_sensor_noise(selected):
+    assert selected.terms is not None and isinstance(selected.learner, oa.Terms)
+    assert set(selected.learner.terms) == TRUE
+    assert selected.nonlinearity is not None and selected.nonlinearity.found
+    assert selected.shares == dict.fromkeys(selected.learner.terms, 1.0)
+    assert (selected.delays[0].correlation, selected.delays[0].fitted) == (1, 1)
+    table = selected.table
+    assert (
+        list(table.columns[:3]) == ["stage", "model", "size"]
+        and table["chosen"].groupby(table["stage"]).sum().eq(1).all()
+    )
+    assert f"learner     terms {', '.join(selected.learner.terms)}\n" in selected.summary()
+
+
+def test_the_fit_of_the_choice_has_the_truth_in_its_intervals(selected):
+    fit = selected.estimate()
+    assert fit.status.ok
+    low, high = fit.terms["ci95_low"], fit.terms["ci95_high"]
+    for term, value in (("y[k-2]**3", -0.2), ("u[k-1]*u[k-2]", 0.4)):
+        assert low[term] < value < high[term]
+
+
+def test_linearised_equations_are_those_of_the_free_run(selected):
+    """What a term lowers the loss by to first order is what it does for a small coefficient."""
+    runs = selected.terms.runs
+    point = runs.fit(runs.start(), ())
+    equations = runs.equations(point)
+    nt = len(point.c)
+    p = np.concatenate([point.c, np.zeros(len(runs.library))])
+    slope = 2 * (equations.hessian @ p - equations.right)[nt:] * runs.rms**2 / equations.rows
+    for term in (3, 7):
+        moved = []
+        for size in (-1e-5, 1e-5):
+            one = runs.fit(point._replace(chosen=(term,), w=np.array([size])), (term,), iterations=0)
+            moved.append(one.loss)
+        assert (moved[1] - moved[0]) / 2e-5 == pytest.approx(slope[term], rel=2e-3)
+
+
+def test_halves_choose_on_one_and_fit_the_other():
+    record = plant(1200)
+    one = oa.select(record, PHYSICS, lags=LAGS, criterion=oa.Prediction(), most=MOST, halves=True)
+    first = oa.select(record.split(0.5)[0], PHYSICS, lags=LAGS, criterion=oa.Prediction(), most=MOST)
+    assert one.learner == first.learner and len(one.record) == 600
+    np.testing.assert_array_equal(one.record.experiments[0].outputs, record.experiments[0].outputs[600:])
+    told = [note.code for note in first.notes]
+    assert "conditional_on_selection" in told and "conditional_on_selection" not in [n.code for n in one.notes]
+
+
+def test_where_nothing_helps_nothing_is_chosen():
+    one = oa.select(plant(terms=False), PHYSICS, lags=LAGS, criterion=FLOWN, most=MOST)
+    assert one.learner is None and "nothing_helps" in [note.code for note in one.notes]
+    assert one.nonlinearity is not None and not one.nonlinearity.found
+
+
+@pytest.mark.parametrize(
+    ("b", "a", "orders"),
+    [
+        ([0.0, 0.0, 1.0, 0.5], [1.0, -1.2, 0.6], (2, 2, 2)),
+        ([0.0, 1.0], [1.0, -0.8], (1, 1, 1)),
+        ([0.7, 0.0, 0.9], [1.0], (0, 3, 0)),
+    ],
+)
+def test_orders_and_delay(b, a, orders):
+    chosen = oa.select(linear(b, a), learner=None, lags=oa.Lags(3, 4, 0), criterion=FLOWN)
+    assert (chosen.orders.chosen.na, *chosen.orders.chosen.nb, *chosen.orders.chosen.nk) == orders
+    assert chosen.delays[0].correlation == orders[2]
+
+
+def test_two_inputs_have_their_own_delays():
+    rng = np.random.default_rng(2)
+    u = rng.normal(size=(600, 2))
+    y = scipy.signal.lfilter([0, 1.0], [1, -0.7], u[:, 0]) + scipy.signal.lfilter([0, 0, 0.8], [1, -0.7], u[:, 1])
+    record = oa.Record.from_arrays(u=u, y=y + 0.02 * rng.normal(size=600))
+    chosen = oa.select(record, learner=None, lags=oa.Lags(2, 3, 0), criterion=FLOWN).orders.chosen
+    assert (chosen.na, chosen.nb, chosen.nk) == (1, (1, 1), (1, 2))
+
+
+def test_what_is_nonlinear_is_named():
+    rng = np.random.default_rng(4)
+    u, e = rng.normal(size=(2, 500))
+    y = scipy.signal.lfilter([1], [1, -0.5], np.concatenate([[0], u[:-1] + 0.05 * u[:-1] ** 3]) + 0.1 * e)
+    found = nonlinearity(pose(oa.Record.from_arrays(u=u, y=y), PHYSICS), ["y[k-1]", "u[k-1]"])
+    assert found is not None and found.p < 0.01 and found.matter == ("u[k-1]",)
+    line = scipy.signal.lfilter([1], [1, -0.5], np.concatenate([[0], u[:-1]]) + 0.1 * e)
+    none = nonlinearity(pose(oa.Record.from_arrays(u=u, y=line), PHYSICS), ["y[k-1]", "u[k-1]"])
+    assert none is not None and none.p > 0.05
+
+
+def test_of_very_many_terms_the_right_ones_are_looked_at():
+    record = plant(400)
+    signals = [f"y[k-{i}]" for i in range(1, 5)] + [f"u[k-{i}]" for i in range(1, 5)]
+    library = TermLibrary.of(signals, 4)
+    found = candidates(pose(record, PHYSICS), library)
+    assert len(library) > SHORTLIST >= len(found.library) and set(found.library.texts) >= TRUE
+    assert [note.code for note in found.notes] == ["terms_are_physics", "terms_shortlisted"]
+    assert "y[k-1], u[k-1]" in found.notes[0].text
+
+
+def test_a_term_that_is_not_finite_is_left_out():
+    with np.errstate(all="ignore"):
+        found = candidates(pose(plant(200), PHYSICS), TermLibrary.of((), 0, (), ["1/(u[k-1]-u[k-1])", "u[k-1]**2"]))
+    assert found.library.texts == ("u[k-1]**2",) and "1/(u[k-1]-u[k-1])" in found.notes[0].text
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"blocks": 1}, "`blocks` must be a whole number, 2 or more"),
+        ({"learner": oa.Terms(degree=2, exclude=("u[k-9]",))}, "`exclude` names the term 'u\\[k-9\\]'"),
+        ({"learner": oa.Terms(("u[k-1]",))}, "the physics expresses all candidate terms already"),
+        ({"learner": oa.Function(lambda w, z: z, lambda key: ())}, "`learner` must be Terms"),
+    ],
+)
+def test_what_cannot_be_selected_from(options, words):
+    with pytest.raises(oa.InputError, match=words):
+        oa.select(plant(200), PHYSICS, lags=LAGS, criterion=oa.Prediction(), **options)
+
+
+def test_several_outputs_are_refused():
+    record = oa.Record.from_arrays(u=np.ones(50), y=np.zeros((50, 2)))
+    with pytest.raises(oa.InputError, match="structure is chosen for one output; the record has 2"):
+        oa.select(record)
+
+
+def test_stopping_keeps_the_best_so_far():
+    judged = itertools.count()
+
+    def stop(stage: str, rung: object) -> None:
+        if stage == "terms" and next(judged) == 2:
+            raise KeyboardInterrupt
+
+    one = oa.select(plant(), PHYSICS, lags=LAGS, criterion=FLOWN, most=MOST, progress=stop)
+    assert one.stopped and len(one.terms.rungs) == 3 and "stopped" in [note.code for note in one.notes]
+    assert isinstance(one.learner, oa.Terms) and set(one.learner.terms) <= TRUE
+
+
+def test_a_network_is_as_wide_as_it_pays():
+    one = oa.select(plant(), PHYSICS, learner=oa.MLP((8,)), lags=LAGS, criterion=oa.Prediction(), widths=(2, 6))
+    assert isinstance(one.learner, oa.MLP) and one.learner.hidden[0] in (2, 6)
+    learners = one.table[one.table["stage"] == "learner"]
+    assert list(learners["model"])[:3] == ["physics alone", "2 neurons of all lags", "6 neurons of all lags"]
+    assert learners["score"].iloc[1:].max() < learners["score"].iloc[0]
+
+
+SPEC = """# my plant
+[data]
+inputs = ["u"]
+outputs = ["y"]
+train = { files = ["run.csv"], rows = [10, 600] }
+
+[data.tests.rest]
+files = ["run.csv"]
+rows = [500, 600]
+
+[[baseline.terms]]
+parameter = "a"
+regressor = "y[k-1]"
+
+[[baseline.terms]]
+parameter = "b"
+regressor = "u[k-1]"  # gain
+
+[lags]
+na = 2
+nb = 2
+
+[learner]
+kind = "terms"
+degree = 3
+
+[selection]
+terms = 4
+
+[training]
+segment = 128
+washout = 20
+"""
+
+
+@pytest.fixture
+def project(tmp_path, monkeypatch):
+    record = plant()
+    table = np.column_stack([record.experiments[0].inputs, record.experiments[0].outputs])
+    (tmp_path / "data").mkdir()
+    np.savetxt(tmp_path / "data" / "run.csv", table, delimiter=",", header="u,y", comments="", fmt="%.17g")
+    (tmp_path / "data" / "plant.toml").write_text(SPEC)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "data" / "plant.toml"
+
+
+def test_select_from_the_shell_leaves_a_spec_that_runs(project, tmp_path):
+    done = run("select", project, "--out", tmp_path / "out", "--json")
+    assert done.code == 0, done.err
+    result = finite_json(done.out)
+    assert set(result["learner"]["terms"]) == TRUE and result["focus"] == "simulation" and not result["stopped"]
+    assert result["orders"] == {"na": 1, "nb": [1], "nk": [1]} or result["orders"]["na"] >= 1
+    files = {str(p.relative_to(tmp_path / "out")) for p in (tmp_path / "out").rglob("*") if p.is_file()}
+    assert files == {"result.json", "spec.toml", "table.csv", "figures/selection.png", "manifest.json"}
+    assert len(pd.read_csv(tmp_path / "out" / "table.csv")) == len(result["models"])
+    spec = (tmp_path / "out" / "spec.toml").read_text()
+    assert "# my plant" in spec and "# gain" in spec and '"../data/run.csv"' in spec
+    fitted = run("fit", tmp_path / "out" / "spec.toml", "--out", tmp_path / "fit", "--json")
+    assert fitted.code == 0, fitted.err
+    content = finite_json(fitted.out)
+    assert {term["term"] for term in content["terms"]} == TRUE
+    assert content["equation"]["text"].startswith("y[k] = ") and r"y_{k} = " in content["equation"]["latex"]
+
+
+def test_select_of_halves_fits_the_other_rows(project, tmp_path):
+    project.write_text(
+        SPEC.replace("terms = 4", "terms = 4\nhalves = true").replace("[training]", '[training]\nfocus = "prediction"')
+    )
+    done = run("select", project, "--out", tmp_path / "out")
+    assert done.code == 0, done.err
+    assert "rows = [305, 600]" in (tmp_path / "out" / "spec.toml").read_text()
+    assert "orders" in done.out and "→" in done.out and "next: orthaug fit" in done.out
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("terms = 4", "terms = -1", "'selection.terms': found -1"),
+        ("terms = 4", "term = 4", "unknown key 'selection.term', did you mean 'terms'?"),
+        (
+            "degree = 3",
+            'degree = 3\nfunctions = ["cosh"]',
+            "no terms are made of the function 'cosh', did you mean 'cos'",
+        ),
+        ("degree = 3", 'terms = ["v[k-1]"]', "v"),
+    ],
+)
+def test_specs_that_cannot_be_selected_from(project, tmp_path, old, new, words):
+    project.write_text(SPEC.replace(old, new))
+    done = run("select", project, "--out", tmp_path / "out")
+    assert done.code == 2 and one_line(done.err, words) and not (tmp_path / "out").exists()
+
+
+def test_a_motion_is_refused(tmp_path):
+    (tmp_path / "run.csv").write_text("u,y\n0,0\n1,1\n")
+    (tmp_path / "motion.toml").write_text(
+        '[data]\ninputs = ["u"]\noutputs = ["y"]\ntrain = { files = ["run.csv"] }\n'
+        '[motion.states]\nx = { derivative = "-k*x + u" }\n[motion.outputs]\ny = "x"\n'
+        "[motion.parameters]\nk = { initial = 1.0 }\n"
+    )
+    done = run("select", tmp_path / "motion.toml", "--out", tmp_path / "out")
+    assert done.code == 2 and one_line(done.err, "structure is selected for lagged signals")
+
+
+def test_a_path_is_the_same_twice():
+    record = plant(300)
+    problem = pose(record, PHYSICS)
+    library = TermLibrary.of(["y[k-2]", "u[k-2]", "u[k-1]"], 2, exclude=["u[k-1]"])
+    paths = [climb(TermRuns.of(problem, library, oa.Prediction()), 4, 3) for _ in range(2)]
+    assert [rung.point.chosen for rung in paths[0].rungs] == [rung.point.chosen for rung in paths[1].rungs]
+    assert [rung.score for rung in paths[0].rungs] == [rung.score for rung in paths[1].rungs]
