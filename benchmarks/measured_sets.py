@@ -25,13 +25,19 @@ from orthaug.fitting.estimation import fit
 @cache
 def job(name: str) -> Job | None:
     """The example with its data; None where these are absent."""
-    text = (ROOT / "examples" / f"{name}.toml").read_text(encoding="utf-8")
-    if not (data_folder() / name.removesuffix("_motion")).is_dir():
-        return None
     with tempfile.TemporaryDirectory() as folder:
-        spec = Path(folder) / f"{name}.toml"
-        spec.write_text(text.replace("../../shared/data", data_folder().as_posix()), encoding="utf-8")
-        return open_job(spec)
+        spec = written(name, Path(folder))
+        return None if spec is None else open_job(spec)
+
+
+def written(name: str, folder: Path) -> Path | None:
+    """The example's spec in a folder, with the data where they are; None where they are absent."""
+    text = (ROOT / "examples" / f"{name}.toml").read_text(encoding="utf-8")
+    if not (data_folder() / name.removesuffix("_motion").removesuffix("_terms")).is_dir():
+        return None
+    spec = folder / f"{name}.toml"
+    spec.write_text(text.replace("../../shared/data", data_folder().as_posix()), encoding="utf-8")
+    return spec
 
 
 @cache

@@ -3,20 +3,25 @@
 Sparse NARX systems and linear ones with known structure, equation noise and sensor noise; the level and power of the
 test for anything nonlinear; coverage of intervals of terms that one half of the data chose and the other fitted; time
 against rows. SysIdentPy's FROLS gets the same data where that package is installed.
-Run: python benchmarks/selection.py [terms | orders | level | power | coverage | time] [systems or draws]
+Run: python benchmarks/selection.py [silverbox | terms | orders | level | power | coverage | time] [systems or draws]
 """
 
 from __future__ import annotations
 
 import sys
+import tempfile
 import time
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import scipy.signal
 from machine import describe
+from measured_sets import written
 
 import orthaug as oa
+from orthaug.commands.fit import score_part
+from orthaug.commands.select import open_select, select_for
 from orthaug.data.terms import TermLibrary
 from orthaug.physics.problem import pose
 from orthaug.selection.nonlinearity import nonlinearity
@@ -235,16 +240,68 @@ def coverage(draws: int = 200) -> dict[str, float]:
 def seconds() -> dict[int, float]:
     """Seconds of a search of 80 terms against the rows; the slope of logarithms is in the last entry."""
     one, found = systems(1)[0], {}
-    for rows in (8000, 16000, 32000, 64000):
+    for rows in (50_000, 100_000, 200_000, 400_000):
         record = one.record("equation", 30, rows)
-        oa.select(record, PHYSICS, lags=LAGS, most=8)
+        oa.select(record, PHYSICS, lags=LAGS, most=4)
         began = time.monotonic()
-        oa.select(record, PHYSICS, lags=LAGS, most=8)
+        oa.select(record, PHYSICS, lags=LAGS, most=4)
         found[rows] = time.monotonic() - began
     return found
 
 
-STUDIES = {"terms": terms, "orders": orders, "level": level, "power": power, "coverage": coverage, "time": seconds}
+def term_table() -> list[list[float]]:
+    """Rows of `terms` without seconds: ours, for each case."""
+    return [row[:3] for name, row in terms().items() if not name.endswith("FROLS")]
+
+
+def frols_table() -> list[list[float | None]]:
+    """The same of FROLS; None where it is not installed."""
+    found = {name: row[:3] for name, row in terms().items() if name.endswith("FROLS")}
+    return [found.get(f"{name}; FROLS", [None] * 3) for name, *_ in CASES]
+
+
+def order_table() -> list[float]:
+    """% of systems whose orders are found, for each case."""
+    return list(orders().values())
+
+
+def level_table() -> list[float]:
+    """% of linear records that are said to lack something, with equation noise and with sensor noise."""
+    return list(level().values())
+
+
+def power_table() -> list[float]:
+    """% of records that are told, by the size of the cubic term."""
+    return list(power().values())
+
+
+def coverage_table() -> list[float]:
+    """% of intervals that hold the truth, of terms fitted on the other half, and on the same data."""
+    return list(coverage().values())
+
+
+def silverbox() -> list[float | None]:
+    """Number of terms, and RMSE in mV of the free run on multisine, arrow and inner arrow; None without the data."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = written("silverbox_terms", Path(folder))
+        if path is None:
+            return [None] * 4
+        job, spec = open_select(path)
+        chosen = select_for(job, spec, path.parent, lambda stage, rung: None).selection
+    fit = chosen.estimate()
+    scored = [score_part(fit.model, part, [])[0].simulation.rmse for part in job.tests]
+    return [len(fit.terms), *(1e3 * rmse[0] for rmse in scored)]
+
+
+STUDIES = {
+    "silverbox": lambda: {"terms, mV": silverbox()},
+    "terms": terms,
+    "orders": orders,
+    "level": level,
+    "power": power,
+    "coverage": coverage,
+    "time": seconds,
+}
 
 
 if __name__ == "__main__":
@@ -253,6 +310,6 @@ if __name__ == "__main__":
     numbers = [int(word) for word in sys.argv[1:] if word.isdigit()]
     for name in chosen:
         print(name, flush=True)
-        for key, value in STUDIES[name](*numbers[: int(name != "time")]).items():
+        for key, value in STUDIES[name](*numbers[: int(name not in ("time", "silverbox"))]).items():
             shown = value if isinstance(value, float) else [round(v, 2) for v in value]
             print(f"  {key}: {shown}", flush=True)
