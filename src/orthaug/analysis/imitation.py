@@ -43,11 +43,15 @@ class Imitation:
     determined: tuple[str, ...]
     physical: tuple[str, ...] | None
     alternatives: tuple[Alternative, ...]
+    terms: bool = False
+    """Whether the learner can be linear combinations of its inputs only."""
 
     @property
     def text(self) -> str:
         """In sentences."""
         sees = f"The learner sees {_listed(self.inputs)}"
+        if self.terms:
+            sees = f"The learner is a sum of {len(self.inputs)} terms"
         if self.everything:
             return f"{sees} and could imitate all of the physics: θ is split off along every direction."
         if not self.directions:
@@ -67,15 +71,14 @@ def imitation(problem: Problem, physics: PhysicsMap | None = None, *, others: bo
     own = problem.shared
     inputs = tuple(str(entry) for entry in problem.features.entries)
     alternatives = []
-    for other in other_inputs(problem) if others else ():
+    for other in other_inputs(problem) if others and not problem.features.linear else ():
         features = Features(tuple(parse(text, {}) for text in other))
         shared = shared_directions(problem.baseline, features, problem.layout, problem.outputs, problem.rows.x)
         if not shared.all and set(other) != set(inputs):
             determined = Alternative(other, shared.basis.shape[1], shared.untouched, _untouched(shared, slopes))
             alternatives.append(determined)
-    return Imitation(
-        inputs, own.all, own.directions, own.untouched, _untouched(own, slopes), tuple(alternatives[:_ALTERNATIVES])
-    )
+    shown, terms = tuple(alternatives[:_ALTERNATIVES]), problem.features.linear
+    return Imitation(inputs, own.all, own.directions, own.untouched, _untouched(own, slopes), shown, terms)
 
 
 def _slopes(problem: Problem, physics: PhysicsMap | None) -> dict[str, np.ndarray] | None:
