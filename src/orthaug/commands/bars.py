@@ -11,6 +11,7 @@ from typing import Any
 from orthaug._base.progress import SILENT, Progress
 from orthaug.commands.signals import WATCH
 
+_LONG = 5.0  # s of a search that are told beforehand
 _SEEN = 3  # models after which the time of the rest is told: the first ones compile
 
 
@@ -107,8 +108,8 @@ def selection_bar(most: int) -> Iterator[Callable[[str, Any], None]]:
             if stage not in tasks:
                 tasks[stage] = bar.add_task(stage, total=most if stage == "terms" else None)
             bar.update(tasks[stage], advance=1)
-            if stage == "terms" and len(done) == _SEEN and not console.is_terminal:
-                whole = done[-1] * most
+            whole = done[-1] * most
+            if stage == "terms" and len(done) == _SEEN and whole > _LONG and not console.is_terminal:
                 console.print(f"note: a model takes {done[-1]:.1f} s; at most {most} are judged, {whole:.0f} s.")
             if asked.is_set():
                 raise KeyboardInterrupt

@@ -10,6 +10,7 @@ import numpy as np
 
 from orthaug._base.errors import InputError, KeyedError
 from orthaug._base.progress import SILENT, Progress
+from orthaug._base.warning import Warning
 from orthaug.commands.job import ALONE, AS_DECLARED, Job, Variant
 from orthaug.commands.parts import load_parts
 from orthaug.commands.spec import Spec
@@ -18,6 +19,7 @@ from orthaug.data.expressions import Lag
 from orthaug.data.record import Record, check_channels
 from orthaug.data.regressors import Layout, lag_rows, largest_lag
 from orthaug.fitting.cost import check_cost
+from orthaug.fitting.independent_terms import independent_terms
 from orthaug.fitting.kinds import STRUCTURES
 from orthaug.fitting.rules import check_scored
 from orthaug.fitting.structures import Structure
@@ -39,6 +41,12 @@ class LaggedJob(Job):
     problem: Problem
     weighed: Weighed
     physics: PhysicsMap | None
+    left_out: tuple[Warning, ...] = ()
+    """What is told of terms that the learner was declared with, and that say nothing of their own."""
+
+    @property
+    def warnings(self) -> tuple[Warning, ...]:
+        return (*super().warnings, *self.left_out)
 
     @property
     def physics_in_words(self) -> str:
@@ -128,15 +136,16 @@ def open_lagged(path: Path, spec: Spec, *, require_full_rank: bool = True) -> La
         validation = validation.without_short(first) if validation else None
         options = {"output_weights": spec.training.output_weights, "require_full_rank": require_full_rank}
         problem = pose(train.record, baseline, lags, learner_inputs, **options)
-        if getattr(spec.declared_learner(), "linear", False):
-            problem = problem.seen_linearly()
+        learner, left_out = spec.declared_learner(), ()
+        if learner is not None and problem.excitation.full_rank:
+            problem, _, left_out = independent_terms(problem, learner)
         problem.feature_rows()
         _check_scored(spec, problem)
         _check_cost(spec, problem)
         weighed = weigh_problem(measure_of(spec, problem, path.parent), problem)
         _check_measure(weighed, problem)
         named = {"path": path, "spec": spec, "train": train, "validation": validation, "tests": tests}
-        job = LaggedJob(**named, problem=problem, weighed=weighed, physics=physics)
+        job = LaggedJob(**named, problem=problem, weighed=weighed, physics=physics, left_out=left_out)
         check_suspects(spec.suspects, problem)
         for part in job.parts:
             part.check_scorable(problem.rows.start, train.record.sampling_time)

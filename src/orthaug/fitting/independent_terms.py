@@ -42,7 +42,7 @@ def independent_terms(problem: Problem, learner: Learner | None) -> tuple[Proble
     size = np.linalg.norm(columns, axis=0)
     kept, gone = _told_apart(columns / np.where(size > 0, size, 1.0), phi.shape[1])
     if not gone:
-        return problem, learner, ()
+        return problem, learner if len(learner.terms) == len(texts) else learner.among(texts), ()
     told = (_warning([texts[i] for i in gone]),)
     left = replace(problem, features=Features(tuple(problem.features.entries[i] for i in kept), linear=True))
     return left, learner.among([texts[i] for i in kept]) if kept else None, told
