@@ -117,11 +117,12 @@ def content(
     from orthaug.analysis.motion_ground import suspected_bias
     from orthaug.analysis.motion_imitation import MotionImitation
     from orthaug.analysis.motion_modes import motion_stability
+    from orthaug.analysis.motion_substeps import substep_bias
     from orthaug.physics.excitation import Excitation, of_gram
 
     motion, form = job.problem.motion, fit.model.form
     count, gram = len(motion.names), fit.model.statistics.gram
-    budget = None
+    budget, coarse = None, None
     told: dict[str, Any] = dict.fromkeys((*_UNKNOWN, "residuals", "stability", "shared", "measure_detail"))
     if fit.status.ok:
         fit = robust_motion(fit)
@@ -132,6 +133,8 @@ def content(
             fit.model, *np.split(points, [form.states], axis=1), record=job.train.record
         )
         warnings += told["stability"].warnings
+        coarse = substep_bias(fit)
+        warnings += coarse.warnings if coarse else ()
         table = suspected_bias(fit, job.suspects) if job.suspects else []
         told["bias"], budget = [entry.as_dict() for entry in table] or None, motion_budget(fit, table)
         warnings += budget.warnings if budget else ()
@@ -155,6 +158,7 @@ def content(
             "substeps": form.substeps,
             "hold": motion.hold,
             "window": fit.model.window,
+            "substep_bias": None if coarse is None else coarse.as_dict(),
         },
     }
 

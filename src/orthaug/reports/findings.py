@@ -367,10 +367,14 @@ class MotionCheckResult(Content):
 
 
 class MotionFitResult(Content):
-    """How a fitted motion is integrated, and the rows that a prediction starts from."""
+    """How a fitted motion is integrated, and the rows that a prediction starts from.
+
+    `substep_bias`: the parameters less what a fit with twice the substeps would give.
+    """
 
     states: list[str]
     integrator: str
     substeps: Whole
     hold: str
     window: Whole
+    substep_bias: ByName | None = None
