@@ -244,6 +244,30 @@ def test_what_the_prior_of_the_weights_holds_has_no_interval() -> None:
     assert told.startswith("not identified: b. ") and "the prior of the weights" in told
 
 
+def test_the_band_of_what_is_learned_follows_all_that_was_estimated(fitted: oa.MotionEstimate) -> None:
+    """Its variance is that of the learner's part when (c, w), and p̂ with them, move by columns of a root of Cov."""
+    from orthaug.analysis.learned_part import learned_reach
+    from orthaug.models.motion_parts import parts_at
+
+    x, u = np.stack([np.zeros(5), np.linspace(-1, 1, 5)], axis=1), np.zeros((5, 1))
+    numbers, slope, tiny = fitted.model.numbers, fitted.split_by.slope, 1e-4
+    joint = fitted.model.statistics.joint(3)
+    q, c = numbers.theta, numbers.theta - numbers.theta_aux
+    moved = []
+    for column in tiny * joint.root().T:
+        sides = []
+        for step in (column, -column):
+            at = q + slope @ step
+            changed = {"theta": at, "theta_aux": at - c - step[:3], "weights": numbers.weights + step[3:]}
+            sides.append(parts_at(fitted.model.form, numbers._replace(**changed), x, u)[1])
+        moved.append((sides[0] - sides[1]) / (2 * tiny))
+    half = learned_reach(fitted, x, u)
+    assert half is not None and half.shape == (5, 1)
+    ratio = half / np.linalg.norm(moved, axis=0)
+    np.testing.assert_allclose(ratio, ratio[0, 0], rtol=1e-3)
+    assert 1.96 < ratio[0, 0] < 2.0
+
+
 def test_too_few_substeps_move_the_parameters_as_a_finer_fit_says() -> None:
     """What one linearisation predicts is what a fit with twice as many gives, where little noise shows it."""
     record = data(friction=0.0, noise=5e-4)

@@ -7,6 +7,7 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError
@@ -236,16 +237,11 @@ def _covariance(
     fit: MotionEstimate, split: MotionSplit, at_bound: tuple[str, ...]
 ) -> tuple[Matrix | None, tuple[str, ...]]:
     """Cov q̂ = K Cov(c, w) Kᵀ, and which parameters no output tells, or the prior of the weights rather than they."""
-    names, numbers, statistics = fit.problem.motion.names, fit.model.numbers, fit.model.statistics
-    if split.slope is None or statistics.gram is None or statistics.middle is None:
+    names, made = fit.problem.motion.names, free_covariance(fit)
+    if split.slope is None or made is None:
         return None, ()
-    c = np.asarray(numbers.theta - numbers.theta_aux)
-    low, high = fit.problem.motion.coordinates.bounds
-    moves = np.concatenate([(low < c) & (c < high), np.ones(len(statistics.gram) - len(c), dtype=bool)])
-    kept = np.ix_(moves, moves)  # what stands at a bound is a constant
-    count, gram, slope = int(moves[: len(c)].sum()), statistics.gram[kept], split.slope[:, moves]
-    joint = replace(statistics, gram=gram, middle=statistics.middle[kept]).joint(count)
-    assert joint is not None
+    joint, moves = made
+    slope = split.slope[:, moves]
     covariance = joint.of(slope)
     std, wider = np.sqrt(np.diag(covariance)), _wider_without_prior(joint, slope)
     vague = fit.problem.motion.coordinates.positive & (std > _VAGUE / wider)
@@ -254,6 +250,20 @@ def _covariance(
         if name in unseen or name in at_bound:
             covariance[i] = covariance[:, i] = np.nan
     return covariance, unseen
+
+
+def free_covariance(fit: MotionEstimate) -> tuple[JointCovariance, Bool[np.ndarray, "n"]] | None:
+    """Cov (c, w) of what is not at a bound, and which entries these are; None without statistics."""
+    numbers, statistics = fit.model.numbers, fit.model.statistics
+    if statistics.gram is None or statistics.middle is None:
+        return None
+    c = np.asarray(numbers.theta - numbers.theta_aux)
+    low, high = fit.problem.motion.coordinates.bounds
+    moves = np.concatenate([(low < c) & (c < high), np.ones(len(statistics.gram) - len(c), dtype=bool)])
+    kept = np.ix_(moves, moves)  # what stands at a bound is a constant
+    own = replace(statistics, gram=statistics.gram[kept], middle=statistics.middle[kept])
+    joint = own.joint(int(moves[: len(c)].sum()))
+    return None if joint is None else (joint, moves)
 
 
 def _wider_without_prior(joint: JointCovariance, slope: Matrix) -> Vector:
