@@ -16,12 +16,15 @@ import numpy as np
 from machine import describe
 
 import orthaug as oa
+from orthaug.analysis.learned_part import learned_reach
+from orthaug.models.motion_parts import parts_at
 
 M, C, K, COULOMB = 1.0, 2.0, 100.0, 1.5
 TS, ROWS, HELD, FINE = 0.01, 1000, 25, 10
 NOISE = 10**-1.5  # over the output's deviation
 NAMES = ("m", "c", "k")
 DRAWS = 200
+SPEEDS = np.linspace(-4, 4, 17)  # m/s, nearly the reach of the data; friction turns over within 0.1 m/s of 0
 
 
 class Plant(NamedTuple):
@@ -78,6 +81,8 @@ class Draws(NamedTuple):
     values: np.ndarray
     std: np.ndarray
     inside: np.ndarray
+    curve: np.ndarray
+    """Whether the band of the learned curve holds the true one (n, speeds)."""
     without: int
     """Draws without intervals."""
 
@@ -97,6 +102,15 @@ class Draws(NamedTuple):
         return 100 * self.inside.mean(axis=0)
 
 
+def curve_inside(fit: oa.MotionEstimate) -> np.ndarray:
+    """Whether the 95 % band of what is learned over the velocity holds friction less the nearest damper (speeds,)."""
+    x, u = np.stack([0 * SPEEDS, SPEEDS], axis=1), np.zeros((len(SPEEDS), 1))
+    true = ((plant().true[1] - C) * SPEEDS - friction(SPEEDS)) / M
+    half = learned_reach(fit, x, u)
+    assert half is not None
+    return np.abs(parts_at(fit.model.form, fit.model.numbers, x, u)[1][:, 0] - true) <= half[:, 0]
+
+
 @cache
 def drawn(draws: int) -> Draws:
     found, without = [], 0
@@ -106,15 +120,21 @@ def drawn(draws: int) -> Draws:
             without += 1
             continue
         low, high = fit.interval.T
-        found.append((fit.values, fit.std, (low <= plant().true) & (plant().true <= high)))
-    values, std, inside = (np.array(part) for part in zip(*found, strict=True))
-    return Draws(values, std, inside, without)
+        found.append((fit.values, fit.std, (low <= plant().true) & (plant().true <= high), curve_inside(fit)))
+    values, std, inside, curve = (np.array(part) for part in zip(*found, strict=True))
+    return Draws(values, std, inside, curve, without)
 
 
 def table() -> list[list[float]]:
     """Bias, scatter and coverage of each parameter, as in benchmarks/README.md."""
     found = drawn(DRAWS)
     return [[float(v) for v in row] for row in zip(found.bias, found.scatter, found.coverage, strict=True)]
+
+
+def band() -> list[float]:
+    """Coverage of the learned curve's band in percent: where friction is smooth, and within 0.5 m/s of its turn."""
+    curve, near = drawn(DRAWS).curve, np.abs(SPEEDS) <= 0.5
+    return [float(100 * curve[:, part].mean()) for part in (~near, near)]
 
 
 def main(draws: int) -> None:
@@ -130,6 +150,13 @@ def main(draws: int) -> None:
     rows = zip(NAMES, plant().true, found.bias, found.scatter, found.coverage, strict=True)
     for name, true, bias, scatter, coverage in rows:
         print(f"| {name} | {true:.3f} | {bias:.2f} | {scatter:.2f} | {coverage:.1f} % |")
+    near = np.abs(SPEEDS) <= 0.5
+    smooth, turn = (100 * found.curve[:, part].mean() for part in (~near, near))
+    print(
+        f"\nThe band of the learned curve holds the true one at {smooth:.0f} % of the speeds beyond 0.5 m/s, at ",
+        end="",
+    )
+    print(f"{turn:.0f} % of those within.")
 
 
 if __name__ == "__main__":

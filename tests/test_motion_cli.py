@@ -160,13 +160,9 @@ def test_a_result_has_what_a_motion_has_and_null_for_the_rest(result):
     assert result["excitation"]["rank"] == result["excitation"]["columns"] == 3
     assert result["orthogonality_defect"] < 1e-10
     assert result["shared"]["inputs"] == ["v"] and result["shared"]["determined"] == ["m", "k"]
-    assert result["motion"] | {"window": 0} == {
-        "states": ["x", "v"],
-        "integrator": "rk4",
-        "substeps": 1,
-        "hold": "zero-order",
-        "window": 0,
-    }
+    own = {"states": ["x", "v"], "integrator": "rk4", "substeps": 1, "hold": "zero-order"}
+    assert {key: result["motion"][key] for key in own} == own
+    assert set(result["motion"]) == {*own, "window", "parts", "substep_bias"}
     for key in ("physical_parameters", "physical_consistency", "sensitivities", "bias", "missing_lags"):
         assert result[key] is None
     found = result["residuals"]
@@ -178,6 +174,11 @@ def test_the_folder_has_figures_and_a_page(folder, printed, result):
     figures = {path.stem for path in (folder / "out" / "figures").iterdir()}
     assert figures == {"simulation", "prediction", "residual", "states", "components", "learner"}
     page = (folder / "out" / "report.html").read_text()
+    assert "<code>(force - c*v - k*x)/m</code>" in page and "<td>dv/dt</td>" in page
+    (part,) = result["motion"]["parts"]
+    assert (part["equation"], part["unit"]) == ("dv/dt", "m/s²") and 0.01 < part["share"] < 0.2
+    assert part["share"] == pytest.approx(part["learner"] / part["physics"], rel=0.2)
+    assert set(result["motion"]["substep_bias"]) == set("mck")
     assert result["shared"]["text"] in printed
     assert all(name in page for name in figures)
 

@@ -226,6 +226,60 @@ def test_what_no_output_tells_has_no_interval() -> None:
     assert "not identified: b, g" in fit.summary()
 
 
+def test_what_the_prior_of_the_weights_holds_has_no_interval() -> None:
+    """A learned sensor may read a hidden state in any unit: of its scale b the weights' prior is all that is known."""
+    rng = np.random.default_rng(0)
+    u, x, y = rng.normal(size=150), 0.0, []
+    for value in u:
+        y.append(x + 0.3 * np.tanh(x / 0.1))
+        x += TS * (-2 * x + 3 * value)
+    record = oa.Record.from_arrays(u=u, y=np.array(y) + 0.01 * rng.normal(size=150), sampling_time=TS)
+    outputs = [oa.Output("y", "z", learned=True)]
+    motion = oa.Motion.from_equations([oa.State("z", "-a*z + b*u")], outputs, positive(a=1.0, b=1.0), ["u"])
+    fit = oa.estimate(record, motion, learner=oa.MLP((4,), inputs=("z",)), criterion=WHOLE, blocks=0)
+    assert fit.unidentified == ("b",) and np.isnan(fit.std[1])
+    decay = 1 - 2 * TS  # of the record's own step; the motion runs between samples
+    assert fit.values[0] == pytest.approx(-np.log(decay) / TS, abs=3 * fit.std[0])
+    (told,) = [warning.text for warning in fit.warnings if warning.code == "not_identified"]
+    assert told.startswith("not identified: b. ") and "the prior of the weights" in told
+
+
+def test_the_band_of_what_is_learned_follows_all_that_was_estimated(fitted: oa.MotionEstimate) -> None:
+    """Its variance is that of the learner's part when (c, w), and p̂ with them, move by columns of a root of Cov."""
+    from orthaug.analysis.learned_part import learned_reach
+    from orthaug.models.motion_parts import parts_at
+
+    x, u = np.stack([np.zeros(5), np.linspace(-1, 1, 5)], axis=1), np.zeros((5, 1))
+    numbers, slope, tiny = fitted.model.numbers, fitted.split_by.slope, 1e-4
+    joint = fitted.model.statistics.joint(3)
+    q, c = numbers.theta, numbers.theta - numbers.theta_aux
+    moved = []
+    for column in tiny * joint.root().T:
+        sides = []
+        for step in (column, -column):
+            at = q + slope @ step
+            changed = {"theta": at, "theta_aux": at - c - step[:3], "weights": numbers.weights + step[3:]}
+            sides.append(parts_at(fitted.model.form, numbers._replace(**changed), x, u)[1])
+        moved.append((sides[0] - sides[1]) / (2 * tiny))
+    half = learned_reach(fitted, x, u)
+    assert half is not None and half.shape == (5, 1)
+    ratio = half / np.linalg.norm(moved, axis=0)
+    np.testing.assert_allclose(ratio, ratio[0, 0], rtol=1e-3)
+    assert 1.96 < ratio[0, 0] < 2.0
+
+
+def test_too_few_substeps_move_the_parameters_as_a_finer_fit_says() -> None:
+    """What one linearisation predicts is what a fit with twice as many gives, where little noise shows it."""
+    record = data(friction=0.0, noise=5e-4)
+    fits = [oa.estimate(record, spring(substeps=n), learner=None, criterion=WHOLE) for n in (1, 2)]
+    found, finer = (oa.substep_bias(fit) for fit in fits)
+    assert found is not None and finer is not None and (found.substeps, finer.substeps) == (1, 2)
+    moved = fits[0].values - fits[1].values
+    assert (np.abs(found.value - moved) < 0.02 * np.abs(fits[0].std)).all()
+    assert found.errors.max() > 0.1 and "substeps = 2 or more" in found.warnings[0].text
+    assert finer.errors.max() < 0.1 and not finer.warnings
+
+
 def test_a_model_runs_on_other_records(fitted: oa.MotionEstimate) -> None:
     record, model = data(seed=7), fitted.model
     free = model.simulate(record)

@@ -8,6 +8,7 @@ from .analysis import design_input as design_input
 from .analysis import design_motion_input as design_motion_input
 from .analysis import diagnose as diagnose
 from .analysis import stability as stability
+from .analysis import substep_bias as substep_bias
 from .analysis import suspected_bias as suspected_bias
 from .analysis import verdict as verdict
 from .commands import fit_spec as fit_spec

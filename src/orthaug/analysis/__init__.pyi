@@ -4,6 +4,7 @@ from .design import design_input as design_input
 from .free_run_stability import stability as stability
 from .motion_design import design_motion_input as design_motion_input
 from .motion_ground import suspected_bias as suspected_bias
+from .motion_substeps import substep_bias as substep_bias
 from .motion_suspects import MotionSuspect as MotionSuspect
 from .suspects import Suspect as Suspect
 from .verdict_on_parts import verdict as verdict

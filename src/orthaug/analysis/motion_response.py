@@ -75,7 +75,7 @@ class TermsResponse:
         free = self.fitted.copy()
         free[: self.parameters] &= ~apart
         found = np.zeros(len(free))
-        found[free] = _solved(self.penalised[np.ix_(free, free)], self.information[free, self.parameters + k])
+        found[free] = solved(self.penalised[np.ix_(free, free)], self.information[free, self.parameters + k])
         return found[: self.parameters], found[self.parameters + self.terms :]
 
     @property
@@ -142,7 +142,7 @@ class TermsResponse:
         row = np.zeros(len(self.fitted))
         row[i] = 1.0
         across = self.information[self.fitted, i]
-        row[self.fitted] = -_solved(self.penalised[np.ix_(self.fitted, self.fitted)], across)
+        row[self.fitted] = -solved(self.penalised[np.ix_(self.fitted, self.fitted)], across)
         return row, float(self.information[i, i] + across @ row[self.fitted])
 
 
@@ -166,7 +166,7 @@ def respond_to(place: Place, added: tuple[AddedTerm, ...]) -> TermsResponse:
     return TermsResponse(place, form, numbers, information, gradient, slope, fitted, len(added))
 
 
-def _solved(matrix: Matrix, right: Vector) -> Vector:
+def solved(matrix: Matrix, right: Vector) -> Vector:
     """Least squares with unit columns; what nothing tells stays at 0."""
     if not len(matrix):
         return np.zeros(0)

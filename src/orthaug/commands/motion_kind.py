@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -112,26 +113,30 @@ def content(
     warnings: list[Any],
 ) -> tuple[MotionEstimate, dict[str, Any]]:
     """The fit, and what results tell of it; warnings are added."""
+    from orthaug.analysis.learned_part import equation_parts
     from orthaug.analysis.motion_budget import motion_budget
     from orthaug.analysis.motion_diagnosis import diagnose_motion, robust_motion
     from orthaug.analysis.motion_ground import suspected_bias
     from orthaug.analysis.motion_imitation import MotionImitation
     from orthaug.analysis.motion_modes import motion_stability
+    from orthaug.analysis.motion_substeps import substep_bias
     from orthaug.physics.excitation import Excitation, of_gram
 
     motion, form = job.problem.motion, fit.model.form
     count, gram = len(motion.names), fit.model.statistics.gram
-    budget = None
+    budget, coarse, parts = None, None, ()
     told: dict[str, Any] = dict.fromkeys((*_UNKNOWN, "residuals", "stability", "shared", "measure_detail"))
     if fit.status.ok:
         fit = robust_motion(fit)
         told["residuals"] = diagnose_motion(fit, responses[job.train.name][1])
         warnings += [_NOT_ANALYSED] if told["residuals"] is None else told["residuals"].warnings
         points = job.reach(fit.model, job.train.record)[0]
-        told["stability"] = motion_stability(
-            fit.model, *np.split(points, [form.states], axis=1), record=job.train.record
-        )
+        x, u = np.split(points, [form.states], axis=1)
+        told["stability"] = motion_stability(fit.model, x, u, record=job.train.record)
+        parts = equation_parts(fit, x, u) if form.bound is not None else ()
         warnings += told["stability"].warnings
+        coarse = substep_bias(fit)
+        warnings += coarse.warnings if coarse else ()
         table = suspected_bias(fit, job.suspects) if job.suspects else []
         told["bias"], budget = [entry.as_dict() for entry in table] or None, motion_budget(fit, table)
         warnings += budget.warnings if budget else ()
@@ -155,6 +160,8 @@ def content(
             "substeps": form.substeps,
             "hold": motion.hold,
             "window": fit.model.window,
+            "parts": parts,
+            "substep_bias": None if coarse is None else coarse.as_dict(),
         },
     }
 
@@ -163,6 +170,7 @@ def figures(
     job: MotionJob, fit: MotionEstimate, result: FitResult, responses: Mapping[str, tuple[Response, Response]]
 ) -> dict[str, Figure]:
     """The figures of a result by their names."""
+    from orthaug.analysis.learned_part import learned_reach
     from orthaug.reports import motion_plots, plots
 
     part = job.parts[-1]
@@ -178,7 +186,9 @@ def figures(
     drawn["prediction"] = plots.output_figure(one_step, f"one-step prediction, {part.name}")
     if learns:
         drawn["components"] = motion_plots.parts_figure(fit.model, part.record, f"physics and learner, {part.name}")
-        drawn["learner"] = motion_plots.learner_figure(fit.model, job.train.record, "learned beside the physics")
+        drawn["learner"] = motion_plots.learner_figure(
+            fit.model, job.train.record, "learned beside the physics", partial(learned_reach, fit)
+        )
     return drawn
 
 

@@ -7,6 +7,7 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError
@@ -27,7 +28,7 @@ from orthaug.inference.measures import Measure, Training
 from orthaug.inference.motion_split import MotionSplit, split_motion
 from orthaug.models.dynamics import Numbers
 from orthaug.models.motion_model import MotionModel
-from orthaug.models.statistics import column_units
+from orthaug.models.statistics import JointCovariance, column_units
 from orthaug.physics.motion_layout import layout_of
 from orthaug.physics.motion_problem import MotionProblem
 from orthaug.physics.shared import Shared
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 
 _UNSEEN = 1e-3  # share of a parameter in directions that no output shows, above which it is not identified
 _VAGUE = 1.0  # standard error of a logarithm above which only the order of magnitude is known
+_LEANING = 2.0  # times wider an interval without the prior of the weights: three quarters of what is known is the prior
 _ROUNDING = 1e-11  # of the largest eigenvalue of the information with unit columns
 
 
@@ -71,7 +73,7 @@ class MotionEstimate:
     """The covariance for white noise, where `covariance` is robust; None where it is not."""
     at_bound: tuple[str, ...] = ()
     unidentified: tuple[str, ...] = ()
-    """Parameters that no output tells beside the learner."""
+    """Parameters that no output tells beside the learner, or only the prior of its weights."""
     held_out: HeldOut | None = None
     warnings: tuple[Warning, ...] = ()
 
@@ -234,29 +236,51 @@ def _with_split(fit: MotionEstimate, split: MotionSplit, told: tuple[Warning, ..
 def _covariance(
     fit: MotionEstimate, split: MotionSplit, at_bound: tuple[str, ...]
 ) -> tuple[Matrix | None, tuple[str, ...]]:
-    """Cov q̂ = K Cov(c, w) Kᵀ, and which parameters no output tells."""
-    names, numbers, statistics = fit.problem.motion.names, fit.model.numbers, fit.model.statistics
-    if split.slope is None or statistics.gram is None or statistics.middle is None:
+    """Cov q̂ = K Cov(c, w) Kᵀ, and which parameters no output tells, or the prior of the weights rather than they."""
+    names, made = fit.problem.motion.names, free_covariance(fit)
+    if split.slope is None or made is None:
         return None, ()
-    c = np.asarray(numbers.theta - numbers.theta_aux)
-    low, high = fit.problem.motion.coordinates.bounds
-    moves = np.concatenate([(low < c) & (c < high), np.ones(len(statistics.gram) - len(c), dtype=bool)])
-    kept = np.ix_(moves, moves)  # what stands at a bound is a constant
-    count, gram, slope = int(moves[: len(c)].sum()), statistics.gram[kept], split.slope[:, moves]
-    joint = replace(statistics, gram=gram, middle=statistics.middle[kept]).joint(count)
-    assert joint is not None
-    unit = column_units(gram, count)
-    values, vectors = np.linalg.eigh(gram * np.outer(unit, unit))
-    hidden = vectors[:, values <= _ROUNDING * values.max(initial=0.0)]
-    own = slope * unit
-    share = np.linalg.norm(own @ hidden, axis=1) / np.maximum(np.linalg.norm(own, axis=1), 1e-300)
+    joint, moves = made
+    slope = split.slope[:, moves]
     covariance = joint.of(slope)
-    vague = np.sqrt(np.diag(covariance)) > np.where(fit.problem.motion.coordinates.positive, _VAGUE, np.inf)
-    unseen = tuple(name for name, part, wide in zip(names, share, vague, strict=True) if part > _UNSEEN or wide)
+    std, wider = np.sqrt(np.diag(covariance)), _wider_without_prior(joint, slope)
+    vague = fit.problem.motion.coordinates.positive & (std > _VAGUE / wider)
+    unseen = tuple(name for name, hidden in zip(names, vague | (wider > _LEANING), strict=True) if hidden)
     for i, name in enumerate(names):
         if name in unseen or name in at_bound:
             covariance[i] = covariance[:, i] = np.nan
     return covariance, unseen
+
+
+def free_covariance(fit: MotionEstimate) -> tuple[JointCovariance, Bool[np.ndarray, "n"]] | None:
+    """Cov (c, w) of what is not at a bound, and which entries these are; None without statistics."""
+    numbers, statistics = fit.model.numbers, fit.model.statistics
+    if statistics.gram is None or statistics.middle is None:
+        return None
+    c = np.asarray(numbers.theta - numbers.theta_aux)
+    low, high = fit.problem.motion.coordinates.bounds
+    moves = np.concatenate([(low < c) & (c < high), np.ones(len(statistics.gram) - len(c), dtype=bool)])
+    kept = np.ix_(moves, moves)  # what stands at a bound is a constant
+    own = replace(statistics, gram=statistics.gram[kept], middle=statistics.middle[kept])
+    joint = own.joint(int(moves[: len(c)].sum()))
+    return None if joint is None else (joint, moves)
+
+
+def _wider_without_prior(joint: JointCovariance, slope: Matrix) -> Vector:
+    """How many times wider the intervals of K (c, w) were without the ridge on w (m,); inf where nothing tells them.
+
+    Both for white noise: the question is where the information comes from.
+    """
+    gram = joint.gram
+    unit = column_units(gram, joint.nt)
+    values, vectors = np.linalg.eigh(gram * np.outer(unit, unit))
+    hidden = vectors[:, values <= _ROUNDING * values.max(initial=0.0)]
+    own = slope * unit
+    share = np.linalg.norm(own @ hidden, axis=1) / np.maximum(np.linalg.norm(own, axis=1), 1e-300)
+    white = replace(joint, middle=gram)
+    with_prior, by_data = (np.sqrt(np.diag(one.of(slope))) for one in (white, replace(white, ridge=0.0)))
+    wider = by_data / np.where(with_prior > 0, with_prior, 1.0)
+    return np.where(share > _UNSEEN, np.inf, np.maximum(wider, 1.0))
 
 
 def _doubts(split: MotionSplit, at_bound: tuple[str, ...], unseen: tuple[str, ...], learns: bool) -> list[Warning]:
@@ -273,7 +297,8 @@ def _doubts(split: MotionSplit, at_bound: tuple[str, ...], unseen: tuple[str, ..
         told.append(Warning("at_a_bound", text))
     if unseen:
         text = (
-            f"not identified: {', '.join(unseen)}. Other values give the same outputs, so there is no interval; "
+            f"not identified: {', '.join(unseen)}. Other values, with other weights of the learner, give the same "
+            "outputs or nearly so, and what picks among them is the prior of the weights, so there is no interval; "
             "measure more, fix one of them as a constant, or let the learner see less or add it to fewer equations."
         )
         if not learns:

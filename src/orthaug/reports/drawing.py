@@ -131,9 +131,11 @@ def window(response: Response) -> tuple[np.ndarray, slice]:
     return np.arange(rows.start, rows.stop) * response.sampling_time, rows
 
 
-def legend(axis: Axes) -> None:
-    """What the lines are, above the panel."""
-    axis.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, fontsize=8, frameon=False, ncols=3)
+def legend(axis: Axes, *shown: Any) -> None:
+    """What the lines are, above the panel: its own, or the handles and labels that are `shown`."""
+    axis.legend(
+        *shown, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, fontsize=8, frameon=False, ncols=3
+    )
 
 
 def save(figure: Figure, path: Path, kind: str = "png") -> None:

@@ -366,11 +366,26 @@ class MotionCheckResult(Content):
     text: str
 
 
+class EquationPartsResult(Content):
+    """RMS of what physics and learner add to a learned equation or output along the training run, in its unit."""
+
+    equation: str
+    unit: str
+    physics: Number
+    learner: Number
+    share: Number
+
+
 class MotionFitResult(Content):
-    """How a fitted motion is integrated, and the rows that a prediction starts from."""
+    """How a fitted motion is integrated, and the rows that a prediction starts from.
+
+    `substep_bias`: the parameters less what a fit with twice the substeps would give.
+    """
 
     states: list[str]
     integrator: str
     substeps: Whole
     hold: str
     window: Whole
+    parts: list[EquationPartsResult] = []
+    substep_bias: ByName | None = None

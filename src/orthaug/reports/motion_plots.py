@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orthaug._base.checks import Matrix
+from orthaug._base.checks import Matrix, Vector
 from orthaug.data.record import Record
 from orthaug.models.motion_parts import labels_of, parts_at
 from orthaug.models.response import Response
@@ -97,10 +98,15 @@ def parts_figure(model: MotionModel, record: Record, title: str) -> Figure:
 
 
 @plain
-def learner_figure(model: MotionModel, record: Record, title: str) -> Figure:
+def learner_figure(
+    model: MotionModel, record: Record, title: str, reach: Callable[[Matrix, Matrix], Matrix | None] | None = None
+) -> Figure:
     """What was learned over each input of the learner: along the training run, and as a curve where that is one.
 
     The curve of a state or input is drawn with all others at their medians, dashed beyond the reach of the data.
+
+    Args:
+        reach: half the length of its 95 % intervals (M, nl) at states and inputs; None where there are none.
     """
     states, inputs = _trajectory(model, record)
     chosen = np.linspace(0, len(states) - 1, min(len(states), _MOST_POINTS)).astype(int)
@@ -121,18 +127,37 @@ def learner_figure(model: MotionModel, record: Record, title: str) -> Figure:
             axis.plot(features[j], values[:, k], ".", color=GREY, markersize=6, label="training run")
             curve = _curve(model, states, inputs, feature)
             if curve is not None:
-                along, inside, learned = curve
+                along, inside, learned, (x, u) = curve
+                half = None if reach is None else reach(x, u)
+                low, high = _limits(learned[:, k], values[:, k])
+                if half is not None:
+                    band = learned[:, k] - half[:, k], learned[:, k] + half[:, k]
+                    axis.fill_between(along, *band, color=GREEN, alpha=0.2, linewidth=0, label="95 % interval")
+                    axis.set_ylim(low, high)
+                axis.axvspan(along[inside][0], along[inside][-1], color=GREY, alpha=0.15, linewidth=0, zorder=0)
                 axis.plot(along, learned[:, k], "--", color=GREEN, linewidth=1.0)
                 axis.plot(along[inside], learned[inside, k], color=GREEN, linewidth=1.2, label="learner")
-            label(axis, x=_with_unit(feature, _units(model).get(feature, "")), y=name)
-            legend(axis)
+            label(axis, x=_with_unit(feature, _units(model).get(feature, "")), y=None if column else name)
     for axis in axes.flat:
         axis.set_visible(bool(axis.lines))
+    told = max(axes[0], key=lambda axis: len(axis.get_legend_handles_labels()[1]))
+    legend(axes[0, -1] if axes[0, -1].lines else told, *told.get_legend_handles_labels())
     return figure
 
 
-def _curve(model: MotionModel, states: Matrix, inputs: Matrix, feature: str) -> tuple[Any, Any, Any] | None:
-    """Values of a state or input, which of them the data reach, and what is learned there; None of an expression."""
+def _limits(curve: Vector, cloud: Vector) -> tuple[float, float]:
+    """What a panel shows: the curve and the cloud, not all of a band that widens where there are no data."""
+    both = np.concatenate([curve, cloud])
+    low, high = float(np.nanmin(both)), float(np.nanmax(both))
+    margin = 0.15 * max(high - low, 1e-12)
+    return low - margin, high + margin
+
+
+def _curve(model: MotionModel, states: Matrix, inputs: Matrix, feature: str) -> tuple[Any, Any, Any, Any] | None:
+    """Values of a state or input, which of them the data reach, what is learned there, and states and inputs there.
+
+    None of an expression.
+    """
     motion = model.form.motion
     names = (*motion.names_of_states, *motion.inputs)
     if feature not in names:
@@ -144,7 +169,7 @@ def _curve(model: MotionModel, states: Matrix, inputs: Matrix, feature: str) -> 
     rows = np.tile(np.median(points, axis=0), (_CURVE, 1))
     rows[:, place] = along
     x, u = np.split(rows, [states.shape[1]], axis=1)
-    return along, (along >= low) & (along <= high), parts_at(model.form, model.numbers, x, u)[1]
+    return along, (along >= low) & (along <= high), parts_at(model.form, model.numbers, x, u)[1], (x, u)
 
 
 def _trajectory(model: MotionModel, record: Record) -> tuple[Matrix, Matrix]:
