@@ -1,8 +1,8 @@
 """What has a learner found? Its output over data, regressed on suspected terms and on products of what it sees.
 
 Forward orthogonal regression: the physics is projected out first where the learner shares directions with it, then the
-term that explains most beside those that are in comes next. A term that is in gives way to a better one (sequential
-replacement), and widths, of a Stribeck curve say, are refined with all others in.
+term that explains most beside those that are in comes next, or a pair that explains more than it and one that is in
+(replacement). Widths, of a Stribeck curve say, are refined with all others in.
 """
 
 from __future__ import annotations
@@ -27,12 +27,14 @@ TERM = "term"
 """The kind of a product of what the learner sees."""
 _PLAIN = ("coulomb", "quadratic_drag", "cubic")
 _WIDE = tuple(kind for kind in ("stribeck", "stribeck_gauss", "dead_zone", "saturation") if kind in WIDTHS)
-_WIDTHS = (0.125, 0.25, 0.5, 1.0, 2.0)  # times the median size of what a term acts on
-_REFINED = 3.0  # how far, as a factor, a width is moved from where it was found
+_WIDTHS = tuple(2.0 ** (i / 2) for i in range(-8, 3))  # times the median size of what a term acts on
+_REFINED = 2.0  # how far, as a factor, a width is moved from where it was found
+_COMPLEXITY = dict.fromkeys(_PLAIN, 1) | {"stribeck": 3, "stribeck_gauss": 3, "dead_zone": 4, "saturation": 4}
 _OWN = 1e-4  # of a candidate's squared norm: what physics, learner and other terms must leave of it
-_TIE = 0.002  # share of the learner: within this of the best the simpler term is taken, also where nothing is noise
-_DRAWS = 4.0  # variances of the noise in one direction: less tells no two terms apart
-_ROUNDS = 10  # of replacements
+_TIE, _TIE_UNKNOWN = 2e-4, 2e-3  # share of the learner: within this of the best the simpler term is taken
+_DRAWS = 10.0  # variances of the noise in one direction: what two terms with widths differ by at random
+_TRIED = 15  # kinds of terms, or pairs of kinds, that are refined before the choice
+_BLOCK, _LOOKED = 256, 200  # candidates whose pairs are looked at together, and pairs of them
 _T = 2.0  # standard errors that a coefficient must differ from 0
 
 
@@ -56,9 +58,15 @@ class Candidate:
         """In words."""
         return self.text if self.kind == TERM else f"{self.kind} of {self.on}"
 
-    def akin(self, other: Candidate) -> bool:
-        """Whether they differ in width only."""
-        return (self.kind, self.on, self.place) == (other.kind, other.on, other.place) and self.kind != TERM
+    @property
+    def complexity(self) -> int:
+        """Of terms that explain as much the simplest is taken. A learner is smooth: clipping imitates jumps last."""
+        return _COMPLEXITY.get(self.kind, 2 + self.text.replace("**", "").count("*"))
+
+    @property
+    def identity(self) -> tuple[str, str, int]:
+        """What it is whatever its width."""
+        return self.kind, self.text if self.on is None else self.on, self.place
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +98,8 @@ class Space:
                 columns.append(column)
         table = np.array(columns).reshape(len(columns), len(shown.target))
         target = shown.target / norm if norm > 1e-9 * shown.size else 0.0 * shown.target
-        tie = max(_TIE, _DRAWS * shown.noise / norm**2) if norm > 0 else _TIE
+        tie = _TIE_UNKNOWN if shown.covariance is None else _TIE
+        tie = max(tie, _DRAWS * shown.noise / norm**2) if norm > 0 else tie
         return cls(ground, shown, target, norm, tuple(kept), table, tie)
 
     @property
@@ -171,38 +180,70 @@ def select(space: Space, most: int, least: float) -> list[Candidate]:
     """
     chosen: list[Candidate] = []
     while len(chosen) < most and not space.empty:
-        columns = [space.column(one) for one in chosen]
-        gains = space.gains(columns)
-        if gains.max(initial=0.0) < least:
-            break
-        grown = _replaced(space, [*chosen, space.candidates[_simplest(gains, space.tie)]])
-        if space.explained([space.column(one) for one in grown]) < space.explained(columns) + least:
+        grown = _grown(space, chosen)
+        if not grown or _share(space, grown) < _share(space, chosen) + least:
             break
         chosen = grown
     return _ordered(space, _pruned(space, chosen, least))
 
 
-def _simplest(gains: Vector, tie: float) -> int:
-    """The first candidate that is as good as the best: simple terms come first."""
-    return int(np.flatnonzero(gains >= max(gains.max() - tie, 1e-12))[0])
+def _share(space: Space, chosen: Sequence[Candidate]) -> float:
+    return space.explained([space.column(one) for one in chosen])
 
 
-def _replaced(space: Space, chosen: list[Candidate]) -> list[Candidate]:
-    """Each term replaced by a better one beside the others, until none is; widths refined."""
-    for _ in range(_ROUNDS):
-        chosen, before = _refined(space, chosen), chosen
-        moved = False
-        for i in range(len(chosen)):
-            columns = [space.column(one) for one in chosen]
-            others = columns[:i] + columns[i + 1 :]
-            base, whole = space.explained(others), space.explained(columns)
-            gains = space.gains(others)
-            best = space.candidates[_simplest(gains, space.tie)] if gains.max() > 0 else chosen[i]
-            if base + gains.max() > whole + 2 * space.tie and not best.akin(chosen[i]):
-                chosen, moved = [*chosen[:i], best, *chosen[i + 1 :]], True
-        if not moved and chosen == before:
+def _grown(space: Space, chosen: list[Candidate]) -> list[Candidate]:
+    """One term more: beside all that are in, or a pair beside all but one; widths refined, the simplest of the best.
+
+    Friction has the sum of a jump and of a peak, neither of which is the best term alone.
+    """
+    trials = [[*chosen, one] for one in _best_single(space, chosen)]
+    for i in range(len(chosen)):
+        others = chosen[:i] + chosen[i + 1 :]
+        trials += [[*others, *pair] for pair in _best_pairs(space, others)]
+    trials = [_refined(space, trial) for trial in trials]
+    shares = [_share(space, trial) for trial in trials]
+    able = [i for i, share in enumerate(shares) if share >= max(shares) - space.tie]
+    best = min(able, key=lambda i: (sum(one.complexity for one in trials[i]), -shares[i]), default=None)
+    return [] if best is None else trials[best]
+
+
+def _best_single(space: Space, chosen: Sequence[Candidate]) -> list[Candidate]:
+    """The terms that explain most beside those that are chosen."""
+    gains = space.gains([space.column(one) for one in chosen])
+    found: dict[Any, Candidate] = {}
+    for i in np.argsort(-gains, kind="stable"):
+        if len(found) == _TRIED or gains[i] <= 0:
             break
-    return _refined(space, chosen)
+        found.setdefault(space.candidates[int(i)].identity, space.candidates[int(i)])
+    return list(found.values())
+
+
+def _best_pairs(space: Space, others: Sequence[Candidate]) -> list[tuple[Candidate, Candidate]]:
+    """The pairs that explain most together beside others, of each two kinds the best."""
+    basis = basis_of([space.column(one) for one in others])
+    x, y = space.columns, without(space.target, basis)
+    if basis.size:
+        x = x - (x @ basis) @ basis.T
+    size, along = np.einsum("kr,kr->k", x, x), x @ y
+    able = np.flatnonzero(size > _OWN)
+    x, size, along = x[able], size[able], along[able]
+    found: dict[Any, tuple[float, Candidate, Candidate]] = {}
+    for begin in range(0, len(able), _BLOCK):
+        rows = slice(begin, begin + _BLOCK)
+        across = x[rows] @ x.T
+        left = np.outer(size[rows], size) - across**2
+        gain = along[rows, None] ** 2 * size + along**2 * size[rows, None] - 2 * np.outer(along[rows], along) * across
+        gain = np.where(left > _OWN * np.outer(size[rows], size), gain / np.where(left > 0, left, 1.0), 0.0)
+        gain = np.where(np.arange(len(able)) > begin + np.arange(len(gain))[:, None], gain, 0.0)
+        best = np.argpartition(-gain, min(_LOOKED, gain.size - 1), axis=None)[:_LOOKED]
+        for flat in best[np.argsort(-gain.ravel()[best], kind="stable")]:
+            i, j = np.unravel_index(flat, gain.shape)
+            one, other = space.candidates[able[begin + i]], space.candidates[able[j]]
+            kinds = (one.identity, other.identity)
+            if gain[i, j] > found.get(kinds, (0.0,))[0]:
+                found[kinds] = (float(gain[i, j]), one, other)
+    ordered = sorted(found.values(), key=lambda entry: -entry[0])
+    return [(one, other) for _, one, other in ordered[:_TRIED]]
 
 
 def _refined(space: Space, chosen: list[Candidate]) -> list[Candidate]:
@@ -295,7 +336,7 @@ def rivals(space: Space, chosen: Sequence[Candidate], number: int, most: int = 3
     near = gains >= space.explained(columns) - 2 * space.tie
     own = chosen[number]
     found = [space.candidates[int(i)] for i in np.argsort(-gains) if near[int(i)]]
-    names = dict.fromkeys(one.name for one in found if not one.akin(own) and one.text != own.text)
+    names = dict.fromkeys(one.name for one in found if one.identity != own.identity)
     return tuple(names)[:most]
 
 
@@ -304,7 +345,7 @@ def alone(space: Space, most: int) -> list[tuple[Candidate, float]]:
     gains, found = space.gains([]), []
     for i in np.argsort(-gains, kind="stable"):
         candidate = space.candidates[int(i)]
-        if gains[i] > 0 and not any(candidate.akin(other) or candidate.text == other.text for other, _ in found):
+        if gains[i] > 0 and all(candidate.identity != other.identity for other, _ in found):
             found.append((candidate, float(min(gains[i], 1.0))))
         if len(found) == most:
             break
