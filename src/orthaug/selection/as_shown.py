@@ -14,12 +14,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.special
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug.selection.explained_ground import Ground
 
 _RANK = 1e-9  # of the largest singular value
+_ROUNDING = 1e-8  # of the largest variance
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +64,16 @@ class Shown:
     def noise(self) -> float:
         """The variance of the learner's errors in a direction, on average; 0 where it is not known."""
         return 0.0 if self.covariance is None else float(np.trace(self.covariance)) / max(len(self.target), 1)
+
+    @property
+    def p(self) -> float | None:
+        """Of the learner being nothing but its own errors, beside the physics (Wald's test); None if not known."""
+        if self.covariance is None:
+            return None
+        values, vectors = np.linalg.eigh(self.covariance)
+        kept = values > _ROUNDING * values.max(initial=0.0)
+        square = float(np.sum((vectors[:, kept].T @ self.target) ** 2 / values[kept]))
+        return float(scipy.special.chdtrc(max(int(kept.sum()), 1), square))
 
     def unit(self, column: Vector) -> Vector:
         """A column of values (R,), taken as of size 1, as the learner would show it; not finite where it is not."""

@@ -33,9 +33,10 @@ _COMPLEXITY = dict.fromkeys(_PLAIN, 1) | {"stribeck": 3, "stribeck_gauss": 3, "d
 _OWN = 1e-4  # of a candidate's squared norm: what physics, learner and other terms must leave of it
 _TIE, _TIE_UNKNOWN = 2e-4, 2e-3  # share of the learner: within this of the best the simpler term is taken
 _DRAWS = 10.0  # variances of the noise in one direction: what two terms with widths differ by at random
-_TRIED = 15  # kinds of terms, or pairs of kinds, that are refined before the choice
+_ROUGH, _FINE = 0.03, 1e-3  # of its logarithm
+_TRIED = 10  # kinds of terms, or pairs of kinds, that are refined before the choice
 _BLOCK, _LOOKED = 256, 200  # candidates whose pairs are looked at together, and pairs of them
-_T = 2.0  # standard errors that a coefficient must differ from 0
+_T = 3.0  # standard errors that a coefficient must differ from 0: the term was chosen among many
 
 
 @dataclass(frozen=True)
@@ -200,11 +201,11 @@ def _grown(space: Space, chosen: list[Candidate]) -> list[Candidate]:
     for i in range(len(chosen)):
         others = chosen[:i] + chosen[i + 1 :]
         trials += [[*others, *pair] for pair in _best_pairs(space, others)]
-    trials = [_refined(space, trial) for trial in trials]
+    trials = [_refined(space, trial, _ROUGH) for trial in trials]
     shares = [_share(space, trial) for trial in trials]
     able = [i for i, share in enumerate(shares) if share >= max(shares) - space.tie]
     best = min(able, key=lambda i: (sum(one.complexity for one in trials[i]), -shares[i]), default=None)
-    return [] if best is None else trials[best]
+    return [] if best is None else _refined(space, trials[best])
 
 
 def _best_single(space: Space, chosen: Sequence[Candidate]) -> list[Candidate]:
@@ -246,7 +247,7 @@ def _best_pairs(space: Space, others: Sequence[Candidate]) -> list[tuple[Candida
     return [(one, other) for _, one, other in ordered[:_TRIED]]
 
 
-def _refined(space: Space, chosen: list[Candidate]) -> list[Candidate]:
+def _refined(space: Space, chosen: list[Candidate], within: float = _FINE) -> list[Candidate]:
     """Widths moved to where the terms together explain most."""
     for i, candidate in enumerate(chosen):
         if candidate.width is None:
@@ -258,7 +259,7 @@ def _refined(space: Space, chosen: list[Candidate]) -> list[Candidate]:
 
         centre = float(np.log(candidate.width))
         around = (centre - np.log(_REFINED), centre + np.log(_REFINED))
-        options: Any = {"xatol": 1e-3}
+        options: Any = {"xatol": within}
         best = scipy.optimize.minimize_scalar(missed, bounds=around, method="bounded", options=options)
         if best.fun < missed(centre) - 1e-6:
             chosen = [*chosen[:i], candidate.wide(float(np.exp(best.x))), *chosen[i + 1 :]]
