@@ -15,7 +15,8 @@ from test_cli import MLP, SPEC, make_project, run
 
 from orthaug._base.warning import Warning
 from orthaug.reports.fields import Content, Flag, Number, Numbers, WarningResult, Whole
-from orthaug.reports.result import RESULTS, DataResult, FitResult, ParameterResult, ScoreResult, schema_of
+from orthaug.reports.result import DataResult, FitResult, ParameterResult, ScoreResult
+from orthaug.reports.schemas import RESULTS, schema_of
 
 DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "spec.md"
 
@@ -140,7 +141,7 @@ def test_the_schema_names_every_key(command):
 
 def test_the_schema_of_another_command_is_refused():
     done = run("schema", "simulate")
-    assert done.code == 2 and "must be one of fit, check, compare, split, design; got 'simulate'" in done.err
+    assert done.code == 2 and "must be one of fit, check, compare, split, design, explain; got 'simulate'" in done.err
 
 
 def test_the_schema_knows_what_may_be_absent_and_null():

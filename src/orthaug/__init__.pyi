@@ -58,6 +58,8 @@ from .physics import State as State
 from .physics import Term as Term
 from .physics import identifiability as identifiability
 from .reports import plot as plot
+from .selection import Explanation as Explanation
+from .selection import explain as explain
 from .studies import synthetic as synthetic
 
 __version__: str

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 SCHEMA = 2
 
 
-class _Headed(Content):
+class Headed(Content):
     """What every result begins with."""
 
     schema_number: Literal[2] = Field(SCHEMA, validation_alias="schema", serialization_alias="schema")
@@ -216,7 +216,7 @@ class EquationResult(Content):
     latex: str
 
 
-class FitResult(_Headed):
+class FitResult(Headed):
     """What `orthaug fit` leaves."""
 
     absent: ClassVar = frozenset({"motion", "terms", "equation"})
@@ -249,7 +249,7 @@ class FitResult(_Headed):
     warnings: list[WarningResult]
 
 
-class CheckResult(_Headed):
+class CheckResult(Headed):
     """What `orthaug check` tells."""
 
     absent: ClassVar = frozenset({"motion"})
@@ -282,7 +282,7 @@ class RowResult(Content):
     validation: ValidationResult | None
 
 
-class CompareResult(_Headed):
+class CompareResult(Headed):
     """What `orthaug compare` leaves."""
 
     spec: dict[str, Any]
@@ -293,7 +293,7 @@ class CompareResult(_Headed):
     warnings: list[WarningResult]
 
 
-class SplitResult(_Headed):
+class SplitResult(Headed):
     """What `orthaug split` tells."""
 
     parameters: list[ParameterResult]
@@ -331,21 +331,6 @@ class DesignResult(Content):
         """The content of a design, without its signal."""
         by_name = {key: dict(zip(design.names, getattr(design, key), strict=True)) for key in ("bias", "std")}
         return cls.model_validate({**vars(design), **by_name, "samples": len(design.signal)})
-
-
-RESULTS: dict[str, type[Content]] = {
-    "fit": FitResult,
-    "check": CheckResult,
-    "compare": CompareResult,
-    "split": SplitResult,
-    "design": DesignResult,
-}
-"""By command."""
-
-
-def schema_of(command: str) -> dict[str, Any]:
-    """The JSON schema of what a command writes."""
-    return RESULTS[command].model_json_schema(mode="serialization")
 
 
 def parameter_rows(

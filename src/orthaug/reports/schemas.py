@@ -1,0 +1,24 @@
+"""The results of all commands, and their JSON schemas."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from orthaug.reports.explanation import ExplainResult
+from orthaug.reports.fields import Content
+from orthaug.reports.result import CheckResult, CompareResult, DesignResult, FitResult, SplitResult
+
+RESULTS: dict[str, type[Content]] = {
+    "fit": FitResult,
+    "check": CheckResult,
+    "compare": CompareResult,
+    "split": SplitResult,
+    "design": DesignResult,
+    "explain": ExplainResult,
+}
+"""By command."""
+
+
+def schema_of(command: str) -> dict[str, Any]:
+    """The JSON schema of what a command writes."""
+    return RESULTS[command].model_json_schema(mode="serialization")
