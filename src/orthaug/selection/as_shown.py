@@ -4,7 +4,7 @@ A learner is smooth, so what it makes of a jump is none; compared as they are, a
 than the jump that is there. Where training ended its errors are orthogonal to Φ and to J = ∂f/∂w, up to the ridge λ:
 `P⊥(δ + e − f) ⊥ J` for what is missing, δ, and noise e. So with `S = J (JᵀJ + λ)⁻¹ Jᵀ`, J less what Φ expresses,
 `S δ = S f + J (JᵀJ + λ)⁻¹ λ w − S e`: regressing that on `S t` has no bias by the learner's shape. In coordinates of J's
-singular vectors.
+singular vectors. Of a motion J, f and t stand for what they do to the outputs of its free run.
 """
 
 from __future__ import annotations
@@ -28,12 +28,13 @@ _ROUNDING = 1e-8  # of the largest variance
 class Shown:
     """How a learner shows what is missing: `target` (r,) is what it shows, `covariance` (r, r) that of its errors.
 
-    `view` (R, r) takes whitened values over all points to that; None where the learner tells no tangent space: then
+    `view` (P, r) takes whitened values over all points to that; None where the learner tells no tangent space: then
     they are taken as they are, less the physics. `size` is the norm of the learner with all that physics expresses.
     """
 
+    ground: Ground
     q: Float[np.ndarray, "R s"]
-    view: Float[np.ndarray, "R r"] | None
+    view: Float[np.ndarray, "P r"] | None
     target: Vector
     covariance: Matrix | None
     size: float
@@ -41,11 +42,11 @@ class Shown:
     @classmethod
     def of(cls, ground: Ground) -> Shown:
         """By the learner's tangent space over the points, where it has one."""
-        q = basis_of(ground.whitened(ground.slopes).T)
-        raw = ground.whitened(ground.target)
+        q = basis_of(ground.physics_moves.T)
+        raw = ground.fitted(ground.learner)
         rest, size, tangent = without(raw, q), float(np.linalg.norm(raw)), ground.tangent
         if tangent is None:
-            return cls(q, None, rest, None, size)
+            return cls(ground, q, None, rest, None, size)
         ridge: Any = np.broadcast_to(np.asarray(tangent.ridge, dtype=float), tangent.weights.shape)
         u, sigma, vt = np.linalg.svd(without(tangent.jacobian, q), full_matrices=False)
         kept = sigma > _RANK * sigma.max(initial=0.0)
@@ -58,7 +59,9 @@ class Shown:
         if tangent.joint is not None:
             k = sigma[:, None] * (inner @ (sigma[:, None] ** 2 * v.T + v.T * ridge))
             covariance = tangent.joint.of(np.concatenate([np.zeros((len(k), tangent.joint.nt)), k], axis=1))
-        return cls(q, u @ smooth.T, target, covariance, size)
+        view = u @ smooth.T
+        view = view if ground.response is None else ground.response.adjoint(view)
+        return cls(ground, q, view, target, covariance, size)
 
     @property
     def noise(self) -> float:
@@ -76,12 +79,12 @@ class Shown:
         return float(scipy.special.chdtrc(max(int(kept.sum()), 1), square))
 
     def unit(self, column: Vector) -> Vector:
-        """A column of values (R,), taken as of size 1, as the learner would show it; not finite where it is not."""
+        """A column over the points (P,), taken as of size 1, as the learner would show it; not finite where it is not."""
         with np.errstate(all="ignore"):
             column = column / np.linalg.norm(column)
         if not np.isfinite(column).all():
             return np.full(len(self.target), np.nan)
-        return without(column, self.q) if self.view is None else self.view.T @ column
+        return without(self.ground.fitted(column), self.q) if self.view is None else self.view.T @ column
 
 
 def without(values: np.ndarray, basis: Float[np.ndarray, "R k"]) -> np.ndarray:

@@ -1,6 +1,7 @@
-"""What is to be explained: a learner's output over data, beside the directions of the physics that it shares.
+"""What is to be explained: a learner's output over data, beside what the parameters of the physics could do.
 
-Of a lagged model over the rows of a record, of a motion over the states and inputs of its free run there.
+Of a lagged model over the rows of a record, of a motion over the states and inputs of its free run there, by what it does
+to the outputs.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from orthaug._base.jax import jax
 from orthaug.data.expressions import SAMPLING_TIME, Expression, parse, parse_named
 from orthaug.data.record import Record
 from orthaug.data.regressors import lag_matrix, stack_rows
-from orthaug.inference.motion_split import shared_of_motion, slopes_at
+from orthaug.inference.motion_split import slopes_at
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.motion_parts import labels_of, parts_at
@@ -26,6 +27,7 @@ from orthaug.models.statistics import JointCovariance
 from orthaug.physics.baseline import Baseline, Parameter
 from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicalParameter
+from orthaug.selection.motion_response import MotionResponse
 
 MOST_CELLS = 10_000
 """Values of the learner that are looked at: a smooth function needs no more, and candidates are kept beside them."""
@@ -35,7 +37,7 @@ _WITHIN = 1e-9  # of a feature's half width: the largest of training is no extra
 
 
 class Tangent(NamedTuple):
-    """The learner's derivatives by its weights w over the points, whitened, and what training left of the weights."""
+    """What the learner's weights w do to what is fitted, whitened, and what training left of the weights."""
 
     jacobian: Float[np.ndarray, "R nw"]
     weights: Vector
@@ -47,13 +49,16 @@ class Tangent(NamedTuple):
 class Ground:
     """The learner over M points in nl outputs or equations (`places`: name and unit).
 
-    `target` is the learner in their units, `slopes` the physics' derivatives along the directions that are shared;
-    `weight` (nl, nl) whitens a row. `outside` is the share of the points beyond the training data.
+    `target` is the learner in their units, `physics_moves` what the parameters, and starts of runs, do to what is
+    fitted. `weight` (nl, nl) whitens a row of a lagged model. `outside` is the share of the points beyond the training
+    data.
     """
 
     target: Float[np.ndarray, "M nl"]
-    slopes: Float[np.ndarray, "M nl s"]
+    physics_moves: Float[np.ndarray, "R s"]
     weight: Matrix
+    response: Response | None
+    """From the points to what was fitted, of a motion; None where that is the same."""
     places: tuple[tuple[str, str], ...]
     signals: tuple[str, ...]
     """What the learner sees, as expressions, and rates of change that follow from it."""
@@ -77,10 +82,14 @@ class Ground:
             values = np.broadcast_to(np.asarray(self.evaluate(expression), dtype=float), (len(self.target),))
         return (values[:, None] * self.weight[:, place]).ravel()
 
-    def whitened(self, values: Float[np.ndarray, "M nl *k"]) -> np.ndarray:
-        """Values with all points and places below each other (M·nl, …)."""
-        white = np.einsum("oi,mi...->mo...", self.weight, values)
-        return white.reshape(white.shape[0] * white.shape[1], *white.shape[2:])
+    def fitted(self, columns: Float[np.ndarray, "P *k"]) -> np.ndarray:
+        """What columns over the points do to what was fitted (R, …)."""
+        return columns if self.response is None else self.response.forward(columns)
+
+    @property
+    def learner(self) -> Vector:
+        """The learner over the points, whitened (M·nl,)."""
+        return np.einsum("oi,mi->mo", self.weight, self.target).ravel()
 
 
 def ground_of(model: Model | MotionModel, record: Record) -> Ground:
@@ -125,8 +134,9 @@ def _of_lagged(model: Model, record: Record) -> Ground:
     c = model.theta - model.theta_aux
     return Ground(
         target=target,
-        slopes=phi,
+        physics_moves=_stacked(np.einsum("oi,mit->mot", model.weight, phi)),
         weight=np.asarray(model.weight),
+        response=None,
         places=tuple((channel.name, channel.unit) for channel in model.outputs),
         signals=(*own, *_rates_of_change(form.outputs, own)),
         seen=len(own),
@@ -137,7 +147,7 @@ def _of_lagged(model: Model, record: Record) -> Ground:
         parameters=form.baseline.parameters,
         values=model.theta,
         physics=form.baseline,
-        tangent=_tangent(model, z, np.asarray(model.weight)),
+        tangent=_tangent(model, z, np.asarray(model.weight), None),
         outside=_beyond(model, z),
     )
 
@@ -145,46 +155,92 @@ def _of_lagged(model: Model, record: Record) -> Ground:
 def _of_motion(model: MotionModel, record: Record) -> Ground:
     form, numbers, motion = model.form, model.numbers, model.form.motion
     record = model.fitting(record, need_outputs=False)
-    states = model.states(record, initial="measured" if record.outputs else "zero")
-    x = states[list(motion.names_of_states)].to_numpy()
-    u = np.concatenate([experiment.inputs for experiment in record.experiments])
-    every = max(1, -(-len(x) * len(labels_of(form)) // MOST_CELLS))
-    x, u = x[::every], u[::every]
-    with np.errstate(all="ignore"):
-        physics, target = parts_at(form, numbers, x, u)
-        z = np.asarray(form.seen(x.T, u.T, np)).T
-        slopes = np.asarray(slopes_at(form, model.theta, x, u))
+    run = _Run.of(model, record)
+    x, u = run.x, run.u
+    target = parts_at(form, numbers, x, u)[1] if len(x) else np.zeros((0, len(_places(model))))
     learned = [*motion.learned[0], *(len(motion.states) + i for i in motion.learned[1])]
-    slopes = slopes[:, learned]
-    finite = np.isfinite(physics + target).all(axis=1) & np.isfinite(slopes).all(axis=(1, 2))
-    finite &= np.isfinite(z).all(axis=1)
-    x, u, z, target, slopes, physics = (part[finite] for part in (x, u, z, target, slopes, physics))
-    basis = shared_of_motion(form, model.theta, x, u).basis if len(x) else np.zeros((len(model.theta), 0))
-    size = np.std(physics + target, axis=0) if len(x) else np.ones(len(learned))
-    weight = np.diag(1 / np.where(size > 0, size, 1.0))
-    coordinates = motion.coordinates
+    linear = MotionResponse.of(form, numbers, x, u, run.rows, run.begins, np.asarray(model.weight))
+    response = Response(linear, tuple(learned), len(motion.states) + len(motion.outputs))
+    slopes = np.nan_to_num(np.asarray(slopes_at(form, model.theta, x, u)))
+    coordinates, count = motion.coordinates, len(model.theta)
     known = motion.values(x.T, u.T, coordinates.physical(model.theta), np)
     own = tuple(dict.fromkeys(str(entry) for entry in form.features))
+    z = np.asarray(form.seen(x.T, u.T, np)).T
     low, high = coordinates.bounds
     units = {channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
     units |= {parameter.name: parameter.unit for parameter in motion.parameters}
     return Ground(
         target=target,
-        slopes=slopes @ basis,
-        weight=weight,
+        physics_moves=np.concatenate([linear.forward(slopes), linear.starts()], axis=1),
+        weight=np.eye(len(learned)),
+        response=response,
         places=_places(model),
         signals=own,
         seen=len(own),
         units=units | {state.name: state.unit for state in motion.states} | {SAMPLING_TIME: "s"},
         parse=lambda text: parse_named(text, motion.known, "the term"),
         evaluate=lambda expression: expression.value(known, np),
-        moved=lambda along: np.asarray(coordinates.physical(np.clip(model.theta + basis @ along, low, high))),
+        moved=lambda along: np.asarray(coordinates.physical(np.clip(model.theta + along[:count], low, high))),
         parameters=coordinates.parameters,
         values=np.asarray(coordinates.physical(model.theta)),
         physics=motion,
-        tangent=_tangent(model, z, weight),
+        tangent=_tangent(model, z, np.eye(len(learned)), response),
         outside=_beyond(model, z),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """A motion's linear map, for terms in learned equations and outputs only."""
+
+    linear: MotionResponse
+    learned: tuple[int, ...]
+    equations: int
+
+    def forward(self, columns: Float[np.ndarray, "P *k"]) -> np.ndarray:
+        """Of columns over all points and places, to whitened outputs."""
+        single = columns.ndim == 1
+        table = columns.reshape(-1, len(self.learned), 1 if single else columns.shape[1])
+        terms = np.zeros((len(table), self.equations, table.shape[2]))
+        terms[:, list(self.learned)] = table
+        found = self.linear.forward(terms)
+        return found[:, 0] if single else found
+
+    def adjoint(self, values: Float[np.ndarray, "R k"]) -> Float[np.ndarray, "P k"]:
+        """The transpose."""
+        return _stacked(self.linear.adjoint(values)[:, list(self.learned)])
+
+
+class _Run(NamedTuple):
+    """States, inputs, and the rows that steps read, along free runs where they have values; where segments begin."""
+
+    x: Matrix
+    u: Matrix
+    rows: Matrix
+    begins: Any
+
+    @classmethod
+    def of(cls, model: MotionModel, record: Record) -> _Run:
+        """Of a long record the first rows."""
+        states = model.states(record, initial="measured" if record.outputs else "zero")
+        states = states[list(model.form.motion.names_of_states)].to_numpy()
+        length = model.trained.segment if model.trained is not None else 0
+        left, begin, pieces = MOST_CELLS // len(model.outputs), 0, []
+        for experiment in record.experiments:
+            x = states[begin : begin + len(experiment)]
+            begin += len(experiment)
+            whole = len(x) if np.isfinite(x).all() else int(np.argmin(np.isfinite(x).all(axis=1)))
+            whole = min(whole, left)
+            left -= whole
+            rows = model.form.inputs(experiment, record)[:whole]
+            starts = np.arange(whole) % (length or max(whole, 1)) == 0
+            pieces.append((x[:whole], experiment.inputs[:whole], rows, starts))
+        return cls(*(np.concatenate(part) for part in zip(*pieces, strict=True)))
+
+
+def _stacked(values: Float[np.ndarray, "M n *k"]) -> np.ndarray:
+    """All points and places below each other."""
+    return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])
 
 
 def _places(model: MotionModel) -> tuple[tuple[str, str], ...]:
@@ -215,7 +271,7 @@ def _beyond(model: Any, z: Matrix) -> float:
     return float(np.mean((np.abs(scaled) > 1 + _WITHIN).any(axis=1)))
 
 
-def _tangent(model: Any, z: Matrix, weight: Matrix) -> Tangent | None:
+def _tangent(model: Any, z: Matrix, weight: Matrix, response: Response | None) -> Tangent | None:
     """The learner's derivatives at its features z (M, nz)."""
     bound, numbers, statistics = model.form.bound, model.numbers, model.statistics
     if not bound.differentiable or numbers.tilt is not None or not 0 < bound.size <= MOST_WEIGHTS:
@@ -224,6 +280,7 @@ def _tangent(model: Any, z: Matrix, weight: Matrix) -> Tangent | None:
     scaled = (z - np.asarray(numbers.centre)) / np.asarray(numbers.halfwidth)
     slopes = jax.jit(jax.vmap(jax.jacrev(bound.values), in_axes=(None, 0)))(w, scaled)
     jacobian = np.einsum("oi,miw->mow", gain, np.asarray(slopes)).reshape(-1, len(w))
+    jacobian = jacobian if response is None else response.forward(jacobian)
     ridge: Any = np.asarray(statistics.ridge)
     if statistics.gram is not None:  # over other rows, of which there may be more or fewer
         there = float(np.trace(statistics.gram[len(model.theta) :, len(model.theta) :]))

@@ -315,9 +315,9 @@ def fit_terms(space: Space, chosen: Sequence[Candidate]) -> Fit:
     if chosen:
         inverse = np.linalg.pinv(np.column_stack([shown.unit(column) for column in raw])) / size[:, None]
     coefficients = inverse @ shown.target
-    rest = ground.whitened(ground.target) - sum((b * c for b, c in zip(coefficients, raw, strict=True)), 0.0)
+    rest = ground.learner - sum((b * c for b, c in zip(coefficients, raw, strict=True)), 0.0)
     covariance = None if shown.covariance is None else inverse @ shown.covariance @ inverse.T
-    return Fit(least_squares(ground.whitened(ground.slopes), rest), coefficients, covariance)
+    return Fit(least_squares(ground.physics_moves, ground.fitted(rest)), coefficients, covariance)
 
 
 def settled(space: Space, chosen: list[Candidate]) -> tuple[list[Candidate], Fit, bool]:
