@@ -32,6 +32,7 @@ _REFINED = 2.0  # how far, as a factor, a width is moved from where it was found
 _COMPLEXITY = dict.fromkeys(_PLAIN, 1) | {"stribeck": 3, "stribeck_gauss": 3, "dead_zone": 4, "saturation": 4}
 _OWN = 1e-4  # of a candidate's squared norm: what physics, learner and other terms must leave of it
 _TIE, _TIE_UNKNOWN = 2e-4, 2e-3  # share of the learner: within this of the best the simpler term is taken
+_PART = 0.1  # of what even the best leaves: less tells no two terms apart either
 _DRAWS = 10.0  # variances of the noise in one direction: what two terms with widths differ by at random
 _ROUGH, _FINE = 0.03, 1e-3  # of its logarithm
 _TRIED = 10  # kinds of terms, or pairs of kinds, that are refined before the choice
@@ -203,9 +204,11 @@ def _grown(space: Space, chosen: list[Candidate]) -> list[Candidate]:
         trials += [[*others, *pair] for pair in _best_pairs(space, others)]
     trials = [_refined(space, trial, _ROUGH) for trial in trials]
     shares = [_share(space, trial) for trial in trials]
-    able = [i for i, share in enumerate(shares) if share >= max(shares) - space.tie]
-    best = min(able, key=lambda i: (sum(one.complexity for one in trials[i]), -shares[i]), default=None)
-    return [] if best is None else _refined(space, trials[best])
+    best = max(shares, default=0.0)
+    tie = max(space.tie, _PART * (1 - best))
+    able = [i for i, share in enumerate(shares) if share >= best - tie]
+    taken = min(able, key=lambda i: (sum(one.complexity for one in trials[i]), -shares[i]), default=None)
+    return [] if taken is None else _refined(space, trials[taken])
 
 
 def _best_single(space: Space, chosen: Sequence[Candidate]) -> list[Candidate]:

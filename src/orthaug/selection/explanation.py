@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -43,6 +43,7 @@ from orthaug.selection.explaining import (
 LEAST = 0.005
 _HALF = 0.5  # of the learner, less its own errors: terms that explain less are none to be added
 _LEVEL = 0.01  # at which the learner is something beside its own errors
+_ENDED = ("converged", "exact")
 _SHOWN = 8  # terms, each as the only one
 _OUTSIDE = 0.05  # share of rows beyond the training data that is told of
 _NAMES = {"coulomb": "coulomb", "quadratic_drag": "drag", "stribeck_gauss": "stribeck", TERM: "term"}
@@ -165,7 +166,12 @@ def explain(
     ground = ground_of(model, record)
     space = Space.of(ground, candidates_of(ground, degree, functions, _declared(suspects, ground)))
     chosen, fitted, dropped = settled(space, select(space, most, least))
-    return _told(space, chosen, fitted, dropped)
+    told = _told(space, chosen, fitted, dropped)
+    code = getattr(getattr(fit, "status", None), "code", "converged")
+    if code not in _ENDED:
+        text = "training did not end at a minimum: the learner may show terms otherwise than they are; train longer."
+        told = replace(told, warnings=(*told.warnings, Warning("not_converged", text)))
+    return told
 
 
 def _declared(suspects: Sequence[Any], ground: Ground) -> list[tuple[str, int]]:
@@ -175,7 +181,9 @@ def _declared(suspects: Sequence[Any], ground: Ground) -> list[tuple[str, int]]:
         check_type(suspect, Suspect | MotionSuspect, "suspects", "a list of Suspects, or of MotionSuspects of a motion")
         where = suspect.equation if isinstance(suspect, MotionSuspect) else suspect.output
         if where is not None and where not in names:
-            raise InputError(f"suspect '{suspect.name}': the learner adds nothing to '{where}', but to {', '.join(names)}.")
+            raise InputError(
+                f"suspect '{suspect.name}': the learner adds nothing to '{where}', but to {', '.join(names)}."
+            )
         ground.evaluate(ground.parse(suspect.expression))
         found.append((suspect.expression, 0 if where is None else names.index(where)))
     return found
@@ -215,7 +223,9 @@ def _told(space: Space, chosen: list[Candidate], fitted: Fit, dropped: bool) -> 
 
 def _why_nothing(space: Space, real: bool, dropped: bool, share: float, singles: Sequence[SingleTerm]) -> str:
     if not space.target.any():
-        return "the learner adds nothing over these data that the physics could not express; there is nothing to explain."
+        return (
+            "the learner adds nothing over these data that the physics could not express; there is nothing to explain."
+        )
     if not space.candidates:
         return "nothing explains the learner: the physics expresses all candidate terms already."
     if not real:
@@ -264,7 +274,9 @@ def _base_name(candidate: Candidate) -> str:
     return "offset" if candidate.text == CONSTANT else _NAMES.get(candidate.kind, candidate.kind)
 
 
-def _physics(ground: Ground, terms: Sequence[ExplainingTerm], moved: Any) -> tuple[Baseline | Motion | None, str | None]:
+def _physics(
+    ground: Ground, terms: Sequence[ExplainingTerm], moved: Any
+) -> tuple[Baseline | Motion | None, str | None]:
     """The physics with the terms added, and the lines that say so in a spec."""
     several = len(ground.places) > 1
     added = [_added(ground, term) for term in terms]
