@@ -1,10 +1,10 @@
 """Terms as a learner would show them: projected onto its tangent space, less what the physics expresses.
 
-A learner is smooth, so what it makes of a jump is none; compared as they are, a steep saturation would explain it better
-than the jump that is there. Where training ended its errors are orthogonal to Φ and to J = ∂f/∂w, up to the ridge λ:
-`P⊥(δ + e − f) ⊥ J` for what is missing, δ, and noise e. So with `S = J (JᵀJ + λ)⁻¹ Jᵀ`, J less what Φ expresses,
-`S δ = S f + J (JᵀJ + λ)⁻¹ λ w − S e`: regressing that on `S t` has no bias by the learner's shape. In coordinates of J's
-singular vectors. Of a motion J, f and t stand for what they do to the outputs of its free run.
+A learner is smooth, so what it makes of a jump is none; compared as they are, a steep saturation would explain it
+better than the jump that is there. Where training ended its errors are orthogonal to Φ and to J = ∂f/∂w, up to the
+ridge λ: `P⊥(δ + e − f) ⊥ J` for what is missing, δ, and noise e. So with `S = J (JᵀJ + λ)⁻¹ Jᵀ`, J less what Φ
+expresses, `S δ = S f + J (JᵀJ + λ)⁻¹ λ w − S e`: regressing that on `S t` has no bias by the learner's shape. In
+coordinates of J's singular vectors. Of a motion J, f and t stand for what they do to the outputs of its free run.
 """
 
 from __future__ import annotations
@@ -79,12 +79,14 @@ class Shown:
         return float(scipy.special.chdtrc(max(int(kept.sum()), 1), square))
 
     def unit(self, column: Vector) -> Vector:
-        """A column over the points (P,), taken as of size 1, as the learner would show it; not finite where it is not."""
+        """A column over the points (P,), taken as of size 1, as the learner would show it."""
         with np.errstate(all="ignore"):
             column = column / np.linalg.norm(column)
         if not np.isfinite(column).all():
             return np.full(len(self.target), np.nan)
-        return without(self.ground.fitted(column), self.q) if self.view is None else self.view.T @ column
+        if self.view is None:
+            return without(self.ground.fitted(column), self.q)
+        return self.view.T @ column
 
 
 def without(values: np.ndarray, basis: Float[np.ndarray, "R k"]) -> np.ndarray:

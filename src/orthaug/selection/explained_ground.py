@@ -1,7 +1,7 @@
 """What is to be explained: a learner's output over data, beside what the parameters of the physics could do.
 
-Of a lagged model over the rows of a record, of a motion over the states and inputs of its free run there, by what it does
-to the outputs.
+Of a lagged model over the rows of a record, of a motion over the states and inputs of its free run there, by what it
+does to the outputs.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def ground_of(model: Model | MotionModel, record: Record) -> Ground:
 
 
 def _of_lagged(model: Model, record: Record) -> Ground:
-    form, numbers = model.form, model.numbers
+    form = model.form
     if form.states and not record.outputs:
         names = ", ".join(channel.name for channel in model.outputs)
         raise InputError(f"the data have no {names}: the learner is evaluated at measured outputs.")

@@ -140,7 +140,8 @@ def candidates_of(
         InputError: more than can be kept in memory.
     """
     library = TermLibrary.of(ground.signals[: ground.seen], degree, functions)
-    texts = [text for text in library.texts if text != CONSTANT]
+    plain = {_written(kind, on) for kind in _PLAIN for on in ground.signals}
+    texts = [text for text in library.texts if text != CONSTANT and text not in plain]
     wide = [(kind, on, width) for kind in _WIDE for on in ground.signals for width in _grid(ground, on)]
     places = range(len(ground.places))
     count = (len(texts) + len(wide)) * len(places)

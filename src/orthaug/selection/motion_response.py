@@ -1,7 +1,7 @@
 """What small terms in a motion's equations do to its outputs: the tangent system along a free run.
 
-`s_{k+1} = A_k s_k + h/2 (A_k t_k + t_{k+1})`, `y_k = C_k s_k + o_k` for terms t in the equations and o in the outputs, h
-the sampling time; A and C are derivatives of the fitted motion. A segment of training starts anew, from a state that
+`s_{k+1} = A_k s_k + h/2 (A_k t_k + t_{k+1})`, `y_k = C_k s_k + o_k` for terms t in the equations and o in the outputs,
+h the sampling time; A and C are derivatives of the fitted motion. A segment of training starts anew, from a state that
 was estimated beside everything else.
 """
 
@@ -47,7 +47,7 @@ class MotionResponse:
         """Of terms in all equations and then all outputs (n = nx + ny)."""
         count, nx, _ = self.steps.shape
         moved, direct = terms[:, :nx], np.einsum("oi,mik->mok", self.weight, terms[:, nx:])
-        s, found = np.zeros(moved.shape[1:]), np.zeros((count, *direct.shape[1:]))
+        s, found = np.zeros((nx, terms.shape[2])), np.zeros_like(direct)
         for k in range(count):
             if self.begins[k]:
                 s = np.zeros_like(s)
@@ -56,7 +56,7 @@ class MotionResponse:
             else:
                 s = self.steps[k - 1] @ s + moved[k - 1]
             found[k] = self.outputs[k] @ s + direct[k]
-        return found.reshape(-1, found.shape[2])
+        return found.reshape(-1, terms.shape[2])
 
     def adjoint(self, values: Float[np.ndarray, "R k"]) -> Float[np.ndarray, "M n k"]:
         """The transpose of `forward`."""
