@@ -60,7 +60,9 @@ from .physics import State as State
 from .physics import Term as Term
 from .physics import identifiability as identifiability
 from .reports import plot as plot
+from .selection import Explanation as Explanation
 from .selection import Selection as Selection
+from .selection import explain as explain
 from .selection import select as select
 from .studies import synthetic as synthetic
 

@@ -280,6 +280,28 @@ def split(
 
 
 @app.command()
+def explain(
+    model: ModelPath,
+    data: DataPath,
+    degree: Annotated[int, typer.Option("--degree", metavar="D", help="Of products of what the learner sees.")] = 3,
+    functions: Annotated[
+        list[str] | None, typer.Option("--function", metavar="NAME", help="In products, such as abs; any number.")
+    ] = None,
+    most: Annotated[int, typer.Option("--terms", metavar="N", help="Terms at most.")] = 6,
+    as_json: AsJson = False,
+) -> None:
+    """Which terms the learner of a saved model has found, and what to write into the physics."""
+    from orthaug.commands.explain import explain_model
+    from orthaug.commands.run import open_run
+    from orthaug.reports.explanation_text import explain_text
+
+    opened = open_run(model, data)
+    _prepare_jax()
+    result = explain_model(opened, degree=degree, functions=functions or (), most=most)
+    streams.echo(result.to_json() if as_json else explain_text(result))
+
+
+@app.command()
 def design(
     spec: SpecPath,
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="CSV file for the input.")],
@@ -327,7 +349,7 @@ def select(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force
 @app.command()
 def schema(
     command: Annotated[
-        str, typer.Argument(metavar="[COMMAND]", help="fit, check, compare, split, design or select.")
+        str, typer.Argument(metavar="[COMMAND]", help="fit, check, compare, split, design, select or explain.")
     ] = "fit",
 ) -> None:
     """The JSON schema of what a command writes."""

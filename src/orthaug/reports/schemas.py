@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from orthaug.reports.explanation import ExplainResult
 from orthaug.reports.fields import Content
 from orthaug.reports.result import CheckResult, CompareResult, DesignResult, FitResult, SplitResult
 from orthaug.reports.selection import SelectResult
@@ -15,6 +16,7 @@ RESULTS: dict[str, type[Content]] = {
     "split": SplitResult,
     "design": DesignResult,
     "select": SelectResult,
+    "explain": ExplainResult,
 }
 
 """By command."""

@@ -1,0 +1,288 @@
+"""What is to be explained: a learner's output over data, beside what the parameters of the physics could do.
+
+Of a lagged model over the rows of a record, of a motion over the states and inputs of its free run there, by what it
+does to the outputs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.errors import InputError
+from orthaug._base.jax import jax
+from orthaug.data.expressions import SAMPLING_TIME, Expression, parse, parse_named
+from orthaug.data.record import Record
+from orthaug.data.regressors import lag_matrix, stack_rows
+from orthaug.inference.motion_split import slopes_at
+from orthaug.models.model import Model
+from orthaug.models.motion_model import MotionModel
+from orthaug.models.motion_parts import labels_of, parts_at
+from orthaug.models.statistics import JointCovariance
+from orthaug.physics.baseline import Baseline, Parameter
+from orthaug.physics.motion import Motion
+from orthaug.physics.parameters import PhysicalParameter
+from orthaug.selection.motion_response import MotionResponse
+
+MOST_CELLS = 10_000
+"""Values of the learner that are looked at: a smooth function needs no more, and candidates are kept beside them."""
+FEWEST = 20  # of them
+MOST_WEIGHTS = 2000  # of a learner whose tangent is looked at
+_WITHIN = 1e-9  # of a feature's half width: the largest of training is no extrapolation
+
+
+class Tangent(NamedTuple):
+    """What the learner's weights w do to what is fitted, whitened, and what training left of the weights."""
+
+    jacobian: Float[np.ndarray, "R nw"]
+    weights: Vector
+    ridge: float | Vector
+    joint: JointCovariance | None
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """The learner over M points in nl outputs or equations (`places`: name and unit).
+
+    `target` is the learner in their units, `physics_moves` what the parameters, and starts of runs, do to what is
+    fitted. `weight` (nl, nl) whitens a row of a lagged model. `outside` is the share of the points beyond the training
+    data.
+    """
+
+    target: Float[np.ndarray, "M nl"]
+    physics_moves: Float[np.ndarray, "R s"]
+    weight: Matrix
+    response: Response | None
+    """From the points to what was fitted, of a motion; None where that is the same."""
+    places: tuple[tuple[str, str], ...]
+    signals: tuple[str, ...]
+    """What the learner sees, as expressions, and rates of change that follow from it."""
+    seen: int
+    """How many of the signals the learner sees as they stand."""
+    units: dict[str, str]
+    parse: Callable[[str], Expression]
+    evaluate: Callable[[Expression], Any]
+    moved: Callable[[Vector], Vector]
+    """The parameters when the physics moves by (s,) along the shared directions."""
+    parameters: Sequence[Parameter] | Sequence[PhysicalParameter]
+    values: Vector
+    physics: Baseline | Motion
+    tangent: Tangent | None
+    """None of an opaque learner, and of one with very many weights."""
+    outside: float
+
+    def column(self, expression: Expression, place: int) -> Vector:
+        """A term with coefficient 1, whitened, all points and places below each other (M·nl,)."""
+        with np.errstate(all="ignore"):
+            values = np.broadcast_to(np.asarray(self.evaluate(expression), dtype=float), (len(self.target),))
+        return (values[:, None] * self.weight[:, place]).ravel()
+
+    def fitted(self, columns: Float[np.ndarray, "P *k"]) -> np.ndarray:
+        """What columns over the points do to what was fitted (R, …)."""
+        return columns if self.response is None else self.response.forward(columns)
+
+    @property
+    def learner(self) -> Vector:
+        """The learner over the points, whitened (M·nl,)."""
+        return np.einsum("oi,mi->mo", self.weight, self.target).ravel()
+
+
+def ground_of(model: Model | MotionModel, record: Record) -> Ground:
+    """The learner of a model over a record.
+
+    Raises:
+        InputError: a model without a learner, other channels, too few rows, or none with a value.
+    """
+    if model.form.bound is None:
+        raise InputError("the model is physics alone: it has no learner that could be explained.")
+    ground = _of_motion(model, record) if isinstance(model, MotionModel) else _of_lagged(model, record)
+    if len(ground.target) < FEWEST:
+        raise InputError(
+            f"the learner has a value at {len(ground.target)} rows of the data; at least {FEWEST} are needed."
+        )
+    return ground
+
+
+def _of_lagged(model: Model, record: Record) -> Ground:
+    form = model.form
+    if form.states and not record.outputs:
+        names = ", ".join(channel.name for channel in model.outputs)
+        raise InputError(f"the data have no {names}: the learner is evaluated at measured outputs.")
+    record = model.fitting(record, need_outputs=bool(form.states))
+    x = (
+        stack_rows(record, form.layout).x
+        if record.outputs
+        else np.concatenate([lag_matrix(e, form.layout, record, form.first_row) for e in record.experiments])
+    )
+    x = x[:: max(1, -(-len(x) * len(form.outputs) // MOST_CELLS))]
+    with np.errstate(all="ignore"):
+        target = model.learner_at(x) if len(x) else np.zeros((0, len(form.outputs)))
+        phi = np.asarray(form.baseline.phi(x, form.layout, form.outputs, np))
+        z = np.asarray(form.features.evaluate(x, form.layout, np))
+    finite = np.isfinite(target).all(axis=1) & np.isfinite(phi).all(axis=(1, 2)) & np.isfinite(z).all(axis=1)
+    x, target, phi, z = x[finite], target[finite], phi[finite], z[finite]
+    constants = {SAMPLING_TIME: model.sampling_time} | dict(form.baseline.constants)
+    for entry in form.features.entries:
+        constants |= dict(entry.constants)
+    columns = {lag: x[:, j] for j, lag in enumerate(form.layout)}
+    own = tuple(dict.fromkeys(str(entry) for entry in form.features.entries))
+    c = model.theta - model.theta_aux
+    return Ground(
+        target=target,
+        physics_moves=_stacked(np.einsum("oi,mit->mot", model.weight, phi)),
+        weight=np.asarray(model.weight),
+        response=None,
+        places=tuple((channel.name, channel.unit) for channel in model.outputs),
+        signals=(*own, *_rates_of_change(form.outputs, own)),
+        seen=len(own),
+        units={channel.name: channel.unit for channel in (*model.outputs, *model.inputs)} | {SAMPLING_TIME: "s"},
+        parse=lambda text: parse(text, constants),
+        evaluate=lambda expression: expression.evaluate(columns, np),
+        moved=lambda along: c + along,
+        parameters=form.baseline.parameters,
+        values=model.theta,
+        physics=form.baseline,
+        tangent=_tangent(model, z, np.asarray(model.weight), None),
+        outside=_beyond(model, z),
+    )
+
+
+def _of_motion(model: MotionModel, record: Record) -> Ground:
+    form, numbers, motion = model.form, model.numbers, model.form.motion
+    record = model.fitting(record, need_outputs=False)
+    run = _Run.of(model, record)
+    x, u = run.x, run.u
+    target = parts_at(form, numbers, x, u)[1] if len(x) else np.zeros((0, len(_places(model))))
+    learned = [*motion.learned[0], *(len(motion.states) + i for i in motion.learned[1])]
+    linear = MotionResponse.of(form, numbers, x, u, run.rows, run.begins, np.asarray(model.weight))
+    response = Response(linear, tuple(learned), len(motion.states) + len(motion.outputs))
+    slopes = np.nan_to_num(np.asarray(slopes_at(form, model.theta, x, u)))
+    coordinates, count = motion.coordinates, len(model.theta)
+    known = motion.values(x.T, u.T, coordinates.physical(model.theta), np)
+    own = tuple(dict.fromkeys(str(entry) for entry in form.features))
+    z = np.asarray(form.seen(x.T, u.T, np)).T
+    low, high = coordinates.bounds
+    units = {channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
+    units |= {parameter.name: parameter.unit for parameter in motion.parameters}
+    return Ground(
+        target=target,
+        physics_moves=np.concatenate([linear.forward(slopes), linear.starts()], axis=1),
+        weight=np.eye(len(learned)),
+        response=response,
+        places=_places(model),
+        signals=own,
+        seen=len(own),
+        units=units | {state.name: state.unit for state in motion.states} | {SAMPLING_TIME: "s"},
+        parse=lambda text: parse_named(text, motion.known, "the term"),
+        evaluate=lambda expression: expression.value(known, np),
+        moved=lambda along: np.asarray(coordinates.physical(np.clip(model.theta + along[:count], low, high))),
+        parameters=coordinates.parameters,
+        values=np.asarray(coordinates.physical(model.theta)),
+        physics=motion,
+        tangent=_tangent(model, z, np.eye(len(learned)), response),
+        outside=_beyond(model, z),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """A motion's linear map, for terms in learned equations and outputs only."""
+
+    linear: MotionResponse
+    learned: tuple[int, ...]
+    equations: int
+
+    def forward(self, columns: Float[np.ndarray, "P *k"]) -> np.ndarray:
+        """Of columns over all points and places, to whitened outputs."""
+        single = columns.ndim == 1
+        table = columns.reshape(-1, len(self.learned), 1 if single else columns.shape[1])
+        terms = np.zeros((len(table), self.equations, table.shape[2]))
+        terms[:, list(self.learned)] = table
+        found = self.linear.forward(terms)
+        return found[:, 0] if single else found
+
+    def adjoint(self, values: Float[np.ndarray, "R k"]) -> Float[np.ndarray, "P k"]:
+        """The transpose."""
+        return _stacked(self.linear.adjoint(values)[:, list(self.learned)])
+
+
+class _Run(NamedTuple):
+    """States, inputs, and the rows that steps read, along free runs where they have values; where segments begin."""
+
+    x: Matrix
+    u: Matrix
+    rows: Matrix
+    begins: Any
+
+    @classmethod
+    def of(cls, model: MotionModel, record: Record) -> _Run:
+        """Of a long record the first rows."""
+        states = model.states(record, initial="measured" if record.outputs else "zero")
+        states = states[list(model.form.motion.names_of_states)].to_numpy()
+        length = model.trained.segment if model.trained is not None else 0
+        left, begin, pieces = MOST_CELLS // len(model.outputs), 0, []
+        for experiment in record.experiments:
+            x = states[begin : begin + len(experiment)]
+            begin += len(experiment)
+            whole = len(x) if np.isfinite(x).all() else int(np.argmin(np.isfinite(x).all(axis=1)))
+            whole = min(whole, left)
+            left -= whole
+            rows = model.form.inputs(experiment, record)[:whole]
+            starts = np.arange(whole) % (length or max(whole, 1)) == 0
+            pieces.append((x[:whole], experiment.inputs[:whole], rows, starts))
+        return cls(*(np.concatenate(part) for part in zip(*pieces, strict=True)))
+
+
+def _stacked(values: Float[np.ndarray, "M n *k"]) -> np.ndarray:
+    """All points and places below each other."""
+    return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])
+
+
+def _places(model: MotionModel) -> tuple[tuple[str, str], ...]:
+    """Name and unit of every learned equation, by its state, and of every learned output."""
+    motion = model.form.motion
+    states, outputs = motion.learned
+    names = [motion.states[i].name for i in states] + [motion.outputs[i].name for i in outputs]
+    units = [unit for _, unit in labels_of(model.form)][: len(states)] + [model.outputs[i].unit for i in outputs]
+    return tuple(zip(names, units, strict=True))
+
+
+def _rates_of_change(outputs: Sequence[str], seen: Sequence[str]) -> list[str]:
+    """The velocity of each output of which the learner sees two lags, one after the other."""
+    found = []
+    for name in outputs:
+        lags = [lag for lag in range(1, len(seen) + 2) if f"{name}[k-{lag}]" in seen]
+        pair = next((lag for lag in lags if lag + 1 in lags), None)
+        if pair is not None:
+            found.append(f"({name}[k-{pair}] - {name}[k-{pair + 1}])/{SAMPLING_TIME}")
+    return found
+
+
+def _beyond(model: Any, z: Matrix) -> float:
+    """Share of the points at which a feature lies outside those of training."""
+    if not model.form.bound.differentiable or not len(z):
+        return 0.0
+    scaled = (z - np.asarray(model.numbers.centre)) / np.asarray(model.numbers.halfwidth)
+    return float(np.mean((np.abs(scaled) > 1 + _WITHIN).any(axis=1)))
+
+
+def _tangent(model: Any, z: Matrix, weight: Matrix, response: Response | None) -> Tangent | None:
+    """The learner's derivatives at its features z (M, nz)."""
+    bound, numbers, statistics = model.form.bound, model.numbers, model.statistics
+    if not bound.differentiable or numbers.tilt is not None or not 0 < bound.size <= MOST_WEIGHTS:
+        return None
+    w, gain = np.asarray(numbers.weights), weight * np.asarray(numbers.gain)
+    scaled = (z - np.asarray(numbers.centre)) / np.asarray(numbers.halfwidth)
+    slopes = jax.jit(jax.vmap(jax.jacrev(bound.values), in_axes=(None, 0)))(w, scaled)
+    jacobian = np.einsum("oi,miw->mow", gain, np.asarray(slopes)).reshape(-1, len(w))
+    jacobian = jacobian if response is None else response.forward(jacobian)
+    ridge: Any = np.asarray(statistics.ridge)
+    if statistics.gram is not None:  # over other rows, of which there may be more or fewer
+        there = float(np.trace(statistics.gram[len(model.theta) :, len(model.theta) :]))
+        ridge = ridge * (float(np.sum(jacobian**2)) / there if there > 0 else 1.0)
+    return Tangent(jacobian, w, ridge, statistics.joint(len(model.theta)))

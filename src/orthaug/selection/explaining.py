@@ -1,0 +1,357 @@
+"""What has a learner found? Its output over data, regressed on suspected terms and on products of what it sees.
+
+Forward orthogonal regression: the physics is projected out first where the learner shares directions with it, then the
+term that explains most beside those that are in comes next, or a pair that explains more than it and one that is in
+(replacement). Widths, of a Stribeck curve say, are refined with all others in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import scipy.optimize
+from jaxtyping import Float
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.errors import InputError
+from orthaug.analysis.suspects import WIDTHS, written
+from orthaug.data.terms import CONSTANT, TermLibrary
+from orthaug.selection.as_shown import Shown, basis_of, least_squares, without
+from orthaug.selection.explained_ground import Ground
+
+MOST_CANDIDATES = 3000
+TERM = "term"
+"""The kind of a product of what the learner sees."""
+_PLAIN = ("coulomb", "quadratic_drag", "cubic")
+_WIDE = tuple(kind for kind in ("stribeck", "stribeck_gauss", "dead_zone", "saturation") if kind in WIDTHS)
+_WIDTHS = tuple(2.0 ** (i / 2) for i in range(-8, 3))  # times the median size of what a term acts on
+_REFINED = 2.0  # how far, as a factor, a width is moved from where it was found
+_COMPLEXITY = dict.fromkeys(_PLAIN, 1) | {"stribeck": 3, "stribeck_gauss": 3, "dead_zone": 4, "saturation": 4}
+_OWN = 1e-4  # of a candidate's squared norm: what physics, learner and other terms must leave of it
+_TIE, _TIE_UNKNOWN = 2e-4, 2e-3  # share of the learner: within this of the best the simpler term is taken
+_PART = 0.1  # of what even the best leaves: less tells no two terms apart either
+_DRAWS = 10.0  # variances of the noise in one direction: what two terms with widths differ by at random
+_ROUGH, _FINE = 0.03, 1e-3  # of its logarithm
+_TRIED = 10  # kinds of terms, or pairs of kinds, that are refined before the choice
+_BLOCK, _LOOKED = 256, 200  # candidates whose pairs are looked at together, and pairs of them
+_T = 3.0  # standard errors that a coefficient must differ from 0: the term was chosen among many
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A term that could explain the learner in one output or equation: `kind` of `on` with its `width`, written out."""
+
+    kind: str
+    on: str | None
+    width: float | None
+    place: int
+    text: str
+
+    def wide(self, width: float) -> Candidate:
+        """The same with another width, of four digits."""
+        width = float(f"{width:.4g}")
+        return replace(self, width=width, text=_written(self.kind, self.on, width))
+
+    @property
+    def name(self) -> str:
+        """In words."""
+        return self.text if self.kind == TERM else f"{self.kind} of {self.on}"
+
+    @property
+    def complexity(self) -> int:
+        """Of terms that explain as much the simplest is taken. A learner is smooth: clipping imitates jumps last."""
+        return _COMPLEXITY.get(self.kind, 2 + self.text.replace("**", "").count("*"))
+
+    @property
+    def identity(self) -> tuple[str, str, int]:
+        """What it is whatever its width."""
+        return self.kind, self.text if self.on is None else self.on, self.place
+
+
+@dataclass(frozen=True, eq=False)
+class Space:
+    """Candidates as the learner would show them, beside the physics: `columns` (K, r), and the learner, `target` (r,).
+
+    The target has norm 1, so that squares are shares of what the learner adds; `norm` is what it had. `tie` is the
+    share by which two terms cannot be told apart.
+    """
+
+    ground: Ground
+    shown: Shown
+    target: Vector
+    norm: float
+    candidates: tuple[Candidate, ...]
+    columns: Float[np.ndarray, "K r"]
+    tie: float
+
+    @classmethod
+    def of(cls, ground: Ground, candidates: Sequence[Candidate]) -> Space:
+        """Candidates without a value on some point, and those that physics expresses or no learner shows, are out."""
+        shown = Shown.of(ground)
+        norm = float(np.linalg.norm(shown.target))
+        kept, columns = [], []
+        for candidate in candidates:
+            column = shown.unit(ground.column(ground.parse(candidate.text), candidate.place))
+            if np.isfinite(column).all() and column @ column > _OWN:
+                kept.append(candidate)
+                columns.append(column)
+        table = np.array(columns).reshape(len(columns), len(shown.target))
+        target = shown.target / norm if norm > 1e-9 * shown.size else 0.0 * shown.target
+        tie = _TIE_UNKNOWN if shown.covariance is None else _TIE
+        tie = max(tie, _DRAWS * shown.noise / norm**2) if norm > 0 else tie
+        return cls(ground, shown, target, norm, tuple(kept), table, tie)
+
+    @property
+    def empty(self) -> bool:
+        """Whether the learner adds nothing beside the physics, or nothing could explain it."""
+        return not self.target.any() or not self.candidates
+
+    def column(self, candidate: Candidate) -> Vector:
+        """A candidate as the learner would show it, (r,)."""
+        return self.shown.unit(self.ground.column(self.ground.parse(candidate.text), candidate.place))
+
+    def gains(self, chosen: Sequence[Vector]) -> Vector:
+        """Share of the learner that each candidate would explain beside those that are chosen (K,)."""
+        basis = basis_of(chosen)
+        left = np.einsum("kr,kr->k", self.columns, self.columns)
+        if basis.size:
+            left = left - np.sum((self.columns @ basis) ** 2, axis=1)
+        able = left > _OWN
+        return np.where(able, (self.columns @ without(self.target, basis)) ** 2 / np.where(able, left, 1.0), 0.0)
+
+    def explained(self, chosen: Sequence[Vector]) -> float:
+        """Share of the learner that chosen columns explain together."""
+        return float(np.sum((basis_of(chosen).T @ self.target) ** 2)) if len(chosen) else 0.0
+
+
+def candidates_of(
+    ground: Ground, degree: int, functions: Sequence[str], suspects: Sequence[tuple[str, int]]
+) -> tuple[Candidate, ...]:
+    """What could explain the learner, simple terms first.
+
+    Args:
+        degree, functions: of products of what the learner sees (`TermLibrary`).
+        suspects: further expressions, each with the number of its place.
+
+    Raises:
+        InputError: more than can be kept in memory.
+    """
+    library = TermLibrary.of(ground.signals[: ground.seen], degree, functions)
+    plain = {_written(kind, on) for kind in _PLAIN for on in ground.signals}
+    texts = [text for text in library.texts if text != CONSTANT and text not in plain]
+    wide = [(kind, on, width) for kind in _WIDE for on in ground.signals for width in _grid(ground, on)]
+    places = range(len(ground.places))
+    count = (len(texts) + len(wide)) * len(places)
+    if count > MOST_CANDIDATES:
+        raise InputError(
+            f"{ground.seen} signals to the degree {degree} make {count} candidate terms; at most {MOST_CANDIDATES} are "
+            "looked at. Lower the degree, or give fewer functions."
+        )
+    found = [Candidate(TERM, None, None, place, text) for text, place in suspects]
+    for place in places:
+        found += [Candidate(kind, on, None, place, _written(kind, on)) for kind in _PLAIN for on in ground.signals]
+        found += [Candidate(TERM, None, None, place, CONSTANT)]
+        found += [Candidate(TERM, None, None, place, text) for text in texts]
+        found += [Candidate(kind, on, width, place, _written(kind, on, width)) for kind, on, width in wide]
+    return tuple(found)
+
+
+def _grid(ground: Ground, on: str) -> Iterator[float]:
+    """Widths that the data could tell; none for what is zero, or has no value somewhere."""
+    with np.errstate(all="ignore"):
+        size = np.abs(np.asarray(ground.evaluate(ground.parse(on)), dtype=float))
+    if np.isfinite(size).all() and np.any(size > 0):
+        yield from (float(f"{share * np.median(size[size > 0]):.4g}") for share in _WIDTHS)
+
+
+def _written(kind: str, on: str | None, width: float | None = None) -> str:
+    simple = on is not None and not any(mark in on for mark in "+-*/ " if mark not in on.partition("[")[2])
+    if kind == "cubic" and simple:
+        return f"{on}**3"
+    return written(kind, on, width, lambda text: text, "v")[0]
+
+
+def select(space: Space, most: int, least: float) -> list[Candidate]:
+    """The terms, in the order in which they explain most.
+
+    Args:
+        most: at most so many.
+        least: share of the learner that each must explain beside all others.
+    """
+    chosen: list[Candidate] = []
+    while len(chosen) < most and not space.empty:
+        grown = _grown(space, chosen)
+        if not grown or _share(space, grown) < _share(space, chosen) + least:
+            break
+        chosen = grown
+    return _ordered(space, _pruned(space, chosen, least))
+
+
+def _share(space: Space, chosen: Sequence[Candidate]) -> float:
+    return space.explained([space.column(one) for one in chosen])
+
+
+def _grown(space: Space, chosen: list[Candidate]) -> list[Candidate]:
+    """One term more: beside all that are in, or a pair beside all but one; widths refined, the simplest of the best.
+
+    Friction has the sum of a jump and of a peak, neither of which is the best term alone.
+    """
+    trials = [[*chosen, one] for one in _best_single(space, chosen)]
+    for i in range(len(chosen)):
+        others = chosen[:i] + chosen[i + 1 :]
+        trials += [[*others, *pair] for pair in _best_pairs(space, others)]
+    trials = [_refined(space, trial, _ROUGH) for trial in trials]
+    shares = [_share(space, trial) for trial in trials]
+    best = max(shares, default=0.0)
+    tie = max(space.tie, _PART * (1 - best))
+    able = [i for i, share in enumerate(shares) if share >= best - tie]
+    taken = min(able, key=lambda i: (sum(one.complexity for one in trials[i]), -shares[i]), default=None)
+    return [] if taken is None else _refined(space, trials[taken])
+
+
+def _best_single(space: Space, chosen: Sequence[Candidate]) -> list[Candidate]:
+    """The terms that explain most beside those that are chosen."""
+    gains = space.gains([space.column(one) for one in chosen])
+    found: dict[Any, Candidate] = {}
+    for i in np.argsort(-gains, kind="stable"):
+        if len(found) == _TRIED or gains[i] <= 0:
+            break
+        found.setdefault(space.candidates[int(i)].identity, space.candidates[int(i)])
+    return list(found.values())
+
+
+def _best_pairs(space: Space, others: Sequence[Candidate]) -> list[tuple[Candidate, Candidate]]:
+    """The pairs that explain most together beside others, of each two kinds the best."""
+    basis = basis_of([space.column(one) for one in others])
+    x, y = space.columns, without(space.target, basis)
+    if basis.size:
+        x = x - (x @ basis) @ basis.T
+    size, along = np.einsum("kr,kr->k", x, x), x @ y
+    able = np.flatnonzero(size > _OWN)
+    x, size, along = x[able], size[able], along[able]
+    found: dict[Any, tuple[float, Candidate, Candidate]] = {}
+    for begin in range(0, len(able), _BLOCK):
+        rows = slice(begin, begin + _BLOCK)
+        across = x[rows] @ x.T
+        left = np.outer(size[rows], size) - across**2
+        gain = along[rows, None] ** 2 * size + along**2 * size[rows, None] - 2 * np.outer(along[rows], along) * across
+        gain = np.where(left > _OWN * np.outer(size[rows], size), gain / np.where(left > 0, left, 1.0), 0.0)
+        gain = np.where(np.arange(len(able)) > begin + np.arange(len(gain))[:, None], gain, 0.0)
+        best = np.argpartition(-gain, min(_LOOKED, gain.size - 1), axis=None)[:_LOOKED]
+        for flat in best[np.argsort(-gain.ravel()[best], kind="stable")]:
+            i, j = np.unravel_index(flat, gain.shape)
+            one, other = space.candidates[able[begin + i]], space.candidates[able[j]]
+            kinds = (one.identity, other.identity)
+            if gain[i, j] > found.get(kinds, (0.0,))[0]:
+                found[kinds] = (float(gain[i, j]), one, other)
+    ordered = sorted(found.values(), key=lambda entry: -entry[0])
+    return [(one, other) for _, one, other in ordered[:_TRIED]]
+
+
+def _refined(space: Space, chosen: list[Candidate], within: float = _FINE) -> list[Candidate]:
+    """Widths moved to where the terms together explain most."""
+    for i, candidate in enumerate(chosen):
+        if candidate.width is None:
+            continue
+        others = [space.column(one) for one in chosen[:i] + chosen[i + 1 :]]
+
+        def missed(log: float, candidate: Candidate = candidate, others: list[Vector] = others) -> float:
+            return -space.explained([*others, space.column(candidate.wide(float(np.exp(log))))])
+
+        centre = float(np.log(candidate.width))
+        around = (centre - np.log(_REFINED), centre + np.log(_REFINED))
+        options: Any = {"xatol": within}
+        best = scipy.optimize.minimize_scalar(missed, bounds=around, method="bounded", options=options)
+        if best.fun < missed(centre) - 1e-6:
+            chosen = [*chosen[:i], candidate.wide(float(np.exp(best.x))), *chosen[i + 1 :]]
+    return chosen
+
+
+def _pruned(space: Space, chosen: list[Candidate], least: float) -> list[Candidate]:
+    """Without terms that the others make superfluous."""
+    while len(chosen) > 1:
+        columns = [space.column(one) for one in chosen]
+        whole = space.explained(columns)
+        losses = [whole - space.explained(columns[:i] + columns[i + 1 :]) for i in range(len(columns))]
+        weakest = int(np.argmin(losses))
+        if losses[weakest] >= least:
+            break
+        chosen = _refined(space, chosen[:weakest] + chosen[weakest + 1 :])
+    return chosen
+
+
+def _ordered(space: Space, chosen: list[Candidate]) -> list[Candidate]:
+    """Each next the one that explains most beside those before it."""
+    left, order = list(chosen), []
+    while left:
+        known = [space.column(one) for one in order]
+        shares = [space.explained([*known, space.column(one)]) for one in left]
+        order.append(left.pop(int(np.argmax(shares))))
+    return order
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Chosen terms fitted beside the physics: how far that moves (s,), coefficients (k,) and their Cov or None."""
+
+    along: Vector
+    coefficients: Vector
+    covariance: Matrix | None
+
+    def doubtful(self) -> int | None:
+        """The number of the term that stands out least from the learner's own errors, where one does not."""
+        if self.covariance is None or not len(self.coefficients):
+            return None
+        std = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        t = np.abs(self.coefficients) / np.where(std > 0, std, 1e-300)
+        return int(np.argmin(t)) if t.min() < _T else None
+
+
+def fit_terms(space: Space, chosen: Sequence[Candidate]) -> Fit:
+    """Least squares of the learner on the terms as it would show them; the physics takes what they do not express."""
+    ground, shown = space.ground, space.shown
+    raw = [ground.column(ground.parse(one.text), one.place) for one in chosen]
+    size = np.array([np.linalg.norm(column) for column in raw])
+    inverse = np.zeros((0, len(shown.target)))
+    if chosen:
+        inverse = np.linalg.pinv(np.column_stack([shown.unit(column) for column in raw])) / size[:, None]
+    coefficients = inverse @ shown.target
+    rest = ground.learner - sum((b * c for b, c in zip(coefficients, raw, strict=True)), 0.0)
+    covariance = None if shown.covariance is None else inverse @ shown.covariance @ inverse.T
+    return Fit(least_squares(ground.physics_moves, ground.fitted(rest)), coefficients, covariance)
+
+
+def settled(space: Space, chosen: list[Candidate]) -> tuple[list[Candidate], Fit, bool]:
+    """The terms whose coefficients stand out from the learner's own errors; and whether any other was dropped."""
+    fit, dropped = fit_terms(space, chosen), False
+    while (weak := fit.doubtful()) is not None:
+        chosen, dropped = chosen[:weak] + chosen[weak + 1 :], True
+        fit = fit_terms(space, chosen)
+    return chosen, fit, dropped
+
+
+def rivals(space: Space, chosen: Sequence[Candidate], number: int, most: int = 3) -> tuple[str, ...]:
+    """Other terms that could stand in the place of one and explain nearly as much."""
+    columns = [space.column(one) for one in chosen]
+    others = columns[:number] + columns[number + 1 :]
+    gains = space.gains(others) + space.explained(others)
+    near = gains >= space.explained(columns) - 2 * space.tie
+    own = chosen[number]
+    found = [space.candidates[int(i)] for i in np.argsort(-gains) if near[int(i)]]
+    names = dict.fromkeys(one.name for one in found if one.identity != own.identity)
+    return tuple(names)[:most]
+
+
+def alone(space: Space, most: int) -> list[tuple[Candidate, float]]:
+    """The terms that explain most if each is the only one, the best width of each."""
+    gains, found = space.gains([]), []
+    for i in np.argsort(-gains, kind="stable"):
+        candidate = space.candidates[int(i)]
+        if gains[i] > 0 and all(candidate.identity != other.identity for other, _ in found):
+            found.append((candidate, float(min(gains[i], 1.0))))
+        if len(found) == most:
+            break
+    return found

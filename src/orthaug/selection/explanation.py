@@ -1,0 +1,297 @@
+"""`explain`: the terms that a learner has found, what they explain of it, and what to write into the physics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import check_count, check_type, is_number
+from orthaug._base.errors import InputError, shown
+from orthaug._base.warning import Warning
+from orthaug.analysis.motion_suspects import MotionSuspect
+from orthaug.analysis.suspects import Suspect
+from orthaug.data.record import Record
+from orthaug.data.terms import CONSTANT
+from orthaug.data.writing import coefficient_unit
+from orthaug.models.model import Model
+from orthaug.models.motion_model import MotionModel
+from orthaug.physics.baseline import Baseline
+from orthaug.physics.motion import Motion
+from orthaug.selection.added_physics import (
+    Added,
+    added_to_baseline,
+    added_to_motion,
+    baseline_lines,
+    names_for,
+)
+from orthaug.selection.explained_ground import Ground, ground_of
+from orthaug.selection.explaining import (
+    TERM,
+    Candidate,
+    Fit,
+    Space,
+    alone,
+    candidates_of,
+    rivals,
+    select,
+    settled,
+)
+
+LEAST = 0.005
+_HALF = 0.5  # of the learner, less its own errors: terms that explain less are none to be added
+_LEVEL = 0.01  # at which the learner is something beside its own errors
+_ENDED = ("converged", "exact")
+_SHOWN = 8  # terms, each as the only one
+_OUTSIDE = 0.05  # share of rows beyond the training data that is told of
+_NAMES = {"coulomb": "coulomb", "quadratic_drag": "drag", "stribeck_gauss": "stribeck", TERM: "term"}
+
+
+@dataclass(frozen=True)
+class ExplainingTerm:
+    """A term to add to the physics.
+
+    `coefficient` is in `unit`, None where that is not told; `std` is its standard error by the learner's, None if not
+    known. `share` is what it adds to the terms before it, `alone` what it explains as the only one. `rivals` would
+    explain nearly as much in its place.
+    """
+
+    parameter: str
+    expression: str
+    kind: str
+    on: str | None
+    width: float | None
+    added_to: str
+    coefficient: float
+    unit: str | None
+    std: float | None
+    share: float
+    alone: float
+    rivals: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class SingleTerm:
+    """A term that was looked at, and the share of the learner that it explains as the only one."""
+
+    name: str
+    expression: str
+    added_to: str
+    share: float
+
+
+@dataclass(frozen=True)
+class MovedParameter:
+    """A parameter of the physics now, and with the terms in it."""
+
+    name: str
+    unit: str
+    value: float
+    value_with: float
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """What a learner has found.
+
+    `share` is what the `terms` explain together of the mean square that the learner adds beside the physics, `noise`
+    the share that is its own error as far as training tells, `p` that of the learner being nothing else; None if not
+    known. `physics` is the baseline or motion with the terms added, None where there are none or it is a function;
+    `spec` the same as lines of a spec file.
+    """
+
+    terms: tuple[ExplainingTerm, ...]
+    share: float
+    noise: float | None
+    p: float | None
+    singles: tuple[SingleTerm, ...]
+    parameters: tuple[MovedParameter, ...]
+    physics: Baseline | Motion | None
+    spec: str | None
+    points: int
+    text: str
+    warnings: tuple[Warning, ...]
+
+    @property
+    def found(self) -> bool:
+        """Whether there are terms to add."""
+        return bool(self.terms)
+
+    def __repr__(self) -> str:
+        return f"Explanation({self.text})"
+
+
+def explain(
+    model: Any,
+    record: Record | None = None,
+    *,
+    suspects: Sequence[Suspect | MotionSuspect] = (),
+    degree: int = 3,
+    functions: Sequence[str] = (),
+    most: int = 6,
+    least: float = LEAST,
+) -> Explanation:
+    """Which terms a learner has found: its output over a record, regressed on suspects and on products.
+
+    Friction, drag, hardening, dead zones and saturations of everything that the learner sees are tried, and products of
+    it. Each is taken as the learner would show it, for a smooth one shows no jumps (`selection.as_shown`).
+
+    Args:
+        model: a model with a learner, or what `estimate` returned.
+        record: best the one that it was trained on; may be left out for an estimate. Outputs are needed but for a
+            motion, whose free run then starts from 0.
+        suspects: further terms to try.
+        degree, functions: of the products, as in `Terms`.
+        most: terms at most.
+        least: share of the learner that each term must explain beside all others.
+
+    Raises:
+        InputError: no learner, other channels, suspects that cannot be read, too many candidates.
+    """
+    fit = model
+    if not isinstance(model, Model | MotionModel):
+        model = getattr(fit, "model", None)
+        if not isinstance(model, Model | MotionModel):
+            raise InputError(f"`model` must be a model or what `estimate` returns; got {shown(fit)}.")
+        record = getattr(getattr(fit, "problem", None), "record", None) if record is None else record
+    check_type(record, Record, "record", "the Record that the model was trained on")
+    assert record is not None
+    degree, most = check_count(degree, "degree", of="factors"), check_count(most, "most", of="terms")
+    if not is_number(least) or not 0 < least < 1:
+        raise InputError(f"`least` must be a share between 0 and 1; got {shown(least)}.")
+    if isinstance(functions, str) or any(not isinstance(name, str) for name in functions):
+        raise InputError(f"`functions` must be a list of names, such as ['abs']; got {shown(functions)}.")
+    ground = ground_of(model, record)
+    space = Space.of(ground, candidates_of(ground, degree, functions, _declared(suspects, ground)))
+    chosen, fitted, dropped = settled(space, select(space, most, least))
+    told = _told(space, chosen, fitted, dropped)
+    code = getattr(getattr(fit, "status", None), "code", "converged")
+    if code not in _ENDED:
+        text = "training did not end at a minimum: the learner may show terms otherwise than they are; train longer."
+        told = replace(told, warnings=(*told.warnings, Warning("not_converged", text)))
+    return told
+
+
+def _declared(suspects: Sequence[Any], ground: Ground) -> list[tuple[str, int]]:
+    """Expressions of suspects with the number of their output or equation."""
+    names, found = [name for name, _ in ground.places], []
+    for suspect in suspects:
+        check_type(suspect, Suspect | MotionSuspect, "suspects", "a list of Suspects, or of MotionSuspects of a motion")
+        where = suspect.equation if isinstance(suspect, MotionSuspect) else suspect.output
+        if where is not None and where not in names:
+            raise InputError(
+                f"suspect '{suspect.name}': the learner adds nothing to '{where}', but to {', '.join(names)}."
+            )
+        ground.evaluate(ground.parse(suspect.expression))
+        found.append((suspect.expression, 0 if where is None else names.index(where)))
+    return found
+
+
+def _told(space: Space, chosen: list[Candidate], fitted: Fit, dropped: bool) -> Explanation:
+    ground, noise, p = space.ground, None, space.shown.p
+    if space.shown.covariance is not None and space.norm > 0:
+        noise = min(float(np.trace(space.shown.covariance)) / space.norm**2, 1.0)
+    singles = tuple(
+        SingleTerm(one.name, one.text, ground.places[one.place][0], share) for one, share in alone(space, _SHOWN)
+    )
+    share = space.explained([space.column(one) for one in chosen])
+    real = p is None or p < _LEVEL
+    if space.empty or not real or share < _HALF * (1 - (noise or 0.0)):
+        chosen, text = [], _why_nothing(space, real, dropped, share, singles)
+    terms = _terms(space, chosen, fitted)
+    moved = ground.moved(fitted.along) if chosen else ground.values
+    parameters = tuple(
+        MovedParameter(p.name, p.unit, float(now), float(then))
+        for p, now, then in zip(ground.parameters, ground.values, moved, strict=True)
+    )
+    physics, spec = _physics(ground, terms, moved) if terms else (None, None)
+    share = share if chosen else 0.0
+    if terms:
+        named = " and ".join(", ".join(term.expression for term in terms).rsplit(", ", 1)) if len(terms) < 3 else ""
+        what = named or f"{len(terms)} terms"
+        verb = "explains" if len(terms) == 1 else "explain"
+        text = f"{what} {verb} {100 * share:.3g} % of what the learner adds beside the physics."
+    told = []
+    if ground.outside > _OUTSIDE:
+        reach = f"{100 * ground.outside:.0f} % of the rows lie beyond what the learner saw in training"
+        told.append(Warning("beyond_training", f"{reach}: there it shows how it extrapolates."))
+    points = len(ground.target)
+    return Explanation(terms, share, noise, p, singles, parameters, physics, spec, points, text, tuple(told))
+
+
+def _why_nothing(space: Space, real: bool, dropped: bool, share: float, singles: Sequence[SingleTerm]) -> str:
+    if not space.target.any():
+        return (
+            "the learner adds nothing over these data that the physics could not express; there is nothing to explain."
+        )
+    if not space.candidates:
+        return "nothing explains the learner: the physics expresses all candidate terms already."
+    if not real:
+        return "what the learner adds does not stand out from its own errors; there is nothing to explain."
+    best = f"the best single term, {singles[0].expression}, explains {100 * singles[0].share:.2g} % of it"
+    if dropped and share < _HALF:
+        return f"no term stands out from the learner's own errors; {best}. Keep the learner."
+    return f"no few terms explain half of what the learner adds; {best}. Keep the learner, or try other suspects."
+
+
+def _terms(space: Space, chosen: Sequence[Candidate], fitted: Fit) -> tuple[ExplainingTerm, ...]:
+    ground, before, found = space.ground, 0.0, []
+    taken = [*ground.units, *(p.name for p in ground.parameters)]
+    if isinstance(ground.physics, Motion):
+        taken += list(ground.physics.known)
+    else:
+        taken += [name for name, _ in ground.physics.constants] + [term.parameter for term in ground.physics.terms]
+    names = names_for([_base_name(one) for one in chosen], taken)
+    columns = [space.column(one) for one in chosen]
+    std = None if fitted.covariance is None else np.sqrt(np.maximum(np.diag(fitted.covariance), 0.0))
+    for i, one in enumerate(chosen):
+        place, unit = ground.places[one.place]
+        whole = space.explained(columns[: i + 1])
+        scale = one.on if one.kind in ("dead_zone", "saturation") and one.on is not None else one.text
+        found.append(
+            ExplainingTerm(
+                parameter=names[i],
+                expression=one.text,
+                kind=one.kind,
+                on=one.on,
+                width=one.width,
+                added_to=place,
+                coefficient=float(fitted.coefficients[i]),
+                unit=coefficient_unit(unit, ground.parse(scale), ground.units),
+                std=None if std is None else float(std[i]),
+                share=whole - before,
+                alone=space.explained([columns[i]]),
+                rivals=rivals(space, chosen, i),
+            )
+        )
+        before = whole
+    return tuple(found)
+
+
+def _base_name(candidate: Candidate) -> str:
+    return "offset" if candidate.text == CONSTANT else _NAMES.get(candidate.kind, candidate.kind)
+
+
+def _physics(
+    ground: Ground, terms: Sequence[ExplainingTerm], moved: Any
+) -> tuple[Baseline | Motion | None, str | None]:
+    """The physics with the terms added, and the lines that say so in a spec."""
+    several = len(ground.places) > 1
+    added = [_added(ground, term) for term in terms]
+    if isinstance(ground.physics, Motion):
+        changed = added_to_motion(ground.physics, moved, added, ground.units)
+        return (None, None) if changed is None else (changed.motion, changed.lines())
+    baseline = added_to_baseline(ground.physics, moved, added, several)
+    return (None, None) if baseline is None else (baseline, baseline_lines(added, several))
+
+
+def _added(ground: Ground, term: ExplainingTerm) -> Added:
+    template = unit = None
+    if term.width is not None:
+        template = term.expression.replace(repr(term.width), "{width}")
+        unit = coefficient_unit("1", ground.parse(str(term.on)), ground.units)
+        unit = None if unit is None else ground.units.get(str(term.on), "")
+    where = (term.added_to, term.coefficient, term.unit)
+    return Added(term.parameter, term.expression, *where, term.width, unit, template)

@@ -1,0 +1,204 @@
+"""What a learner has found: terms with their coefficients, the loop to the true physics, and where there is nothing."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from test_cli import one_line, run, write_csv
+
+import orthaug as oa
+from orthaug._base.errors import InputError
+from orthaug.commands.spec import load_spec
+from orthaug.selection.motion_response import MotionResponse
+
+ROWS = 600
+SPEC = """
+[data]
+sampling_time = 0.1
+inputs = ["u"]
+outputs = ["y"]
+train = { files = ["run.csv"] }
+[data.channels]
+y = { unit = "m" }
+[[baseline.terms]]
+parameter = "a"
+regressor = "y[k-1]"
+[[baseline.terms]]
+parameter = "b"
+regressor = "y[k-2]"
+[[baseline.terms]]
+parameter = "g"
+regressor = "u[k-1]"
+"""
+ALONE = '[learner]\nkind = "none"\n'
+LEARNER = "[learner]\nhidden = [6]\n"
+TRUE = {"a": 0.6, "b": -0.2, "g": 1.0}
+
+
+def system(cubic: float, noise: float = 0.02) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    u, y = rng.uniform(-1, 1, ROWS), np.zeros(ROWS)
+    for k in range(2, ROWS):
+        y[k] = 0.6 * y[k - 1] - 0.2 * y[k - 2] + u[k - 1] + cubic * y[k - 1] ** 3 + noise * rng.normal()
+    return {"u": u, "y": y}
+
+
+def fitted(cubic: float, **options) -> oa.Estimate:
+    given = system(cubic)
+    units = {"inputs": [oa.Channel("u", "V")], "outputs": [oa.Channel("y", "m")]}
+    record = oa.Record.from_arrays(given["u"], given["y"], **units, sampling_time=0.1)
+    terms = [oa.Term("a", "y[k-1]"), oa.Term("b", "y[k-2]"), oa.Term("g", "u[k-1]")]
+    return oa.estimate(record, oa.Baseline.from_terms(terms), **{"learner": oa.MLP(hidden=(6,)), **options})
+
+
+@pytest.fixture(scope="module")
+def hardening() -> oa.Estimate:
+    return fitted(-0.3)
+
+
+def test_a_cubic_is_found_with_its_coefficient_and_theta(hardening):
+    told = oa.explain(hardening)
+    (term,) = told.terms
+    assert term.expression == "y[k-1]**3" and term.unit == "1/m**2" and term.added_to == "y"
+    assert term.coefficient == pytest.approx(-0.3, rel=0.03) and abs(term.coefficient + 0.3) < 4 * term.std
+    assert told.share > 0.95 and term.alone == pytest.approx(told.share)
+    assert told.p < 1e-6 and told.noise < 0.05
+    now = {moved.name: moved.value for moved in told.parameters}
+    then = {moved.name: moved.value_with for moved in told.parameters}
+    assert now["a"] < 0.45, "the physics took on the cubic's nearest line"
+    assert then == pytest.approx(TRUE, abs=0.01)
+
+
+def test_the_physics_with_the_term_leaves_the_learner_nothing(hardening):
+    grown = oa.explain(hardening).physics
+    assert grown.names == ("a", "b", "g", "cubic") and grown.initial[3] == pytest.approx(-0.3, rel=0.03)
+    again = fitted(-0.3, learner=None)
+    again = oa.estimate(again.problem.record, grown, learner=oa.MLP(hidden=(6,)))
+    told = oa.explain(again)
+    assert not told.found and told.physics is None and told.spec is None and told.share == 0.0
+    assert "does not stand out from its own errors" in told.text
+    assert dict(zip(grown.names, again.theta, strict=True)) == pytest.approx(TRUE | {"cubic": -0.3}, abs=0.01)
+
+
+def test_a_suspect_that_is_given_is_tried(hardening):
+    own = oa.Suspect("strange", "y[k-1]**3 + 0.02*y[k-2]**2")
+    assert oa.explain(hardening, suspects=[own], degree=1).singles
+    with pytest.raises(InputError, match="adds nothing to 'w', but to y"):
+        oa.explain(hardening, suspects=[oa.Suspect("far", "y[k-1]**3", output="w")])
+
+
+def test_a_function_from_another_toolbox_is_explained_as_it_is():
+    given = fitted(-0.3, learner=None).problem
+    plant = lambda x: (x @ [0.6, -0.2, 1.0] - 0.3 * x[:, 0] ** 3)[:, None]  # noqa: E731
+    told = oa.explain(oa.orthogonalize(given.record, given.baseline, plant))
+    (term,) = told.terms
+    assert term.expression == "y[k-1]**3" and term.coefficient == pytest.approx(-0.3) and term.std is None
+    assert told.share == pytest.approx(1) and told.p is None and told.noise is None
+    assert [moved.value_with for moved in told.parameters] == pytest.approx(list(TRUE.values()))
+
+
+def friction(rows: int = 2000) -> oa.Record:
+    """A mass of 1 kg on 2 N s/m and 100 N/m, with Coulomb friction of 0.8 N that starts at 1.6 N (backward Euler)."""
+    step, rng = 0.01, np.random.default_rng(3)
+    gain = step**2 / (1.0 + 2.0 * step + 100.0 * step**2)
+    force, y, e = np.repeat(rng.normal(0, 6.0, rows // 20), 20), np.zeros(rows), 1e-5 * rng.normal(size=rows)
+    for k in range(2, rows):
+        v = (y[k - 1] - y[k - 2]) / step
+        held = (0.8 + 0.8 * np.exp(-((v / 0.1) ** 2))) * np.sign(v)
+        free = (2.0 + 2.0 * step) / step**2 * y[k - 1] - y[k - 2] / step**2
+        y[k] = gain * (free + force[k - 1] - held) + e[k]
+    units = {"inputs": [oa.Channel("force", "N")], "outputs": [oa.Channel("position", "m")]}
+    return oa.Record.from_arrays(force, y, **units, sampling_time=step)
+
+
+def test_the_loop_ends_at_the_friction_law():
+    """The learner sees all lags. Its jump is smooth; the terms are sign(v) and the Stribeck peak all the same."""
+    record, gain = friction(), 1e-4 / 1.03
+    terms = [oa.Term("a", "position[k-1]"), oa.Term("b", "position[k-2]"), oa.Term("g", "force[k-1]", unit="m/N")]
+    speed = "(position[k-1] - position[k-2])/Ts"
+    options = {"learner": oa.MLP(hidden=(8,)), "solver": oa.LevenbergMarquardt(iterations=1500)}
+    first = oa.explain(oa.estimate(record, oa.Baseline.from_terms(terms), **options))
+    assert not first.warnings, "training ended at a minimum"
+    coulomb, peak = first.terms
+    assert coulomb.expression == f"sign({speed})" and coulomb.unit == "m"
+    assert peak.kind == "stribeck_gauss" and peak.on == speed and peak.width == pytest.approx(0.1, rel=0.05)
+    assert [coulomb.coefficient, peak.coefficient] == pytest.approx([-0.8 * gain, -0.8 * gain], rel=0.05)
+    assert first.share > 0.99 and coulomb.share + peak.share == pytest.approx(first.share)
+    again = oa.estimate(record, first.physics, **options)
+    then = dict(zip(again.problem.baseline.names, again.theta, strict=True))
+    assert then["coulomb"] / then["g"] == pytest.approx(-0.8, rel=0.03), "in N"
+    assert then["stribeck"] / then["g"] == pytest.approx(-0.8, rel=0.05)
+    assert not oa.explain(again).found
+
+
+def test_nothing_is_found_where_nothing_is_missing():
+    told = oa.explain(fitted(0.0))
+    assert not told.found and told.terms == () and "its own errors" in told.text
+    assert all(moved.value == moved.value_with for moved in told.parameters)
+
+
+def test_what_python_is_given(hardening):
+    model, record = hardening.model, hardening.problem.record
+    with pytest.raises(InputError, match="the model is physics alone: it has no learner"):
+        oa.explain(fitted(-0.3, learner=None))
+    with pytest.raises(InputError, match="`model` must be a model or what `estimate` returns; got 3"):
+        oa.explain(3, record)
+    with pytest.raises(InputError, match="record"):
+        oa.explain(model)
+    with pytest.raises(InputError, match="`least` must be a share between 0 and 1; got 2"):
+        oa.explain(model, record, least=2)
+    with pytest.raises(InputError, match="`functions` must be a list of names"):
+        oa.explain(model, record, functions="abs")
+    with pytest.raises(InputError, match="no terms are made of the function 'asb', did you mean 'abs'"):
+        oa.explain(model, record, functions=["asb"])
+    with pytest.raises(InputError, match="candidate terms; at most 3000 are looked at"):
+        oa.explain(model, record, degree=30)
+
+
+@pytest.mark.parametrize("half", [0.0, 0.005])
+def test_the_response_of_a_motion_has_its_transpose(half):
+    rng = np.random.default_rng(1)
+    begins = np.array([1, 0, 0, 1, 0, 0, 0])
+    steps, outputs = rng.normal(size=(7, 2, 2)), rng.normal(size=(7, 1, 2))
+    response = MotionResponse(steps, outputs, begins, np.array([[1.3]]), half)
+    terms, values = rng.normal(size=(7, 3, 2)), rng.normal(size=(7, 4))
+    back = np.einsum("mnk,mnj->kj", response.adjoint(values), terms)
+    assert back == pytest.approx(values.T @ response.forward(terms))
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("explained")
+    write_csv(folder / "run.csv", **system(-0.3))
+    (folder / "plant.toml").write_text(SPEC + LEARNER, encoding="utf-8")
+    (folder / "alone.toml").write_text(SPEC + ALONE, encoding="utf-8")
+    for name in ("plant", "alone"):
+        assert run("fit", folder / f"{name}.toml", "--out", folder / name).code == 0
+    return folder
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_the_command_tells_what_to_write_and_that_can_be_read(project):
+    done = run("explain", project / "plant", project / "run.csv", "--json")
+    told = json.loads(done.out)
+    assert done.code == 0 and told["found"] and told["terms"][0]["expression"] == "y[k-1]**3"
+    grown = project / "grown.toml"
+    grown.write_text(SPEC + told["spec"] + "\n" + ALONE, encoding="utf-8")
+    assert [term.parameter for term in load_spec(grown).baseline.terms] == ["a", "b", "g", "cubic"]
+    page = run("explain", project / "plant", project / "run.csv").out
+    assert page.startswith("y[k-1]**3 explains 9") and "[[baseline.terms]]" in page and "1/m**2" in page
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_wrong_use_is_told_in_a_line(project):
+    refused = run("explain", project / "alone", project / "run.csv")
+    assert refused.code == 2 and one_line(refused.err, "physics alone")
+    write_csv(project / "inputs.csv", u=np.zeros(50))
+    assert one_line(run("explain", project / "plant", project / "inputs.csv").err, "the data have no y")
+    write_csv(project / "other.csv", w=np.zeros(50))
+    assert one_line(run("explain", project / "plant", project / "other.csv").err, "u")
+    write_csv(project / "short.csv", u=np.ones(9), y=np.ones(9))
+    assert one_line(run("explain", project / "plant", project / "short.csv").err, "at least 20 are needed")
+    assert one_line(run("explain", project, project / "run.csv").err, "no saved model")
