@@ -156,6 +156,8 @@ def _sees(features: Features, lags: Iterable[Lag]) -> bool:
 
 def agreeing(before: Matrix, after: Matrix) -> Matrix:
     """The directions a with `before a = after a`, relative to the size of `before a`, in reduced form."""
+    if not before.size:  # of no points at all, as of a run that diverged
+        return np.zeros((before.shape[1], 0))
     scale = np.sqrt(np.mean(before**2 + after**2, axis=0))
     unit = 1 / np.where(scale > 0, scale, 1.0)
     r = np.linalg.qr(np.concatenate([before, after]) * unit, mode="r")

@@ -18,7 +18,6 @@ RESULTS: dict[str, type[Content]] = {
     "select": SelectResult,
     "explain": ExplainResult,
 }
-
 """By command."""
 
 
