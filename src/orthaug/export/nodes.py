@@ -148,6 +148,13 @@ def functions_in(node: Node) -> set[str]:
     return {node.function}.union(*map(functions_in, node.arguments))
 
 
+def names_in(node: Node) -> set[str]:
+    """The names that a node reads."""
+    if isinstance(node, Name):
+        return {node.name}
+    return set[str]().union(*map(names_in, node.arguments)) if isinstance(node, Apply) else set()
+
+
 def identifier(name: str) -> str:
     """A name in ASCII: other letters by their code point, as `u03b8` for θ."""
     plain = unicodedata.normalize("NFKC", name)

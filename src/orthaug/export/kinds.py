@@ -1,0 +1,16 @@
+"""The targets of `orthaug export --to`. A new one is a file with its declaration, and an entry here."""
+
+from __future__ import annotations
+
+from orthaug.export.c_source import CSource
+from orthaug.export.casadi_module import CasadiModule
+from orthaug.export.latex_text import LatexText
+from orthaug.export.numpy_module import NumpyModule
+from orthaug.export.target import Target
+
+TARGETS: dict[str, type[Target]] = {
+    "c": CSource,
+    "casadi": CasadiModule,
+    "numpy": NumpyModule,
+    "latex": LatexText,
+}
