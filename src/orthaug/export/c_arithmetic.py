@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 
 import numpy as np
@@ -17,6 +16,7 @@ _OWN = {
     "sign": "static real sign(real a) { return a > 0 ? 1 : a < 0 ? -1 : a; } /* NaN stays NaN */",
     "min": "static real least(real a, real b) { return a < b || isnan(a) ? a : b; }",
     "max": "static real largest(real a, real b) { return a > b || isnan(a) ? a : b; }",
+    "square": "static real square(real a) { return a * a; }",
     "whole_power": """static real whole_power(real base, int n)
 {
     real value = 1;
@@ -53,7 +53,7 @@ def _number(value: float) -> str:
 
 
 def _power(base: str, n: int) -> str:
-    return f"({base}*{base})" if n == 2 and re.fullmatch(r"[\w.\[\]>-]+", base) else f"whole_power({base}, {n})"
+    return f"square({base})" if n == 2 else f"whole_power({base}, {n})"
 
 
 def _plain(vector: str, index: int) -> str:

@@ -142,10 +142,11 @@ def _constant(tree: ast.expr, numbers: Mapping[str, float]) -> float | None:
 
 
 def functions_in(node: Node) -> set[str]:
-    """The functions that a node is made of."""
+    """The functions that a node is made of; a whole power of 2 counts as `square`."""
     if not isinstance(node, Apply):
         return set()
-    return {node.function}.union(*map(functions_in, node.arguments))
+    square = node.function == "whole_power" and node.arguments[1] == Number(2.0)
+    return {"square" if square else node.function}.union(*map(functions_in, node.arguments))
 
 
 def names_in(node: Node) -> set[str]:

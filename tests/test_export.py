@@ -1,0 +1,289 @@
+"""Exports run for real: every target computes what the model computes, for every kind of model."""
+
+from __future__ import annotations
+
+import csv
+import ctypes
+import importlib.util
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import orthaug as oa
+from orthaug._base.jax import jax, jnp
+from orthaug.commands.cli import main
+from orthaug.data.expressions import FUNCTIONS, parse, parse_named
+from orthaug.data.regressors import Features
+from orthaug.export import activations
+from orthaug.export.kinds import TARGETS
+from orthaug.export.lowering import program_of
+from orthaug.export.nodes import Number, apply
+from orthaug.export.numpy_step import NumpyStep, numpy_step
+from orthaug.models.dynamics import Numbers
+from orthaug.models.lagged import Lagged
+from orthaug.models.learners import ACTIVATIONS, Bound
+from orthaug.models.model import Model
+from orthaug.models.motion_model import MotionModel
+from orthaug.models.moving import Moving
+from orthaug.models.terms import Terms
+from orthaug.physics.baseline import Baseline
+
+POINTS, STEPS = 1000, 10_000
+STRICT = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion", "-Wshadow")
+
+
+@dataclass(frozen=True)
+class Deep:
+    """A network with every activation, as a learner from outside: what an export needs is `layers`."""
+
+    inputs: tuple[str, ...] | None = None
+
+    def init(self, key, nz, ny):
+        rng, sizes = np.random.default_rng(5), (nz, *(3,) * len(ACTIVATIONS), ny)
+        shapes = zip(sizes[1:], sizes, strict=False)
+        return [(rng.normal(size=shape), 0.5 * rng.normal(size=shape[0])) for shape in shapes]
+
+    def layers(self, tree):
+        names = [*ACTIVATIONS, "identity"]
+        return [(weight, bias, name) for (weight, bias), name in zip(tree, names, strict=True)]
+
+    def apply(self, tree, z):
+        for weight, bias, name in self.layers(tree):
+            z = ACTIVATIONS[name](weight @ z + bias)
+        return z
+
+
+def lagged(terms, features, learner, outputs, inputs, constants=None) -> Model:
+    """A lagged model with arbitrary numbers."""
+    rng = np.random.default_rng(len(terms))
+    baseline = Baseline.from_terms(terms, constants)
+    entries = tuple(parse(text, constants) for text in features)
+    lags = {*baseline.lags, *(lag for entry in entries for lag in entry.lags)}
+    order = {name: i for i, name in enumerate((*outputs, *inputs))}
+    layout = tuple(sorted(lags, key=lambda lag: (order[lag.channel], lag.lag)))
+    ny, nz, nt = len(outputs), len(entries), len(baseline.names)
+    bound = Bound(learner, nz, ny) if learner is not None else None
+    weights = np.zeros(0) if bound is None else np.asarray(bound.init(jax.random.key(2)))
+    if bound is not None and not weights.any():
+        weights = rng.normal(size=weights.shape)
+    scaling = (0.2 * rng.normal(size=nz), 1 + rng.random(nz), 0.2 * (1 + rng.random(ny)))
+    numbers = Numbers(0.3 * rng.normal(size=nt), 0.1 * rng.normal(size=nt), weights, *scaling)
+    return Model(
+        form=Lagged(baseline, Features(entries), layout, outputs, bound),
+        numbers=numbers,
+        outputs=tuple(oa.Channel(name, "m") for name in outputs),
+        inputs=tuple(oa.Channel(name, "N") for name in inputs),
+        sampling_time=0.1,
+        structure="orthogonal",
+        largest_output=np.ones(ny),
+        deviation=np.ones(ny),
+        weight=np.eye(ny),
+    )
+
+
+def moving(motion: oa.Motion, features=(), learner=None, substeps=2) -> MotionModel:
+    """A motion with arbitrary weights."""
+    motion = motion.sampled(0.1)
+    entries = tuple(parse_named(text, motion.known, "feature") for text in features)
+    values = sum(map(len, motion.learned))
+    bound = Bound(learner, len(entries), values) if learner is not None else None
+    weights = np.zeros(0) if bound is None else np.asarray(bound.init(jax.random.key(4)))
+    q, nz = motion.coordinates.initial, len(entries)
+    numbers = Numbers(q, 0.02 * np.ones_like(q), weights, 0.1 * np.ones(nz), 1.5 * np.ones(nz), 0.3 * np.ones(values))
+    ny = len(motion.outputs)
+    return MotionModel(
+        form=Moving(motion, entries, bound, 0.1, substeps),
+        numbers=numbers,
+        outputs=tuple(oa.Channel(output.name, "m") for output in motion.outputs),
+        inputs=tuple(oa.Channel(name, "N") for name in motion.inputs),
+        sampling_time=0.1,
+        structure="orthogonal",
+        largest_output=np.ones(ny),
+        deviation=np.ones(ny),
+        weight=np.eye(ny),
+        loose=np.ones(len(motion.states)),
+        window=5,
+    )
+
+
+TWO_OUTPUTS = [
+    oa.Term("a", "tanh(y1[k-1]) + 0.5*y1[k-3]", output="y1"),
+    oa.Term("a", "sin(gain*y2[k-2])", output="y2"),  # θ shared
+    oa.Term("known", "cos(y2[k-1]) - floor(2*u1[k])/3", 0.25, output="y1", fixed=True),
+    oa.Term("b", "max(min(3*u1[k-4], limit, 1), -limit)*atan2(u2[k], 2)", output="y2"),
+    oa.Term("c", "sqrt(abs(u2[k-2]))*sign(u1[k]) - (-u2[k])**3/(1 + u1[k]**2)**2", output="y1"),
+    oa.Term("d", "exp(-abs(y1[k-1]))**1.5 - (u1[k] - (u2[k] - 1)) + 2**-2", output="y2"),
+    oa.Term("e", "log(2 + atan(u2[k-1]))/(tan(0.3) + y2[k-1]**gain) + (1 + abs(u1[k]))**-0.5", output="y2"),
+    oa.Term("f", "-(2 + abs(u1[k-1]))**-2 + u2[k]/(gain*limit)", output="y1"),
+]
+POSITIVE = [oa.PhysicalParameter(n, v, min=0) for n, v in (("m", 1.3), ("c", 2.7), ("k", 9.0))]
+
+
+def spring(**options) -> oa.Motion:
+    return oa.Motion.from_equations(
+        states=[oa.State("x", "v", unit="m"), oa.State("v", "(total - drag*v)/m", learned=True, unit="m/s")],
+        outputs=[oa.Output("y", "x + 0.1*v**2", learned=True), oa.Output("rate", "v + 0.01*u")],
+        inputs=["u", "w"],
+        parameters=[*POSITIVE, oa.PhysicalParameter("offset", -0.2)],
+        constants={"limit": 0.8},
+        define={"drag": "c + abs(v)", "total": "max(min(u, limit), -limit) + w - k*x - k*offset*x**3"},
+        **options,
+    )
+
+
+DISCRETE = oa.Motion.from_equations(
+    states=[oa.State("a", "0.6*a + 0.3*sin(θ*b)"), oa.State("b", "0.5*b - g*a/(1 + a**2) + Ts")],
+    outputs=[oa.Output("y", "a*b")],
+    parameters=[oa.PhysicalParameter("θ", 1.2), oa.PhysicalParameter("g", 0.7, "m/s²", min=0)],
+    integrator="discrete",
+)
+LINEAR = [oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]", unit="m/N"), oa.Term("c", "u[k-2]")]
+MODELS: dict[str, Callable[[], Model | MotionModel]] = {
+    "several outputs, every activation": lambda: lagged(
+        TWO_OUTPUTS, ("y1[k-1]", "gain*u1[k-1]", "u2[k]*y2[k-2]"), Deep(), ("y1", "y2"), ("u1", "u2"),
+        {"gain": 2.0, "limit": 0.7},
+    ),  # fmt: skip
+    "terms": lambda: lagged(
+        LINEAR, ("tanh(y[k-1])", "u[k-1]**2"), Terms(("tanh(y[k-1])", "u[k-1]**2")), ("y",), ("u",)
+    ),
+    "network": lambda: lagged(LINEAR, ("y[k-1]", "u[k-1]"), oa.MLP((16,)), ("y",), ("u",)),
+    "physics alone, no feedback": lambda: lagged([oa.Term("a", "double[k]")], (), None, ("flag",), ("double",)),
+    "motion, first-order hold": lambda: moving(
+        spring(hold="first-order"), ("v", "x*u"), oa.MLP((5, 4), "silu"), substeps=2
+    ),
+    "motion, exact": lambda: moving(spring(integrator="exact"), ("v", "w"), oa.MLP((5,)), substeps=1),
+    "motion, discrete, no inputs": lambda: moving(DISCRETE, substeps=1),
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    model: Model | MotionModel
+    state: np.ndarray
+    inputs: np.ndarray
+    stepped: tuple[np.ndarray, np.ndarray]
+    """Next states and outputs of single steps."""
+    free: np.ndarray
+    """The outputs of a free run."""
+
+
+@cache
+def case(name: str) -> Case:
+    """A model with what it says itself."""
+    model, rng = MODELS[name](), np.random.default_rng(0)
+    state = rng.normal(size=(POINTS, len(model.state_names)))
+    inputs = rng.normal(size=(STEPS, len(model.step_inputs)))
+    stepped = jax.jit(jax.vmap(model.step))(state, inputs[:POINTS])
+    free = jax.jit(lambda s, u: jax.lax.scan(model.step, s, u)[1])(np.zeros(state.shape[1]), inputs)
+    assert np.isfinite(free).all() and np.ptp(free) > 0.01
+    return Case(model, state, inputs, tuple(map(np.asarray, stepped)), np.asarray(free))
+
+
+def near(found: np.ndarray, expected: np.ndarray, relative: float) -> None:
+    largest = np.abs(expected).max(axis=0)
+    assert found.shape == expected.shape
+    assert (np.abs(found - expected).max(axis=0, initial=0.0) <= relative * largest).all()
+
+
+def imported(path: Path):
+    spec = importlib.util.spec_from_file_location(f"exported_{path.parent.name}", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def run_numpy(folder: Path, given: Case):
+    module = imported(folder / "plant.py")
+    steps = [module.step(s, u) for s, u in zip(given.state, given.inputs, strict=False)]
+    yield "float64", (*map(np.array, zip(*steps, strict=True)), module.run(module.start(), given.inputs))
+
+
+def run_casadi(folder: Path, given: Case):
+    pytest.importorskip("casadi")
+    step = imported(folder / "plant.py").step()
+    following, y = (np.array(part).T for part in step.map(POINTS)(given.state.T, given.inputs[:POINTS].T))
+    free = step.mapaccum(STEPS)(np.zeros(given.state.shape[1]), given.inputs.T)[1]
+    yield "float64", (following, y, np.array(free).T)
+
+
+def run_c(folder: Path, given: Case):
+    compiler = shutil.which("gcc") or shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler")
+    for precision, options in (("float64", ()), ("float32", ("-DPLANT_FLOAT",))):
+        shared = folder.parent / f"{folder.name}_{precision}.so"
+        made = [compiler, *STRICT, *options, "-shared", "-fPIC", "plant.c", "-lm", "-o", str(shared)]
+        subprocess.run(made, cwd=folder, check=True)
+        yield precision, run_library(ctypes.CDLL(str(shared)), given, np.dtype(precision))
+    checking = [compiler, *STRICT, "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "plant.c", "check.c"]
+    subprocess.run([*checking, "-lm", "-o", "../check"], cwd=folder, check=True)
+    done = subprocess.run(["../check"], cwd=folder, check=True, capture_output=True, text=True)
+    assert done.stdout.startswith("64 steps: ") and done.stderr == ""
+
+
+def run_library(library, given: Case, dtype: np.dtype):
+    """Steps and the free run by a shared library; a state is its numbers, then the flag."""
+    n, ny = given.state.shape[1], given.free.shape[1]
+    state = np.zeros(1, np.dtype([("x", dtype, n), ("flag", np.intc)], align=True))
+    inputs, y = np.ascontiguousarray(given.inputs, dtype=dtype), np.zeros((STEPS, ny), dtype=dtype)
+
+    def at(array: np.ndarray) -> ctypes.c_void_p:
+        return ctypes.c_void_p(array.ctypes.data)
+
+    following = []
+    for k in range(POINTS):
+        state["x"] = given.state[k]
+        library.plant_step(at(state), at(inputs[k:]), at(y[k:]))
+        following.append(state["x"][0].copy())
+    single = np.array(following), y[:POINTS].copy()
+    library.plant_start(at(state))
+    library.plant_run.restype = ctypes.c_size_t
+    assert library.plant_run(at(state), at(inputs), at(y), ctypes.c_size_t(STEPS)) == 0
+    run = y.copy()
+    flagged_steps(library.plant_step, state, inputs[:1].copy(), y, at)
+    return *single, run
+
+
+def flagged_steps(step, state, row, y, at) -> None:
+    """NaN and infinity in the inputs or the state are flagged, and the state stays; then it goes on."""
+    good = state.copy()
+    for bad in (np.nan, np.inf, -np.inf):
+        for where in ("inputs", "state"):
+            given, held = row.copy(), good.copy()
+            if where == "inputs":
+                given[:] = bad
+            else:
+                held["x"] = bad
+            if not (given if where == "inputs" else held["x"]).size:
+                continue
+            state[:] = held
+            step(at(state), at(given), at(y))
+            if where == "inputs" or not np.isfinite(y[0]).all():
+                assert state["flag"][0] == 1
+                np.testing.assert_array_equal(state["x"], held["x"])
+    state[:] = good
+    step(at(state), at(row), at(y))
+    assert state["flag"][0] == 0
+
+
+RUNS = {"numpy": run_numpy, "c": run_c, "casadi": run_casadi}
+
+
+@pytest.mark.parametrize("target", RUNS)
+@pytest.mark.parametrize("name", MODELS)
+def test_an_export_computes_what_the_model_computes(tmp_path, name, target):
+    given = case(name)
+    oa.export(given.model, tmp_path / target, target, name="plant")
+    for precision, (following, y, free) in RUNS[target](tmp_path / target, given):
+        relative = {"float64": 1e-12, "float32": 1e-5}[precision]
+        near(following, given.stepped[0], relative)
+        near(y, given.stepped[1], relative)
+        near(free, given.free, relative)
