@@ -25,6 +25,7 @@ from orthaug.export import activations
 from orthaug.export.kinds import TARGETS
 from orthaug.export.lowering import program_of
 from orthaug.export.nodes import Number, apply
+from orthaug.export.numpy_step import FUNCTIONS as NUMPY_FUNCTIONS
 from orthaug.export.numpy_step import NumpyStep, numpy_step
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
@@ -147,7 +148,11 @@ DISCRETE = oa.Motion.from_equations(
 LINEAR = [oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]", unit="m/N"), oa.Term("c", "u[k-2]")]
 MODELS: dict[str, Callable[[], Model | MotionModel]] = {
     "several outputs, every activation": lambda: lagged(
-        TWO_OUTPUTS, ("y1[k-1]", "gain*u1[k-1]", "u2[k]*y2[k-2]"), Deep(), ("y1", "y2"), ("u1", "u2"),
+        TWO_OUTPUTS,
+        ("y1[k-1]", "gain*u1[k-1]", "u2[k]*y2[k-2]"),
+        Deep(),
+        ("y1", "y2"),
+        ("u1", "u2"),
         {"gain": 2.0, "limit": 0.7},
     ),  # fmt: skip
     "terms": lambda: lagged(
@@ -287,3 +292,182 @@ def test_an_export_computes_what_the_model_computes(tmp_path, name, target):
         near(following, given.stepped[0], relative)
         near(y, given.stepped[1], relative)
         near(free, given.free, relative)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_step_in_numpy_alone(name):
+    given, step = case(name), numpy_step(case(name).model)
+    assert (step.state_names, step.step_inputs) == (given.model.state_names, given.model.step_inputs)
+    following, y = map(
+        np.array, zip(*(step(s, u) for s, u in zip(given.state, given.inputs, strict=False)), strict=True)
+    )
+    near(following, given.stepped[0], 1e-12)
+    near(y, given.stepped[1], 1e-12)
+    with pytest.raises(oa.InputError, match="a step takes a state of"):
+        step(np.zeros(99), given.inputs[0])
+
+
+def record_for(model: Model | MotionModel, rows: int = 40) -> oa.Record:
+    rng = np.random.default_rng(1)
+    u, y = (rng.normal(size=(rows, len(channels))) for channels in (model.inputs, model.outputs))
+    return oa.Record.from_arrays(u, y, inputs=model.inputs, outputs=model.outputs, sampling_time=0.1)
+
+
+@pytest.mark.parametrize("name", ["several outputs, every activation", "motion, first-order hold"])
+def test_steps_from_a_start_are_the_free_run(name):
+    model = case(name).model
+    record = record_for(model)
+    first, u = model.form.first_row, record.experiments[0].inputs
+    rows = u if len(model.step_inputs) == u.shape[1] else np.concatenate([u, np.vstack([u[1:], u[-1:]])], axis=1)
+    start = model.start(record)
+    last, y = jax.jit(lambda s, u: jax.lax.scan(model.step, s, u))(start, rows[first:-1])
+    np.testing.assert_allclose(y, model.simulate(record).model[first:-1], rtol=1e-9, atol=1e-12)
+    if first:  # the state says what it holds
+        named = dict(zip(model.state_names, start, strict=True))
+        assert named["u1[k-4]"] == u[first - 4, 0] and named["y1[k-3]"] == record.experiments[0].outputs[first - 3, 0]
+        assert model.start(record, row=40)[0] == record.experiments[0].outputs[39, 0]
+    else:
+        np.testing.assert_allclose(model.start(record, row=39), last, rtol=1e-9)
+    assert jax.jacobian(lambda s: model.step(s, rows[0])[1])(start).shape == (len(model.outputs), len(start))
+
+
+def test_starts_that_are_refused_in_words():
+    model = case("network").model
+    record = record_for(model)
+    for given, row, words in (
+        (oa.Record.join([record, record]), None, "the record has 2 experiments"),
+        (replace(record, outputs=(), experiments=(replace(record.experiments[0], outputs=np.zeros((40, 0))),)), None,
+         "no measured outputs to start from"),
+        (record, 1, "`row` must be a whole number from 2 to 40"),
+        (record, "x", "`row` must be a whole number"),
+    ):  # fmt: skip
+        with pytest.raises(oa.InputError, match=words):
+            model.start(given, row=row)
+
+
+@pytest.mark.parametrize("name", ACTIVATIONS)
+def test_activations_are_those_of_the_learners(name):
+    a = np.array([-800.0, -30.0, -2.5, -1e-9, 0.0, 1e-9, 0.7, 3.0, 40.0, 800.0])
+    with np.errstate(all="ignore"):
+        found = NumpyStep(program_of(case("terms").model))._evaluation(activations.ACTIVATIONS[name])({"a": a})
+    np.testing.assert_allclose(found, ACTIVATIONS[name](jnp.asarray(a)), rtol=1e-14, atol=1e-15)
+
+
+def test_arithmetic_on_numbers_follows_floating_point():
+    assert apply("div", Number(1.0), Number(0.0)) == Number(np.inf)
+    assert apply("whole_power", Number(-2.0), Number(3.0)) == Number(-8.0)
+    assert set(FUNCTIONS) <= set(NUMPY_FUNCTIONS)
+
+
+def test_what_is_written_beside_the_code(tmp_path):
+    model = case("network").model
+    oa.save(model, tmp_path / "model")
+    for target in TARGETS:
+        program = oa.export(model, tmp_path / target, target, name="plant")
+        text = (tmp_path / target / "README.md").read_text()
+        assert f'"checksum": "{program.digest}"' in (tmp_path / "model" / "model.json").read_text()
+        assert program.digest in text and "`u` [N]" in text and "0.1 s" in text
+        with open(tmp_path / target / "vectors.csv", newline="") as file:
+            head, *rows = csv.reader(file)
+        assert head == ["input:u", "state:y[k-1]", "state:u[k-1]", "state:u[k-2]", "output:y"]
+        numbers = np.array(rows, dtype=float)
+        y = np.asarray(jax.vmap(model.step)(numbers[:, 1:4], numbers[:, :1])[1])
+        np.testing.assert_allclose(numbers[:, 4:], y, rtol=1e-13, atol=1e-15)
+        assert any(program.digest in path.read_text() for path in (tmp_path / target).glob("plant.*"))
+    source = (tmp_path / "c" / "plant.c").read_text()
+    assert "/* b [m/N], theta - theta_aux */" in source and "malloc" not in source
+
+
+def test_equations_in_latex(tmp_path):
+    for name in MODELS:
+        oa.export(case(name).model, tmp_path, "latex")
+        text = (tmp_path / "model.tex").read_text()
+        assert all(text.count(f"\\begin{{{what}}}") == text.count(f"\\end{{{what}}}") for what in ("align*", "pmatrix"))
+        assert text.count("{") == text.count("}") and text.count(r"\left") == text.count(r"\right")
+    assert r"a_{k+1} &= 0.6 \, a + 0.3 \, \sin\left(θ \, b\right)" in text
+    assert r"\DeclareUnicodeCharacter{03B8}{\ensuremath{\theta}}" in text
+    oa.export(case("terms").model, tmp_path, "latex")
+    text = (tmp_path / "model.tex").read_text()
+    assert r"y_{k} &= a \, y_{k-1} + b \, u_{k-1} + c \, u_{k-2} + g^{y}_{1}" in text
+    assert r"\frac{\tanh\left(y_{k-1}\right)" in text
+
+
+def opaque(model: Model, **changed) -> Model:
+    return replace(model, form=replace(model.form, **changed))
+
+
+def refusals():
+    network = case("network").model
+    function = oa.Function(lambda w, z: w * z[:1], lambda key: jnp.ones(1))
+    own = oa.Baseline.from_function(lambda x: jnp.ones((1, 3)), ["a", "b", "c"])
+    members = network.numbers._replace(weights=np.ones((3, 5)), tilt=np.zeros((3, 3)))
+    yield (
+        opaque(network, bound=Bound(function, 2, 1)),
+        "the learner Function is a function that no target can write; fit",
+    )
+    yield opaque(network, baseline=own), "the physics is a Python function"
+    yield replace(network, numbers=members), "the model is an ensemble"
+    yield moving(spring(hold="spline"), ("v", "w"), oa.MLP((2,))), "a step knows no spline through the whole record"
+    made = oa.Motion.from_functions(
+        lambda x, u, p: x, lambda x, u, p: x, ["x"], ["y"], [oa.PhysicalParameter("a", 1.0)]
+    )
+    yield moving(made), "the motion is a Python function"
+
+
+def test_models_without_code_are_refused_in_words(tmp_path):
+    for model, words in refusals():
+        for target in TARGETS:
+            with pytest.raises(oa.InputError) as error:
+                oa.export(model, tmp_path / "out", target)
+            assert str(error.value).startswith(words)
+        with pytest.raises(oa.InputError):
+            numpy_step(model)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def saved(tmp_path, monkeypatch) -> Path:
+    oa.save(case("network").model, tmp_path / "out" / "model")
+    (tmp_path / "theirs").mkdir()
+    (tmp_path / "theirs" / "notes.txt").write_text("mine")
+    (tmp_path / "file").write_text("")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def command(monkeypatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["orthaug", "export", *arguments])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    return int(stop.value.code or 0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("out", "--to", "cassadi", "--out", "new"), "no export to 'cassadi', did you mean 'casadi'?; known are c, "),
+        (("out", "--to", "c", "--out", "theirs"), "theirs: holds notes.txt"),
+        (("out", "--to", "c", "--out", "file/new"), "file/new: cannot be written"),
+        (("out", "--to", "c", "--out", "out"), "out: holds"),
+        (("absent", "--to", "c", "--out", "new"), "absent: no saved model there"),
+        (("out", "--to", "c", "--out", "new", "--name", "2nd"), "'2nd' cannot name the exported code"),
+        (("out", "--to", "c", "--out", "new", "--name", "while"), "'while' cannot name the exported code"),
+        (("out", "--out", "new"), "Missing option '--to'"),
+    ],
+)
+def test_bad_input_of_the_command_writes_nothing(saved, monkeypatch, capsys, arguments, words):
+    before = sorted(path.name for path in saved.rglob("*"))
+    assert command(monkeypatch, *arguments) == 2
+    assert words in capsys.readouterr().err
+    assert sorted(path.name for path in saved.rglob("*")) == before
+
+
+def test_the_command_writes_a_folder_and_replaces_its_own(saved, monkeypatch, capsys):
+    for _ in range(2):
+        assert command(monkeypatch, "out", "--to", "numpy", "--out", "new", "--name", "plant") == 0
+        assert capsys.readouterr().out == "written to new\n"
+    assert {path.name for path in (saved / "new").iterdir()} >= {"plant.py", "README.md", "vectors.csv"}
+    newer = (saved / "out" / "model" / "model.json").read_text().replace('"format": 2', '"format": 99')
+    (saved / "out" / "model" / "model.json").write_text(newer)
+    assert command(monkeypatch, "out", "--to", "c", "--out", "other") == 2
+    assert "in format 99" in capsys.readouterr().err and not (saved / "other").exists()

@@ -33,12 +33,13 @@ _NAMES = {name: f"{name}_" for name in _MATH} | {
     "min": "least",
     "max": "largest",
 }
-FIELD_WORDS = frozenset(
-    "auto break case char const continue default do double else enum extern float for goto if inline int long register "
-    "restrict return short signed sizeof static struct switch typedef union unsigned void volatile while flag "
-    "class bool true false new delete this template operator private public protected namespace try catch throw using "
-    "typename virtual friend explicit export mutable and or not xor real".split()
-)
+_WORDS = """
+auto break case char const continue default do double else enum extern float for goto if inline int long register
+restrict return short signed sizeof static struct switch typedef union unsigned void volatile while flag
+class bool true false new delete this template operator private public protected namespace try catch throw using
+typename virtual friend explicit export mutable and or not xor real
+"""
+FIELD_WORDS = frozenset(_WORDS.split())
 """What cannot name a field of the state, in C or in C++."""
 
 
@@ -63,7 +64,9 @@ def _plain(vector: str, index: int) -> str:
 def arithmetic(program: Program) -> str:
     """Everything before the functions that the header declares."""
     parts = [_functions(program)]
-    parts += ["\n".join(f"static const real {c.name} = {_number(c.value)}; /* {_safe(c.meaning)} */" for c in _used(program))]
+    parts += [
+        "\n".join(f"static const real {c.name} = {_number(c.value)}; /* {_safe(c.meaning)} */" for c in _used(program))
+    ]
     for name in sorted(program.activations - {"identity"}):
         written = _language(_plain).write(ACTIVATIONS[name])
         parts.append(f"static real act_{name}(real a) {{ return {written}; }}")

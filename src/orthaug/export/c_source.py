@@ -40,9 +40,10 @@ says the largest difference from the test vectors. With `-D{name.upper()}_FLOAT`
 {name}_step(&state, u, y);     /* one sample: y, and the state goes on */
 ```
 
-`{name}_run` takes many samples at once. Where an input or a result is NaN or infinite, `state.flag` is 1 after the step and
-the state is left as it was; otherwise it is 0. There is no allocation, no input or output and no global that changes, so one
-state per instance is all that several instances need. Not to be compiled with `-ffast-math`, which takes NaN for impossible."""
+`{name}_run` takes many samples at once. Where an input or a result is NaN or infinite, `state.flag` is 1 after the
+step and the state is left as it was; otherwise it is 0. There is no allocation, no input or output and no global that
+changes, so that several instances need a state each and nothing else. Not to be compiled with `-ffast-math`, which
+takes NaN for impossible."""
 
 
 def fields_of(program: Program) -> list[tuple[str, Signal, int]]:
@@ -51,7 +52,8 @@ def fields_of(program: Program) -> list[tuple[str, Signal, int]]:
         wanted = [(signal.identifier, signal, depth) for signal, depth in program.lines if depth]
     else:
         wanted = [(signal.identifier, signal, 0) for signal in program.states]
-    taken, fields = set(FIELD_WORDS), []
+    taken: set[str] = set(FIELD_WORDS)
+    fields = []
     for identifier, signal, depth in wanted:
         while identifier in taken:
             identifier += "_"
@@ -206,7 +208,9 @@ def _check(program: Program, fields: list[tuple[str, Signal, int]], vectors: Vec
 
     def table(kind: str, values: list[list[float]]) -> str:
         body = ",\n".join("    {" + ", ".join(map(repr, row)) + "}" for row in values)
-        return f"static const double {kind}[{max(rows, 1)}][{max(len(values[0]) if values else 1, 1)}] = {{\n{body}\n}};"
+        return (
+            f"static const double {kind}[{max(rows, 1)}][{max(len(values[0]) if values else 1, 1)}] = {{\n{body}\n}};"
+        )
 
     inputs = vectors.inputs.tolist() if program.inputs else [[0.0]] * rows
     places = [f"{identifier}[{i}]" for identifier, _, depth in fields for i in range(depth)]

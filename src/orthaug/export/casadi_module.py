@@ -40,8 +40,8 @@ state, outputs = step({[0] * len(program.states)}, {[0] * len(program.inputs)})
 run = step.mapaccum(100)           # a free run of 100 steps, inputs in columns
 ```
 
-It needs `casadi` (`pip install orthaug[casadi]` installs the version that it was tried with). `step` takes symbols as well as
-numbers, so it can stand in an optimal control problem: one call for each step of the horizon."""
+It needs `casadi` (`pip install casadi`; the extra `orthaug[casadi]` installs it too). `step` takes symbols as well as
+numbers, so that it can stand in an optimal control problem: one call for each step of the horizon."""
 
 
 _STEP = '''

@@ -21,7 +21,21 @@ from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 
 _LONGEST = 40  # characters of a name, which stands in front of others
-_TAKEN = ("check", "numpy", "casadi", "math", "main", "real", "int", "double", "float", "void", "char", "control", "onnx")
+_TAKEN = (
+    "check",
+    "numpy",
+    "casadi",
+    "math",
+    "main",
+    "real",
+    "int",
+    "double",
+    "float",
+    "void",
+    "char",
+    "control",
+    "onnx",
+)
 
 
 def not_an_export(folder: Path, names: Sequence[str]) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -34,21 +35,23 @@ class LatexText:
 
 
 def _document(program: Program) -> str:
-    lines = [r"\documentclass{article}", r"\usepackage{amsmath}", r"\setcounter{MaxMatrixCols}{1000}"]
-    lines += [rf"% Model sha256 {program.digest}", r"\begin{document}"]
+    head = [r"\documentclass{article}", r"\usepackage{amsmath}", r"\setcounter{MaxMatrixCols}{1000}"]
+    head.append(f"% Model sha256 {program.digest}")
+    lines = [r"\begin{document}"]
     moves = program.scheme is not None
     if program.rate is not None and program.scheme is not None:
         discrete = program.scheme.kind == "discrete"
-        left = [
-            rf"{_name(signal)}_{{k+1}}" if discrete else rf"\dot{{{_name(signal)}}}" for signal in program.states
-        ]
+        left = [rf"{_name(signal)}_{{k+1}}" if discrete else rf"\dot{{{_name(signal)}}}" for signal in program.states]
         lines += _equations(program.rate, left, program)
-    lines += _equations(program.output, [_name(signal) if moves else f"{_name(signal)}_{{k}}" for signal in program.outputs], program)
+    lines += _equations(
+        program.output, [_name(signal) if moves else f"{_name(signal)}_{{k}}" for signal in program.outputs], program
+    )
     lines += [r"\begin{center}", r"\begin{tabular}{lll}"]
     lines += [
-        rf"${_constant(c.name)}$ & ${number(c.value)}$ & {_plain(c.meaning)} \\" for c in program.constants
+        rf"${_constant(c.name, program)}$ & ${number(c.value)}$ & {_plain(c.meaning)} \\" for c in program.constants
     ]
-    return "\n".join([*lines, r"\end{tabular}", r"\end{center}", r"\end{document}", ""])
+    lines += [r"\end{tabular}", r"\end{center}", r"\end{document}", ""]
+    return "\n".join([*head, *_letters("".join(lines)), *lines])
 
 
 def _name(signal: Signal) -> str:
@@ -57,7 +60,7 @@ def _name(signal: Signal) -> str:
 
 def _equations(block: Block, left: list[str], program: Program) -> list[str]:
     suffix = "r" if block is program.rate else "y"
-    pairs = [(_constant(name), _latex(node, program, suffix)) for name, node in block.locals]
+    pairs = [(_constant(name, program), _latex(node, program, suffix)) for name, node in block.locals]
     pairs += [(text, _latex(node, program, suffix)) for text, node in zip(left, block.results, strict=True)]
     if block.network is not None:
         pairs += [
@@ -90,13 +93,25 @@ def number(value: float) -> str:
     return rf"{mantissa} \cdot 10^{{{int(power)}}}" if power else mantissa
 
 
-def _constant(name: str) -> str:
-    return symbol(name.partition("_")[2])
+def _constant(name: str, program: Program) -> str:
+    return symbol(dict(program.symbols)[name])
 
 
 def _plain(text: str) -> str:
-    escaped = "".join(rf"\{c}" if c in "_%&#$" else {"^": r"\^{}", "~": r"\~{}"}.get(c, c) for c in text)
-    return escaped.replace("θ", r"$\theta$")
+    return "".join(rf"\{c}" if c in "_%&#$" else {"^": r"\^{}", "~": r"\~{}"}.get(c, c) for c in text)
+
+
+def _letters(text: str) -> list[str]:
+    """What Greek letters and the micro sign are, so that pdflatex reads them."""
+    lines = []
+    for letter in sorted(set(text)):
+        kind, _, name = unicodedata.name(letter, "").partition(" LETTER ")
+        if letter == "µ":
+            kind, name = "GREEK SMALL", "mu"
+        if kind in ("GREEK SMALL", "GREEK CAPITAL") and " " not in name:
+            written = name.lower() if kind == "GREEK SMALL" else name.capitalize()
+            lines.append(rf"\DeclareUnicodeCharacter{{{ord(letter):04X}}}{{\ensuremath{{\{written}}}}}")
+    return lines
 
 
 def _entry(node: Entry, program: Program, suffix: str) -> str:
@@ -117,7 +132,7 @@ def _level(node: Node, program: Program, suffix: str) -> tuple[int, str]:
     if isinstance(node, Number):
         return (0 if node.value < 0 else 9), number(node.value)
     if isinstance(node, Name):
-        return 9, _constant(node.name)
+        return 9, _constant(node.name, program)
     if isinstance(node, Entry):
         return 9, _entry(node, program, suffix)
     assert isinstance(node, Apply)

@@ -38,20 +38,24 @@ class _Constants:
 
     def __init__(self) -> None:
         self.found: dict[str, Constant] = {}
+        self.symbols: dict[str, str] = {}
 
-    def node(self, name: str, value: float, meaning: str) -> Name:
-        """The constant's node; another value under the same name gets a name of its own."""
-        written, i = name, 2
+    def node(self, kind: str, name: str, value: float, meaning: str) -> Name:
+        """The constant's node, `p_` for parameters and `c_` for others before its name.
+
+        Another value under the same name gets a name of its own.
+        """
+        first = written = f"{kind}_{identifier(name)}"
+        i = 2
         while written in self.found and self.found[written].value != value:
-            written, i = f"{name}_{i}", i + 1
+            written, i = f"{first}_{i}", i + 1
         self.found[written] = Constant(written, float(value), meaning)
+        self.symbols[written] = name
         return Name(written)
 
     def of(self, expression: Expression) -> dict[str, Node]:
         """The constants of an expression of lagged channels."""
-        return {
-            name: self.node(f"c_{identifier(name)}", value, f"constant {name}") for name, value in expression.constants
-        }
+        return {name: self.node("c", name, value, f"constant {name}") for name, value in expression.constants}
 
 
 def _lagged(model: Model, name: str, digest: str) -> Program:
@@ -79,7 +83,7 @@ def _lagged(model: Model, name: str, digest: str) -> Program:
         unit = term.unit or units.get(term.parameter, "")
         what = "known" if term.fixed else "theta - theta_aux"
         meaning = f"{term.parameter}{f' [{unit}]' if unit else ''}, {what}"
-        factor = constants.node(f"p_{identifier(term.parameter)}", value, meaning)
+        factor = constants.node("p", term.parameter, value, meaning)
         row = form.outputs.index(term.output) if term.output is not None else 0
         sums[row].append(apply("mul", factor, written(expression)))
     network = None
@@ -103,6 +107,7 @@ def _lagged(model: Model, name: str, digest: str) -> Program:
         output=block,
         lines=lines,
         following=tuple(memory.following.tolist()),
+        symbols=tuple(constants.symbols.items()),
         digest=digest,
     )
 
@@ -116,12 +121,12 @@ def _motion(model: MotionModel, name: str, digest: str) -> Program:
     values = np.asarray(motion.coordinates.physical(np.asarray(numbers.theta) - np.asarray(numbers.theta_aux)))
     constants = _Constants()
     names: dict[str, Node] = {
-        key: constants.node(f"c_{identifier(key)}", value, f"constant {key}") for key, value in motion.constants
+        key: constants.node("c", key, value, f"constant {key}") for key, value in motion.constants
     }
     for parameter, value in zip(motion.parameters, values.tolist(), strict=True):
         unit = f" [{parameter.unit}]" if parameter.unit else ""
         beside = "" if form.bound is None else ", beside the learner"
-        names[parameter.name] = constants.node(f"p_{identifier(parameter.name)}", value, f"{parameter.name}{unit}{beside}")
+        names[parameter.name] = constants.node("p", parameter.name, value, f"{parameter.name}{unit}{beside}")
     names |= {state.name: Entry("x", i) for i, state in enumerate(motion.states)}
     names |= {channel: Entry("u", i) for i, channel in enumerate(motion.inputs)}
     numeric = dict(motion.constants)
@@ -129,6 +134,7 @@ def _motion(model: MotionModel, name: str, digest: str) -> Program:
     for key, expression in motion.definitions:
         defined[f"v_{identifier(key)}"] = node_of(expression, names, {}, numeric)
         names[key] = Name(f"v_{identifier(key)}")
+        constants.symbols[f"v_{identifier(key)}"] = key
 
     def written(expression: Expression) -> Node:
         return node_of(expression, names, {}, numeric)
@@ -156,6 +162,7 @@ def _motion(model: MotionModel, name: str, digest: str) -> Program:
         rate=blocks["rate"],
         scheme=_scheme(model),
         ends=2 if len(step_inputs) > len(motion.inputs) else 1,
+        symbols=tuple(constants.symbols.items()),
         digest=digest,
     )
 

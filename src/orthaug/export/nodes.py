@@ -99,9 +99,7 @@ def node_of(
     return _node(expression.tree, names, lags, numbers)
 
 
-def _node(
-    tree: ast.expr, names: Mapping[str, Node], lags: Mapping[Lag, Node], numbers: Mapping[str, float]
-) -> Node:
+def _node(tree: ast.expr, names: Mapping[str, Node], lags: Mapping[Lag, Node], numbers: Mapping[str, float]) -> Node:
     if isinstance(tree, ast.Constant):
         return Number(float(tree.value))  # type: ignore[arg-type]  (checked by the parser)
     if isinstance(tree, ast.Name):

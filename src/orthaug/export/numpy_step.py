@@ -20,6 +20,7 @@ Values = dict[str, Any]
 """`x`, `u`, `g` and intermediate results by name."""
 Evaluation = Callable[[Values], Any]
 
+_SAME = ("sin", "cos", "tan", "exp", "log", "sqrt", "abs", "sign", "floor", "tanh", "expm1", "log1p")
 FUNCTIONS: dict[str, Any] = {
     "neg": np.negative,
     "add": lambda a, b: a + b,
@@ -32,7 +33,7 @@ FUNCTIONS: dict[str, Any] = {
     "atan2": np.arctan2,
     "min": np.minimum,
     "max": np.maximum,
-} | {name: getattr(np, name) for name in "sin cos tan exp log sqrt abs sign floor tanh expm1 log1p".split()}
+} | {name: getattr(np, name) for name in _SAME}
 
 
 class NumpyStep:
@@ -137,7 +138,9 @@ def _advancing(
         now = u[:held]
         slope = (u[held:] - now) / halves if ends == 2 else None
         for j in range(0, halves, 2):
-            points = (now, now, now) if slope is None else (now + j * slope, now + (j + 1) * slope, now + (j + 2) * slope)
+            points = (
+                (now, now, now) if slope is None else (now + j * slope, now + (j + 1) * slope, now + (j + 2) * slope)
+            )
             x = one(x, *points)
         return x
 

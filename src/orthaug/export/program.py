@@ -113,8 +113,8 @@ class Program:
     rate: Block | None = None
     scheme: Scheme | None = None
     ends: int = 1
-    equations: str = ""
-    """The model in words of mathematics, a line each."""
+    symbols: tuple[tuple[str, str], ...] = ()
+    """The names of constants and intermediate results as users write them."""
     digest: str = ""
 
     @property

@@ -39,7 +39,8 @@ def python_language(functions: dict[str, str]) -> Language:
 def declarations(program: Program) -> str:
     """The names and the sampling time of a model."""
     names = {
-        kind.upper(): tuple(signal.name for signal in getattr(program, kind)) for kind in ("states", "inputs", "outputs")
+        kind.upper(): tuple(signal.name for signal in getattr(program, kind))
+        for kind in ("states", "inputs", "outputs")
     }
     lines = [f"{kind} = {texts!r}" for kind, texts in names.items()]
     units = {s.name: s.unit for s in (*program.states, *program.inputs, *program.outputs) if s.unit}
@@ -111,9 +112,7 @@ def _advance(program: Program, dialect: Dialect) -> list[str]:
         body = f"    for _ in range({scheme.substeps}):\n        x = substep(x, u, u, u)\n    return x"
     else:
         halves, held = 2 * scheme.substeps, program.held
-        now, after = (
-            dialect.vector.format(", ".join(f"u[{i + first}]" for i in range(held))) for first in (0, held)
-        )
+        now, after = (dialect.vector.format(", ".join(f"u[{i + first}]" for i in range(held))) for first in (0, held))
         body = (
             f"    now, slope = {now}, ({after} - {now}) / {halves}\n"
             f"    for j in range(0, {halves}, 2):\n"

@@ -41,8 +41,8 @@ class Vectors:
             return jax.lax.scan(one, state, rows)[1]
 
         states, outputs = map(np.asarray, jax.jit(run)(np.zeros(len(program.states)), inputs))
-        finite = np.isfinite(np.concatenate([states, outputs], axis=1)).all(axis=1)
-        count = len(finite) if finite.all() else int(np.argmin(finite))
+        finite = np.asarray(np.isfinite(np.concatenate([states, outputs], axis=1)).all(axis=1))
+        count = finite.size if finite.all() else int(np.argmin(finite))
         return cls(inputs[:count], states[:count], outputs[:count])
 
     def csv(self, program: Program) -> str:

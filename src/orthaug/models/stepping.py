@@ -1,7 +1,7 @@
 """A fitted model one sample at a time: `state, outputs = model.step(state, inputs)`, a state with names.
 
-The state of a lagged model is what its regressor remembers of outputs and inputs, so that a step takes the inputs of its
-own sample alone; that of a motion is its state.
+The state of a lagged model is what its regressor remembers of outputs and inputs, so that a step takes the inputs of
+its own sample alone; that of a motion is its state.
 """
 
 from __future__ import annotations
