@@ -219,6 +219,49 @@ def run_casadi(folder: Path, given: Case):
     yield "float64", (following, y, np.array(free).T)
 
 
+def run_control(folder: Path, given: Case):
+    control = pytest.importorskip("control")
+    plant = imported(folder / "plant.py").system()
+    rows = list(zip(given.state, given.inputs, strict=False))
+    single = [np.array([ask(0.0, s, u) for s, u in rows]) for ask in (plant.dynamics, plant.output)]
+    time = 0.1 * np.arange(STEPS)
+    free = control.input_output_response(plant, time, given.inputs.T, np.zeros(given.state.shape[1]), squeeze=False)
+    yield "float64", (*single, free.outputs.T)
+
+
+def run_fmu(folder: Path, given: Case):
+    fmpy = pytest.importorskip("fmpy")
+    from fmpy.fmi2 import FMU2Slave
+    from fmpy.validation import validate_fmu
+
+    assert validate_fmu(str(folder / "plant.fmu")) == []
+    described = fmpy.read_model_description(str(folder / "plant.fmu"))
+    place = fmpy.extract(str(folder / "plant.fmu"), folder.parent / "unpacked")
+    by = {kind: [v.valueReference for v in described.modelVariables if v.causality == kind] for kind in
+          ("input", "output", "local")}  # fmt: skip
+    fmu = FMU2Slave(guid=described.guid, unzipDirectory=place, modelIdentifier="plant", instanceName="one")
+    fmu.instantiate()
+    fmu.setupExperiment(startTime=0.0)
+    fmu.enterInitializationMode()
+    fmu.exitInitializationMode()
+
+    def step(k: int) -> list[float]:
+        fmu.setReal(by["input"], given.inputs[k].tolist())
+        y = fmu.getReal(by["output"])
+        fmu.doStep(currentCommunicationPoint=0.1 * k, communicationStepSize=0.1)
+        return y
+
+    free = np.array([step(k) for k in range(STEPS)])
+    following, y = [], []
+    for k, state in enumerate(given.state):
+        fmu.setReal(by["local"], state.tolist())
+        y.append(step(k))
+        following.append(fmu.getReal(by["local"]))
+    fmu.terminate()
+    fmu.freeInstance()
+    yield "float64", (np.array(following), np.array(y), free)
+
+
 def run_c(folder: Path, given: Case):
     compiler = shutil.which("gcc") or shutil.which("cc")
     if compiler is None:
@@ -279,7 +322,7 @@ def flagged_steps(step, state, row, y, at) -> None:
     assert state["flag"][0] == 0
 
 
-RUNS = {"numpy": run_numpy, "c": run_c, "casadi": run_casadi}
+RUNS = {"numpy": run_numpy, "c": run_c, "casadi": run_casadi, "control": run_control, "fmu": run_fmu}
 
 
 @pytest.mark.parametrize("target", RUNS)

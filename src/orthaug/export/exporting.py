@@ -92,8 +92,8 @@ def export(
     files = dict(target.files(program, vectors))
     files |= {VECTORS: vectors.csv(program), "README.md": _readme(program, target, len(vectors.outputs))}
     with whole_folder(folder, not_an_export, force=force) as partial:
-        for file, text in files.items():
-            (partial / file).write_text(text, encoding="utf-8")
+        for file, content in files.items():
+            (partial / file).write_bytes(content if isinstance(content, bytes) else content.encode("utf-8"))
     return program
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from orthaug.export.c_source import CSource
 from orthaug.export.casadi_module import CasadiModule
+from orthaug.export.control_module import ControlModule
+from orthaug.export.fmu import Fmu
 from orthaug.export.latex_text import LatexText
 from orthaug.export.numpy_module import NumpyModule
 from orthaug.export.target import Target
@@ -11,6 +13,8 @@ from orthaug.export.target import Target
 TARGETS: dict[str, type[Target]] = {
     "c": CSource,
     "casadi": CasadiModule,
+    "control": ControlModule,
+    "fmu": Fmu,
     "numpy": NumpyModule,
     "latex": LatexText,
 }

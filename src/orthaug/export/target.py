@@ -16,8 +16,8 @@ class Target(Protocol):
 
     summary: str
 
-    def files(self, program: Program, vectors: Vectors) -> Mapping[str, str]:
-        """Text by file name; README.md and the test vectors are added to them.
+    def files(self, program: Program, vectors: Vectors) -> Mapping[str, str | bytes]:
+        """Content by file name; README.md and the test vectors are added to them.
 
         Raises:
             InputError: a model that this target cannot hold.
