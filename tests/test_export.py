@@ -262,6 +262,26 @@ def run_fmu(folder: Path, given: Case):
     yield "float64", (np.array(following), np.array(y), free)
 
 
+def run_onnx(folder: Path, given: Case):
+    runtime = pytest.importorskip("onnxruntime")
+    session = runtime.InferenceSession(str(folder / "plant.onnx"), providers=["CPUExecutionProvider"])
+    wanted = {value.name for value in session.get_inputs()}
+    n = given.state.shape[1]
+
+    def step(state, row):
+        fed = {name: value for name, value in (("state", state), ("inputs", row)) if name in wanted}
+        names = [value.name for value in session.get_outputs()]
+        found = dict(zip(names, session.run(names, fed), strict=True))
+        return found.get("next_state", np.zeros(0)), found["outputs"]
+
+    state, free = np.zeros(n), []
+    for row in given.inputs:
+        state, y = step(state, row)
+        free.append(y)
+    single = [step(s, u) for s, u in zip(given.state, given.inputs, strict=False)]
+    yield "float64", (*map(np.array, zip(*single, strict=True)), np.array(free))
+
+
 def run_c(folder: Path, given: Case):
     compiler = shutil.which("gcc") or shutil.which("cc")
     if compiler is None:
@@ -322,7 +342,7 @@ def flagged_steps(step, state, row, y, at) -> None:
     assert state["flag"][0] == 0
 
 
-RUNS = {"numpy": run_numpy, "c": run_c, "casadi": run_casadi, "control": run_control, "fmu": run_fmu}
+RUNS = {"numpy": run_numpy, "c": run_c, "casadi": run_casadi, "control": run_control, "fmu": run_fmu, "onnx": run_onnx}
 
 
 @pytest.mark.parametrize("target", RUNS)

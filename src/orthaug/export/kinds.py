@@ -8,6 +8,7 @@ from orthaug.export.control_module import ControlModule
 from orthaug.export.fmu import Fmu
 from orthaug.export.latex_text import LatexText
 from orthaug.export.numpy_module import NumpyModule
+from orthaug.export.onnx_graph import OnnxGraph
 from orthaug.export.target import Target
 
 TARGETS: dict[str, type[Target]] = {
@@ -16,5 +17,6 @@ TARGETS: dict[str, type[Target]] = {
     "control": ControlModule,
     "fmu": Fmu,
     "numpy": NumpyModule,
+    "onnx": OnnxGraph,
     "latex": LatexText,
 }
