@@ -21,7 +21,7 @@ from orthaug._base.jax import jax, jnp
 from orthaug.commands.cli import main
 from orthaug.data.expressions import FUNCTIONS, parse, parse_named
 from orthaug.data.regressors import Features
-from orthaug.export import activations
+from orthaug.export import activations, fmu
 from orthaug.export.kinds import TARGETS
 from orthaug.export.lowering import program_of
 from orthaug.export.nodes import Number, apply
@@ -212,7 +212,6 @@ def run_numpy(folder: Path, given: Case):
 
 
 def run_casadi(folder: Path, given: Case):
-    pytest.importorskip("casadi")
     step = imported(folder / "plant.py").step()
     following, y = (np.array(part).T for part in step.map(POINTS)(given.state.T, given.inputs[:POINTS].T))
     free = step.mapaccum(STEPS)(np.zeros(given.state.shape[1]), given.inputs.T)[1]
@@ -220,7 +219,8 @@ def run_casadi(folder: Path, given: Case):
 
 
 def run_control(folder: Path, given: Case):
-    control = pytest.importorskip("control")
+    import control
+
     plant = imported(folder / "plant.py").system()
     rows = list(zip(given.state, given.inputs, strict=False))
     single = [np.array([ask(0.0, s, u) for s, u in rows]) for ask in (plant.dynamics, plant.output)]
@@ -230,7 +230,7 @@ def run_control(folder: Path, given: Case):
 
 
 def run_fmu(folder: Path, given: Case):
-    fmpy = pytest.importorskip("fmpy")
+    import fmpy
     from fmpy.fmi2 import FMU2Slave
     from fmpy.validation import validate_fmu
 
@@ -263,8 +263,9 @@ def run_fmu(folder: Path, given: Case):
 
 
 def run_onnx(folder: Path, given: Case):
-    runtime = pytest.importorskip("onnxruntime")
-    session = runtime.InferenceSession(str(folder / "plant.onnx"), providers=["CPUExecutionProvider"])
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(str(folder / "plant.onnx"), providers=["CPUExecutionProvider"])
     wanted = {value.name for value in session.get_inputs()}
     n = given.state.shape[1]
 
@@ -342,12 +343,15 @@ def flagged_steps(step, state, row, y, at) -> None:
     assert state["flag"][0] == 0
 
 
+NEEDED = {"casadi": ["casadi"], "control": ["control"], "fmu": ["fmpy"], "onnx": ["onnx", "onnxruntime"]}
 RUNS = {"numpy": run_numpy, "c": run_c, "casadi": run_casadi, "control": run_control, "fmu": run_fmu, "onnx": run_onnx}
 
 
 @pytest.mark.parametrize("target", RUNS)
 @pytest.mark.parametrize("name", MODELS)
 def test_an_export_computes_what_the_model_computes(tmp_path, name, target):
+    for package in NEEDED.get(target, []):
+        pytest.importorskip(package)
     given = case(name)
     oa.export(given.model, tmp_path / target, target, name="plant")
     for precision, (following, y, free) in RUNS[target](tmp_path / target, given):
@@ -425,20 +429,41 @@ def test_arithmetic_on_numbers_follows_floating_point():
 def test_what_is_written_beside_the_code(tmp_path):
     model = case("network").model
     oa.save(model, tmp_path / "model")
-    for target in TARGETS:
+    for target in ("c", "casadi", "control", "numpy", "latex"):
         program = oa.export(model, tmp_path / target, target, name="plant")
         text = (tmp_path / target / "README.md").read_text()
         assert f'"checksum": "{program.digest}"' in (tmp_path / "model" / "model.json").read_text()
         assert program.digest in text and "`u` [N]" in text and "0.1 s" in text
-        with open(tmp_path / target / "vectors.csv", newline="") as file:
-            head, *rows = csv.reader(file)
-        assert head == ["input:u", "state:y[k-1]", "state:u[k-1]", "state:u[k-2]", "output:y"]
-        numbers = np.array(rows, dtype=float)
-        y = np.asarray(jax.vmap(model.step)(numbers[:, 1:4], numbers[:, :1])[1])
-        np.testing.assert_allclose(numbers[:, 4:], y, rtol=1e-13, atol=1e-15)
         assert any(program.digest in path.read_text() for path in (tmp_path / target).glob("plant.*"))
+        assert (tmp_path / target / "vectors.csv").read_text() == (tmp_path / "c" / "vectors.csv").read_text()
+    with open(tmp_path / "c" / "vectors.csv", newline="") as file:
+        head, *rows = csv.reader(file)
+    assert head == ["input:u", "state:y[k-1]", "state:u[k-1]", "state:u[k-2]", "output:y"]
+    numbers = np.array(rows, dtype=float)
+    y = np.asarray(jax.vmap(model.step)(numbers[:, 1:4], numbers[:, :1])[1])
+    np.testing.assert_allclose(numbers[:, 4:], y, rtol=1e-13, atol=1e-15)
     source = (tmp_path / "c" / "plant.c").read_text()
     assert "/* b [m/N], theta - theta_aux */" in source and "malloc" not in source
+
+
+def test_what_an_export_needs_is_named_where_it_is_missing(tmp_path, monkeypatch):
+    model = case("network").model
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(oa.InputError, match="the package onnx, which is not installed; pip install onnx"):
+        oa.export(model, tmp_path / "out", "onnx")
+    monkeypatch.setattr(fmu, "_target", lambda: ("linux64", ".so"))
+    for path, words in (("", "no C compiler was found"), (str(tmp_path / "bin"), "cc failed: no licence")):
+        monkeypatch.setenv("PATH", path)
+        (tmp_path / "bin").mkdir(exist_ok=True)
+        (tmp_path / "bin" / "cc").write_text("#!/bin/sh\necho no licence >&2\nexit 1\n")
+        (tmp_path / "bin" / "cc").chmod(0o755)
+        with pytest.raises(oa.InputError, match=words):
+            oa.export(model, tmp_path / "out", "fmu")
+    monkeypatch.undo()
+    monkeypatch.setattr(sys, "platform", "plan9")
+    with pytest.raises(oa.InputError, match="compiled for 64-bit x86 under Linux or macOS"):
+        oa.export(model, tmp_path / "out", "fmu")
+    assert not (tmp_path / "out").exists()
 
 
 def test_equations_in_latex(tmp_path):

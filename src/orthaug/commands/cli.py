@@ -282,7 +282,7 @@ def split(
 @app.command()
 def export(
     model: ModelPath,
-    to: Annotated[str, typer.Option("--to", metavar="TARGET", help="c, casadi, numpy or latex.")],
+    to: Annotated[str, typer.Option("--to", metavar="TARGET", help="c, casadi, control, fmu, numpy, onnx or latex.")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the code.")],
     name: Annotated[str, typer.Option("--name", help="Of files and functions.")] = "model",
     force: Force = False,

@@ -75,7 +75,7 @@ def export(
     Args:
         model: what to write.
         folder: a new one, or one that holds an export.
-        to: c, casadi, numpy or latex.
+        to: c, casadi, control, fmu, numpy, onnx or latex.
         name: stands in front of the functions in C, and names the files.
         force: replace the folder whatever it holds.
 
