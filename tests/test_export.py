@@ -398,6 +398,17 @@ def test_steps_from_a_start_are_the_free_run(name):
     assert jax.jacobian(lambda s: model.step(s, rows[0])[1])(start).shape == (len(model.outputs), len(start))
 
 
+@pytest.mark.parametrize("name", ["network", "motion, first-order hold"])
+def test_arguments_of_a_step_are_checked(name):
+    model = case(name).model
+    n, nu = len(model.state_names), len(model.step_inputs)
+    for state, inputs in ((np.zeros(n + 1), np.zeros(nu)), (np.zeros(n), 0.0), (np.zeros((1, n)), np.zeros(nu))):
+        with pytest.raises(oa.InputError, match=f"a step takes a state of {n} and inputs of {nu} numbers"):
+            model.step(state, inputs)
+    with pytest.raises(oa.InputError, match="a step takes two vectors of numbers"):
+        model.step("x", np.zeros(nu))
+
+
 def test_starts_that_are_refused_in_words():
     model = case("network").model
     record = record_for(model)
@@ -466,6 +477,19 @@ def test_what_an_export_needs_is_named_where_it_is_missing(tmp_path, monkeypatch
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(("term", "rows"), [("log(y[k-1])", 1), ("log(-1 - y[k-1]**2)", 0)])
+def test_vectors_of_a_model_without_values_at_zero(tmp_path, term, rows):
+    """A free run that cannot start at zero starts at one; where it cannot start at all, there is nothing to compare."""
+    model = lagged([oa.Term("a", term)], (), None, ("y",), ("u",))
+    oa.export(model, tmp_path / "c", "c")
+    lines = (tmp_path / "c" / "vectors.csv").read_text().splitlines()
+    assert (len(lines) > 1) == bool(rows)
+    compiler = shutil.which("gcc") or pytest.skip("no C compiler")
+    subprocess.run([compiler, *STRICT, "model.c", "check.c", "-lm", "-o", "check"], cwd=tmp_path / "c", check=True)
+    done = subprocess.run(["./check"], cwd=tmp_path / "c", check=True, capture_output=True, text=True)
+    assert done.stdout.startswith(f"{len(lines) - 1} steps")
+
+
 def test_equations_in_latex(tmp_path):
     for name in MODELS:
         oa.export(case(name).model, tmp_path, "latex")
@@ -495,6 +519,9 @@ def refusals():
     )
     yield opaque(network, baseline=own), "the physics is a Python function"
     yield replace(network, numbers=members), "the model is an ensemble"
+    broken = network.numbers._replace(gain=np.array([np.nan]))
+    yield replace(network, numbers=broken), "the model holds numbers that are not finite"
+    yield 5, "`model` must be a fitted model"
     yield moving(spring(hold="spline"), ("v", "w"), oa.MLP((2,))), "a step knows no spline through the whole record"
     made = oa.Motion.from_functions(
         lambda x, u, p: x, lambda x, u, p: x, ["x"], ["y"], [oa.PhysicalParameter("a", 1.0)]

@@ -207,7 +207,7 @@ def _check(program: Program, fields: list[tuple[str, Signal, int]], vectors: Vec
     rows = len(vectors.outputs)
 
     def table(kind: str, values: list[list[float]]) -> str:
-        body = ",\n".join("    {" + ", ".join(map(repr, row)) + "}" for row in values)
+        body = ",\n".join("    {" + ", ".join(map(repr, row)) + "}" for row in values or [[0.0]])
         return (
             f"static const double {kind}[{max(rows, 1)}][{max(len(values[0]) if values else 1, 1)}] = {{\n{body}\n}};"
         )

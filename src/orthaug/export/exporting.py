@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import keyword
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -84,6 +85,7 @@ def export(
             folder that cannot be written.
     """
     check_type(model, Model | MotionModel, "model", "a fitted model")
+    check_type(folder, str | os.PathLike, "folder", "a folder's name")
     folder = Path(folder)
     check_export(to, folder, name, force=force)
     target: Target = TARGETS[to]()

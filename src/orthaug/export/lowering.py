@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.checks import Vector
+from orthaug._base.checks import Vector, check_type
 from orthaug._base.errors import InputError
 from orthaug.data.expressions import Expression, Lag
 from orthaug.data.record import Channel
@@ -30,6 +30,10 @@ def program_of(model: Model | MotionModel, name: str = "model", digest: str = ""
     Raises:
         InputError: physics or a learner that is a Python function, an ensemble, a hold that needs the whole record.
     """
+    check_type(model, Model | MotionModel, "model", "a fitted model")
+    numbers = model.numbers
+    if not all(np.isfinite(np.asarray(values)).all() for values in numbers[:6]):
+        raise InputError("the model holds numbers that are not finite; fit it again.")
     return _LOWERED[type(model)](model, name, digest)
 
 

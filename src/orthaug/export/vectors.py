@@ -27,7 +27,10 @@ class Vectors:
 
     @classmethod
     def of(cls, model: Any, program: Program) -> Vectors:
-        """A free run from zero under random inputs, in the range that the model was trained on where that is known."""
+        """A free run under random inputs, in the range that the model was trained on where that is known.
+
+        It starts from zero, or from one where zero has no output.
+        """
         rng = np.random.default_rng(_SEED)
         middle, reach = _range(model, program)
         drawn = middle + reach * rng.uniform(-1, 1, (_ROWS, program.held))
@@ -40,9 +43,13 @@ class Vectors:
 
             return jax.lax.scan(one, state, rows)[1]
 
-        states, outputs = map(np.asarray, jax.jit(run)(np.zeros(len(program.states)), inputs))
-        finite = np.asarray(np.isfinite(np.concatenate([states, outputs], axis=1)).all(axis=1))
-        count = finite.size if finite.all() else int(np.argmin(finite))
+        run, count, states, outputs = jax.jit(run), 0, np.zeros(0), np.zeros(0)
+        for start in (np.zeros(len(program.states)), np.ones(len(program.states))):
+            states, outputs = map(np.asarray, run(start, inputs))
+            finite = np.asarray(np.isfinite(np.concatenate([states, outputs], axis=1)).all(axis=1))
+            count = finite.size if finite.all() else int(np.argmin(finite))
+            if count:
+                break
         return cls(inputs[:count], states[:count], outputs[:count])
 
     def csv(self, program: Program) -> str:

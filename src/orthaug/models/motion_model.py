@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector, as_signal, check_count
 from orthaug._base.errors import InputError
-from orthaug._base.jax import Array, jax, jnp, padded_length
+from orthaug._base.jax import Array, jax, padded_length
 from orthaug.data.record import Channel, Experiment, Record
 from orthaug.models.dynamics import Numbers, Parts
 from orthaug.models.motion_parts import parts_at
@@ -25,7 +25,7 @@ from orthaug.models.on_records import RUNAWAY, OnRecords, trajectory
 from orthaug.models.response import Response, Trajectory
 from orthaug.models.settling import Windows, settle
 from orthaug.models.statistics import Statistics
-from orthaug.models.stepping import checked_row, one_experiment, step_inputs, with_scheme
+from orthaug.models.stepping import checked_row, one_experiment, step_arguments, step_inputs, with_scheme
 from orthaug.physics.parameters import PhysicalParameter
 
 if TYPE_CHECKING:
@@ -225,9 +225,8 @@ class MotionModel(OnRecords):
         Raises:
             InputError: a spline hold, which needs the whole record.
         """
-        step_inputs(self.form)
-        arrays = jnp.asarray(state, dtype=float), jnp.asarray(inputs, dtype=float)
-        following, parts = self.form.step(self._stepping, *arrays)
+        arguments = step_arguments(state, inputs, self.form.states, len(self.step_inputs))
+        following, parts = self.form.step(self._stepping, *arguments)
         return following, parts.total
 
     def reach(self, record: Record) -> Matrix:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Int
 
 from orthaug._base.checks import Vector
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, shown
 from orthaug._base.jax import jax, jnp
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Experiment, Record
@@ -76,9 +76,27 @@ class Memory:
         return np.array([column[lag.channel][row - lag.lag] for lag in self.lags], dtype=float)
 
 
+def step_arguments(state: Any, inputs: Any, states: int, count: int) -> tuple[Any, Any]:
+    """A step's arguments as arrays of JAX, which takes wrong lengths in silence.
+
+    Raises:
+        InputError: vectors of other lengths, or no numbers.
+    """
+    try:
+        state, inputs = jnp.asarray(state, dtype=float), jnp.asarray(inputs, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"a step takes two vectors of numbers; got {shown(state)} and {shown(inputs)}.") from None
+    if state.shape != (states,) or inputs.shape != (count,):
+        raise InputError(
+            f"a step takes a state of {states} and inputs of {count} numbers; got the shapes {state.shape} and "
+            f"{inputs.shape}."
+        )
+    return state, inputs
+
+
 def step_lagged(form: Lagged, numbers: Numbers, memory: Memory, state: Any, inputs: Any) -> tuple[Any, Any]:
     """The next state and the outputs (ny,) of one sample."""
-    state, inputs = jnp.asarray(state, dtype=float), jnp.asarray(inputs, dtype=float)
+    state, inputs = step_arguments(state, inputs, len(memory.lags), len(memory.inputs))
     y = form.at(numbers, jnp.concatenate([state, inputs])[memory.read]).total
     return jnp.concatenate([y, inputs, state])[memory.following], y
 
@@ -115,7 +133,7 @@ def checked_row(row: Any, first: int, rows: int) -> int:
     if row is None:
         row = first
     if isinstance(row, bool) or not isinstance(row, int | np.integer) or not first <= row <= rows:
-        raise InputError(f"`row` must be a whole number from {first} to {rows} in this record; got {row!r}.")
+        raise InputError(f"`row` must be a whole number from {first} to {rows} in this record; got {shown(row)}.")
     return int(row)
 
 
