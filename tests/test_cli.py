@@ -715,7 +715,7 @@ ARGUMENTS = [
     (["compare", "plant.toml", "--out", "theirs"], ["theirs", "not an orthaug result"]),
     (["compare", "plant.toml", "--out", "x", "--model", "theirs"], ["theirs", "no saved model there"]),
     (["design", "plant.toml"], ["Missing option", "--out"]),
-    (["export", "out", "--to", "c"], ["No such command 'export'"]),
+    (["export", "out", "--to", "c"], ["Missing option", "--out"]),
     (["reproduce", "static_eror"], ["no study", "static_errors"]),
     (["fit", "plant.toml", "--out", "run.csv"], ["run.csv", "not a folder"]),
     (["fit", "plant.toml", "--out", "run.csv/out"], ["run.csv/out", "cannot be written", "is not a folder"]),

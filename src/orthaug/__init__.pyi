@@ -19,6 +19,8 @@ from .data import Experiment as Experiment
 from .data import Lags as Lags
 from .data import Record as Record
 from .data import read_record as read_record
+from .export import export as export
+from .export import numpy_step as numpy_step
 from .fitting import AdamLBFGS as AdamLBFGS
 from .fitting import Additive as Additive
 from .fitting import BaselinePenalty as BaselinePenalty

@@ -302,6 +302,23 @@ def explain(
 
 
 @app.command()
+def export(
+    model: ModelPath,
+    to: Annotated[str, typer.Option("--to", metavar="TARGET", help="c, casadi, control, fmu, numpy, onnx or latex.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the code.")],
+    name: Annotated[str, typer.Option("--name", help="Of files and functions.")] = "model",
+    force: Force = False,
+) -> None:
+    """A saved model as code that needs no orthaug."""
+    from orthaug.commands import export as exporting
+
+    exporting.check(model, to, out, name, force=force)
+    _prepare_jax()
+    exporting.run(model, to, out, name, force=force)
+    streams.echo(f"written to {out}")
+
+
+@app.command()
 def design(
     spec: SpecPath,
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="CSV file for the input.")],

@@ -90,9 +90,9 @@ def _latex(node: ast.AST) -> str:
     if isinstance(node, ast.Constant):
         return f"{node.value:g}" if isinstance(node.value, int | float) else str(node.value)
     if isinstance(node, ast.Name):
-        return _symbol(node.id)
+        return symbol(node.id)
     if isinstance(node, ast.Subscript):
-        return _symbol(getattr(node.value, "id", ""), ast.unparse(node.slice).replace(" ", ""))
+        return symbol(getattr(node.value, "id", ""), ast.unparse(node.slice).replace(" ", ""))
     if isinstance(node, ast.UnaryOp):
         return ("-" if isinstance(node.op, ast.USub) else "") + _tight(node.operand)
     if isinstance(node, ast.Call):
@@ -121,7 +121,7 @@ def _tight(node: ast.AST) -> str:
     return f"({_latex(node)})" if loose else _latex(node)
 
 
-def _symbol(name: str, index: str = "") -> str:
+def symbol(name: str, index: str = "") -> str:
     """A name: one letter as it stands, with digits behind it as an index, words upright."""
     letters = name.rstrip("0123456789")
     if len(letters) == 1:

@@ -132,12 +132,15 @@ class MLP:
             for values, shape in zip(drawn, shapes, strict=True)
         ]
 
+    def layers(self, tree: Tree) -> list[tuple[Any, Any, str]]:
+        """Weight, bias and activation of each layer: what is written where the learner is exported."""
+        names = [self.activation] * len(self.hidden) + ["identity"]
+        return [(weight, bias, name) for (weight, bias), name in zip(tree, names, strict=True)]
+
     def apply(self, tree: Tree, z: Float[Array, "nz"]) -> Float[Array, "ny"]:
-        activation = ACTIVATIONS[self.activation]
-        for weight, bias in tree[:-1]:
-            z = activation(weight @ z + bias)
-        weight, bias = tree[-1]
-        return weight @ z + bias
+        for weight, bias, activation in self.layers(tree):
+            z = ACTIVATIONS[activation](weight @ z + bias)
+        return z
 
 
 def _uniform(key: Array, reach: Vector, count: int) -> Any:
@@ -319,7 +322,7 @@ class Bound:
         leaves = self.leaves(np.asarray(w))
         declared = getattr(self.learner, "silent", None)
         if declared is not None:
-            return np.asarray(self.ravel(jax.tree.leaves(declared(jax.tree.unflatten(self._shape[0], leaves)))))
+            return np.asarray(self.ravel(jax.tree.leaves(declared(self.tree(leaves)))))
         for count in range(1, len(leaves) + 1):
             tried = np.asarray(self.ravel([*leaves[:-count], *(jnp.zeros_like(leaf) for leaf in leaves[-count:])]))
             values, slopes = _probed(self, tried)
@@ -335,7 +338,7 @@ class Bound:
         leaves = self.leaves(np.zeros(self.size))
         declared = getattr(self.learner, "groups", None)
         if declared is not None:
-            leaves = jax.tree.leaves(declared(jax.tree.unflatten(self._shape[0], leaves)))
+            leaves = jax.tree.leaves(declared(self.tree(leaves)))
         else:
             leaves = [np.full(np.shape(leaf), i) for i, leaf in enumerate(leaves)]
         labels = np.concatenate([np.zeros(0, int), *(np.ravel(np.asarray(leaf)) for leaf in leaves)])
@@ -363,7 +366,11 @@ class Bound:
 
     def from_leaves(self, leaves: list[Any], z: Float[Array, "nz"]) -> Float[Array, "ny"]:
         """f(z; w) for one row, of the weight arrays."""
-        return self.learner.apply(jax.tree.unflatten(self._shape[0], leaves), z)
+        return self.learner.apply(self.tree(leaves), z)
+
+    def tree(self, leaves: list[Any]) -> Tree:
+        """The learner's own weights, of the weight arrays."""
+        return jax.tree.unflatten(self._shape[0], leaves)
 
     def jacobian(
         self, w: Float[Array, "nw"], z: Float[Array, "nz m"], gain: Float[Array, "ny ny m"]

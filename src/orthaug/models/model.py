@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from orthaug.models.lagged import Lagged
 from orthaug.models.on_records import OnRecords, trajectory
 from orthaug.models.response import Response
 from orthaug.models.statistics import Statistics
+from orthaug.models.stepping import Memory, checked_row, one_experiment, step_lagged
 from orthaug.physics.baseline import Parameter
 
 _WITHIN = 1e-9  # of a feature's half width: the largest of training is no extrapolation
@@ -143,6 +144,39 @@ class Model(OnRecords):
             outside = self._outside(start, parts, experiment, record)
             trajectories.append(replace(self.bounded(parts, experiment, measured), outside=outside))
         return Response(tuple(trajectories), None, self.outputs, record.sampling_time)
+
+    @cached_property
+    def memory(self) -> Memory:
+        """What a step remembers."""
+        return Memory.of(self.form.layout, self.form.outputs, [channel.name for channel in self.inputs])
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """The entries of a step's state: past outputs, then past inputs, `y[k-1]`."""
+        return self.memory.names
+
+    @property
+    def step_inputs(self) -> tuple[str, ...]:
+        """What a step takes: the inputs at its sample."""
+        return self.memory.inputs
+
+    def start(self, record: Record, row: int | None = None) -> Vector:
+        """The state before a row of a record of one experiment, by default the first that has a prediction.
+
+        Raises:
+            InputError: other channels, several experiments, a row that is not there.
+        """
+        record = self.fitting(record, need_outputs=False)
+        experiment = one_experiment(record)
+        return self.memory.at(experiment, record, checked_row(row, self.form.first_row, len(experiment)))
+
+    def step(self, state: Any, inputs: Any) -> tuple[Array, Array]:
+        """One sample of a free run: the next state (n,) and the outputs (ny,), from a state and the inputs (nu,).
+
+        A pure function of JAX arrays, so that `jax.jit`, `jax.vmap` and `jax.grad` take it; to go on from a measured
+        output, put that in the place of the model's own.
+        """
+        return step_lagged(self.form, self.numbers, self.memory, state, inputs)
 
     def check_initial(self, initial: Any) -> Matrix:
         """Outputs before the first usable row, (rows, ny).

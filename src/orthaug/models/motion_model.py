@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -25,6 +25,7 @@ from orthaug.models.on_records import RUNAWAY, OnRecords, trajectory
 from orthaug.models.response import Response, Trajectory
 from orthaug.models.settling import Windows, settle
 from orthaug.models.statistics import Statistics
+from orthaug.models.stepping import checked_row, one_experiment, step_arguments, step_inputs, with_scheme
 from orthaug.physics.parameters import PhysicalParameter
 
 if TYPE_CHECKING:
@@ -187,6 +188,46 @@ class MotionModel(OnRecords):
                 columns |= {f"{name}_physics": physics[:, i], f"{name}_learner": learner[:, i]}
             frames.append(pd.DataFrame(columns))
         return pd.concat(frames, ignore_index=True)
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """The entries of a step's state."""
+        return self.form.motion.names_of_states
+
+    @property
+    def step_inputs(self) -> tuple[str, ...]:
+        """What a step takes: the inputs at its sample, under a first-order hold those at the next one behind them."""
+        return step_inputs(self.form)
+
+    @cached_property
+    def _stepping(self) -> Numbers:
+        return with_scheme(self.form, self.numbers)
+
+    def start(self, record: Record, row: int | None = None) -> Vector:
+        """The state at a row of the free run on a record of one experiment, by default at the first row.
+
+        Raises:
+            InputError: other channels, several experiments, a row that is not there.
+        """
+        record = self.fitting(record, need_outputs=False)
+        experiment = one_experiment(record)
+        row = checked_row(row, 0, len(experiment) - 1)
+        state = self._start(experiment, "measured", record)
+        if not row:
+            return state
+        return self._follow(self.form, self.numbers, state, self.form.inputs(experiment, record))[0][row]
+
+    def step(self, state: Any, inputs: Any) -> tuple[Array, Array]:
+        """One sample: the next state (nx,) and the outputs (ny,) at this one, from a state and `step_inputs`.
+
+        A pure function of JAX arrays, so that `jax.jit`, `jax.vmap` and `jax.grad` take it.
+
+        Raises:
+            InputError: a spline hold, which needs the whole record.
+        """
+        arguments = step_arguments(state, inputs, self.form.states, len(self.step_inputs))
+        following, parts = self.form.step(self._stepping, *arguments)
+        return following, parts.total
 
     def reach(self, record: Record) -> Matrix:
         """The states and inputs (N, nx + nu) of the free run on a record, where they are finite."""

@@ -75,7 +75,7 @@ class Moving(MotionField, Differentiated):
 
         following = advance(
             partial(_field, self, numbers),
-            self._exponentials(numbers) if numbers.scheme is None else numbers.scheme[0],
+            self.exponentials(numbers) if numbers.scheme is None else numbers.scheme[0],
             state,
             inputs,
             len(self.motion.inputs),
@@ -91,12 +91,13 @@ class Moving(MotionField, Differentiated):
             return numbers
 
         def of(theta: Any) -> Any:
-            return self._exponentials(numbers._replace(theta=theta))
+            return self.exponentials(numbers._replace(theta=theta))
 
         theta = jnp.asarray(numbers.theta)
         return numbers._replace(scheme=(of(theta), jax.jacfwd(of)(theta)))
 
-    def _exponentials(self, numbers: Numbers) -> Exponentials | None:
+    def exponentials(self, numbers: Numbers) -> Exponentials | None:
+        """Of the linear part over a substep; None where the integrator needs none."""
         if self.motion.integrator != "exact":
             return None
         return Exponentials.of(self.linear_part(numbers), self.sampling_time / self.substeps)

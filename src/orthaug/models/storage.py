@@ -59,15 +59,25 @@ def save(model: Model | MotionModel, folder: str | Path, *, force: bool = False)
 
 def write(model: Model | MotionModel, folder: Path) -> None:
     """Write the two files into an existing folder."""
+    declaration, packed = _packed(model)
+    (folder / _ARRAYS).write_bytes(packed)
+    (folder / _DECLARATION).write_text(json.dumps(declaration, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def digest(model: Model | MotionModel) -> str:
+    """The sha256 that tells a model from others: `checksum` in the file that this version writes of it."""
+    return _packed(model)[0]["checksum"]
+
+
+def _packed(model: Model | MotionModel) -> tuple[dict[str, Any], bytes]:
+    """What the two files hold."""
     kind = _KINDS[type(model)]
     declared, arrays = kind.declare(model)
     packed = save_arrays({name: np.ascontiguousarray(value, dtype=np.float64) for name, value in arrays.items()})
     declaration = {"format": FORMAT, "orthaug": __version__, **declared} | {
         "arrays_sha256": hashlib.sha256(packed).hexdigest()
     }
-    declaration["checksum"] = _checksum(declaration)
-    (folder / _ARRAYS).write_bytes(packed)
-    (folder / _DECLARATION).write_text(json.dumps(declaration, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    return declaration | {"checksum": _checksum(declaration)}, packed
 
 
 def load(

@@ -112,6 +112,10 @@ class Terms:
         """Each term by itself."""
         return np.broadcast_to(np.arange(np.shape(tree)[1]), np.shape(tree))
 
+    def layers(self, tree: Tree) -> list[tuple[Any, Any, str]]:
+        """One layer without bias."""
+        return [(tree, None, "identity")]
+
     def init(self, key: Array, nz: int, ny: int) -> Tree:
         return np.zeros((ny, nz))
 

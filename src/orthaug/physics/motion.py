@@ -234,8 +234,8 @@ class Motion:
         """Every parameter is used, and every output follows from a state."""
         used: set[str] = set()
         for state in self.states:
-            used |= self._names_in(self._expressions[state.name])
-        for output, expression in zip(self.outputs, self._observed, strict=True):
+            used |= self._names_in(self.equations[state.name])
+        for output, expression in zip(self.outputs, self.observations, strict=True):
             there = self._names_in(expression)
             used |= there
             if not there & set(self.names_of_states):
@@ -257,7 +257,7 @@ class Motion:
 
     def parameters_in(self, state: str) -> tuple[str, ...]:
         """The parameters of a state's equation; of a motion that has expressions."""
-        there = self._names_in(self._expressions[state])
+        there = self._names_in(self.equations[state])
         return tuple(name for name in self.names if name in there)
 
     @property
@@ -289,11 +289,13 @@ class Motion:
         return replace(self, constants=tuple(sorted((*self.constants, (SAMPLING_TIME, float(sampling_time))))))
 
     @cached_property
-    def _expressions(self) -> dict[str, Expression]:
+    def equations(self) -> dict[str, Expression]:
+        """The parsed equation of each state."""
         return {s.name: parse_named(s.derivative, self.known, f"the equation of '{s.name}'") for s in self.states}
 
     @cached_property
-    def _observed(self) -> tuple[Expression, ...]:
+    def observations(self) -> tuple[Expression, ...]:
+        """The parsed expression of each output."""
         return tuple(parse_named(o.expression, self.known, f"the output '{o.name}'") for o in self.outputs)
 
     def values(self, x: Any, u: Any, p: Any, xp: Any) -> dict[str, Any]:
@@ -311,7 +313,7 @@ class Motion:
         if self.functions is not None:
             return xp.asarray(self.functions[0](x, u, p))
         values = self.values(x, u, p, xp)
-        rates = [self._expressions[state.name].value(values, xp) for state in self.states]
+        rates = [self.equations[state.name].value(values, xp) for state in self.states]
         return xp.stack([xp.broadcast_to(xp.asarray(rate, dtype=float), x.shape[1:]) for rate in rates])
 
     def observed(self, x: Any, u: Any, p: Any, xp: Any) -> Any:
@@ -319,7 +321,7 @@ class Motion:
         if self.functions is not None:
             return xp.asarray(self.functions[1](x, u, p))
         values = self.values(x, u, p, xp)
-        outputs = [expression.value(values, xp) for expression in self._observed]
+        outputs = [expression.value(values, xp) for expression in self.observations]
         return xp.stack([xp.broadcast_to(xp.asarray(output, dtype=float), x.shape[1:]) for output in outputs])
 
     def term_without_value(self, i: int, x: Vector, u: Vector) -> str:
@@ -329,7 +331,7 @@ class Motion:
         with np.errstate(all="ignore"):
             values = self.values(x, u, self.initial, np)
         definitions = dict(self.definitions)
-        term, names = (*self._expressions.values(), *self._observed)[i].term_without_value(values)
+        term, names = (*self.equations.values(), *self.observations)[i].term_without_value(values)
         while len(names) == 1 and term in definitions:  # a name for what has no value
             term, names = definitions[term].term_without_value(values)
         at = ", ".join(f"{name} = {float(values[name]):.4g}" for name in dict.fromkeys(names))

@@ -1,0 +1,136 @@
+"""The verb `export`: a folder with the code of a model, its test vectors and how to run it; whole or not at all."""
+
+from __future__ import annotations
+
+import keyword
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from orthaug import __version__
+from orthaug._base.checks import check_type, nearest
+from orthaug._base.errors import InputError, shown
+from orthaug._base.folders import check_replaceable, whole_folder
+from orthaug.export.kinds import TARGETS
+from orthaug.export.lowering import program_of
+from orthaug.export.program import Program, Signal
+from orthaug.export.target import VECTORS, Target
+from orthaug.export.vectors import Vectors
+from orthaug.models import storage
+from orthaug.models.model import Model
+from orthaug.models.motion_model import MotionModel
+
+_LONGEST = 40  # characters of a name, which stands in front of others
+_TAKEN = (
+    "check",
+    "numpy",
+    "casadi",
+    "math",
+    "main",
+    "real",
+    "int",
+    "double",
+    "float",
+    "void",
+    "char",
+    "control",
+    "onnx",
+)
+
+
+def not_an_export(folder: Path, names: Sequence[str]) -> str | None:
+    """A file in a folder without manifest: every export has one."""
+    return names[0]
+
+
+def check_target(to: str) -> str:
+    """`to` where it is a target.
+
+    Raises:
+        InputError: none of that name; the nearest is named.
+    """
+    if not isinstance(to, str) or to not in TARGETS:
+        hint = nearest(to, TARGETS) if isinstance(to, str) else ""
+        raise InputError(f"no export to {shown(to)}{hint}; known are {', '.join(TARGETS)}.")
+    return to
+
+
+def check_export(to: str, folder: Path, name: str = "model", *, force: bool = False) -> None:
+    """Raise InputError early where there is no such target, name or place."""
+    check_target(to)
+    plain = isinstance(name, str) and re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) and len(name) <= _LONGEST
+    if not plain or keyword.iskeyword(name) or name in _TAKEN:
+        raise InputError(
+            f"{shown(name)} cannot name the exported code; use ASCII letters, digits and underscores, at most "
+            f"{_LONGEST}, starting with a letter, and no word of a language or library."
+        )
+    check_replaceable(folder, not_an_export, force=force)
+
+
+def export(
+    model: Model | MotionModel, folder: str | Path, to: str, *, name: str = "model", force: bool = False
+) -> Program:
+    """Write a model as code that needs no orthaug, and return the program that was written.
+
+    Args:
+        model: what to write.
+        folder: a new one, or one that holds an export.
+        to: c, casadi, control, fmu, numpy, onnx or latex.
+        name: stands in front of the functions in C, and names the files.
+        force: replace the folder whatever it holds.
+
+    Raises:
+        InputError: an unknown target, a model that has no code (a Python function, an ensemble, a spline hold), or a
+            folder that cannot be written.
+    """
+    check_type(model, Model | MotionModel, "model", "a fitted model")
+    check_type(folder, str | os.PathLike, "folder", "a folder's name")
+    folder = Path(folder)
+    check_export(to, folder, name, force=force)
+    target: Target = TARGETS[to]()
+    program = program_of(model, name, storage.digest(model))
+    vectors = Vectors.of(model, program)
+    files = dict(target.files(program, vectors))
+    files |= {VECTORS: vectors.csv(program), "README.md": _readme(program, target, len(vectors.outputs))}
+    with whole_folder(folder, not_an_export, force=force) as partial:
+        for file, content in files.items():
+            (partial / file).write_bytes(content if isinstance(content, bytes) else content.encode("utf-8"))
+    return program
+
+
+def _readme(program: Program, target: Target, rows: int) -> str:
+    state = "What the state holds at a sample k:" if program.scheme is None else "The state:"
+    hold = ""
+    if program.scheme is not None and program.scheme.kind != "discrete" and program.inputs:
+        hold = "\nInputs are held from one sample to the next.\n"
+        if program.ends == 2:
+            hold = (
+                "\nInputs run straight from one sample to the next, so that a step takes those of the next sample too: "
+                "a step can be made when the next inputs are known.\n"
+            )
+    return f"""# {program.name}
+
+A step of a fitted model, {target.summary}. Written by orthaug {__version__}.
+
+Model sha256: `{program.digest}` (`checksum` in `model.json`)
+
+Sampling time: {program.sampling_time!r} s. A step takes the inputs of one sample and gives the outputs of that sample.
+
+{_listed("Inputs, in order:", program.inputs)}
+{_listed("Outputs:", program.outputs)}
+{_listed(state, program.states)}{hold}
+## Use
+
+{target.usage(program)}
+
+## Test vectors
+
+`{VECTORS}` has {rows} steps of a free run of the model in double precision: inputs, the state before the step, and the
+outputs. Each row can be checked by itself.
+"""
+
+
+def _listed(head: str, signals: Sequence[Signal]) -> str:
+    lines = [f"- `{signal.name}`{f' [{signal.unit}]' if signal.unit else ''}" for signal in signals]
+    return "\n".join([head, "", *(lines or ["- none"]), ""])

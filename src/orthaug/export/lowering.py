@@ -1,0 +1,249 @@
+"""Fitted models in the intermediate form."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import Vector, check_type
+from orthaug._base.errors import InputError
+from orthaug.data.expressions import Expression, Lag
+from orthaug.data.record import Channel
+from orthaug.export.nodes import Apply, Entry, Name, Node, Number, apply, identifier, node_of, total
+from orthaug.export.program import Block, Constant, Layer, Network, Program, Scheme, Signal
+from orthaug.models.dynamics import Numbers
+from orthaug.models.learners import ACTIVATIONS, Bound
+from orthaug.models.model import Model
+from orthaug.models.motion_model import MotionModel
+
+_OWN_FUNCTION = (
+    "is a Python function, which no target can write; give it as expressions, or call `model.step` where Python with "
+    "JAX runs"
+)
+
+
+def program_of(model: Model | MotionModel, name: str = "model", digest: str = "") -> Program:
+    """The step of a model in the intermediate form.
+
+    Raises:
+        InputError: physics or a learner that is a Python function, an ensemble, a hold that needs the whole record.
+    """
+    check_type(model, Model | MotionModel, "model", "a fitted model")
+    numbers = model.numbers
+    if not all(np.isfinite(np.asarray(values)).all() for values in numbers[:6]):
+        raise InputError("the model holds numbers that are not finite; fit it again.")
+    return _LOWERED[type(model)](model, name, digest)
+
+
+class _Constants:
+    """Named numbers of expressions, each under one name."""
+
+    def __init__(self) -> None:
+        self.found: dict[str, Constant] = {}
+        self.symbols: dict[str, str] = {}
+
+    def node(self, kind: str, name: str, value: float, meaning: str) -> Name:
+        """The constant's node, `p_` for parameters and `c_` for others before its name.
+
+        Another value under the same name gets a name of its own.
+        """
+        first = written = f"{kind}_{identifier(name)}"
+        i = 2
+        while written in self.found and self.found[written].value != value:
+            written, i = f"{first}_{i}", i + 1
+        self.found[written] = Constant(written, float(value), meaning)
+        self.symbols[written] = name
+        return Name(written)
+
+    def of(self, expression: Expression) -> dict[str, Node]:
+        """The constants of an expression of lagged channels."""
+        return {name: self.node("c", name, value, f"constant {name}") for name, value in expression.constants}
+
+
+def _lagged(model: Model, name: str, digest: str) -> Program:
+    form, numbers, memory = model.form, model.numbers, model.memory
+    if form.baseline.function is not None:
+        raise InputError(f"the physics {_OWN_FUNCTION}.")
+    if numbers.tilt is not None:
+        raise InputError(
+            "the model is an ensemble, whose learner is the median of several; fit with `restarts` but without an "
+            "ensemble to export it, or call `model.step` where Python with JAX runs."
+        )
+    channels = {channel.name: channel for channel in (*model.outputs, *model.inputs)}
+    lags: dict[Lag, Node] = {lag: Entry("x", i) for i, lag in enumerate(memory.lags)}
+    lags |= {Lag(channel, 0): Entry("u", i) for i, channel in enumerate(memory.inputs)}
+    constants = _Constants()
+
+    def written(expression: Expression) -> Node:
+        return node_of(expression, constants.of(expression), lags, dict(expression.constants))
+
+    effective = dict(zip(form.baseline.names, np.asarray(model.theta - model.theta_aux).tolist(), strict=True))
+    sums: list[list[Node]] = [[] for _ in form.outputs]
+    units = {parameter.name: parameter.unit for parameter in form.baseline.parameters}
+    for term, expression in zip(form.baseline.terms, form.baseline.expressions, strict=True):
+        value = (term.initial or 0.0) if term.fixed else effective[term.parameter]
+        unit = term.unit or units.get(term.parameter, "")
+        what = "known" if term.fixed else "theta - theta_aux"
+        meaning = f"{term.parameter}{f' [{unit}]' if unit else ''}, {what}"
+        factor = constants.node("p", term.parameter, value, meaning)
+        row = form.outputs.index(term.output) if term.output is not None else 0
+        sums[row].append(apply("mul", factor, written(expression)))
+    network = None
+    if form.bound is not None:
+        features = [written(entry) for entry in form.features.entries]
+        network = _network(form.bound, numbers, features, np.arange(len(form.outputs)))
+        for i, summands in enumerate(sums):
+            summands.append(Entry("g", i))
+    block = Block("output", (), network, tuple(map(total, sums)))
+    lines = tuple((_signal(channels[channel]), depth) for channel, depth in memory.depths)
+    states = tuple(
+        Signal(str(lag), f"{identifier(lag.channel)}_{lag.lag}", channels[lag.channel].unit) for lag in memory.lags
+    )
+    return Program(
+        name=name,
+        states=states,
+        inputs=tuple(map(_signal, model.inputs)),
+        outputs=tuple(map(_signal, model.outputs)),
+        sampling_time=model.sampling_time,
+        constants=tuple(constants.found.values()),
+        output=block,
+        lines=lines,
+        following=tuple(memory.following.tolist()),
+        symbols=tuple(constants.symbols.items()),
+        digest=digest,
+    )
+
+
+def _motion(model: MotionModel, name: str, digest: str) -> Program:
+    form, numbers, motion = model.form, model.numbers, model.form.motion
+    if motion.functions is not None:
+        raise InputError(f"the motion {_OWN_FUNCTION}.")
+    step_inputs = model.step_inputs
+    units = {channel.name: channel.unit for channel in model.inputs}
+    values = np.asarray(motion.coordinates.physical(np.asarray(numbers.theta) - np.asarray(numbers.theta_aux)))
+    constants = _Constants()
+    names: dict[str, Node] = {
+        key: constants.node("c", key, value, f"constant {key}") for key, value in motion.constants
+    }
+    for parameter, value in zip(motion.parameters, values.tolist(), strict=True):
+        unit = f" [{parameter.unit}]" if parameter.unit else ""
+        beside = "" if form.bound is None else ", beside the learner"
+        names[parameter.name] = constants.node("p", parameter.name, value, f"{parameter.name}{unit}{beside}")
+    names |= {state.name: Entry("x", i) for i, state in enumerate(motion.states)}
+    names |= {channel: Entry("u", i) for i, channel in enumerate(motion.inputs)}
+    numeric = dict(motion.constants)
+    defined: dict[str, Node] = {}
+    for key, expression in motion.definitions:
+        defined[f"v_{identifier(key)}"] = node_of(expression, names, {}, numeric)
+        names[key] = Name(f"v_{identifier(key)}")
+        constants.symbols[f"v_{identifier(key)}"] = key
+
+    def written(expression: Expression) -> Node:
+        return node_of(expression, names, {}, numeric)
+
+    features = [written(entry) for entry in form.features]
+    learned_states, learned_outputs = motion.learned
+    results = {"rate": list(map(written, motion.equations.values())), "output": list(map(written, motion.observations))}
+    blocks = {}
+    for kind, learned, first in (("output", learned_outputs, len(learned_states)), ("rate", learned_states, 0)):
+        network = None
+        if form.bound is not None and learned:
+            network = _network(form.bound, numbers, features, first + np.arange(len(learned)))
+            for i, place in enumerate(learned):
+                results[kind][place] = apply("add", results[kind][place], Entry("g", i))
+        seen = features if network is not None else []
+        blocks[kind] = Block(kind, _needed(defined, [*results[kind], *seen]), network, tuple(results[kind]))
+    return Program(
+        name=name,
+        states=tuple(Signal(state.name, identifier(state.name), state.unit) for state in motion.states),
+        inputs=tuple(_step_input(key, units) for key in step_inputs),
+        outputs=tuple(map(_signal, model.outputs)),
+        sampling_time=model.sampling_time,
+        constants=tuple(constants.found.values()),
+        output=blocks["output"],
+        rate=blocks["rate"],
+        scheme=_scheme(model),
+        ends=2 if len(step_inputs) > len(motion.inputs) else 1,
+        symbols=tuple(constants.symbols.items()),
+        digest=digest,
+    )
+
+
+_LOWERED: dict[type, Callable[[Any, str, str], Program]] = {Model: _lagged, MotionModel: _motion}
+
+
+def _signal(channel: Channel) -> Signal:
+    return Signal(channel.name, identifier(channel.name), channel.unit)
+
+
+def _step_input(name: str, units: Mapping[str, str]) -> Signal:
+    bare = name.removesuffix("[k+1]")
+    return Signal(name, identifier(bare) + "_next" * (bare != name), units.get(bare, ""))
+
+
+def _needed(defined: Mapping[str, Node], roots: Sequence[Node]) -> tuple[tuple[str, Node], ...]:
+    """The definitions that some nodes reach, in order."""
+    reached: set[str] = set()
+
+    def visit(node: Node) -> None:
+        if isinstance(node, Name) and node.name in defined and node.name not in reached:
+            reached.add(node.name)
+            visit(defined[node.name])
+        elif isinstance(node, Apply):
+            for argument in node.arguments:
+                visit(argument)
+
+    for root in roots:
+        visit(root)
+    return tuple((name, node) for name, node in defined.items() if name in reached)
+
+
+def _network(bound: Bound, numbers: Numbers, features: Sequence[Node], rows: Vector) -> Network:
+    """The learner with its scaling; `rows` are those of its values that are wanted."""
+    declared = getattr(bound.learner, "layers", None)
+    if declared is None:
+        raise InputError(
+            f"the learner {type(bound.learner).__name__} is a function that no target can write; fit with an MLP or "
+            "Terms, or give its class a method `layers(tree)` that returns weight, bias and activation of each layer. "
+            "`model.step` runs it where Python with JAX does."
+        )
+    centre, halfwidth = np.asarray(numbers.centre), np.asarray(numbers.halfwidth)
+    scaled: list[Node] = []
+    for feature, middle, width in zip(features, centre.tolist(), halfwidth.tolist(), strict=True):
+        moved = feature if middle == 0 else apply("sub", feature, Number(middle))
+        scaled.append(moved if width == 1 else apply("div", moved, Number(width)))
+    layers = []
+    for weight, bias, activation in declared(bound.tree(bound.leaves(np.asarray(numbers.weights)))):
+        if activation not in ACTIVATIONS:
+            raise InputError(f"the learner has the activation {activation!r}; known are {', '.join(ACTIVATIONS)}.")
+        layers.append(
+            Layer(np.asarray(weight, dtype=float), None if bias is None else np.asarray(bias, dtype=float), activation)
+        )
+    last, gain = layers[-1], np.asarray(numbers.gain, dtype=float)[rows]
+    layers[-1] = Layer(
+        gain[:, None] * last.weight[rows], None if last.bias is None else gain * last.bias[rows], last.activation
+    )
+    return Network(tuple(scaled), tuple(layers))
+
+
+def _scheme(model: MotionModel) -> Scheme:
+    form = model.form
+    kind, substeps = form.motion.integrator, form.substeps
+    h = model.sampling_time / substeps
+    if kind != "exact":
+        return Scheme(kind, h, substeps)
+    found = form.exponentials(model.numbers)
+    assert found is not None
+    linear, whole, phi1, phi2, phi3, half, half1 = (np.asarray(matrix) for matrix in found)
+    matrices = {
+        "linear": linear,
+        "whole": whole,
+        "half": half,
+        "half1": half1,
+        "first": h * (phi1 - 3 * phi2 + 4 * phi3),
+        "middle": 2 * h * (phi2 - 2 * phi3),
+        "last": h * (4 * phi3 - phi2),
+    }
+    return Scheme(kind, h, substeps, tuple(matrices.items()))

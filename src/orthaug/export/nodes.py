@@ -1,0 +1,160 @@
+"""Scalar expressions in the intermediate form: numbers, names, entries of vectors, and functions of them.
+
+Targets write them; nothing of Python's syntax tree, of NumPy or of JAX is left in them.
+"""
+
+from __future__ import annotations
+
+import ast
+import unicodedata
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Union
+
+import numpy as np
+
+from orthaug.data.expressions import Expression, Lag
+
+_BINARY = {ast.Add: "add", ast.Sub: "sub", ast.Mult: "mul", ast.Div: "div"}
+ARITHMETIC: dict[str, Callable[..., float]] = {
+    "neg": lambda a: -a,
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "div": lambda a, b: a / b,
+    "power": lambda a, b: a**b,
+    "whole_power": lambda a, b: a**b,
+}
+"""Beside these a node may hold every function of expressions."""
+
+
+@dataclass(frozen=True)
+class Number:
+    """A number as it stands."""
+
+    value: float
+
+
+@dataclass(frozen=True)
+class Name:
+    """A named constant or an intermediate result."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An entry of a vector, counted from 0."""
+
+    vector: str
+    index: int
+
+
+@dataclass(frozen=True)
+class Apply:
+    """A function of nodes: of `ARITHMETIC` or of `FUNCTIONS` of expressions; `min` and `max` of two.
+
+    The second argument of `whole_power` is a whole `Number`.
+    """
+
+    function: str
+    arguments: tuple[Node, ...]
+
+
+Node = Union[Number, Name, Entry, Apply]  # noqa: UP007  (refers to itself)
+
+
+def apply(function: str, *arguments: Node) -> Node:
+    """A function of nodes; arithmetic on numbers is done here, by the rules of floating point."""
+    numbers = [argument.value for argument in arguments if isinstance(argument, Number)]
+    if function in ARITHMETIC and len(numbers) == len(arguments):
+        with np.errstate(all="ignore"):
+            return Number(float(ARITHMETIC[function](*map(np.float64, numbers))))
+    return Apply(function, arguments)
+
+
+def total(summands: list[Node]) -> Node:
+    """Their sum, from the left; 0 of none."""
+    if not summands:
+        return Number(0.0)
+    value = summands[0]
+    for summand in summands[1:]:
+        value = apply("add", value, summand)
+    return value
+
+
+def node_of(
+    expression: Expression,
+    names: Mapping[str, Node],
+    lags: Mapping[Lag, Node],
+    numbers: Mapping[str, float],
+) -> Node:
+    """An expression as a node.
+
+    Args:
+        expression: from the parser.
+        names, lags: what its names and its channels at a lag stand for.
+        numbers: names of constants, whose values tell whether a power is a whole one.
+    """
+    return _node(expression.tree, names, lags, numbers)
+
+
+def _node(tree: ast.expr, names: Mapping[str, Node], lags: Mapping[Lag, Node], numbers: Mapping[str, float]) -> Node:
+    if isinstance(tree, ast.Constant):
+        return Number(float(tree.value))  # type: ignore[arg-type]  (checked by the parser)
+    if isinstance(tree, ast.Name):
+        return names[tree.id]
+    if isinstance(tree, ast.Subscript):
+        return lags[Expression(ast.unparse(tree)).lags[0]]
+    if isinstance(tree, ast.UnaryOp):
+        operand = _node(tree.operand, names, lags, numbers)
+        return apply("neg", operand) if isinstance(tree.op, ast.USub) else operand
+    if isinstance(tree, ast.BinOp) and isinstance(tree.op, ast.Pow):
+        base, exponent = _node(tree.left, names, lags, numbers), _constant(tree.right, numbers)
+        if exponent is not None and exponent.is_integer() and abs(exponent) <= 2**31 - 1:
+            return apply("whole_power", base, Number(exponent))
+        return apply("power", base, _node(tree.right, names, lags, numbers))
+    if isinstance(tree, ast.BinOp):
+        sides = (_node(side, names, lags, numbers) for side in (tree.left, tree.right))
+        return apply(_BINARY[type(tree.op)], *sides)
+    assert isinstance(tree, ast.Call) and isinstance(tree.func, ast.Name)
+    arguments = [_node(argument, names, lags, numbers) for argument in tree.args]
+    if tree.func.id in ("min", "max"):
+        value = arguments[0]
+        for other in arguments[1:]:
+            value = Apply(tree.func.id, (value, other))
+        return value
+    return Apply(tree.func.id, tuple(arguments))
+
+
+def _constant(tree: ast.expr, numbers: Mapping[str, float]) -> float | None:
+    """The number that an exponent is, where it is one."""
+    if isinstance(tree, ast.Constant):
+        return float(tree.value)  # type: ignore[arg-type]
+    if isinstance(tree, ast.Name):
+        return numbers.get(tree.id)
+    if isinstance(tree, ast.UnaryOp):
+        value = _constant(tree.operand, numbers)
+        return -value if value is not None and isinstance(tree.op, ast.USub) else value
+    return None
+
+
+def functions_in(node: Node) -> set[str]:
+    """The functions that a node is made of; a whole power of 2 counts as `square`."""
+    if not isinstance(node, Apply):
+        return set()
+    square = node.function == "whole_power" and node.arguments[1] == Number(2.0)
+    return {"square" if square else node.function}.union(*map(functions_in, node.arguments))
+
+
+def names_in(node: Node) -> set[str]:
+    """The names that a node reads."""
+    if isinstance(node, Name):
+        return {node.name}
+    return set[str]().union(*map(names_in, node.arguments)) if isinstance(node, Apply) else set()
+
+
+def identifier(name: str) -> str:
+    """A name in ASCII: other letters by their code point, as `u03b8` for θ."""
+    plain = unicodedata.normalize("NFKC", name)
+    return "".join(c if c.isascii() and (c.isalnum() or c == "_") else f"u{ord(c):04x}" for c in plain)

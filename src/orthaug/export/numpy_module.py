@@ -1,0 +1,82 @@
+"""A Python module that needs NumPy alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from orthaug.export.program import Program
+from orthaug.export.python_code import Dialect, arithmetic, declarations, python_language
+from orthaug.export.vectors import Vectors
+
+_SAME = ("sin", "cos", "tan", "exp", "log", "sqrt", "abs", "sign", "floor", "tanh", "expm1", "log1p", "power")
+_OTHER = {"atan": "np.arctan", "atan2": "np.arctan2", "min": "np.minimum", "max": "np.maximum"}
+NUMPY = Dialect(
+    python_language({name: f"np.{name}" for name in _SAME} | _OTHER),
+    vector="np.array([{}])",
+    array="np.array({})",
+    join="np.concatenate(({}))",
+    constant="np.float64({})",
+)
+
+
+@dataclass(frozen=True)
+class NumpyModule:
+    """`NAME.py` with `step(state, inputs)` and `run(state, inputs)`."""
+
+    summary = "a Python module that needs NumPy alone"
+
+    def files(self, program: Program, vectors: Vectors) -> Mapping[str, str]:
+        return {f"{program.name}.py": module(program)}
+
+    def usage(self, program: Program) -> str:
+        return f"""```python
+import numpy as np
+import {program.name} as model
+
+state = model.start()                             # zeros, in the order of model.STATES
+state, outputs = model.step(state, np.zeros({len(program.inputs)}))  # inputs in the order of model.INPUTS
+outputs = model.run(state, np.zeros((100, {len(program.inputs)})))   # a free run
+```
+
+`step` is a pure function. It needs NumPy and nothing else."""
+
+
+def module(program: Program) -> str:
+    """The text of the module."""
+    return "\n".join(
+        [
+            f'"""{program.name}: one step of a fitted model. Written by orthaug; needs NumPy alone."""',
+            "",
+            "import numpy as np",
+            "",
+            declarations(program),
+            "",
+            arithmetic(program, NUMPY),
+            _STEP,
+        ]
+    )
+
+
+_STEP = '''
+
+def start():
+    """A state of zeros."""
+    return np.zeros(len(STATES))
+
+
+def step(state, inputs):
+    """The next state and the outputs of one sample."""
+    x, u = np.asarray(state, dtype=float), np.asarray(inputs, dtype=float)
+    with np.errstate(all="ignore"):
+        y = output(x, u)
+        return advance(x, u, y), y
+
+
+def run(state, inputs):
+    """The outputs of a free run, a row for each row of inputs."""
+    outputs = np.empty((len(inputs), len(OUTPUTS)))
+    for k, row in enumerate(inputs):
+        state, outputs[k] = step(state, row)
+    return outputs
+'''

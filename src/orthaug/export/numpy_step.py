@@ -1,0 +1,175 @@
+"""A step in NumPy alone: no JAX in the loop, no text that is run as code."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import Vector
+from orthaug._base.errors import InputError
+from orthaug.export.activations import ACTIVATIONS
+from orthaug.export.lowering import program_of
+from orthaug.export.nodes import Apply, Entry, Name, Node, Number
+from orthaug.export.program import Block, Program, Scheme
+from orthaug.models.model import Model
+from orthaug.models.motion_model import MotionModel
+
+Values = dict[str, Any]
+"""`x`, `u`, `g` and intermediate results by name."""
+Evaluation = Callable[[Values], Any]
+
+_SAME = ("sin", "cos", "tan", "exp", "log", "sqrt", "abs", "sign", "floor", "tanh", "expm1", "log1p")
+FUNCTIONS: dict[str, Any] = {
+    "neg": np.negative,
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "div": lambda a, b: a / b,
+    "power": np.power,
+    "whole_power": lambda a, n: a ** int(n),
+    "atan": np.arctan,
+    "atan2": np.arctan2,
+    "min": np.minimum,
+    "max": np.maximum,
+} | {name: getattr(np, name) for name in _SAME}
+
+
+class NumpyStep:
+    """`state, outputs = step(state, inputs)` on NumPy vectors, as `model.step`; make one with `numpy_step`."""
+
+    def __init__(self, program: Program) -> None:
+        self.state_names = tuple(signal.name for signal in program.states)
+        self.step_inputs = tuple(signal.name for signal in program.inputs)
+        self._sizes = len(program.states), len(program.inputs)
+        self._constants = {constant.name: np.float64(constant.value) for constant in program.constants}
+        self._output = self._block(program.output)
+        self._following = np.array(program.following, dtype=int)
+        self._advance = None
+        if program.rate is not None and program.scheme is not None:
+            self._advance = _advancing(self._block(program.rate), program.scheme, program.held, program.ends)
+        self._held = program.held
+
+    def __call__(self, state: Any, inputs: Any) -> tuple[Vector, Vector]:
+        """The next state (n,) and the outputs (ny,) of one sample.
+
+        Raises:
+            InputError: vectors of another length.
+        """
+        x, u = np.asarray(state, dtype=float), np.asarray(inputs, dtype=float)
+        if x.shape != self._sizes[:1] or u.shape != self._sizes[1:]:
+            raise InputError(
+                f"a step takes a state of {self._sizes[0]} and inputs of {self._sizes[1]} numbers; got the shapes "
+                f"{x.shape} and {u.shape}."
+            )
+        with np.errstate(all="ignore"):
+            y = self._output(x, u[: self._held])
+            if self._advance is not None:
+                return self._advance(x, u), y
+            return np.concatenate((y, u, x))[self._following], y
+
+    def _block(self, block: Block) -> Callable[[Vector, Vector], Vector]:
+        intermediate = [(name, self._evaluation(node)) for name, node in block.locals]
+        network = block.network
+        features = [self._evaluation(node) for node in network.features] if network is not None else []
+        layers = []
+        for layer in network.layers if network is not None else ():
+            bias = np.zeros(len(layer.weight)) if layer.bias is None else layer.bias
+            act = None if layer.activation == "identity" else self._evaluation(ACTIVATIONS[layer.activation])
+            layers.append((layer.weight, bias, act))
+        results = [self._evaluation(node) for node in block.results]
+
+        def evaluate(x: Vector, u: Vector) -> Vector:
+            values: Values = {"x": x, "u": u}
+            for name, of in intermediate:
+                values[name] = of(values)
+            if layers:
+                z = np.array([of(values) for of in features], dtype=float)
+                for weight, bias, act in layers:
+                    z = weight @ z + bias
+                    z = z if act is None else act({"a": z})
+                values["g"] = z
+            return np.array([of(values) for of in results], dtype=float)
+
+        return evaluate
+
+    def _evaluation(self, node: Node) -> Evaluation:
+        if isinstance(node, Number):
+            value = np.float64(node.value)
+            return lambda values: value
+        if isinstance(node, Name):
+            name = node.name
+            if name in self._constants:
+                constant = self._constants[name]
+                return lambda values: constant
+            return lambda values: values[name]
+        if isinstance(node, Entry):
+            vector, index = node.vector, node.index
+            return lambda values: values[vector][index]
+        assert isinstance(node, Apply)
+        function, arguments = FUNCTIONS[node.function], [self._evaluation(argument) for argument in node.arguments]
+        if len(arguments) == 1:
+            (only,) = arguments
+            return lambda values: function(only(values))
+        first, second = arguments
+        return lambda values: function(first(values), second(values))
+
+
+def numpy_step(model: Model | MotionModel) -> NumpyStep:
+    """The step of a fitted model in NumPy alone, for loops in Python and where JAX is too slow to call.
+
+    Raises:
+        InputError: physics or a learner that is a Python function, an ensemble, a spline hold.
+    """
+    return NumpyStep(program_of(model))
+
+
+def _advancing(
+    rate: Callable[[Vector, Vector], Vector], scheme: Scheme, held: int, ends: int
+) -> Callable[[Vector, Vector], Vector]:
+    """x one sample later, of x and the step's inputs."""
+    if scheme.kind == "discrete":
+        return rate
+    h, halves = scheme.step, 2 * scheme.substeps
+    one = _exponential(rate, dict(scheme.matrices)) if scheme.kind == "exact" else _runge_kutta(rate, h)
+
+    def advance(x: Vector, u: Vector) -> Vector:
+        now = u[:held]
+        slope = (u[held:] - now) / halves if ends == 2 else None
+        for j in range(0, halves, 2):
+            points = (
+                (now, now, now) if slope is None else (now + j * slope, now + (j + 1) * slope, now + (j + 2) * slope)
+            )
+            x = one(x, *points)
+        return x
+
+    return advance
+
+
+def _runge_kutta(rate: Callable[[Vector, Vector], Vector], h: float) -> Callable[..., Vector]:
+    def one(x: Vector, first: Vector, middle: Vector, last: Vector) -> Vector:
+        k1 = rate(x, first)
+        k2 = rate(x + h / 2 * k1, middle)
+        k3 = rate(x + h / 2 * k2, middle)
+        k4 = rate(x + h * k3, last)
+        return x + h / 6 * (k1 + 2 * (k2 + k3) + k4)
+
+    return one
+
+
+def _exponential(rate: Callable[[Vector, Vector], Vector], m: dict[str, Any]) -> Callable[..., Vector]:
+    def rest(x: Vector, u: Vector) -> Vector:
+        return rate(x, u) - m["linear"] @ x
+
+    def one(x: Vector, first: Vector, middle: Vector, last: Vector) -> Vector:
+        begin = rest(x, first)
+        a = m["half"] @ x + m["half1"] @ begin
+        at_a = rest(a, middle)
+        b = m["half"] @ x + m["half1"] @ at_a
+        at_b = rest(b, middle)
+        c = m["half"] @ a + m["half1"] @ (2 * at_b - begin)
+        ends = m["first"] @ begin + m["last"] @ rest(c, last)
+        return m["whole"] @ x + ends + m["middle"] @ (at_a + at_b)
+
+    return one

@@ -1,0 +1,138 @@
+"""A model's step in the intermediate form: constants, blocks of scalar expressions with a network, and how to advance.
+
+A target writes a `Program`, and knows nothing of models.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug.export.nodes import Node, functions_in
+
+
+@dataclass(frozen=True)
+class Signal:
+    """An entry of state, inputs or outputs: its name as users write it, an identifier in ASCII, its unit."""
+
+    name: str
+    identifier: str
+    unit: str = ""
+
+    @property
+    def label(self) -> str:
+        """`name [unit]`."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A named number; `meaning` is one line."""
+
+    name: str
+    value: float
+    meaning: str
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """`activation(weight @ z + bias)`; without a bias where that is None."""
+
+    weight: Float[np.ndarray, "no ni"]
+    bias: Float[np.ndarray, "no"] | None
+    activation: str
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """The learner: layers on scaled features. Its values are the vector `g` of the block that it stands in."""
+
+    features: tuple[Node, ...]
+    layers: tuple[Layer, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """A function of `x` and `u`: named intermediate results in order, a network, and the results."""
+
+    name: str
+    locals: tuple[tuple[str, Node], ...]
+    network: Network | None
+    results: tuple[Node, ...]
+
+    @property
+    def functions(self) -> set[str]:
+        """The functions of all its expressions."""
+        features = self.network.features if self.network is not None else ()
+        nodes = (*(node for _, node in self.locals), *features, *self.results)
+        return set[str]().union(*map(functions_in, nodes))
+
+    @property
+    def activations(self) -> set[str]:
+        """Those of its network."""
+        return {layer.activation for layer in self.network.layers} if self.network is not None else set()
+
+
+@dataclass(frozen=True, eq=False)
+class Scheme:
+    """How a motion goes on by one sample: `discrete`, `rk4`, or `exact` by matrices.
+
+    Of the exact one, with the rest r = rate − `linear` x and substep h:
+    `a = half x + half1 r(x)`, `b = half x + half1 r(a)`, `c = half a + half1 (2 r(b) − r(x))`,
+    `x⁺ = whole x + first r(x) + middle (r(a) + r(b)) + last r(c)`.
+    """
+
+    kind: str
+    step: float
+    """The substep h [s]."""
+    substeps: int
+    matrices: tuple[tuple[str, Float[np.ndarray, "nx nx"]], ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """A step: `output` gives y of state x and inputs u; then the state goes on.
+
+    Of a lagged model `lines` are the channels that it remembers with how many samples of each, outputs first; the state
+    is these lines, newest first, and outputs and inputs are put in front of them. Of a motion `rate` and `scheme` make
+    the next state; under a first-order hold, `ends` = 2, the inputs of the next sample stand behind those of this one.
+    """
+
+    name: str
+    states: tuple[Signal, ...]
+    inputs: tuple[Signal, ...]
+    outputs: tuple[Signal, ...]
+    sampling_time: float
+    constants: tuple[Constant, ...]
+    output: Block
+    lines: tuple[tuple[Signal, int], ...] = ()
+    following: tuple[int, ...] = ()
+    """Of a lagged model where the next state's entries are among outputs, inputs and state."""
+    rate: Block | None = None
+    scheme: Scheme | None = None
+    ends: int = 1
+    symbols: tuple[tuple[str, str], ...] = ()
+    """The names of constants and intermediate results as users write them."""
+    digest: str = ""
+
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """What a step evaluates."""
+        return (self.output,) if self.rate is None else (self.output, self.rate)
+
+    @property
+    def functions(self) -> set[str]:
+        """The functions of all expressions."""
+        return set[str]().union(*(block.functions for block in self.blocks))
+
+    @property
+    def activations(self) -> set[str]:
+        """Those of all networks."""
+        return set[str]().union(*(block.activations for block in self.blocks))
+
+    @property
+    def held(self) -> int:
+        """Inputs at an instant, of which a step takes `ends`."""
+        return len(self.inputs) // self.ends

@@ -1,0 +1,588 @@
+"""Exports run for real: every target computes what the model computes, for every kind of model."""
+
+from __future__ import annotations
+
+import csv
+import ctypes
+import importlib.util
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import orthaug as oa
+from orthaug._base.jax import jax, jnp
+from orthaug.commands.cli import main
+from orthaug.data.expressions import FUNCTIONS, parse, parse_named
+from orthaug.data.regressors import Features
+from orthaug.export import activations, fmu
+from orthaug.export.kinds import TARGETS
+from orthaug.export.lowering import program_of
+from orthaug.export.nodes import Number, apply
+from orthaug.export.numpy_step import FUNCTIONS as NUMPY_FUNCTIONS
+from orthaug.export.numpy_step import NumpyStep, numpy_step
+from orthaug.models.dynamics import Numbers
+from orthaug.models.lagged import Lagged
+from orthaug.models.learners import ACTIVATIONS, Bound
+from orthaug.models.model import Model
+from orthaug.models.motion_model import MotionModel
+from orthaug.models.moving import Moving
+from orthaug.models.terms import Terms
+from orthaug.physics.baseline import Baseline
+
+POINTS, STEPS = 1000, 10_000
+STRICT = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion", "-Wshadow")
+
+
+@dataclass(frozen=True)
+class Deep:
+    """A network with every activation, as a learner from outside: what an export needs is `layers`."""
+
+    inputs: tuple[str, ...] | None = None
+
+    def init(self, key, nz, ny):
+        rng, sizes = np.random.default_rng(5), (nz, *(3,) * len(ACTIVATIONS), ny)
+        shapes = zip(sizes[1:], sizes, strict=False)
+        return [(rng.normal(size=shape), 0.5 * rng.normal(size=shape[0])) for shape in shapes]
+
+    def layers(self, tree):
+        names = [*ACTIVATIONS, "identity"]
+        return [(weight, bias, name) for (weight, bias), name in zip(tree, names, strict=True)]
+
+    def apply(self, tree, z):
+        for weight, bias, name in self.layers(tree):
+            z = ACTIVATIONS[name](weight @ z + bias)
+        return z
+
+
+def lagged(terms, features, learner, outputs, inputs, constants=None) -> Model:
+    """A lagged model with arbitrary numbers."""
+    rng = np.random.default_rng(len(terms))
+    baseline = Baseline.from_terms(terms, constants)
+    entries = tuple(parse(text, constants) for text in features)
+    lags = {*baseline.lags, *(lag for entry in entries for lag in entry.lags)}
+    order = {name: i for i, name in enumerate((*outputs, *inputs))}
+    layout = tuple(sorted(lags, key=lambda lag: (order[lag.channel], lag.lag)))
+    ny, nz, nt = len(outputs), len(entries), len(baseline.names)
+    bound = Bound(learner, nz, ny) if learner is not None else None
+    weights = np.zeros(0) if bound is None else np.asarray(bound.init(jax.random.key(2)))
+    if bound is not None and not weights.any():
+        weights = rng.normal(size=weights.shape)
+    scaling = (0.2 * rng.normal(size=nz), 1 + rng.random(nz), 0.2 * (1 + rng.random(ny)))
+    numbers = Numbers(0.3 * rng.normal(size=nt), 0.1 * rng.normal(size=nt), weights, *scaling)
+    return Model(
+        form=Lagged(baseline, Features(entries), layout, outputs, bound),
+        numbers=numbers,
+        outputs=tuple(oa.Channel(name, "m") for name in outputs),
+        inputs=tuple(oa.Channel(name, "N") for name in inputs),
+        sampling_time=0.1,
+        structure="orthogonal",
+        largest_output=np.ones(ny),
+        deviation=np.ones(ny),
+        weight=np.eye(ny),
+    )
+
+
+def moving(motion: oa.Motion, features=(), learner=None, substeps=2) -> MotionModel:
+    """A motion with arbitrary weights."""
+    motion = motion.sampled(0.1)
+    entries = tuple(parse_named(text, motion.known, "feature") for text in features)
+    values = sum(map(len, motion.learned))
+    bound = Bound(learner, len(entries), values) if learner is not None else None
+    weights = np.zeros(0) if bound is None else np.asarray(bound.init(jax.random.key(4)))
+    q, nz = motion.coordinates.initial, len(entries)
+    numbers = Numbers(q, 0.02 * np.ones_like(q), weights, 0.1 * np.ones(nz), 1.5 * np.ones(nz), 0.3 * np.ones(values))
+    ny = len(motion.outputs)
+    return MotionModel(
+        form=Moving(motion, entries, bound, 0.1, substeps),
+        numbers=numbers,
+        outputs=tuple(oa.Channel(output.name, "m") for output in motion.outputs),
+        inputs=tuple(oa.Channel(name, "N") for name in motion.inputs),
+        sampling_time=0.1,
+        structure="orthogonal",
+        largest_output=np.ones(ny),
+        deviation=np.ones(ny),
+        weight=np.eye(ny),
+        loose=np.ones(len(motion.states)),
+        window=5,
+    )
+
+
+TWO_OUTPUTS = [
+    oa.Term("a", "tanh(y1[k-1]) + 0.5*y1[k-3]", output="y1"),
+    oa.Term("a", "sin(gain*y2[k-2])", output="y2"),  # θ shared
+    oa.Term("known", "cos(y2[k-1]) - floor(2*u1[k])/3", 0.25, output="y1", fixed=True),
+    oa.Term("b", "max(min(3*u1[k-4], limit, 1), -limit)*atan2(u2[k], 2)", output="y2"),
+    oa.Term("c", "sqrt(abs(u2[k-2]))*sign(u1[k]) - (-u2[k])**3/(1 + u1[k]**2)**2", output="y1"),
+    oa.Term("d", "exp(-abs(y1[k-1]))**1.5 - (u1[k] - (u2[k] - 1)) + 2**-2", output="y2"),
+    oa.Term("e", "log(2 + atan(u2[k-1]))/(tan(0.3) + y2[k-1]**gain) + (1 + abs(u1[k]))**-0.5", output="y2"),
+    oa.Term("f", "-(2 + abs(u1[k-1]))**-2 + u2[k]/(gain*limit)", output="y1"),
+]
+POSITIVE = [oa.PhysicalParameter(n, v, min=0) for n, v in (("m", 1.3), ("c", 2.7), ("k", 9.0))]
+
+
+def spring(**options) -> oa.Motion:
+    return oa.Motion.from_equations(
+        states=[oa.State("x", "v", unit="m"), oa.State("v", "(total - drag*v)/m", learned=True, unit="m/s")],
+        outputs=[oa.Output("y", "x + 0.1*v**2", learned=True), oa.Output("rate", "v + 0.01*u")],
+        inputs=["u", "w"],
+        parameters=[*POSITIVE, oa.PhysicalParameter("offset", -0.2)],
+        constants={"limit": 0.8},
+        define={"drag": "c + abs(v)", "total": "max(min(u, limit), -limit) + w - k*x - k*offset*x**3"},
+        **options,
+    )
+
+
+DISCRETE = oa.Motion.from_equations(
+    states=[oa.State("a", "0.6*a + 0.3*sin(θ*b)"), oa.State("b", "0.5*b - g*a/(1 + a**2) + Ts")],
+    outputs=[oa.Output("y", "a*b")],
+    parameters=[oa.PhysicalParameter("θ", 1.2), oa.PhysicalParameter("g", 0.7, "m/s²", min=0)],
+    integrator="discrete",
+)
+LINEAR = [oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]", unit="m/N"), oa.Term("c", "u[k-2]")]
+MODELS: dict[str, Callable[[], Model | MotionModel]] = {
+    "several outputs, every activation": lambda: lagged(
+        TWO_OUTPUTS,
+        ("y1[k-1]", "gain*u1[k-1]", "u2[k]*y2[k-2]"),
+        Deep(),
+        ("y1", "y2"),
+        ("u1", "u2"),
+        {"gain": 2.0, "limit": 0.7},
+    ),  # fmt: skip
+    "terms": lambda: lagged(
+        LINEAR, ("tanh(y[k-1])", "u[k-1]**2"), Terms(("tanh(y[k-1])", "u[k-1]**2")), ("y",), ("u",)
+    ),
+    "network": lambda: lagged(LINEAR, ("y[k-1]", "u[k-1]"), oa.MLP((16,)), ("y",), ("u",)),
+    "physics alone, no feedback": lambda: lagged([oa.Term("a", "double[k]")], (), None, ("flag",), ("double",)),
+    "motion, first-order hold": lambda: moving(
+        spring(hold="first-order"), ("v", "x*u"), oa.MLP((5, 4), "silu"), substeps=2
+    ),
+    "motion, exact": lambda: moving(spring(integrator="exact"), ("v", "w"), oa.MLP((5,)), substeps=1),
+    "motion, discrete, no inputs": lambda: moving(DISCRETE, substeps=1),
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    model: Model | MotionModel
+    state: np.ndarray
+    inputs: np.ndarray
+    stepped: tuple[np.ndarray, np.ndarray]
+    """Next states and outputs of single steps."""
+    free: np.ndarray
+    """The outputs of a free run."""
+
+
+@cache
+def case(name: str) -> Case:
+    """A model with what it says itself."""
+    model, rng = MODELS[name](), np.random.default_rng(0)
+    state = rng.normal(size=(POINTS, len(model.state_names)))
+    inputs = rng.normal(size=(STEPS, len(model.step_inputs)))
+    stepped = jax.jit(jax.vmap(model.step))(state, inputs[:POINTS])
+    free = jax.jit(lambda s, u: jax.lax.scan(model.step, s, u)[1])(np.zeros(state.shape[1]), inputs)
+    assert np.isfinite(free).all() and np.ptp(free) > 0.01
+    return Case(model, state, inputs, tuple(map(np.asarray, stepped)), np.asarray(free))
+
+
+def near(found: np.ndarray, expected: np.ndarray, relative: float) -> None:
+    largest = np.abs(expected).max(axis=0)
+    assert found.shape == expected.shape
+    assert (np.abs(found - expected).max(axis=0, initial=0.0) <= relative * largest).all()
+
+
+def imported(path: Path):
+    spec = importlib.util.spec_from_file_location(f"exported_{path.parent.name}", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def run_numpy(folder: Path, given: Case):
+    module = imported(folder / "plant.py")
+    steps = [module.step(s, u) for s, u in zip(given.state, given.inputs, strict=False)]
+    yield "float64", (*map(np.array, zip(*steps, strict=True)), module.run(module.start(), given.inputs))
+
+
+def run_casadi(folder: Path, given: Case):
+    step = imported(folder / "plant.py").step()
+    following, y = (np.array(part).T for part in step.map(POINTS)(given.state.T, given.inputs[:POINTS].T))
+    free = step.mapaccum(STEPS)(np.zeros(given.state.shape[1]), given.inputs.T)[1]
+    yield "float64", (following, y, np.array(free).T)
+
+
+def run_control(folder: Path, given: Case):
+    import control
+
+    plant = imported(folder / "plant.py").system()
+    rows = list(zip(given.state, given.inputs, strict=False))
+    single = [np.array([ask(0.0, s, u) for s, u in rows]) for ask in (plant.dynamics, plant.output)]
+    time = 0.1 * np.arange(STEPS)
+    free = control.input_output_response(plant, time, given.inputs.T, np.zeros(given.state.shape[1]), squeeze=False)
+    yield "float64", (*single, free.outputs.T)
+
+
+def run_fmu(folder: Path, given: Case):
+    import fmpy
+    from fmpy.fmi2 import FMU2Slave
+    from fmpy.validation import validate_fmu
+
+    assert validate_fmu(str(folder / "plant.fmu")) == []
+    described = fmpy.read_model_description(str(folder / "plant.fmu"))
+    place = fmpy.extract(str(folder / "plant.fmu"), folder.parent / "unpacked")
+    by = {kind: [v.valueReference for v in described.modelVariables if v.causality == kind] for kind in
+          ("input", "output", "local")}  # fmt: skip
+    fmu = FMU2Slave(guid=described.guid, unzipDirectory=place, modelIdentifier="plant", instanceName="one")
+    fmu.instantiate()
+    fmu.setupExperiment(startTime=0.0)
+    fmu.enterInitializationMode()
+    fmu.exitInitializationMode()
+
+    def step(k: int) -> list[float]:
+        fmu.setReal(by["input"], given.inputs[k].tolist())
+        y = fmu.getReal(by["output"])
+        fmu.doStep(currentCommunicationPoint=0.1 * k, communicationStepSize=0.1)
+        return y
+
+    free = np.array([step(k) for k in range(STEPS)])
+    following, y = [], []
+    for k, state in enumerate(given.state):
+        fmu.setReal(by["local"], state.tolist())
+        y.append(step(k))
+        following.append(fmu.getReal(by["local"]))
+    fmu.terminate()
+    fmu.freeInstance()
+    yield "float64", (np.array(following), np.array(y), free)
+
+
+def run_onnx(folder: Path, given: Case):
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(str(folder / "plant.onnx"), providers=["CPUExecutionProvider"])
+    wanted = {value.name for value in session.get_inputs()}
+    n = given.state.shape[1]
+
+    def step(state, row):
+        fed = {name: value for name, value in (("state", state), ("inputs", row)) if name in wanted}
+        names = [value.name for value in session.get_outputs()]
+        found = dict(zip(names, session.run(names, fed), strict=True))
+        return found.get("next_state", np.zeros(0)), found["outputs"]
+
+    state, free = np.zeros(n), []
+    for row in given.inputs:
+        state, y = step(state, row)
+        free.append(y)
+    single = [step(s, u) for s, u in zip(given.state, given.inputs, strict=False)]
+    yield "float64", (*map(np.array, zip(*single, strict=True)), np.array(free))
+
+
+def run_c(folder: Path, given: Case):
+    compiler = shutil.which("gcc") or shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler")
+    for precision, options in (("float64", ()), ("float32", ("-DPLANT_FLOAT",))):
+        shared = folder.parent / f"{folder.name}_{precision}.so"
+        made = [compiler, *STRICT, *options, "-shared", "-fPIC", "plant.c", "-lm", "-o", str(shared)]
+        subprocess.run(made, cwd=folder, check=True)
+        yield precision, run_library(ctypes.CDLL(str(shared)), given, np.dtype(precision))
+    checking = [compiler, *STRICT, "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "plant.c", "check.c"]
+    subprocess.run([*checking, "-lm", "-o", "../check"], cwd=folder, check=True)
+    done = subprocess.run(["../check"], cwd=folder, check=True, capture_output=True, text=True)
+    assert done.stdout.startswith("64 steps: ") and done.stderr == ""
+
+
+def run_library(library, given: Case, dtype: np.dtype):
+    """Steps and the free run by a shared library; a state is its numbers, then the flag."""
+    n, ny = given.state.shape[1], given.free.shape[1]
+    state = np.zeros(1, np.dtype([("x", dtype, n), ("flag", np.intc)], align=True))
+    inputs, y = np.ascontiguousarray(given.inputs, dtype=dtype), np.zeros((STEPS, ny), dtype=dtype)
+
+    def at(array: np.ndarray) -> ctypes.c_void_p:
+        return ctypes.c_void_p(array.ctypes.data)
+
+    following = []
+    for k in range(POINTS):
+        state["x"] = given.state[k]
+        library.plant_step(at(state), at(inputs[k:]), at(y[k:]))
+        following.append(state["x"][0].copy())
+    single = np.array(following), y[:POINTS].copy()
+    library.plant_start(at(state))
+    library.plant_run.restype = ctypes.c_size_t
+    assert library.plant_run(at(state), at(inputs), at(y), ctypes.c_size_t(STEPS)) == 0
+    run = y.copy()
+    flagged_steps(library.plant_step, state, inputs[:1].copy(), y, at)
+    return *single, run
+
+
+def flagged_steps(step, state, row, y, at) -> None:
+    """NaN and infinity in the inputs or the state are flagged, and the state stays; then it goes on."""
+    good = state.copy()
+    for bad in (np.nan, np.inf, -np.inf):
+        for where in ("inputs", "state"):
+            given, held = row.copy(), good.copy()
+            if where == "inputs":
+                given[:] = bad
+            else:
+                held["x"] = bad
+            if not (given if where == "inputs" else held["x"]).size:
+                continue
+            state[:] = held
+            step(at(state), at(given), at(y))
+            if where == "inputs" or not np.isfinite(y[0]).all():
+                assert state["flag"][0] == 1
+                np.testing.assert_array_equal(state["x"], held["x"])
+    state[:] = good
+    step(at(state), at(row), at(y))
+    assert state["flag"][0] == 0
+
+
+NEEDED = {"casadi": ["casadi"], "control": ["control"], "fmu": ["fmpy"], "onnx": ["onnx", "onnxruntime"]}
+RUNS = {"numpy": run_numpy, "c": run_c, "casadi": run_casadi, "control": run_control, "fmu": run_fmu, "onnx": run_onnx}
+
+
+@pytest.mark.parametrize("target", RUNS)
+@pytest.mark.parametrize("name", MODELS)
+def test_an_export_computes_what_the_model_computes(tmp_path, name, target):
+    for package in NEEDED.get(target, []):
+        pytest.importorskip(package)
+    given = case(name)
+    oa.export(given.model, tmp_path / target, target, name="plant")
+    for precision, (following, y, free) in RUNS[target](tmp_path / target, given):
+        relative = {"float64": 1e-12, "float32": 1e-5}[precision]
+        near(following, given.stepped[0], relative)
+        near(y, given.stepped[1], relative)
+        near(free, given.free, relative)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_step_in_numpy_alone(name):
+    given, step = case(name), numpy_step(case(name).model)
+    assert (step.state_names, step.step_inputs) == (given.model.state_names, given.model.step_inputs)
+    following, y = map(
+        np.array, zip(*(step(s, u) for s, u in zip(given.state, given.inputs, strict=False)), strict=True)
+    )
+    near(following, given.stepped[0], 1e-12)
+    near(y, given.stepped[1], 1e-12)
+    with pytest.raises(oa.InputError, match="a step takes a state of"):
+        step(np.zeros(99), given.inputs[0])
+
+
+def record_for(model: Model | MotionModel, rows: int = 40) -> oa.Record:
+    rng = np.random.default_rng(1)
+    u, y = (rng.normal(size=(rows, len(channels))) for channels in (model.inputs, model.outputs))
+    return oa.Record.from_arrays(u, y, inputs=model.inputs, outputs=model.outputs, sampling_time=0.1)
+
+
+@pytest.mark.parametrize("name", ["several outputs, every activation", "motion, first-order hold"])
+def test_steps_from_a_start_are_the_free_run(name):
+    model = case(name).model
+    record = record_for(model)
+    first, u = model.form.first_row, record.experiments[0].inputs
+    rows = u if len(model.step_inputs) == u.shape[1] else np.concatenate([u, np.vstack([u[1:], u[-1:]])], axis=1)
+    start = model.start(record)
+    last, y = jax.jit(lambda s, u: jax.lax.scan(model.step, s, u))(start, rows[first:-1])
+    np.testing.assert_allclose(y, model.simulate(record).model[first:-1], rtol=1e-9, atol=1e-12)
+    if first:  # the state says what it holds
+        named = dict(zip(model.state_names, start, strict=True))
+        assert named["u1[k-4]"] == u[first - 4, 0] and named["y1[k-3]"] == record.experiments[0].outputs[first - 3, 0]
+        assert model.start(record, row=40)[0] == record.experiments[0].outputs[39, 0]
+    else:
+        np.testing.assert_allclose(model.start(record, row=39), last, rtol=1e-9)
+    assert jax.jacobian(lambda s: model.step(s, rows[0])[1])(start).shape == (len(model.outputs), len(start))
+
+
+@pytest.mark.parametrize("name", ["network", "motion, first-order hold"])
+def test_arguments_of_a_step_are_checked(name):
+    model = case(name).model
+    n, nu = len(model.state_names), len(model.step_inputs)
+    for state, inputs in ((np.zeros(n + 1), np.zeros(nu)), (np.zeros(n), 0.0), (np.zeros((1, n)), np.zeros(nu))):
+        with pytest.raises(oa.InputError, match=f"a step takes a state of {n} and inputs of {nu} numbers"):
+            model.step(state, inputs)
+    with pytest.raises(oa.InputError, match="a step takes two vectors of numbers"):
+        model.step("x", np.zeros(nu))
+
+
+def test_starts_that_are_refused_in_words():
+    model = case("network").model
+    record = record_for(model)
+    for given, row, words in (
+        (oa.Record.join([record, record]), None, "the record has 2 experiments"),
+        (replace(record, outputs=(), experiments=(replace(record.experiments[0], outputs=np.zeros((40, 0))),)), None,
+         "no measured outputs to start from"),
+        (record, 1, "`row` must be a whole number from 2 to 40"),
+        (record, "x", "`row` must be a whole number"),
+    ):  # fmt: skip
+        with pytest.raises(oa.InputError, match=words):
+            model.start(given, row=row)
+
+
+@pytest.mark.parametrize("name", ACTIVATIONS)
+def test_activations_are_those_of_the_learners(name):
+    a = np.array([-800.0, -30.0, -2.5, -1e-9, 0.0, 1e-9, 0.7, 3.0, 40.0, 800.0])
+    with np.errstate(all="ignore"):
+        found = NumpyStep(program_of(case("terms").model))._evaluation(activations.ACTIVATIONS[name])({"a": a})
+    np.testing.assert_allclose(found, ACTIVATIONS[name](jnp.asarray(a)), rtol=1e-14, atol=1e-15)
+
+
+def test_arithmetic_on_numbers_follows_floating_point():
+    assert apply("div", Number(1.0), Number(0.0)) == Number(np.inf)
+    assert apply("whole_power", Number(-2.0), Number(3.0)) == Number(-8.0)
+    assert set(FUNCTIONS) <= set(NUMPY_FUNCTIONS)
+
+
+def test_what_is_written_beside_the_code(tmp_path):
+    model = case("network").model
+    oa.save(model, tmp_path / "model")
+    for target in ("c", "casadi", "control", "numpy", "latex"):
+        program = oa.export(model, tmp_path / target, target, name="plant")
+        text = (tmp_path / target / "README.md").read_text()
+        assert f'"checksum": "{program.digest}"' in (tmp_path / "model" / "model.json").read_text()
+        assert program.digest in text and "`u` [N]" in text and "0.1 s" in text
+        assert any(program.digest in path.read_text() for path in (tmp_path / target).glob("plant.*"))
+        assert (tmp_path / target / "vectors.csv").read_text() == (tmp_path / "c" / "vectors.csv").read_text()
+    with open(tmp_path / "c" / "vectors.csv", newline="") as file:
+        head, *rows = csv.reader(file)
+    assert head == ["input:u", "state:y[k-1]", "state:u[k-1]", "state:u[k-2]", "output:y"]
+    numbers = np.array(rows, dtype=float)
+    y = np.asarray(jax.vmap(model.step)(numbers[:, 1:4], numbers[:, :1])[1])
+    np.testing.assert_allclose(numbers[:, 4:], y, rtol=1e-13, atol=1e-15)
+    source = (tmp_path / "c" / "plant.c").read_text()
+    assert "/* b [m/N], theta - theta_aux */" in source and "malloc" not in source
+
+
+def test_what_an_export_needs_is_named_where_it_is_missing(tmp_path, monkeypatch):
+    model = case("network").model
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(oa.InputError, match="the package onnx, which is not installed; pip install onnx"):
+        oa.export(model, tmp_path / "out", "onnx")
+    monkeypatch.setattr(fmu, "_target", lambda: ("linux64", ".so"))
+    for path, words in (("", "no C compiler was found"), (str(tmp_path / "bin"), "cc failed: no licence")):
+        monkeypatch.setenv("PATH", path)
+        (tmp_path / "bin").mkdir(exist_ok=True)
+        (tmp_path / "bin" / "cc").write_text("#!/bin/sh\necho no licence >&2\nexit 1\n")
+        (tmp_path / "bin" / "cc").chmod(0o755)
+        with pytest.raises(oa.InputError, match=words):
+            oa.export(model, tmp_path / "out", "fmu")
+    monkeypatch.undo()
+    monkeypatch.setattr(sys, "platform", "plan9")
+    with pytest.raises(oa.InputError, match="compiled for 64-bit x86 under Linux or macOS"):
+        oa.export(model, tmp_path / "out", "fmu")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("term", "rows"), [("log(y[k-1])", 1), ("log(-1 - y[k-1]**2)", 0)])
+def test_vectors_of_a_model_without_values_at_zero(tmp_path, term, rows):
+    """A free run that cannot start at zero starts at one; where it cannot start at all, there is nothing to compare."""
+    model = lagged([oa.Term("a", term)], (), None, ("y",), ("u",))
+    oa.export(model, tmp_path / "c", "c")
+    lines = (tmp_path / "c" / "vectors.csv").read_text().splitlines()
+    assert (len(lines) > 1) == bool(rows)
+    compiler = shutil.which("gcc") or pytest.skip("no C compiler")
+    subprocess.run([compiler, *STRICT, "model.c", "check.c", "-lm", "-o", "check"], cwd=tmp_path / "c", check=True)
+    done = subprocess.run(["./check"], cwd=tmp_path / "c", check=True, capture_output=True, text=True)
+    assert done.stdout.startswith(f"{len(lines) - 1} steps")
+
+
+def test_equations_in_latex(tmp_path):
+    for name in MODELS:
+        oa.export(case(name).model, tmp_path, "latex")
+        text = (tmp_path / "model.tex").read_text()
+        assert all(text.count(f"\\begin{{{what}}}") == text.count(f"\\end{{{what}}}") for what in ("align*", "pmatrix"))
+        assert text.count("{") == text.count("}") and text.count(r"\left") == text.count(r"\right")
+    assert r"a_{k+1} &= 0.6 \, a + 0.3 \, \sin\left(θ \, b\right)" in text
+    assert r"\DeclareUnicodeCharacter{03B8}{\ensuremath{\theta}}" in text
+    oa.export(case("terms").model, tmp_path, "latex")
+    text = (tmp_path / "model.tex").read_text()
+    assert r"y_{k} &= a \, y_{k-1} + b \, u_{k-1} + c \, u_{k-2} + g^{y}_{1}" in text
+    assert r"\frac{\tanh\left(y_{k-1}\right)" in text
+
+
+def opaque(model: Model, **changed) -> Model:
+    return replace(model, form=replace(model.form, **changed))
+
+
+def refusals():
+    network = case("network").model
+    function = oa.Function(lambda w, z: w * z[:1], lambda key: jnp.ones(1))
+    own = oa.Baseline.from_function(lambda x: jnp.ones((1, 3)), ["a", "b", "c"])
+    members = network.numbers._replace(weights=np.ones((3, 5)), tilt=np.zeros((3, 3)))
+    yield (
+        opaque(network, bound=Bound(function, 2, 1)),
+        "the learner Function is a function that no target can write; fit",
+    )
+    yield opaque(network, baseline=own), "the physics is a Python function"
+    yield replace(network, numbers=members), "the model is an ensemble"
+    broken = network.numbers._replace(gain=np.array([np.nan]))
+    yield replace(network, numbers=broken), "the model holds numbers that are not finite"
+    yield 5, "`model` must be a fitted model"
+    yield moving(spring(hold="spline"), ("v", "w"), oa.MLP((2,))), "a step knows no spline through the whole record"
+    made = oa.Motion.from_functions(
+        lambda x, u, p: x, lambda x, u, p: x, ["x"], ["y"], [oa.PhysicalParameter("a", 1.0)]
+    )
+    yield moving(made), "the motion is a Python function"
+
+
+def test_models_without_code_are_refused_in_words(tmp_path):
+    for model, words in refusals():
+        for target in TARGETS:
+            with pytest.raises(oa.InputError) as error:
+                oa.export(model, tmp_path / "out", target)
+            assert str(error.value).startswith(words)
+        with pytest.raises(oa.InputError):
+            numpy_step(model)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def saved(tmp_path, monkeypatch) -> Path:
+    oa.save(case("network").model, tmp_path / "out" / "model")
+    (tmp_path / "theirs").mkdir()
+    (tmp_path / "theirs" / "notes.txt").write_text("mine")
+    (tmp_path / "file").write_text("")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def command(monkeypatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["orthaug", "export", *arguments])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    return int(stop.value.code or 0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("out", "--to", "cassadi", "--out", "new"), "no export to 'cassadi', did you mean 'casadi'?; known are c, "),
+        (("out", "--to", "c", "--out", "theirs"), "theirs: holds notes.txt"),
+        (("out", "--to", "c", "--out", "file/new"), "file/new: cannot be written"),
+        (("out", "--to", "c", "--out", "out"), "out: holds"),
+        (("absent", "--to", "c", "--out", "new"), "absent: no saved model there"),
+        (("out", "--to", "c", "--out", "new", "--name", "2nd"), "'2nd' cannot name the exported code"),
+        (("out", "--to", "c", "--out", "new", "--name", "while"), "'while' cannot name the exported code"),
+        (("out", "--out", "new"), "Missing option '--to'"),
+    ],
+)
+def test_bad_input_of_the_command_writes_nothing(saved, monkeypatch, capsys, arguments, words):
+    before = sorted(path.name for path in saved.rglob("*"))
+    assert command(monkeypatch, *arguments) == 2
+    assert words in capsys.readouterr().err
+    assert sorted(path.name for path in saved.rglob("*")) == before
+
+
+def test_the_command_writes_a_folder_and_replaces_its_own(saved, monkeypatch, capsys):
+    for _ in range(2):
+        assert command(monkeypatch, "out", "--to", "numpy", "--out", "new", "--name", "plant") == 0
+        assert capsys.readouterr().out == "written to new\n"
+    assert {path.name for path in (saved / "new").iterdir()} >= {"plant.py", "README.md", "vectors.csv"}
+    newer = (saved / "out" / "model" / "model.json").read_text().replace('"format": 2', '"format": 99')
+    (saved / "out" / "model" / "model.json").write_text(newer)
+    assert command(monkeypatch, "out", "--to", "c", "--out", "other") == 2
+    assert "in format 99" in capsys.readouterr().err and not (saved / "other").exists()
