@@ -33,7 +33,10 @@ ROOMS = (
 )
 NUMERICAL = ROOMS[: ROOMS.index("reports")]  # these know no pictures and no user
 NOT_NUMERICAL = ("matplotlib", "typer", "rich", "pandas.io")
-ONLY_IN = {"matplotlib": {"reports.drawing", "studies"}, "typer": {"commands.cli"}}  # a room, or a file
+ONLY_IN = {
+    "matplotlib": {"reports.drawing", "studies"},
+    "typer": {"commands.cli", "commands.program"},
+}  # a room, or a file
 UNSAFE_MODULES = ("pickle", "cPickle", "_pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve")
 UNSAFE_CALLS = ("eval", "exec", "read_pickle", "to_pickle")
 MOST_LINES, MOST_FUNCTION_LINES = 400, 60  # of a file; of a function, its docstring aside

@@ -3,115 +3,33 @@
 from __future__ import annotations
 
 import json
-import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-import typer.core
 
-from orthaug import __version__
 from orthaug._base.checks import check_choice
-from orthaug._base.errors import InputError, TrainingError
+from orthaug._base.errors import TrainingError
 from orthaug.commands import streams
 from orthaug.commands.bars import study_bars, training_bar
-from orthaug.commands.signals import WATCH
+from orthaug.commands.program import (
+    AsJson,
+    DataPath,
+    Force,
+    Initial,
+    ModelPath,
+    OutFile,
+    OutFolder,
+    SpecPath,
+    app,
+    main,
+)
 
 if TYPE_CHECKING:
     from orthaug.models.response import Response
 
-
-class Interrupted(Exception):
-    """Ctrl-C, with what it stopped; typer would turn a KeyboardInterrupt into a bare exit code."""
-
-
-class _Group(typer.core.TyperGroup):
-    def invoke(self, ctx: Any) -> Any:
-        try:
-            return super().invoke(ctx)
-        except (Interrupted, KeyboardInterrupt) as interrupt:
-            raise Interrupted(*interrupt.args) from None
-
-
-app = typer.Typer(
-    name="orthaug",
-    cls=_Group,
-    help="Fit physics together with a learned correction, so that the physics keeps all that physics can explain.",
-    add_completion=False,
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-)
-SpecPath = Annotated[Path, typer.Argument(metavar="SPEC", help="Spec file (TOML).")]
-ModelPath = Annotated[Path, typer.Argument(metavar="MODEL", help="Result folder of `fit`, or its model/.")]
-DataPath = Annotated[Path, typer.Argument(metavar="DATA", help="Data file with the model's channels.")]
-OutFolder = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Result folder.")]
-OutFile = Annotated[Path | None, typer.Option("--out", metavar="FILE", help="CSV file; standard output without it.")]
-Initial = Annotated[
-    str | None,
-    typer.Option("--initial", metavar="measured|zero|INIT", help="Outputs before the first step; INIT is a CSV."),
-]
-Force = Annotated[bool, typer.Option("--force", help="Replace what is there, whoever wrote it.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the summary.")]
-
-
-def main() -> None:
-    """Entry point: runs the command and turns errors into one line and an exit code."""
-    try:
-        code = app(standalone_mode=False)
-        sys.stdout.flush()
-    except InputError as error:
-        _fail(f"error: {error}", 2)
-    except TrainingError as error:
-        _fail(f"training failed: {error}", 1)
-    except (Interrupted, KeyboardInterrupt) as interrupt:
-        _fail(f"interrupted{''.join(f' during {text}' for text in interrupt.args)}; nothing was written", 130)
-    except BrokenPipeError:
-        streams.silence(sys.stdout)
-        sys.exit(0)
-    except OSError as error:
-        streams.silence(sys.stdout)
-        what = error.filename or "standard output"
-        _fail(f"error: {InputError(f'{what}: cannot be read or written ({error.strerror or error}).')}", 2)
-    except Exception as error:
-        text = _complaint(error)
-        if text is None:
-            raise
-        _fail(text if text.startswith("Usage") else f"error: {' '.join(text.split())}", getattr(error, "exit_code", 2))
-    sys.exit(code if isinstance(code, int) else 0)
-
-
-def _complaint(error: Exception) -> str | None:
-    """What to tell of an error that is not ours; None of one that should not be."""
-    from orthaug._base.jax import starts
-
-    complaint = getattr(error, "format_message", None)  # typer's own, about arguments
-    if complaint is not None:
-        return complaint()
-    text = str(error)
-    if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in text:
-        return "there is not enough memory; take fewer rows, a smaller learner, or every n-th row."
-    platforms = os.environ.get("JAX_PLATFORMS", "")
-    if platforms not in ("", "cpu") and not starts():
-        return f"JAX cannot start with JAX_PLATFORMS={platforms}; unset it, or set it to cpu."
-    return None
-
-
-def _version(show: bool) -> None:
-    if show:
-        streams.echo(f"orthaug {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-def _options(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
-    ] = False,
-) -> None:
-    pass
+__all__ = ["main"]
 
 
 @app.command()
@@ -403,12 +321,6 @@ def _prepare_jax() -> None:
     from orthaug._base.jax import use_compilation_cache
 
     use_compilation_cache()
-
-
-def _fail(message: str, code: int) -> None:
-    WATCH.hold()
-    streams.say(message)
-    sys.exit(code)
 
 
 def _write_response(response: Response, out: Path | None, force: bool, notes: Sequence[str] = ()) -> None:
