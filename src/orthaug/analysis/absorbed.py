@@ -68,11 +68,24 @@ class Smoother:
         return (low + high) / 2, np.where(high > low, (high - low) / 2, 1.0)
 
     def _z(self, x: Matrix) -> Matrix:
-        """z on rows of the regressor, over its range in the data."""
-        centre, half = self._unit
-        with np.errstate(all="ignore"):
-            z = (np.asarray(self.problem.features.evaluate(x, self.problem.layout, np)) - centre) / half
-        return np.nan_to_num(z)
+        """z on rows of the regressor, over its range in the data; kept, for the same rows are asked for again."""
+        known = self._evaluated.get(id(x))
+        if known is None or known[0] is not x:
+            centre, half = self._unit
+            with np.errstate(all="ignore"):
+                z = (np.asarray(self.problem.features.evaluate(x, self.problem.layout, np)) - centre) / half
+            known = self._evaluated[id(x)] = (x, np.nan_to_num(z))
+        return known[1]
+
+    @cached_property
+    def _evaluated(self) -> dict[int, tuple[Matrix, Matrix]]:
+        """Rows and z on them."""
+        return {}
+
+    @cached_property
+    def _inverse(self) -> Matrix:
+        """z⁺ on the training rows that are used."""
+        return np.linalg.pinv(self.inputs, rcond=1e-10)
 
     @cached_property
     def _basis(self) -> Matrix:
@@ -98,7 +111,7 @@ class Smoother:
         sizes = np.abs(np.diag(factors[1]))
         return factors[0][:, sizes > _ROUNDING * sizes[0]]
 
-    @property
+    @cached_property
     def inputs(self) -> Matrix:
         """z on the training rows that are used, over its range."""
         return self._z(self.problem.rows.x[self.every])
@@ -114,7 +127,7 @@ class Smoother:
         Of a linear combination of the features it is that combination.
         """
         if self.problem.features.linear:
-            return self._z(x) @ np.linalg.lstsq(self.inputs, values, rcond=1e-10)[0]
+            return self._z(x) @ (self._inverse @ values)
         known = self._basis @ (self._basis.T @ values)
         if x is self.problem.rows.x and len(known) == len(x):
             return known

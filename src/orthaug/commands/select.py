@@ -192,6 +192,7 @@ def _new_spec(job: LaggedJob, folder: Path, selection: Selection, *, halved: boo
     if learner is None or learner["kind"] == "terms":  # linear in its weights: one start, and no prior
         training["regularization"] = "none"
         training["restarts"] = 1
+        training["fallback"] = False  # physics alone was judged beside it
     elif training.get("regularization") is None:
         training["regularization"] = "evidence"
     head = f"# Selected by orthaug from {path.name}: {orders}. The other models are in table.csv.\n"

@@ -95,9 +95,9 @@ class Selection:
     @property
     def options(self) -> dict[str, Any]:
         """What `estimate` is to be called with, beside record and baseline."""
-        regularization = {"regularization": "none"} if isinstance(self.learner, Terms) else {}
+        judged = {"regularization": "none", "fallback": False} if isinstance(self.learner, Terms) else {}
         lags = None if isinstance(self.learner, Terms | None) else self.lags
-        return {"learner": self.learner, "lags": lags, "criterion": self.criterion} | regularization
+        return {"learner": self.learner, "lags": lags, "criterion": self.criterion} | judged
 
     def estimate(self, **options: Any) -> Estimate:
         """The fit of the choice; `options` of `estimate` beside it."""
