@@ -11,6 +11,7 @@ from test_cli import one_line, run, write_csv
 import orthaug as oa
 from orthaug._base.errors import InputError
 from orthaug.commands.spec import load_spec
+from orthaug.selection.explaining import _written
 from orthaug.selection.motion_response import MotionResponse
 
 ROWS = 600
@@ -202,3 +203,11 @@ def test_wrong_use_is_told_in_a_line(project):
     write_csv(project / "short.csv", u=np.ones(9), y=np.ones(9))
     assert one_line(run("explain", project / "plant", project / "short.csv").err, "at least 20 are needed")
     assert one_line(run("explain", project, project / "run.csv").err, "no saved model")
+
+
+@pytest.mark.parametrize(
+    ("on", "expected"),
+    [("v", "v**3"), ("y[k-2]", "y[k-2]**3"), ("(y[k-1] - y[k-2])/Ts", "((y[k-1] - y[k-2])/Ts)**3")],
+)
+def test_a_cube_of_what_is_no_name_has_brackets(on, expected):
+    assert _written("cubic", on) == expected

@@ -7,6 +7,7 @@ term that explains most beside those that are in comes next, or a pair that expl
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -25,6 +26,7 @@ from orthaug.selection.explained_ground import Ground
 MOST_CANDIDATES = 3000
 TERM = "term"
 """The kind of a product of what the learner sees."""
+_SIMPLE = re.compile(r"\w+(\[[^][]*\])?")  # a name, or a channel at a lag
 _PLAIN = ("coulomb", "quadratic_drag", "cubic")
 _WIDE = tuple(kind for kind in ("stribeck", "stribeck_gauss", "dead_zone", "saturation") if kind in WIDTHS)
 _WIDTHS = tuple(2.0 ** (i / 2) for i in range(-8, 3))  # times the median size of what a term acts on
@@ -168,8 +170,7 @@ def _grid(ground: Ground, on: str) -> Iterator[float]:
 
 
 def _written(kind: str, on: str | None, width: float | None = None) -> str:
-    simple = on is not None and not any(mark in on for mark in "+-*/ " if mark not in on.partition("[")[2])
-    if kind == "cubic" and simple:
+    if kind == "cubic" and on is not None and _SIMPLE.fullmatch(on):
         return f"{on}**3"
     return written(kind, on, width, lambda text: text, "v")[0]
 
