@@ -12,7 +12,7 @@ import orthaug as oa
 from orthaug._base.errors import InputError
 from orthaug.commands.spec import load_spec
 from orthaug.selection.explaining import _written
-from orthaug.selection.motion_response import MotionResponse
+from orthaug.selection.tangent_run import MotionResponse
 
 ROWS = 600
 SPEC = """

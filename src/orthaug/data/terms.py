@@ -124,7 +124,7 @@ class TermLibrary:
         written = []
         for number, power in powers.items():
             factor = self.factors[number]
-            atom = factor if _is_atom(factor) or len(product) == 1 else f"({factor})"
+            atom = factor if len(product) == 1 or not outside_brackets(factor, "+-*/ ") else f"({factor})"
             written.append(atom if power == 1 else f"{atom}**{power}")
         return "*".join(written)
 
@@ -150,14 +150,14 @@ def products_of(factors: Any, numbers: Any, xp: Any) -> Any:
     return value
 
 
-def _is_atom(text: str) -> bool:
-    """Whether powers and products can take a text as it stands: a name, a lag, or one function of something."""
+def outside_brackets(text: str, marks: str) -> bool:
+    """Whether one of some marks stands in a text outside of all brackets."""
     depth = 0
     for character in text:
         depth += (character in "([") - (character in ")]")
-        if depth == 0 and character in "+-*/ ":
-            return False
-    return True
+        if depth == 0 and character in marks:
+            return True
+    return False
 
 
 def _factors_of(text: str) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ import numpy as np
 from orthaug._base.checks import check_choice
 from orthaug._base.errors import InputError
 from orthaug.data.expressions import Expression
+from orthaug.data.terms import outside_brackets
 from orthaug.data.writing import coefficient_unit, latex
 from orthaug.inference.covariance import interval
 from orthaug.models.terms import Terms
@@ -161,22 +162,12 @@ def _product(value: float, text: str, writing: str, model: Any) -> str:
     if writing == "latex":
         number = _power_of_ten(number)
         return number if text == "1" else rf"{number}\,{latex(Expression(text))}"
-    return number if text == "1" else f"{number}*{text}" if _closed(text) else f"{number}*({text})"
+    return number if text == "1" else f"{number}*({text})" if outside_brackets(text, "+-") else f"{number}*{text}"
 
 
 def _power_of_ten(number: str) -> str:
     mantissa, _, power = number.partition("e")
     return rf"{mantissa} \cdot 10^{{{int(power)}}}" if power else number
-
-
-def _closed(text: str) -> bool:
-    """Whether a number can stand in front of a product."""
-    depth = 0
-    for character in text:
-        depth += (character in "([") - (character in ")]")
-        if depth == 0 and character in "+-":
-            return False
-    return True
 
 
 def term_frame(terms: Sequence[LearnedTerm]) -> pd.DataFrame:

@@ -75,13 +75,11 @@ class SelectResult(Headed):
 
 def selection_text(result: SelectResult) -> str:
     """A page: what was chosen, why, and the models beside it."""
-    orders = result.orders
-    several = len(orders.nb) != 1
-    nb, nk = (str(n) if several else str(n[0]) for n in (orders.nb, orders.nk))
-    lines = [f"orders       na {orders.na}, nb {nb}, nk {nk}"]
-    for delay in result.delays:
-        seen = "none is significant" if delay.correlation is None else f"{delay.correlation}"
-        lines.append(f"delay        {delay.input}: {seen} by cross-correlation, {delay.fitted} by the fit")
+    from orthaug.selection.orders import Delay, Orders
+
+    orders = Orders(result.orders.na, tuple(result.orders.nb), tuple(result.orders.nk))
+    lines = [f"orders       {orders}"]
+    lines += [f"delay        {Delay(delay.input, delay.correlation, delay.fitted)}" for delay in result.delays]
     if result.nonlinearity is not None:
         lines.append(f"nonlinear    {result.nonlinearity.text}")
     lines.append(f"learner      {_learner(result)}")

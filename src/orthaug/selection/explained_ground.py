@@ -27,7 +27,7 @@ from orthaug.models.statistics import JointCovariance
 from orthaug.physics.baseline import Baseline, Parameter
 from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicalParameter
-from orthaug.selection.motion_response import MotionResponse
+from orthaug.selection.tangent_run import MotionResponse
 
 MOST_CELLS = 10_000
 """Values of the learner that are looked at: a smooth function needs no more, and candidates are kept beside them."""

@@ -7,7 +7,6 @@ term that explains most beside those that are in comes next, or a pair that expl
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,14 +18,13 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug.analysis.suspects import WIDTHS, written
-from orthaug.data.terms import CONSTANT, TermLibrary
+from orthaug.data.terms import CONSTANT, TermLibrary, outside_brackets
 from orthaug.selection.as_shown import Shown, basis_of, least_squares, without
 from orthaug.selection.explained_ground import Ground
 
 MOST_CANDIDATES = 3000
 TERM = "term"
 """The kind of a product of what the learner sees."""
-_SIMPLE = re.compile(r"\w+(\[[^][]*\])?")  # a name, or a channel at a lag
 _PLAIN = ("coulomb", "quadratic_drag", "cubic")
 _WIDE = tuple(kind for kind in ("stribeck", "stribeck_gauss", "dead_zone", "saturation") if kind in WIDTHS)
 _WIDTHS = tuple(2.0 ** (i / 2) for i in range(-8, 3))  # times the median size of what a term acts on
@@ -170,7 +168,7 @@ def _grid(ground: Ground, on: str) -> Iterator[float]:
 
 
 def _written(kind: str, on: str | None, width: float | None = None) -> str:
-    if kind == "cubic" and on is not None and _SIMPLE.fullmatch(on):
+    if kind == "cubic" and on is not None and not outside_brackets(on, "+-*/ "):
         return f"{on}**3"
     return written(kind, on, width, lambda text: text, "v")[0]
 

@@ -67,6 +67,10 @@ class Delay:
     correlation: int | None
     fitted: int
 
+    def __str__(self) -> str:
+        seen = "none is significant" if self.correlation is None else f"{self.correlation}"
+        return f"{self.input}: {seen} by cross-correlation, {self.fitted} by the fit"
+
 
 @dataclass(frozen=True, eq=False)
 class OrderSearch:

@@ -141,9 +141,7 @@ class Selection:
     def summary(self) -> str:
         """A page of text."""
         lines = [f"orders      {self.orders.chosen}"]
-        for delay in self.delays:
-            seen = "none is significant" if delay.correlation is None else f"{delay.correlation}"
-            lines.append(f"delay       {delay.input}: {seen} by cross-correlation, {delay.fitted} by the fit")
+        lines += [f"delay       {delay}" for delay in self.delays]
         if self.nonlinearity is not None:
             lines.append(f"nonlinear   {self.nonlinearity}")
         lines.append(f"learner     {self.learner or 'none: nothing helps on the blocks that were held out'}")
