@@ -108,9 +108,10 @@ def test_it_is_an_engine():
 def test_streamed_rows_train_to_the_same_model(structure, regularization, ny):
     memory, streamed = both(structure, regularization, ny)
     assert memory.status.ok and streamed.status.ok
-    assert apart(streamed.theta, memory.theta) <= (1e-10 if structure.projects else 1e-6)
-    assert apart(prediction(streamed), prediction(memory)) <= 1e-6
-    assert streamed.status.loss == pytest.approx(memory.status.loss, rel=1e-6)
+    assert apart(streamed.theta, memory.theta) <= (1e-10 if structure.projects else 2e-9)
+    assert apart(prediction(streamed), prediction(memory)) <= 2e-9
+    assert streamed.status.loss == pytest.approx(memory.status.loss, rel=1e-9)
+    assert streamed.status.iterations == memory.status.iterations
 
 
 @pytest.mark.parametrize(("structure", "regularization", "ny"), CASES, ids=named)
@@ -153,7 +154,7 @@ def test_the_path_of_the_host_s_loop_is_that_of_the_compiled_one(structure):
         solver = LevenbergMarquardt(steps, tolerance=1e-13)
         memory, streamed = (fit(posed(1), solver=solver, engine=e, **options) for e in (InMemory(), Streaming()))
         assert memory.status.iterations == streamed.status.iterations == steps
-        assert apart(streamed.model.numbers.weights, memory.model.numbers.weights) <= 1e-7
+        assert apart(streamed.model.numbers.weights, memory.model.numbers.weights) <= 1e-10
 
 
 LINEAR = Function(lambda w, z: w @ (z**2 - z**3), lambda key: 0.1 * jax.random.normal(key, (2, 4)))

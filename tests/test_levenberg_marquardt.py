@@ -9,7 +9,7 @@ import pytest
 from helpers import linear_columns, problem
 
 from orthaug._base.jax import jax, jnp, training_clock
-from orthaug.fitting.normal_equations import Normal
+from orthaug.fitting.normal_equations import Normal, linearise
 from orthaug.fitting.solvers import compiled
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import Ending
@@ -228,7 +228,7 @@ def test_pauses_change_nothing(monkeypatch, seconds):
     solver = LevenbergMarquardt(iterations=40)
     w = given.bound.init(jax.random.key(3))
     options = compiled.Options(jnp.asarray(solver.tolerance), jnp.asarray(True), jnp.asarray(float(SAMPLES)))
-    start = compiled._start(given.criterion, w, given.arguments, given.nothing, jnp.asarray(0.1))
+    start = compiled._begun(w, linearise(given.criterion, w, given.arguments, given.nothing), jnp.asarray(0.1))
     whole = compiled._advance(given.criterion, start, given.arguments, options, jnp.asarray(solver.iterations))
 
     monkeypatch.setattr(compiled, "_SECONDS_PER_BURST", seconds)

@@ -118,7 +118,6 @@ FREE, PAPER = Simulation(), AdamLBFGS()
 STANDS_FOR = [
     ({}, ("none", "ard")),
     ({"validated": True}, ("none", "ard")),
-    ({"resident": False}, ("none", "evidence")),
     ({"linear": False}, ("none",)),
     ({"criterion": Prediction(2)}, ("none",)),
     ({"criterion": FREE}, ("none",)),
@@ -133,7 +132,7 @@ STANDS_FOR = [
 @pytest.mark.parametrize(("change", "expected"), STANDS_FOR)
 def test_what_auto_stands_for(change, expected):
     usual = {"given": "auto", "solver": LevenbergMarquardt(), "criterion": Prediction(), "structure": Orthogonal()}
-    assert tried(**(usual | {"linear": True, "resident": True, "validated": False} | change)) == expected
+    assert tried(**(usual | {"linear": True, "validated": False} | change)) == expected
 
 
 @pytest.mark.parametrize(

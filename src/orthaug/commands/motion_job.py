@@ -120,7 +120,7 @@ def _check_choices(spec: Spec, motion: Motion) -> None:
         solver, criterion = spec.declared_solver(), spec.declared_criterion()
         check_motion_choices(motion, learner, structure, criterion, solver)
         given, validated = spec.training.regularization, spec.data.validation is not None
-        conditions = {"linear": False, "resident": True, "validated": validated, "learner": learner}
+        conditions = {"linear": False, "validated": validated, "learner": learner}
         choices = tried(given, solver, criterion, structure, **conditions)
         check_solver(solver, criterion, choices)
     except KeyedError as error:

@@ -315,7 +315,7 @@ class Spec(Section):
         """Those that every start is run with."""
         given = self.training.regularization
         declared = (self.declared_solver(), self.declared_criterion(), self.declared_structure())
-        conditions: dict[str, Any] = {"linear": linear, "resident": True, "validated": validated}
+        conditions: dict[str, Any] = {"linear": linear, "validated": validated}
         return tried(given, *declared, **conditions, motion=self.motion is not None, learner=self.declared_learner())
 
     def runs(self, *, linear: bool) -> int:

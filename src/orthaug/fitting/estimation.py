@@ -200,7 +200,7 @@ def fit(
     _check_choices(learner, structure, criterion, solver, initial, validation)
     _check_splittable(structure, problem.baseline, learner)
     blocks = _check_blocks(blocks)
-    conditions = {"linear": problem.baseline.linear, "resident": engine.resident, "validated": validation is not None}
+    conditions = {"linear": problem.baseline.linear, "validated": validation is not None}
     choices = tried(regularization, solver, criterion, structure, learner=learner, **conditions)
     auto = _check_regularizations(regularization, choices, validation is not None or blocks > 0)
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)

@@ -61,7 +61,7 @@ def fit_motion(
     """
     check_motion_choices(problem.motion, learner, structure, criterion, solver)
     validated = validation is not None
-    conditions = {"linear": False, "resident": True, "validated": validated, "motion": True}
+    conditions = {"linear": False, "validated": validated, "motion": True}
     choices = tried(regularization, solver, criterion, structure, learner=learner, **conditions)
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
     check_starts(restarts, seed, ensemble=False)

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.models.learners import Bound
 from orthaug.models.rows import Chunk, Engine, Overlap, gram, row_sum
@@ -103,47 +102,18 @@ def linearise(
     return one_pass(criterion, w, arguments, first.overlap)
 
 
-class Passed(NamedTuple):
-    """One pass over the rows at w."""
-
-    p: Vector
-    loss: float
-    normal: Normal
-
-
-class LinearisedPass(NamedTuple):
-    """A pass as a solver's step needs it, with the overlap that the next pass subtracts."""
-
-    hessian: Matrix
-    gradient: Vector
-    start: Overlap
-
-
 @dataclass(frozen=True, eq=False)
-class Streamed:
-    """The criterion `OneStep` over rows that an engine sums over, for the solver's loop on the host."""
+class Summed:
+    """The criterion `OneStep` over rows that an engine sums over, wherever they are."""
 
     engine: Engine
     bound: Bound
     rows: Any
     hold: Hold
-    samples_left: float
-    """Residuals less the physics' own parameters."""
-    physics: int = 0
 
-    def fly(self, p: Vector, start: Overlap) -> Passed:
-        """The normal equations at w = p; `start` is the overlap from the previous pass."""
-        total = self.engine.sum(Blocks(self.bound), self.rows, p, start)
-        normal = _collect(total, self.hold, start)
-        return Passed(np.asarray(p), float(normal.loss), normal)
-
-    def linearise(self, flown: Passed) -> LinearisedPass:
-        normal = flown.normal
-        return LinearisedPass(np.asarray(normal.hessian), np.asarray(normal.gradient), normal.overlap)
-
-    def samples(self, flown: Passed) -> tuple[float, float]:
-        """Residuals, all of them independent."""
-        return self.samples_left, 1.0
+    def __call__(self, w: Any, before: Overlap) -> Normal:
+        """The normal equations at w; `before` is the overlap from the previous pass."""
+        return _collect(self.engine.sum(Blocks(self.bound), self.rows, w, before), self.hold, before)
 
 
 _collect = jax.jit(collect)

@@ -19,13 +19,11 @@ from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.elimination import Elimination, Fixed, eliminate
 from orthaug.fitting.learned import Learned
 from orthaug.fitting.learner_sums import LearnerSums, ResidualGram, row_values
-from orthaug.fitting.normal_equations import Blocks, Hold, Normal, OneStep, Streamed, linearise
+from orthaug.fitting.normal_equations import Blocks, Hold, OneStep, Summed, linearise
 from orthaug.fitting.paper_criterion import JointOneStep, PaperCriterion, Physics
 from orthaug.fitting.rules import ridge_of
 from orthaug.fitting.solvers import compiled
 from orthaug.fitting.solvers.adam_lbfgs import GradientRun
-from orthaug.fitting.solvers.descent import IDENTITY
-from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.inference.covariance import mixing
 from orthaug.models.learners import Bound, Learner, Scaling
@@ -244,17 +242,8 @@ class OneStepTask:
         if self.engine.resident:
             criterion, arguments = OneStep(self.bound), (self.rows, hold)
             return solver.minimise(criterion, w, arguments, self._nothing, samples=samples, **options)
-        if "groups" in options:
-            raise InputError("ard regularization needs rows that are in memory; take evidence.")
-        objective = Streamed(self.engine, self.bound, self.rows, hold, samples)
-        first = objective.fly(np.asarray(w), self._nothing)
-        first = objective.fly(np.asarray(w), first.normal.overlap)  # less what rounding left of J in the physics
-        if np.isfinite(first.normal.hessian).all() and compiled.spanned(first.normal):
-            return compiled.TrainingRun(w, first.normal, options["ridge"], 0.0, 0, Ending.SPANNED, 0.0)
-        end = solver.descend(objective, np.asarray(w), first.normal.overlap, damping=IDENTITY, **options)
-        normal: Normal = end.flown.normal
-        weights = np.asarray(end.flown.p)
-        return compiled.TrainingRun(weights, normal, end.ridge, end.effective, end.iterations, end.ending, end.seconds)
+        summed = Summed(self.engine, self.bound, self.rows, hold)
+        return solver.drive(summed, jnp.asarray(w), self._nothing, samples=samples, **options)
 
     @property
     def _nothing(self) -> Overlap:
@@ -378,7 +367,7 @@ class OneStepTask:
             nt = len(normal.overlap.values)
             free = Hold(np.zeros((nt, nt)), np.zeros(nt))
             assert self.bound is not None
-            normal = Streamed(self.engine, self.bound, self.rows, free, 0).fly(np.asarray(run.w), normal.overlap).normal
+            normal = Summed(self.engine, self.bound, self.rows, free)(np.asarray(run.w), normal.overlap)
         overlap = np.asarray(normal.overlap.jacobian) * self.rms
         to_phi = self.problem.projection.to_coordinates
         inner = np.asarray(normal.hessian) * self.rms**2 + overlap.T @ overlap

@@ -78,7 +78,6 @@ def tried(
     structure: Any,
     *,
     linear: bool,
-    resident: bool,
     validated: bool,
     motion: bool = False,
     learner: Learner | None = None,
@@ -87,7 +86,6 @@ def tried(
 
     Args:
         linear: whether the physics is linear in θ, which is then solved.
-        resident: whether the rows are in memory.
         validated: whether a validation part chooses.
         motion: whether the physics are equations of motion.
         learner: one that is linear in its weights needs none.
@@ -102,7 +100,7 @@ def tried(
         return ("none",)
     if not (criterion.one_step and linear):
         return ("none", "evidence") if validated else ("none",)
-    return ("none", "ard") if resident else ("none", "evidence")
+    return ("none", "ard")
 
 
 def ridge_of(regularization: str | float) -> tuple[float, bool]:

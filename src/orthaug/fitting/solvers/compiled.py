@@ -93,12 +93,8 @@ def minimise(
         samples: residuals less the physics' own parameters, for the noise variance.
         iterations, tolerance: as of `LevenbergMarquardt`.
     """
-    single = groups is None
-    if single and not evidence:  # the program of groups serves a fixed ridge as well
-        groups = np.zeros(len(w), dtype=int)
-    options = Options(np.asarray(tolerance), np.asarray(evidence), np.asarray(float(samples)), groups)
-    start = np.float64(ridge) if groups is None else np.full(len(groups), float(ridge))
-    state = _start(criterion, w, arguments, overlap, start)
+    options, start = _prepared(w, ridge, evidence, groups, samples, tolerance)
+    state = _begun(w, linearise(criterion, w, arguments, overlap), start)
     if int(state.code) == Ending.RUNNING and iterations:  # a run beside this one may be compiling: no time of this one
         jax.block_until_ready(_advance(criterion, state, arguments, options, np.int64(0)))
     began = training_clock()
@@ -110,6 +106,48 @@ def minimise(
         spent = training_clock() - tick
         burst = burst_length(burst, spent)
         progress(int(state.iteration), float(state.normal.loss))
+    return _ended(state, ridge, evidence, groups, training_clock() - began)
+
+
+def driven(
+    normal_at: Callable[[Any, Overlap], Normal],
+    w: Float[Array, "nw"],
+    overlap: Overlap,
+    *,
+    ridge: float = 0.0,
+    evidence: bool = False,
+    groups: Int[np.ndarray, "nw"] | None = None,
+    samples: int,
+    iterations: int,
+    tolerance: float,
+    progress: RunTell = quiet,
+) -> TrainingRun:
+    """`minimise` where every pass over the rows is asked for from here: the same steps, whoever makes the sums.
+
+    Args:
+        normal_at: the criterion at weights, with the overlap of the pass before.
+    """
+    options, start = _prepared(w, ridge, evidence, groups, samples, tolerance)
+    began = training_clock()
+    first = normal_at(w, overlap)
+    state = _begun(w, normal_at(w, first.overlap), start)  # less what rounding left of J in the physics
+    while int(state.code) == Ending.RUNNING and int(state.iteration) < iterations:
+        step = _proposed(state)
+        state = _judged(state, step, normal_at(state.w + step, state.normal.overlap), options)
+        progress(int(state.iteration), float(state.normal.loss))
+    return _ended(state, ridge, evidence, groups, training_clock() - began)
+
+
+def _prepared(w: Any, ridge: float, evidence: bool, groups: Any, samples: int, tolerance: float) -> tuple[Options, Any]:
+    """The numbers of a run, and the ridge it starts with."""
+    if groups is None and not evidence:  # the program of groups serves a fixed ridge as well
+        groups = np.zeros(len(w), dtype=int)
+    options = Options(np.asarray(tolerance), np.asarray(evidence), np.asarray(float(samples)), groups)
+    return options, np.float64(ridge) if groups is None else np.full(len(groups), float(ridge))
+
+
+def _ended(state: State, ridge: float, evidence: bool, groups: Any, seconds: float) -> TrainingRun:
+    single = groups is None
     end = np.asarray(state.ridge) if not single else np.float64(state.ridge if evidence else ridge)
     return TrainingRun(
         state.w,
@@ -118,17 +156,13 @@ def minimise(
         float(effective_weights(state.normal, end)),
         int(state.iteration),
         Ending(int(state.code)),
-        training_clock() - began,
+        seconds,
     )
 
 
 def burst_length(burst: int, spent: float) -> int:
     """How many steps to take at a time, when `burst` of them took `spent` seconds."""
     return int(np.clip(burst * _SECONDS_PER_BURST / max(spent, 1e-6), 1, 4 * burst))
-
-
-def _start(criterion: Any, w: Any, arguments: tuple[Any, ...], overlap: Overlap, ridge: Any) -> State:
-    return _begun(w, linearise(criterion, w, arguments, overlap), ridge)
 
 
 @jax.jit
@@ -159,12 +193,25 @@ def _advance(criterion: Any, state: State, arguments: tuple[Any, ...], options: 
 
 def _trial(criterion: Any, state: State, arguments: tuple[Any, ...], options: Options) -> State:
     """One damped step: accept it, or damp more."""
-    w, normal, alpha = state.w, state.normal, state.ridge
-    downhill = normal.gradient - alpha * w
-    shifted = normal.hessian + (alpha + state.damping) * jnp.eye(w.shape[0])
-    step = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(shifted), downhill)
-    trial = one_pass(criterion, w + step, arguments, normal.overlap)
+    step = _proposed(state)
+    return _judged(state, step, one_pass(criterion, state.w + step, arguments, state.normal.overlap), options)
 
+
+def _downhill(state: State) -> Any:
+    return state.normal.gradient - state.ridge * state.w
+
+
+@jax.jit
+def _proposed(state: State) -> Any:
+    """The damped step."""
+    shifted = state.normal.hessian + (state.ridge + state.damping) * jnp.eye(state.w.shape[0])
+    return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(shifted), _downhill(state))
+
+
+@jax.jit
+def _judged(state: State, step: Any, trial: Normal, options: Options) -> State:
+    """The state after a step was tried: moved where the objective is lower, otherwise damped more."""
+    w, normal, alpha, downhill = state.w, state.normal, state.ridge, _downhill(state)
     before = normal.loss + _prior(alpha, w)
     after = trial.loss + _prior(alpha, w + step)
     gain = (before - after) / (step @ (state.damping * step + downhill))

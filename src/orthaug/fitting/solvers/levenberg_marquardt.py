@@ -53,6 +53,13 @@ class LevenbergMarquardt:
         limits: dict[str, Any] = {"iterations": self.iterations, "tolerance": self.tolerance}
         return compiled.minimise(criterion, w, arguments, overlap, **limits, **options)
 
+    def drive(
+        self, normal_at: Callable[[Any, Overlap], Normal], w: Float[Array, "nw"], overlap: Overlap, **options: Any
+    ) -> TrainingRun:
+        """The same, pass by pass: the rows are elsewhere; see `compiled.driven`."""
+        limits: dict[str, Any] = {"iterations": self.iterations, "tolerance": self.tolerance}
+        return compiled.driven(normal_at, w, overlap, **limits, **options)
+
     def descend(self, objective: SquaredResiduals, p: Vector, start: Any, **options: Any) -> Descent:
         """`‖r(p)‖² + α‖w‖²` from p, driven by the host; see `descent.descend`."""
         return descend(objective, p, start, iterations=self.iterations, tolerance=self.tolerance, **options)
