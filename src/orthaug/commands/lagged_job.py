@@ -167,7 +167,7 @@ def _check_scored(spec: Spec, problem: Problem) -> None:
 
 def _check_cost(spec: Spec, problem: Problem) -> None:
     """`check_cost` before JAX is loaded."""
-    sizes = {"rows": len(problem.rows), "features": len(problem.features.entries), "outputs": len(problem.outputs)}
+    sizes = {"rows": problem.count, "features": len(problem.features.entries), "outputs": len(problem.outputs)}
     runs = spec.runs(linear=problem.baseline.linear)
     check_cost(spec.declared_learner(), **sizes, iterations=spec.declared_solver().iterations, runs=runs)
 

@@ -32,7 +32,7 @@ def checked(job: LaggedJob) -> CheckResult:
             "data": job.data,
             "parameters": problem.baseline.names,
             "regressor": [str(lag) for lag in problem.layout],
-            "rows": len(problem.rows),
+            "rows": problem.count,
             "excitation": problem.excitation,
             "identifiability": identifiability(problem.baseline, problem.layout, problem.outputs, problem.rows.x),
             "shared": shared_of(job),
@@ -45,7 +45,7 @@ def checked(job: LaggedJob) -> CheckResult:
 def refused(job: LaggedJob, result: CheckResult) -> InputError | None:
     """Why the job cannot be fitted, after the report."""
     try:
-        require_rank(job.problem.excitation, job.problem.rows.y.size)
+        require_rank(job.problem.excitation, job.problem.samples)
     except InputError as error:
         return error
     return None

@@ -19,8 +19,8 @@ from orthaug.data.record import Channel, Experiment, Record, as_channels, check_
 from orthaug.data.tables import Table, check_readable, has_column, read_table
 
 RowRange = tuple[int, int] | list[int]
-_JITTER = 0.45  # largest deviation of a step from the usual one, relative: one lost sample is a deviation of 1 or ½
-_DRIFT = 0.02  # largest change of the mean step over the record, relative; it must also displace half a sample
+JITTER = 0.45  # largest deviation of a step from the usual one, relative: one lost sample is a deviation of 1 or ½
+DRIFT = 0.02  # largest change of the mean step over the record, relative; it must also displace half a sample
 _RESOLUTION = 1e-6  # what rounding of the instants may change the mean step by, relative
 _LATEST = 1e11  # s; later than the year 5000
 _MISSING = ("", "nan", "na", "n/a", "#n/a", "null", "none")  # how files write a sample that is not there
@@ -228,7 +228,7 @@ def _uniform_step(table: Table, time: str, start: int, stop: int) -> float:
         raise InputError(f"{table.path}: one row is too few to tell the sampling time from column '{time}'.")
     steps = np.diff(instants)
     mean, usual = float(steps.mean()), float(np.sort(steps)[(len(steps) - 1) // 2])
-    odd = np.flatnonzero(np.abs(steps - usual) > _JITTER * usual) if usual > 0 else np.array([0])
+    odd = np.flatnonzero(np.abs(steps - usual) > JITTER * usual) if usual > 0 else np.array([0])
     remedy = "expected evenly sampled, rising time. Resample, or take row ranges without gaps."
     if odd.size:
         row = start + int(odd[0]) + 1
@@ -240,7 +240,7 @@ def _uniform_step(table: Table, time: str, start: int, stop: int) -> float:
     if third:
         rates = [float(piece.mean()) for piece in (steps[:third], steps[third:-third], steps[-third:])]
         change = max(rates) - min(rates)
-        if change > _DRIFT * mean and change * third > 0.5 * mean:
+        if change > DRIFT * mean and change * third > 0.5 * mean:
             drifts = f"the step drifts between {min(rates):g} s and {max(rates):g} s"
             raise InputError(f"{table.path}: column '{time}': {drifts}; {remedy}")
     resolution = float(np.spacing(np.abs(instants).max())) / len(steps)

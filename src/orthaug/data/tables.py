@@ -5,8 +5,8 @@ from __future__ import annotations
 import csv
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -94,7 +94,7 @@ def _read_text(path: Path, columns: Sequence[str]) -> Table:
     try:
         _check_no_nul(path)
         header, header_line, separator = _header(path)
-        _check_present(path, columns, header)
+        check_present(path, columns, header)
         commas = separator == ";" and _DECIMAL_COMMA.search(path.read_text(encoding="utf-8-sig")) is not None
     except (UnicodeDecodeError, csv.Error):
         raise InputError(f"{path}: not a text table; expected UTF-8 text with a header row.") from None
@@ -210,6 +210,23 @@ def _up_to_last(held: np.ndarray) -> int:
 
 
 def _read_parquet(path: Path, columns: Sequence[str]) -> Table:
+    with parquet_file(path) as file:
+        check_present(path, columns, file.schema_arrow.names)
+        check_memory(16 * file.metadata.num_rows * len(columns), f"{path}: reading {file.metadata.num_rows} rows")
+        table = file.read(columns=list(columns))
+        table.validate(full=True)
+    return _full(
+        path, {name: _as_floats(table.column(name).to_numpy(zero_copy_only=False), name, path) for name in columns}
+    )
+
+
+@contextmanager
+def parquet_file(path: Path) -> Iterator[Any]:
+    """The file, opened by pyarrow.
+
+    Raises:
+        InputError: without pyarrow, and for a file that is none or breaks off.
+    """
     try:
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -217,22 +234,16 @@ def _read_parquet(path: Path, columns: Sequence[str]) -> Table:
         raise InputError(f"{path}: reading Parquet needs pyarrow; install orthaug[parquet].") from None
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
-            _check_present(path, columns, file.schema_arrow.names)
-            check_memory(16 * file.metadata.num_rows * len(columns), f"{path}: reading {file.metadata.num_rows} rows")
-            table = file.read(columns=list(columns))
-        table.validate(full=True)
+            yield file
     except (pa.ArrowException, OSError) as error:
         raise InputError(f"{path}: not a readable Parquet file ({short(error)}).") from None
-    return _full(
-        path, {name: _as_floats(table.column(name).to_numpy(zero_copy_only=False), name, path) for name in columns}
-    )
 
 
 def _read_excel(path: Path, columns: Sequence[str]) -> Table:
     """The first worksheet."""
 
     def place(header: Sequence[str]) -> list[int]:
-        _check_present(path, columns, header)
+        check_present(path, columns, header)
         return [header.index(name) for name in columns]
 
     top, found = read_sheet(path, place)
@@ -274,7 +285,8 @@ _READERS: dict[str, Callable[[Path, Sequence[str]], Table]] = {
 }
 
 
-def _check_present(path: Path, columns: Sequence[str], header: Sequence[str]) -> None:
+def check_present(path: Path, columns: Sequence[str], header: Sequence[str]) -> None:
+    """Raise InputError for a column that is not there, or stands twice."""
     for name in columns:
         if name not in header:
             known = ", ".join(f"'{h}'" for h in list(header)[:_NAMED] if h) or "no column names"

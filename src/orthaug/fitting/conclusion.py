@@ -86,7 +86,7 @@ def _model(
         sampling_time=record.sampling_time,
         time_column=record.time_column,
         structure=structure.name,
-        largest_output=np.max([np.abs(e.outputs).max(axis=0) for e in record.experiments], axis=0),
+        largest_output=problem.largest_output,
         deviation=problem.deviation,
         weight=problem.weight.matrix,
         shared=directions(structure, problem),
@@ -100,7 +100,7 @@ def _one_step_errors(
     """The statistics of the one-step residual."""
     problem, ny = task.problem, len(task.problem.outputs)
     whitened = task.residual_gram(learned, c)
-    freedom = degrees_of_freedom(len(problem.rows), problem.freedom_used, learned.effective) + len(fixed) / ny
+    freedom = degrees_of_freedom(problem.count, problem.freedom_used, learned.effective) + len(fixed) / ny
     finite = bool(np.isfinite(whitened).all())
     mixed = noise_covariance(whitened, freedom) if finite else None
     noise = covariance = None
@@ -112,7 +112,7 @@ def _one_step_errors(
             covariance = theta_covariance(problem.projection, middle, fixed)
         elif not fixed:
             covariance = _beside_the_learner(problem, learned, mixed, taken)
-    mean_square = float(np.trace(whitened)) / problem.target.size
+    mean_square = float(np.trace(whitened)) / problem.samples
     return ErrorStatistics(noise, covariance, float(freedom.min()), mean_square, fixed)
 
 
@@ -187,7 +187,7 @@ def _warnings(
         told.append(Warning(NOT_UNIQUE, text))
     elif noise is None:
         text = (
-            f"no standard errors: {len(problem.rows)} rows leave no degrees of freedom for "
+            f"no standard errors: {problem.count} rows leave no degrees of freedom for "
             f"{len(problem.baseline.names)} parameters and {learned.effective:.1f} effective weights; "
             "use more data or a smaller learner."
         )

@@ -299,7 +299,7 @@ def summary_lines(fit: Estimate) -> Sequence[str]:
     lines = [
         f"structure   {fit.model.structure}",
         f"learner     {learner}",
-        f"data        {fit.problem.record!r}, {len(fit.problem.rows)} usable rows",
+        f"data        {fit.problem.record!r}, {fit.problem.count} usable rows",
         f"status      {status.code}, {status.iterations} iterations, {status.seconds:.2f} s, loss {status.loss:.6g}",
     ]
     if status.message:

@@ -243,7 +243,7 @@ def fit(
 
 def _check_cost(problem: Problem, learner: Learner | None, solver: Solver, runs: int) -> None:
     """Raise InputError for what would take more memory or time than there is."""
-    sizes = {"rows": len(problem.rows), "features": len(problem.features.entries), "outputs": len(problem.outputs)}
+    sizes = {"rows": problem.count, "features": len(problem.features.entries), "outputs": len(problem.outputs)}
     check_cost(learner, **sizes, iterations=solver.iterations, runs=runs)
 
 

@@ -30,6 +30,7 @@ from orthaug.models.learners import Bound, Learner, Scaling
 from orthaug.models.rows import Engine, InMemory, MixedGram, Overlap, from_chunks
 from orthaug.models.terms import scaling_of
 from orthaug.physics.problem import Problem
+from orthaug.physics.streamed import StreamedProblem
 
 OUTPUT_UNIT = 10.0
 """The learner's output unit in standard deviations of the baseline's residual: the table is in docs/design.md."""
@@ -72,25 +73,30 @@ class OneStepTask:
         engine: Engine = InMemory(),  # noqa: B008  (frozen)
     ) -> OneStepTask:
         """Scale features to [-1, 1] and the learner's output to the baseline's residual, unless both are given."""
-        z = np.zeros((len(problem.rows), 0)) if learner is None else problem.feature_rows()
-        bound = None if learner is None else Bound(learner, z.shape[1], len(problem.outputs))
-        e, deviation = problem.unexplained, problem.deviation
-        spread, whitened = (
-            np.maximum(rows.std(axis=0) if bound else np.sqrt(np.mean(rows**2, axis=0)), _SMALLEST_RESIDUAL * least)
-            for rows, least in ((problem.weight.outputs(e), deviation), (e, 1.0))
-        )
+        bound = None if learner is None else Bound(learner, len(problem.features.entries), len(problem.outputs))
+        if isinstance(problem, StreamedProblem):
+            z = problem.feature_range if bound else np.zeros((2, 0))
+        else:
+            z = problem.feature_rows() if bound else np.zeros((problem.count, 0))
+        whitened, spread = _sizes(problem, centred=bound is not None)
         rms = float(np.sqrt(np.mean(whitened**2)))
         scaling = scaling_of(learner, z) if scaling is None else scaling
         unit = np.asarray(OUTPUT_UNIT * spread if unit is None else unit)
         unit = unit if bound is not None else np.zeros_like(unit)
-        gain = np.broadcast_to(problem.weight.matrix * unit / rms, (*e.shape, e.shape[1]))
-        rows = engine.lay(scaling(z), problem.projection.q, e / rms, gain)
+        gain = problem.weight.matrix * unit / rms
+        if isinstance(problem, StreamedProblem):
+            laying = problem.laying(scaling.centre, scaling.halfwidth, rms, gain)
+            return cls(problem, bound, scaling, unit, rms, engine, engine.draw(problem.source, laying))
+        e = problem.unexplained / rms
+        rows = engine.lay(scaling(z), problem.projection.q, e, np.broadcast_to(gain, (*e.shape, e.shape[1])))
         return cls(problem, bound, scaling, unit, rms, engine, rows)
 
     @property
     def start_loss(self) -> float:
         """Loss of physics alone, in the units of `loss`: of least squares before `prepared`."""
-        return float(np.mean(self.problem.unexplained**2)) if self.physics_loss is None else self.physics_loss
+        if self.physics_loss is not None:
+            return self.physics_loss
+        return self.problem.unexplained_moments.square / self.problem.samples
 
     @property
     def seconds(self) -> float:
@@ -126,7 +132,7 @@ class OneStepTask:
         nothing = np.zeros_like(problem.target_coordinates)
         theta = elimination.theta(nothing, elimination.active(nothing))
         missed = problem.target_coordinates - problem.projection.to_coordinates @ theta
-        loss = float(np.sum(problem.unexplained**2) + missed @ missed) / problem.target.size
+        loss = float(problem.unexplained_moments.square + missed @ missed) / problem.samples
         return replace(self, physics_loss=loss)
 
     def run(
@@ -231,14 +237,14 @@ class OneStepTask:
         nt = len(physics.outputs)
         nothing = Overlap(np.zeros((nt, nt + self.bound.size)), np.zeros(nt))
         unknowns = np.concatenate([np.zeros(nt), w])
-        options: dict[str, Any] = {"samples": self.problem.target.size, "progress": progress}
+        options: dict[str, Any] = {"samples": self.problem.samples, "progress": progress}
         end = solver.minimise(JointOneStep(self.bound), unknowns, (self.rows, physics), nothing, **options)
         return GradientRun(end.w[:nt], end.w[nt:], end.iterations, end.ending, end.seconds)
 
     def _least_squares(self, solver: Any, w: Any, hold: Hold, options: dict[str, Any]) -> compiled.TrainingRun:
         """Levenberg-Marquardt: compiled whole where the rows are in memory, otherwise driven by the host."""
         assert self.bound is not None
-        samples = self.problem.target.size - len(self.problem.baseline.names)
+        samples = self.problem.samples - len(self.problem.baseline.names)
         if self.engine.resident:
             criterion, arguments = OneStep(self.bound), (self.rows, hold)
             return solver.minimise(criterion, w, arguments, self._nothing, samples=samples, **options)
@@ -257,7 +263,7 @@ class OneStepTask:
 
     def mean_square(self, loss: Any) -> float:
         """The criterion's `‖r‖²` as the mean of squared errors with each output in its standard deviation."""
-        return float(loss) * self.rms**2 / self.problem.target.size
+        return float(loss) * self.rms**2 / self.problem.samples
 
     def learned(self, run: compiled.TrainingRun) -> Learned:
         """What a run left."""
@@ -387,3 +393,14 @@ class OneStepTask:
     def physics_middle(self, noise: Matrix) -> Matrix:
         """ΣqᵀΣ_eq (nθ, nθ) of the rows q of Q, for the noise covariance of whitened outputs."""
         return np.asarray(self.engine.sum(MixedGram(None), self.rows, np.zeros(0), mixing(noise)))
+
+
+def _sizes(problem: Problem, *, centred: bool) -> tuple[Vector, Vector]:
+    """How large what the physics leaves is in each output (ny,), whitened and not: its deviation, or its RMS."""
+    moments, back = problem.unexplained_moments, np.linalg.inv(problem.weight.matrix)
+    found = []
+    for change, least in ((np.eye(len(back)), np.ones(len(back))), (back, problem.deviation)):
+        square = np.diag(change @ moments.covariance @ change.T)
+        square = square if centred else square + (change @ moments.mean) ** 2
+        found.append(np.maximum(np.sqrt(square), _SMALLEST_RESIDUAL * least))
+    return found[0], found[1]

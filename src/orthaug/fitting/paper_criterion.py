@@ -41,7 +41,7 @@ class Physics(NamedTuple):
         initial = np.array([fixed.get(i, value) for i, value in enumerate(problem.baseline.initial)])
         free = np.array([float(i not in fixed) for i in range(len(initial))])
         nt = len(initial)
-        scale = free * np.sqrt(len(problem.rows)) / np.linalg.norm(to_rows, axis=0) if nt else free
+        scale = free * np.sqrt(problem.count) / np.linalg.norm(to_rows, axis=0) if nt else free
 
         def padded(matrix: np.ndarray) -> np.ndarray:
             return np.concatenate([matrix, np.zeros((nt - len(matrix), *matrix.shape[1:]))])
@@ -54,7 +54,7 @@ class Physics(NamedTuple):
             padded(penalty.theta * scale) / rms,
             padded(penalty.learner),
             padded(penalty.target - penalty.theta @ initial) / rms,
-            problem.target.size,
+            problem.samples,
             ridge,
         )
         return cls(*(jnp.asarray(piece, dtype=float) for piece in pieces))

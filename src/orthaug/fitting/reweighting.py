@@ -33,7 +33,7 @@ def reweighted(first: Estimate, again: Callable[[Problem, Estimate], Estimate]) 
         singular; a warning tells that the turns did not settle.
     """
     estimate, problem = first, first.problem
-    covariance = np.atleast_2d(np.cov(problem.target, rowvar=False, bias=True))
+    covariance = problem.target_covariance
     for _ in range(_TURNS):
         noise = estimate.model.statistics.noise if estimate.status.ok else None
         white = None if noise is None else whitening(noise)

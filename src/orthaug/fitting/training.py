@@ -135,7 +135,7 @@ def train(
 
 def _cross_validation(task: Task, run: Any) -> float:
     """Generalised: `N RSS / (N − nθ − 1.4 γ)²` of a run one step ahead; infinite where it uses up all rows."""
-    samples = task.problem.target.size
+    samples = task.problem.samples
     left = samples - len(task.problem.baseline.names) - _INFLATION * run.effective
     return task.loss(run) * (samples / left) ** 2 if left > 0 else math.inf
 

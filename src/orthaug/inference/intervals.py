@@ -178,7 +178,9 @@ def robust_split_covariance(
 
 def _correction(problem: Problem, residual: Matrix, used: float) -> float:
     """For what the fit has used up."""
-    return residual.size / max(residual.size - len(problem.baseline.names) - used, 1.0)
+    share = problem.count / len(problem.rows)  # of which the residual is a witness
+    samples = residual.size * share
+    return share * samples / max(samples - len(problem.baseline.names) - used, 1.0)
 
 
 def _by_experiment(problem: Problem, scores: Matrix) -> list[Matrix]:

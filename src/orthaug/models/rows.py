@@ -59,6 +59,10 @@ class Engine(Protocol):
         """Rows (N, …) as this engine keeps them."""
         ...
 
+    def draw(self, source: Any, laying: Callable[[Any], Any]) -> Any:
+        """Rows of a source (`data.sources.Source`), laid out by `laying` of each of its partitions."""
+        ...
+
     def sum(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> Any:
         """Σ function(chunk, *arguments) over all chunks; `function` is hashable, its result any pytree of arrays."""
         ...
@@ -75,6 +79,10 @@ class InMemory:
         shape = chunk_shape(len(z), self.limit)
         padded = in_chunks(z, shape, repeat=True)  # zeros may be where the learner has no value
         return Chunk(*map(jax.device_put, (padded, *(in_chunks(piece, shape) for piece in (q, e, gain)))))
+
+    def draw(self, source: Any, laying: Callable[[Any], Any]) -> Chunk:
+        pieces = [laid for partition in source.partitions for laid in laying(partition)]
+        return self.lay(*(np.concatenate(parts) for parts in zip(*pieces, strict=True)))
 
     def sum(self, function: Callable[..., Any], rows: Chunk, *arguments: Any) -> Any:
         return _compiled_sum(function, rows, arguments)

@@ -20,6 +20,7 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import Features, Lags, Layout, UsableRows, in_order, lag_matrix, stack_rows
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.excitation import Excitation, excitation, require_rank
+from orthaug.physics.moments import Extent, Moments
 from orthaug.physics.output_weights import OutputWeights, check_output_weights, weigh_outputs
 from orthaug.physics.projection import Projection
 from orthaug.physics.shared import Shared, shared_directions
@@ -61,6 +62,16 @@ class Problem:
         return self.rows.start
 
     @property
+    def count(self) -> int:
+        """How many rows there are."""
+        return len(self.rows)
+
+    @property
+    def samples(self) -> int:
+        """Rows times outputs."""
+        return self.count * len(self.outputs)
+
+    @property
     def used(self) -> tuple[Lag, ...]:
         """The raw lags that the physics or the learner reads."""
         read = {*self.baseline.lags, *self.features.lags}
@@ -84,6 +95,20 @@ class Problem:
     def unexplained(self) -> Float[np.ndarray, "N ny"]:
         """P⊥Y, what the physics cannot express of the whitened outputs."""
         return self.projection.orthogonal_part(self.whitened_target)
+
+    @cached_property
+    def unexplained_moments(self) -> Moments:
+        """Of `unexplained`."""
+        return Moments.of(self.unexplained)
+
+    @property
+    def target_covariance(self) -> Matrix:
+        return Moments.of(self.target).covariance
+
+    @property
+    def largest_output(self) -> Vector:
+        """The largest size of each output (ny,)."""
+        return np.max([np.abs(e.outputs).max(axis=0) for e in self.record.experiments], axis=0)
 
     @cached_property
     def shared(self) -> Shared:
@@ -127,7 +152,7 @@ class Problem:
         Raises:
             InputError: a feature that is not finite on some row.
         """
-        return _feature_rows(self.features, self.rows, self.layout, self.record)
+        return feature_rows(self.features, self.rows, self.layout, self.record)
 
 
 @one_blas_thread()
@@ -177,19 +202,15 @@ def _posed(
     """Rows, physics matrix and factor of a record whose channels were checked."""
     outputs = tuple(channel.name for channel in record.outputs)
     rows = stack_rows(record, layout)
-    _check_moving(record, layout)
+    signals = [np.concatenate([e.outputs, e.inputs], axis=1) for e in record.experiments]
+    check_moving(Extent.of(np.concatenate(signals)), record, layout)
     with np.errstate(all="ignore"):
         phi = np.asarray(baseline.phi(rows.x, layout, outputs, np))
         known = np.asarray(baseline.known(rows.x, layout, outputs, np))
         target = rows.y - known
         deviation = rows.y.std(axis=0)
-    _check_physics(phi, known, baseline, rows, record)
-    moves = np.ptp(target, axis=0) > 0
-    if not np.all(np.isfinite(deviation)) or np.any(moves & ((deviation > _LARGEST) | (deviation < 1 / _LARGEST))):
-        raise InputError(
-            f"the outputs move by {np.max(np.ptp(target, axis=0)):.3g}, too large or too small for double precision "
-            "arithmetic; scale them (`scale` of the channel)."
-        )
+    check_physics(phi, known, baseline, rows, record)
+    check_sizes(deviation, np.ptp(target, axis=0))
     deviation = np.where(deviation > 0, deviation, 1.0)
     weight = weigh_outputs(output_weights, deviation)
     projection = Projection.factor(weight.rows(phi))
@@ -208,11 +229,12 @@ def check_defined(problem: Problem, record: Record) -> None:
         with np.errstate(all="ignore"):
             phi = np.asarray(problem.baseline.phi(rows.x, layout, outputs, np))
             known = np.asarray(problem.baseline.known(rows.x, layout, outputs, np))
-        _check_physics(phi, known, problem.baseline, rows, alone)
-        _feature_rows(problem.features, rows, layout, alone)
+        check_physics(phi, known, problem.baseline, rows, alone)
+        feature_rows(problem.features, rows, layout, alone)
 
 
-def _feature_rows(features: Features, rows: UsableRows, layout: Layout, record: Record) -> Matrix:
+def feature_rows(features: Features, rows: UsableRows, layout: Layout, record: Record) -> Matrix:
+    """The learner's features (N, nz) of some rows; InputError where one is not finite."""
     with np.errstate(all="ignore"):
         z = np.asarray(features.evaluate(rows.x, layout, np))
     for j, entry in enumerate(features.entries):
@@ -253,20 +275,29 @@ def regressor_of(
     return in_order((*chosen, *features.lags, *baseline.lags), outputs, inputs), features
 
 
-def _check_moving(record: Record, layout: Layout) -> None:
+def check_moving(extent: Extent, record: Record, layout: Layout) -> None:
+    """Raise InputError for a channel of the model that is constant; `extent` is that of outputs, then inputs."""
     used = {lag.channel for lag in layout} | {channel.name for channel in record.outputs}
-    for kind, channels in (("outputs", record.outputs), ("inputs", record.inputs)):
-        for i, channel in enumerate(channels):
-            values = [getattr(experiment, kind)[:, i] for experiment in record.experiments]
-            low, high = min(v.min() for v in values), max(v.max() for v in values)
-            if channel.name in used and low == high:
-                raise InputError(
-                    f"channel '{channel.name}' is constant ({low:g}) over all training data; "
-                    "nothing can be learned from it. Remove it, or use data in which it moves."
-                )
+    for channel, low, high in zip(record.channels, *extent, strict=True):
+        if channel.name in used and low == high:
+            raise InputError(
+                f"channel '{channel.name}' is constant ({low:g}) over all training data; "
+                "nothing can be learned from it. Remove it, or use data in which it moves."
+            )
 
 
-def _check_physics(phi: np.ndarray, known: np.ndarray, baseline: Baseline, rows: UsableRows, record: Record) -> None:
+def check_sizes(deviation: Vector, moved: Vector) -> None:
+    """Raise InputError for outputs of such a deviation (ny,) that move by `moved`, if their squares do not add up."""
+    moves = moved > 0
+    if not np.all(np.isfinite(deviation)) or np.any(moves & ((deviation > _LARGEST) | (deviation < 1 / _LARGEST))):
+        raise InputError(
+            f"the outputs move by {np.max(moved):.3g}, too large or too small for double precision "
+            "arithmetic; scale them (`scale` of the channel)."
+        )
+
+
+def check_physics(phi: np.ndarray, known: np.ndarray, baseline: Baseline, rows: UsableRows, record: Record) -> None:
+    """Raise InputError where Φ (N, ny, nθ) or the fixed terms (N, ny) are not finite, or their squares not."""
     for j, name in enumerate(baseline.names):
         texts = ", ".join(t.regressor for t in baseline.terms if t.parameter == name) or "the baseline function"
         _check_finite(phi[:, :, j], f"the regressor of {name} ({texts})", rows, record)

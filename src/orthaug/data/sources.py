@@ -1,0 +1,166 @@
+"""Rows that stay where they are: files larger than memory, read piece by piece with the rows that lags need.
+
+A source is cut into partitions. Each can be read on its own, here or by another process, and gives pieces: experiments
+whose first rows are history only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from orthaug._base.errors import InputError
+from orthaug.data.record import Channel, Experiment, Record
+
+WITNESS_ROWS = 200_000
+"""Rows that are kept in memory to look at: for tests of residuals, findings and figures."""
+_WINDOWS = 20  # that they are taken from, where the source has more
+
+
+@runtime_checkable
+class Partition(Protocol):
+    """Consecutive rows that one task reads; small and picklable."""
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        ...
+
+    @property
+    def rows(self) -> int:
+        """How many it has, at most: missing samples are left out when it is read."""
+        ...
+
+    def pieces(self, lead: int) -> Iterator[Experiment]:
+        """Its rows in order. The first `lead` rows of a piece are history, or the begin of an experiment.
+
+        Raises:
+            InputError: cells that are no finite numbers, a file that has changed.
+        """
+        ...
+
+
+@runtime_checkable
+class Source(Protocol):
+    """Records whose rows are read when they are needed."""
+
+    inputs: tuple[Channel, ...]
+    outputs: tuple[Channel, ...]
+    sampling_time: float
+    time_column: str | None
+
+    @property
+    def partitions(self) -> Sequence[Partition]:
+        """In order; experiments may begin in one and go on in the next."""
+        ...
+
+    def window(self, start: int, stop: int) -> list[Experiment]:
+        """Rows `[start, stop)`, counted over all partitions."""
+        ...
+
+
+def rows_of(source: Source) -> int:
+    """How many rows a source has."""
+    return sum(partition.rows for partition in source.partitions)
+
+
+def as_record(source: Source, experiments: Sequence[Experiment]) -> Record:
+    """Some of its rows as a record in memory."""
+    return Record(source.inputs, source.outputs, source.sampling_time, tuple(experiments), source.time_column)
+
+
+def witness(source: Source, limit: int = WITNESS_ROWS) -> Record:
+    """A record in memory that stands for the source: all of it, or windows that are spread over it evenly."""
+    total = rows_of(source)
+    if total <= limit:
+        return as_record(source, source.window(0, total))
+    size = limit // _WINDOWS
+    begins = np.linspace(0, total - size, _WINDOWS).astype(int)
+    return as_record(source, [e for begin in begins for e in source.window(int(begin), int(begin) + size)])
+
+
+@dataclass(frozen=True, eq=False)
+class HeldRows:
+    """A partition that carries its rows."""
+
+    experiment: Experiment
+    start: int
+    """The first row of its own; those before it are history."""
+
+    @property
+    def name(self) -> str:
+        return self.experiment.where(self.start)
+
+    @property
+    def rows(self) -> int:
+        return len(self.experiment) - self.start
+
+    def pieces(self, lead: int) -> Iterator[Experiment]:
+        first = max(self.start - lead, 0)
+        yield self.experiment.rows(first, None) if first else self.experiment
+
+
+@dataclass(frozen=True, eq=False)
+class RecordSource:
+    """A record in memory as a source, in partitions of `size` rows that carry `lead` rows of history."""
+
+    record: Record
+    lead: int
+    size: int = 100_000
+
+    @property
+    def inputs(self) -> tuple[Channel, ...]:
+        return self.record.inputs
+
+    @property
+    def outputs(self) -> tuple[Channel, ...]:
+        return self.record.outputs
+
+    @property
+    def sampling_time(self) -> float:
+        return self.record.sampling_time
+
+    @property
+    def time_column(self) -> str | None:
+        return self.record.time_column
+
+    @cached_property
+    def partitions(self) -> tuple[HeldRows, ...]:
+        held = []
+        for experiment in self.record.experiments:
+            for begin in range(0, len(experiment), self.size):
+                first = max(begin - self.lead, 0)
+                held.append(HeldRows(experiment.rows(first, begin + self.size), begin - first))
+        return tuple(held)
+
+    def window(self, start: int, stop: int) -> list[Experiment]:
+        found, before = [], 0
+        for experiment in self.record.experiments:
+            a, b = max(start - before, 0), min(stop - before, len(experiment))
+            whole = a == 0 and b == len(experiment)
+            if a < b:
+                found.append(experiment if whole else experiment.rows(a, b))
+            before += len(experiment)
+        return found
+
+
+def stretches(experiment: Experiment, lead: int) -> Iterator[Experiment]:
+    """A piece without its rows that have a missing sample, cut there: no lag reaches across."""
+    there = np.isfinite(experiment.inputs).all(axis=1) & np.isfinite(experiment.outputs).all(axis=1)
+    if there.all():
+        yield experiment
+        return
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int)))
+    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        if end - begin > lead:
+            yield replace(experiment.rows(begin, end), offset=experiment.offset + begin)
+
+
+def same_channels(source: Source, record: Any) -> None:
+    """Raise InputError unless a record has the source's channels."""
+    if (source.inputs, source.outputs) != (record.inputs, record.outputs):
+        raise InputError(f"the channels of {record!r} are not those of the training data.")

@@ -1,0 +1,364 @@
+"""A problem whose rows stay in a source: what training needs of them comes from passes over its partitions.
+
+Three passes: a survey of sizes and ranges, a tree QR of `[Φ Y]`, and a second QR of the rows that the first one gives.
+The second makes Q orthonormal to rounding however ill-conditioned Φ is, as Householder's does in memory. A `witness` of
+the rows stays in memory for everything that only looks at the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.linalg
+from jaxtyping import Float
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.errors import InputError
+from orthaug.data.record import Experiment, Record
+from orthaug.data.regressors import Features, Layout, UsableRows, lag_matrix, largest_lag
+from orthaug.data.sources import Partition, Source
+from orthaug.physics.baseline import Baseline
+from orthaug.physics.excitation import excitation, require_rank
+from orthaug.physics.moments import Extent, Moments
+from orthaug.physics.output_weights import OutputWeights, weigh_outputs
+from orthaug.physics.problem import Problem, check_moving, check_physics, check_sizes, feature_rows, pose
+from orthaug.physics.projection import Projection
+
+Passes = Callable[[Callable[[Partition], Any], Sequence[Partition]], list[Any]]
+"""`[function(partition) for partition in partitions]`, wherever that is done."""
+
+
+@dataclass(frozen=True, eq=False)
+class Form:
+    """How a piece of a source becomes rows; picklable if the baseline is."""
+
+    baseline: Baseline
+    features: Features
+    layout: Layout
+    empty: Record
+    """Channels and sampling time; its experiment has no rows."""
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return tuple(channel.name for channel in self.empty.outputs)
+
+    @property
+    def lead(self) -> int:
+        """Rows of history that a row needs."""
+        return largest_lag(self.layout)
+
+    def posed(self, partition: Partition) -> Iterator[tuple[Experiment, UsableRows, np.ndarray, np.ndarray]]:
+        """Pieces with their rows, Φ (m, ny, nθ) and the sum of the fixed terms (m, ny)."""
+        for piece in partition.pieces(self.lead):
+            if len(piece) <= self.lead:
+                continue
+            x = lag_matrix(piece, self.layout, self.empty, self.lead)
+            rows = UsableRows(x, piece.outputs[self.lead :], self.layout, self.lead)
+            with np.errstate(all="ignore"):
+                phi = np.asarray(self.baseline.phi(x, self.layout, self.outputs, np))
+                known = np.asarray(self.baseline.known(x, self.layout, self.outputs, np))
+            yield piece, rows, phi, known
+
+    def checked(self, piece: Experiment, rows: UsableRows, phi: np.ndarray, known: np.ndarray) -> Matrix:
+        """The learner's features (m, nz), after everything was found to be finite."""
+        alone = replace(self.empty, experiments=(piece,))
+        check_physics(phi, known, self.baseline, rows, alone)
+        return feature_rows(self.features, rows, self.layout, alone)
+
+
+class Survey(NamedTuple):
+    """Sizes and ranges of the rows."""
+
+    channels: Extent
+    """Of outputs, then inputs, over all rows."""
+    features: Extent
+    columns: Vector
+    """Largest entry of each column of Φ (nθ,), in the outputs' units."""
+    outputs: Moments
+    target: Moments
+
+    def __or__(self, other: Survey) -> Survey:
+        columns = np.maximum(self.columns, other.columns)
+        return Survey(
+            self.channels | other.channels,
+            self.features | other.features,
+            columns,
+            self.outputs | other.outputs,
+            self.target | other.target,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Surveying:
+    """The survey of a partition; everything in it is checked to be finite."""
+
+    form: Form
+
+    def __call__(self, partition: Partition) -> Survey | None:
+        found = None
+        for piece, rows, phi, known in self.form.posed(partition):
+            z = self.form.checked(piece, rows, phi, known)
+            seen = Survey(
+                Extent.of(np.concatenate([piece.outputs, piece.inputs], axis=1)),
+                Extent.of(z),
+                np.abs(phi).max(axis=(0, 1), initial=0.0),
+                Moments.of(rows.y),
+                Moments.of(rows.y - known),
+            )
+            found = seen if found is None else found | seen
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Factoring:
+    """R of `[Φ Y]`, columns scaled, outputs whitened."""
+
+    form: Form
+    weight: OutputWeights
+    scale: Vector
+
+    def __call__(self, partition: Partition) -> Matrix:
+        n = len(self.scale) + 1
+        r = np.zeros((0, n))
+        for _, rows, phi, known in self.form.posed(partition):
+            columns = self.weight.rows(phi).reshape(-1, n - 1) * self.scale
+            target = self.weight.rows(rows.y - known).reshape(-1, 1)
+            r = _triangle([r, np.concatenate([columns, target], axis=1)])
+        return r
+
+
+class Refined(NamedTuple):
+    """What the second QR tells: R of `[Q₁ e₁]`, the moments of e₁ and `Σ ‖q_ki‖²` of each output."""
+
+    r: Matrix
+    errors: Moments
+    freedom: Vector
+
+
+@dataclass(frozen=True, eq=False)
+class Basis:
+    """Rows of Q: `Φ scale R₁⁻¹ turn`, with `turn = R₂⁻¹` of the second QR."""
+
+    form: Form
+    weight: OutputWeights
+    scale: Vector
+    r: Matrix
+    turn: Matrix
+
+    def rows(self, phi: np.ndarray) -> Float[np.ndarray, "m ny nt"]:
+        flat = self.weight.rows(phi).reshape(-1, len(self.scale)) * self.scale
+        if not len(self.scale):
+            return phi
+        q = scipy.linalg.solve_triangular(self.r.T, flat.T, lower=True, check_finite=False).T @ self.turn
+        return q.reshape(phi.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class Refining:
+    """The second QR, and what the physics leaves."""
+
+    basis: Basis
+    coordinates: Vector
+
+    def __call__(self, partition: Partition) -> Refined | None:
+        basis, found, nt = self.basis, None, len(self.coordinates)
+        for _, rows, phi, known in basis.form.posed(partition):
+            q = basis.rows(phi)
+            e = basis.weight.rows(rows.y - known) - q @ self.coordinates
+            r = _triangle([np.concatenate([q.reshape(-1, nt), e.reshape(-1, 1)], axis=1)])
+            seen = Refined(r, Moments.of(e), np.sum(q**2, axis=(0, 2)))
+            found = seen if found is None else _both(found, seen)
+        return found
+
+
+def _both(one: Refined, other: Refined) -> Refined:
+    return Refined(_triangle([one.r, other.r]), one.errors | other.errors, one.freedom + other.freedom)
+
+
+def _triangle(blocks: Sequence[Matrix]) -> Matrix:
+    """R of blocks of rows upon each other, its diagonal not negative."""
+    r = np.asarray(np.linalg.qr(np.concatenate(blocks), mode="r"))
+    return r * np.where(np.diag(r) < 0, -1.0, 1.0)[:, None] if len(r) == r.shape[1] else r
+
+
+def _merged(parts: Sequence[Any], merge: Callable[[Any, Any], Any]) -> Any:
+    """Neighbours two by two, and so on: an order that does not depend on who was ready first."""
+    parts = [part for part in parts if part is not None]
+    while len(parts) > 1:
+        parts = [merge(*parts[i : i + 2]) if i + 1 < len(parts) else parts[i] for i in range(0, len(parts), 2)]
+    return parts[0] if parts else None
+
+
+@dataclass(frozen=True, eq=False)
+class Laying:
+    """Rows of a piece for training: scaled features, Q, P⊥Y and the learner's gain, (m, …) each."""
+
+    basis: Basis
+    coordinates: Vector
+    centre: Vector
+    halfwidth: Vector
+    rms: float
+    gain: Matrix
+
+    def __call__(self, partition: Partition) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+        form = self.basis.form
+        for _, rows, phi, known in form.posed(partition):
+            q = self.basis.rows(phi)
+            e = (self.basis.weight.rows(rows.y - known) - q @ self.coordinates) / self.rms
+            z = np.asarray(form.features.evaluate(rows.x, form.layout, np)) if len(self.centre) else rows.x[:, :0]
+            yield (z - self.centre) / self.halfwidth, q, e, np.broadcast_to(self.gain, (*e.shape, e.shape[1]))
+
+
+@dataclass(frozen=True, eq=False)
+class StreamedProblem(Problem):
+    """A problem of a source. `record`, `rows` and the rows of `projection` are those of its witness.
+
+    `passes` makes passes over the source. `moments` are those of what the physics leaves, in whitened outputs.
+    """
+
+    source: Source
+    passes: Passes
+    survey: Survey
+    basis: Basis
+    solution: tuple[Vector, Vector]
+    """θ̂ of physics alone and its coordinates QᵀY."""
+    moments: Moments
+    freedom: Vector
+
+    def __repr__(self) -> str:
+        return super().__repr__().replace(f"{len(self.rows)} rows", f"{self.count} rows", 1)
+
+    @property
+    def count(self) -> int:
+        return self.moments.count
+
+    @property
+    def least_squares(self) -> Vector:
+        return self.solution[0]
+
+    @property
+    def target_coordinates(self) -> Vector:
+        return self.solution[1]
+
+    @property
+    def freedom_used(self) -> Vector:
+        return self.freedom
+
+    @property
+    def unexplained_moments(self) -> Moments:
+        return self.moments
+
+    @property
+    def target_covariance(self) -> Matrix:
+        return self.survey.target.covariance
+
+    @property
+    def largest_output(self) -> Vector:
+        extent = self.survey.channels
+        return np.maximum(np.abs(extent.low), np.abs(extent.high))[: len(self.outputs)]
+
+    @cached_property
+    def feature_range(self) -> Float[np.ndarray, "2 nz"]:
+        extent = self.survey.features
+        if self.features != self.basis.form.features:
+            form = replace(self.basis.form, features=self.features)
+            extent = _survey(form, self.source, self.passes).features
+        return np.stack(extent)
+
+    def laying(self, centre: Vector, halfwidth: Vector, rms: float, gain: Matrix) -> Laying:
+        """How its rows are laid out for training."""
+        basis = replace(self.basis, form=replace(self.basis.form, features=self.features))
+        return Laying(basis, self.target_coordinates, centre, halfwidth, rms, gain)
+
+    def physics_alone(self) -> Problem:
+        alone = super().physics_alone()
+        return alone if isinstance(alone, StreamedProblem) else streamed(alone, self.source, self.passes)
+
+    def weighed(self, weight: OutputWeights) -> Problem:
+        if weight is self.weight:
+            return self
+        return _factored(replace(self, weight=weight), self.source, self.passes, self.survey, self.basis.form)
+
+
+def _survey(form: Form, source: Source, passes: Passes) -> Survey:
+    found = _merged(passes(Surveying(form), source.partitions), Survey.__or__)
+    if found is None:
+        raise InputError(
+            f"no experiment has enough rows for a single prediction: the largest lag is {form.lead}, so at least "
+            f"{form.lead + 1} are needed."
+        )
+    return found
+
+
+def pose_streamed(
+    source: Source, record: Record, passes: Passes, baseline: Baseline, *args: Any, **options: Any
+) -> Problem:
+    """`pose` for a source, with a witness `record` of it in memory; the arguments are those of `pose`.
+
+    Raises:
+        InputError: as `pose`, wherever in the source it is; RankError.
+    """
+    require = options.pop("require_full_rank", True)
+    seen = pose(record, baseline, *args, **options, require_full_rank=False)
+    found = streamed(seen, source, passes)
+    if require:
+        require_rank(found.excitation, found.count * len(found.outputs))
+    return found
+
+
+def streamed(seen: Problem, source: Source, passes: Passes) -> StreamedProblem:
+    """The problem of a source, from that of a witness of it."""
+    empty = replace(seen.record, experiments=(seen.record.experiments[0].rows(0, 0),))
+    form = Form(seen.baseline, seen.features, seen.layout, empty)
+    survey = _survey(form, source, passes)
+    check_moving(survey.channels, empty, seen.layout)
+    deviation = np.sqrt(np.diag(survey.outputs.covariance))
+    check_sizes(deviation, np.sqrt(np.diag(survey.target.covariance)))
+    deviation = np.where(deviation > 0, deviation, 1.0)
+    weight = seen.weight
+    if weight.kind != "covariance":
+        weight = weigh_outputs("none" if weight.kind == "none" else weight.choice, deviation)
+    return _factored(replace(seen, deviation=deviation, weight=weight), source, passes, survey, form)
+
+
+def _factored(seen: Problem, source: Source, passes: Passes, survey: Survey, form: Form) -> StreamedProblem:
+    """Two passes: R of `[Φ Y]`, and again of what it gives."""
+    weight, nt = seen.weight, len(seen.baseline.names)
+    # powers of two of the largest whitened entry at most: exact, and the same wherever the rows are
+    sizes = survey.columns * np.abs(weight.matrix).max()
+    scale = np.where(sizes > 0, 2.0 ** -np.round(np.log2(np.where(sizes > 0, sizes, 1.0))), 1.0)
+    first = _merged(passes(Factoring(form, weight, scale), source.partitions), lambda a, b: _triangle([a, b]))
+    r, coordinates = first[:nt, :nt], first[:nt, nt]
+    excited = excitation(r, seen.baseline.names)
+    ready = excited.full_rank and len(r) == nt
+    if not ready:  # `check` tells; nothing can be solved
+        r, coordinates = np.eye(nt), np.zeros(nt)
+    basis = Basis(form, weight, scale, r, np.eye(nt))
+    second = _merged(passes(Refining(basis, coordinates), source.partitions), _both)
+    turn, rest = (second.r[:nt, :nt], second.r[:nt, nt]) if ready else (np.eye(nt), np.zeros(nt))
+    inverse = np.linalg.inv(turn)
+    basis = replace(basis, turn=inverse)
+    theta = scale * scipy.linalg.solve_triangular(r, coordinates + inverse @ rest) if nt else coordinates
+    phi = _phi(seen)
+    fields = {name: getattr(seen, name) for name in Problem.__dataclass_fields__}
+    fields |= {"projection": Projection(turn @ r, scale, weight.rows(phi), basis.rows(phi)), "excitation": excited}
+    return StreamedProblem(
+        **fields,
+        source=source,
+        passes=passes,
+        survey=survey,
+        basis=basis,
+        solution=(theta, turn @ coordinates + rest),
+        moments=second.errors,
+        freedom=second.freedom,
+    )
+
+
+def _phi(seen: Problem) -> np.ndarray:
+    """Φ of the witness, in the outputs' units."""
+    with np.errstate(all="ignore"):
+        return np.asarray(seen.baseline.phi(seen.rows.x, seen.layout, seen.outputs, np))
