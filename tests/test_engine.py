@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass, field
 from functools import cache
 
@@ -12,6 +13,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
+from orthaug.data.sources import RecordSource
 from orthaug.fitting.criteria import Simulation
 from orthaug.fitting.estimation import estimate, fit
 from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
@@ -19,35 +21,25 @@ from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
 from orthaug.models.learners import MLP, Bound, Function
-from orthaug.models.rows import Chunk, Engine, InMemory, MixedGram, Overlaps
+from orthaug.models.rows import Engine, InMemory, MixedGram, Overlaps
+from orthaug.models.streaming import Stream, read_ahead
 from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.problem import pose
+from orthaug.physics.streamed import streamed
 
 SIZE, ROWS = 53, 160  # 159 rows after the first: three chunks of one size, which share their compiled programs
 
 
 @dataclass(frozen=True)
-class Streaming:
-    """Rows as a list of host chunks, summed one at a time."""
+class Streaming(Stream):
+    """It keeps what it was asked to sum."""
 
-    resident: bool = False
-    passes: list = field(default_factory=list, compare=False)
-
-    def lay(self, z, q, e, gain):
-        pieces = []
-        for begin in range(0, len(z), SIZE):
-            rows = slice(begin, begin + SIZE)
-            pieces.append(Chunk(*(np.moveaxis(np.asarray(part)[rows], 0, -1) for part in (z, q, e, gain))))
-        return pieces
+    limit: int = SIZE
+    asked: list = field(default_factory=list, compare=False)
 
     def sum(self, function, rows, *arguments):
-        assert isinstance(rows, list) and all(isinstance(chunk.z, np.ndarray) for chunk in rows)
-        self.passes.append(function)
-        total = None
-        for chunk in rows:
-            found = jax.jit(function)(chunk, *arguments)
-            total = found if total is None else jax.tree.map(lambda a, b: a + b, total, found)
-        return total
+        self.asked.append(function)
+        return super().sum(function, rows, *arguments)
 
 
 @cache
@@ -249,7 +241,7 @@ def test_a_trial_is_one_pass_over_the_rows():
         for n, engine in zip((8, 15), engines, strict=True)  # both end below physics alone
     ]
     assert [found.status.iterations for found in fits] == [8, 15]
-    assert len(engines[1].passes) - len(engines[0].passes) == 7
+    assert len(engines[1].asked) - len(engines[0].asked) == 7
 
 
 def test_estimate_is_fit_of_the_problem_it_poses():
@@ -282,9 +274,84 @@ def test_a_free_run_needs_rows_in_memory():
         fit(posed(1), learner=MLP(hidden=(3,)), criterion=Simulation(20, 2), engine=Streaming())
 
 
-def test_chunks_of_uneven_size(monkeypatch):
-    monkeypatch.setattr(f"{__name__}.SIZE", 37)
+def test_chunks_of_another_size():
     options = {"learner": MLP(hidden=(3,)), "solver": LevenbergMarquardt(20), "regularization": 0.1}
-    memory, streamed = (fit(posed(1), engine=engine, **options) for engine in (InMemory(), Streaming()))
+    memory, streamed = (fit(posed(1), engine=engine, **options) for engine in (InMemory(), Streaming(37)))
     np.testing.assert_allclose(streamed.theta, memory.theta, rtol=1e-10)
-    assert streamed.status.loss == pytest.approx(memory.status.loss, rel=1e-6)
+    assert streamed.status.loss == pytest.approx(memory.status.loss, rel=1e-9)
+
+
+def source(problem, size):
+    return RecordSource(problem.record, problem.rows.start, size)
+
+
+@pytest.mark.parametrize(("structure", "regularization", "ny"), CASES, ids=named)
+def test_a_problem_of_a_source_is_that_of_its_record(structure, regularization, ny):
+    """Posed by passes over partitions, and trained on what they give."""
+    problem, engine = posed(ny), Streaming()
+    there = streamed(problem, source(problem, 47), engine.passes)
+    assert there.count == problem.count
+    np.testing.assert_allclose(there.least_squares, problem.least_squares, rtol=1e-13)
+    np.testing.assert_allclose(there.freedom_used, problem.freedom_used, rtol=1e-13)
+    assert there.unexplained_moments.square == pytest.approx(problem.unexplained_moments.square, rel=1e-13)
+    solver = LevenbergMarquardt(20, tolerance=1e-13)
+    options = {"learner": MLP(hidden=(3,)), "solver": solver, "structure": structure, "regularization": regularization}
+    memory, streamed_fit = fit(problem, **options), fit(there, engine=engine, **options)
+    assert apart(streamed_fit.theta, memory.theta) <= 1e-9
+    assert streamed_fit.status.loss == pytest.approx(memory.status.loss, rel=1e-9)
+    assert streamed_fit.status.iterations == memory.status.iterations == 20
+    assert streamed_fit.defect == pytest.approx(memory.defect, rel=1e-6, abs=1e-12)
+    assert (streamed_fit.std is None) == (memory.std is None)
+    if memory.std is not None:
+        np.testing.assert_allclose(streamed_fit.robust().std, memory.robust().std, rtol=1e-8)
+
+
+def test_ill_conditioned_physics_keeps_its_digits():
+    """Q is made twice: columns that are almost parallel leave it orthonormal, and θ with the digits of a QR."""
+    rng = np.random.default_rng(1)
+    u = rng.normal(size=(400, 2)) @ [[1.0, 1.0], [0.0, 1e-7]]
+    record = Record.from_arrays(u, u @ [1.0, 2.0] + 1e-3 * rng.normal(size=400))
+    problem = pose(record, Baseline.from_terms([Term("a", "u1[k]"), Term("b", "u2[k]")]))
+    there = streamed(problem, source(problem, 90), Stream().passes)
+    assert there.excitation.condition == pytest.approx(problem.excitation.condition, rel=1e-6)
+    assert problem.excitation.condition > 1e6
+    gram = np.einsum("koi,koj->ij", there.projection.q, there.projection.q)
+    np.testing.assert_allclose(gram, np.eye(2), atol=1e-13)
+    np.testing.assert_allclose(there.least_squares, problem.least_squares, rtol=1e-8)
+
+
+def test_what_is_wrong_with_a_row_is_found_where_it_is():
+    rng = np.random.default_rng(0)
+    u = rng.uniform(0.1, 1, 200)
+    record = Record.from_arrays(u, 2 * u + rng.normal(size=200), source="run.csv")
+    baseline = Baseline.from_terms([Term("a", "u[k]"), Term("b", "log(u[k])")])
+    problem = pose(record, baseline)
+    problem.record.experiments[0].inputs[137] = -1.0  # behind the problem's back
+    with pytest.raises(InputError, match=r"run.csv: row 137: the regressor of b \(log\(u\[k\]\)\) is not finite there"):
+        streamed(problem, source(problem, 50), Stream().passes)
+
+
+def test_a_reader_s_error_reaches_the_caller():
+    def broken():
+        yield 1
+        raise InputError("the file is gone.")
+
+    seen = []
+    with pytest.raises(InputError, match="the file is gone"):
+        seen += list(read_ahead(broken()))
+
+
+def test_reading_ahead_stops_when_nobody_asks():
+    made = []
+
+    def endless():
+        while True:
+            made.append(len(made))
+            yield made[-1]
+
+    for item in read_ahead(endless()):
+        if item == 5:
+            break
+    count = len(made)
+    assert count <= 12
+    assert len(made) == count and not any(t.name == "orthaug-read-ahead" for t in threading.enumerate())

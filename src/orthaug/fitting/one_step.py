@@ -35,7 +35,6 @@ from orthaug.physics.streamed import StreamedProblem
 OUTPUT_UNIT = 10.0
 """The learner's output unit in standard deviations of the baseline's residual: the table is in docs/design.md."""
 _ACTIVE_SETS = 10  # tries to find which bounds are active; each changes at least one entry
-_SMALLEST_RESIDUAL = 1e-10  # of an output's deviation: the physics leaves at least rounding
 
 
 class Share(NamedTuple):
@@ -78,7 +77,7 @@ class OneStepTask:
             z = problem.feature_range if bound else np.zeros((2, 0))
         else:
             z = problem.feature_rows() if bound else np.zeros((problem.count, 0))
-        whitened, spread = _sizes(problem, centred=bound is not None)
+        whitened, spread = problem.unexplained_sizes(centred=bound is not None)
         rms = float(np.sqrt(np.mean(whitened**2)))
         scaling = scaling_of(learner, z) if scaling is None else scaling
         unit = np.asarray(OUTPUT_UNIT * spread if unit is None else unit)
@@ -393,14 +392,3 @@ class OneStepTask:
     def physics_middle(self, noise: Matrix) -> Matrix:
         """ΣqᵀΣ_eq (nθ, nθ) of the rows q of Q, for the noise covariance of whitened outputs."""
         return np.asarray(self.engine.sum(MixedGram(None), self.rows, np.zeros(0), mixing(noise)))
-
-
-def _sizes(problem: Problem, *, centred: bool) -> tuple[Vector, Vector]:
-    """How large what the physics leaves is in each output (ny,), whitened and not: its deviation, or its RMS."""
-    moments, back = problem.unexplained_moments, np.linalg.inv(problem.weight.matrix)
-    found = []
-    for change, least in ((np.eye(len(back)), np.ones(len(back))), (back, problem.deviation)):
-        square = np.diag(change @ moments.covariance @ change.T)
-        square = square if centred else square + (change @ moments.mean) ** 2
-        found.append(np.maximum(np.sqrt(square), _SMALLEST_RESIDUAL * least))
-    return found[0], found[1]

@@ -27,6 +27,8 @@ from orthaug.physics.shared import Shared, shared_directions
 
 _LARGEST = 1e120  # size of outputs and regressors whose squares still add up; 1 / _LARGEST is the smallest
 
+_SMALLEST_RESIDUAL = 1e-10  # of an output's deviation: the physics leaves at least rounding
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
@@ -100,6 +102,16 @@ class Problem:
     def unexplained_moments(self) -> Moments:
         """Of `unexplained`."""
         return Moments.of(self.unexplained)
+
+    def unexplained_sizes(self, *, centred: bool) -> tuple[Vector, Vector]:
+        """How large what the physics leaves is in each output (ny,), whitened and not: its deviation, or its RMS."""
+        moments, back = self.unexplained_moments, np.linalg.inv(self.weight.matrix)
+        found = []
+        for change, least in ((np.eye(len(back)), np.ones(len(back))), (back, self.deviation)):
+            square = np.diag(change @ moments.covariance @ change.T)
+            square = square if centred else square + (change @ moments.mean) ** 2
+            found.append(np.maximum(np.sqrt(square), _SMALLEST_RESIDUAL * least))
+        return found[0], found[1]
 
     @property
     def target_covariance(self) -> Matrix:
