@@ -23,7 +23,7 @@ _OF_THE_SYSTEM = {".DS_Store", "Thumbs.db", "desktop.ini"}  # file managers writ
 
 def write_manifest(folder: Path) -> None:
     """Write `manifest.json` about all files of a folder."""
-    files = {name: _digest(folder / name) for name in sorted(_names(folder))}
+    files = {name: file_digest(folder / name) for name in sorted(_names(folder))}
     content = {"orthaug": __version__, "files": files}
     (folder / MANIFEST).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
@@ -40,7 +40,7 @@ def not_ours(folder: Path, foreign: Foreign) -> str | None:
         if name not in listed:
             return f"{name}, which orthaug did not write"
     for name in names:
-        if (folder / name).is_symlink() or _digest(folder / name) != listed[name]:
+        if (folder / name).is_symlink() or file_digest(folder / name) != listed[name]:
             return f"{name}, which was changed since orthaug wrote it"
     return None
 
@@ -55,7 +55,8 @@ def _names(folder: Path) -> Iterator[str]:
                 yield Path(place, name).relative_to(folder).as_posix()
 
 
-def _digest(path: Path) -> str:
+def file_digest(path: Path) -> str:
+    """The sha256 of a file; empty where there is none."""
     if not path.is_file():
         return ""
     with path.open("rb") as file:

@@ -75,3 +75,9 @@ def spread(
             for future in futures:
                 future.cancel()
             raise
+
+
+def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    """`[function(item) for item in items]`, as many at a time as there are cores."""
+    with ThreadPoolExecutor(min(len(items), os.cpu_count() or 1)) as pool:
+        return list(pool.map(function, items))

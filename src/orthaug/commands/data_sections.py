@@ -36,6 +36,7 @@ class Data(Section):
 
     sampling_time: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
     time: Annotated[str, Field(min_length=1)] | None = None
+    experiment: Annotated[str, Field(min_length=1)] | None = None
     inputs: list[str] = []
     outputs: Annotated[list[str], Field(min_length=1)]
     missing: Literal["error", "skip"] = "error"

@@ -156,6 +156,8 @@ def cross_validated(job: Job, blocks: int, variants: Sequence[Variant]) -> list[
 def score_part(model: Any, part: Part, warnings: list[Any]) -> tuple[PartScores, tuple[Response, Response]]:
     """Scores of a part, and the responses they come from. For a score that does not exist a warning is added."""
     responses = model.predict(part.record), model.simulate(part.record)
+    if part.source is not None:
+        return _scored_along(model, part, warnings), responses
     scores = {}
     for kind, response in zip(("prediction", "simulation"), responses, strict=True):
         runaway = next((t.diverged for t in response.trajectories if t.diverged), None)
@@ -171,6 +173,19 @@ def score_part(model: Any, part: Part, warnings: list[Any]) -> tuple[PartScores,
             told = f"{part.name}: an output is constant over the scored samples; no NRMSE and FIT of its {kind}."
             warnings.append(Warning("constant_output", told))
     return PartScores.model_validate(scores), responses
+
+
+def _scored_along(model: Any, part: Part, warnings: list[Any]) -> PartScores:
+    """Scores of all rows of a part of which only a witness is in memory."""
+    from orthaug.models.long_runs import scores_along
+
+    found = scores_along(model, part.source, part.skip)
+    if found.diverged is not None:
+        file, row, output = found.diverged
+        told = f"{part.name}: the free run diverged in output '{output}' at row {row} of {file}; no simulation scores."
+        warnings.append(Warning("free_run_diverged", told))
+    simulation = ScoreResult() if found.diverged is not None else found.simulation
+    return PartScores.model_validate({"prediction": found.prediction, "simulation": simulation})
 
 
 def write_result(fitted: Fitted, folder: Path, *, force: bool = False) -> None:

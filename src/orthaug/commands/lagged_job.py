@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from orthaug._base.errors import InputError, KeyedError
+from orthaug._base.parallel import in_threads
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.warning import Warning
+from orthaug.commands.engine_section import engine_of
 from orthaug.commands.job import ALONE, AS_DECLARED, Job, Variant
 from orthaug.commands.parts import load_parts
 from orthaug.commands.spec import Spec
@@ -18,6 +21,7 @@ from orthaug.commands.suspects import check_suspects
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Record, check_channels
 from orthaug.data.regressors import Layout, lag_rows, largest_lag
+from orthaug.data.sources import RecordSource
 from orthaug.fitting.cost import check_cost
 from orthaug.fitting.independent_terms import independent_terms
 from orthaug.fitting.kinds import STRUCTURES
@@ -28,10 +32,12 @@ from orthaug.inference.measures import Measure
 from orthaug.inference.weighed import Weighed, weigh_problem
 from orthaug.physics.parameters import PhysicsMap, with_initial
 from orthaug.physics.problem import Problem, check_defined, pose, regressor_of
+from orthaug.physics.streamed import pose_streamed
 
 if TYPE_CHECKING:
     from orthaug.fitting.estimates import Estimate
     from orthaug.models.model import Model
+    from orthaug.models.rows import Engine
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -41,6 +47,7 @@ class LaggedJob(Job):
     problem: Problem
     weighed: Weighed
     physics: PhysicsMap | None
+    engine_kind: str = "memory"
     left_out: tuple[Warning, ...] = ()
     """What is told of terms that the learner was declared with, and that say nothing of their own."""
 
@@ -95,6 +102,11 @@ class LaggedJob(Job):
             return pose(variant.fold, baseline, output_weights=weights)
         return pose(variant.fold, baseline, spec.lag_orders(), spec.learner_inputs(), output_weights=weights)
 
+    @cached_property
+    def engine(self) -> Engine:
+        """Who sums over the rows."""
+        return engine_of(self.spec.engine, self.engine_kind)
+
     def run(self, variant: Variant = AS_DECLARED, progress: Progress = SILENT) -> Estimate:
         from orthaug.fitting.estimation import fit
 
@@ -103,6 +115,8 @@ class LaggedJob(Job):
             structure = structure_of(self.spec, variant.structure_kind)
         options = self.training_options(variant)
         options["ensemble"] = self.spec.training.ensemble and variant.fold is None and options["learner"] is not None
+        if variant.fold is None:  # a fold is small
+            options["engine"] = self.engine
         return fit(self.posed(variant), structure=structure, progress=progress, **options)
 
 
@@ -135,7 +149,12 @@ def open_lagged(path: Path, spec: Spec, *, require_full_rank: bool = True) -> La
         train, tests = train.without_short(first), tuple(part.without_short(first) for part in tests)
         validation = validation.without_short(first) if validation else None
         options = {"output_weights": spec.training.output_weights, "require_full_rank": require_full_rank}
-        problem = pose(train.record, baseline, lags, learner_inputs, **options)
+        kind = spec.engine_kind([path.parent / entry.file for entry in train.files])
+        if kind in ("memory", "devices"):
+            problem = pose(train.record, baseline, lags, learner_inputs, **options)
+        else:
+            source = train.source or RecordSource(train.record, first, spec.engine.partition_rows)
+            problem = pose_streamed(source, train.record, in_threads, baseline, lags, learner_inputs, **options)
         learner, left_out = spec.declared_learner(), ()
         if learner is not None and problem.excitation.full_rank:
             problem, _, left_out = independent_terms(problem, learner)
@@ -145,7 +164,7 @@ def open_lagged(path: Path, spec: Spec, *, require_full_rank: bool = True) -> La
         weighed = weigh_problem(measure_of(spec, problem, path.parent), problem)
         _check_measure(weighed, problem)
         named = {"path": path, "spec": spec, "train": train, "validation": validation, "tests": tests}
-        job = LaggedJob(**named, problem=problem, weighed=weighed, physics=physics, left_out=left_out)
+        job = LaggedJob(**named, problem=problem, weighed=weighed, physics=physics, engine_kind=kind, left_out=left_out)
         check_suspects(spec.suspects, problem)
         for part in job.parts:
             part.check_scorable(problem.rows.start, train.record.sampling_time)
@@ -169,7 +188,8 @@ def _check_cost(spec: Spec, problem: Problem) -> None:
     """`check_cost` before JAX is loaded."""
     sizes = {"rows": problem.count, "features": len(problem.features.entries), "outputs": len(problem.outputs)}
     runs = spec.runs(linear=problem.baseline.linear)
-    check_cost(spec.declared_learner(), **sizes, iterations=spec.declared_solver().iterations, runs=runs)
+    held = len(problem.rows)
+    check_cost(spec.declared_learner(), **sizes, held=held, iterations=spec.declared_solver().iterations, runs=runs)
 
 
 def structure_of(spec: Spec, kind: str | None = None, measure: Measure | None = None) -> Structure:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-import hashlib
+import glob
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from orthaug._base.errors import InputError
+from orthaug._base.manifest import file_digest
 from orthaug._base.warning import Warning
 from orthaug.commands.data_sections import PartSection
 from orthaug.commands.spec import Spec
+from orthaug.data.parquet_source import open_parquet
 from orthaug.data.readers import read_record
 from orthaug.data.record import Record, same_step
+from orthaug.data.sources import Source, witness
+from orthaug.data.tables import KNOWN
 from orthaug.reports.result import FileResult
 
 
@@ -25,6 +30,8 @@ class Part:
     files: tuple[FileResult, ...]
     warnings: tuple[Warning, ...] = ()
     """Rows that were thinned out, or left out around missing samples."""
+    source: Source | None = None
+    """All rows of the part, where its record is a witness of them only."""
 
     def without_short(self, first: int, least: int = 0) -> Part:
         """Without stretches between missing samples that are too short for a row after the first `first`.
@@ -90,39 +97,103 @@ class Part:
 
 def load_parts(path: Path, spec: Spec) -> tuple[Part, Part | None, tuple[Part, ...]]:
     """Training, validation and test parts of the spec at `path`, as their files hold them."""
-    train = _load(path, spec, spec.data.train, "train")
+    files = [path.parent / file for file in expanded(path, spec.data.train.files, "train")]
+    stays = spec.engine_kind(files) in ("stream", "dask")
+    train = _load(path, spec, spec.data.train, "train", stays=stays)
     validation = _load(path, spec, spec.data.validation, "validation") if spec.data.validation else None
-    tests = tuple(_load(path, spec, part, f"tests.{name}") for name, part in spec.data.tests.items())
-    return train, validation, tests
+    tests = [_load(path, spec, part, f"tests.{name}", stays=stays) for name, part in spec.data.tests.items()]
+    return train, validation, tuple(tests)
 
 
-def _load(path: Path, spec: Spec, part: PartSection, name: str) -> Part:
-    """Read a part's files. Messages begin with the file at fault; once it is read, with its name in the spec."""
+def expanded(path: Path, entries: Sequence[str], name: str) -> list[str]:
+    """Files as the spec names them: a pattern such as `runs/*.parquet`, or a folder, stands for all in it, sorted."""
+    found = []
+    for entry in entries:
+        if (path.parent / entry).is_dir():
+            files = [f"{entry.rstrip('/')}/{file.name}" for file in (path.parent / entry).iterdir()]
+            files = [file for file in files if Path(file).suffix.lower() in KNOWN]
+        elif any(mark in entry for mark in "*?["):
+            files = glob.glob(entry, root_dir=path.parent, recursive=True)
+        else:
+            found.append(entry)
+            continue
+        if not files:
+            raise InputError(
+                f"{path}: 'data.{name}.files': no file fits '{entry}'; expected one of {', '.join(KNOWN)}."
+            )
+        found += sorted(file for file in files if Path(file).suffix)
+    return found
+
+
+def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool = False) -> Part:
+    """Read a part's files. Messages begin with the file at fault; once it is read, with its name in the spec.
+
+    Args:
+        stays: leave the rows of Parquet files where they are, and read a witness of them.
+    """
     unknown = [channel for channel in part.columns if channel not in (*spec.data.inputs, *spec.data.outputs)]
     if unknown:
         raise InputError(f"{path}: 'data.{name}.columns': '{unknown[0]}' is neither an input nor an output.")
-    records, files = [], []
-    for file in part.files:
+    files = expanded(path, part.files, name)
+    if stays and all(Path(file).suffix.lower() == ".parquet" for file in files):
+        return _left(path, spec, part, name, files)
+    records, results = [], []
+    for file in files:
         record = read_record(
             path.parent / file,
             inputs=spec.channels(spec.data.inputs),
             outputs=spec.channels(spec.data.outputs),
             sampling_time=spec.data.sampling_time,
             time=spec.data.time,
+            experiment=spec.data.experiment,
             rows=part.rows,  # type: ignore[arg-type]  (lists of two, checked by the spec)
             every=part.every,
             columns=part.columns,
             missing=spec.data.missing,
         )
-        digest = hashlib.sha256((path.parent / file).read_bytes()).hexdigest()
-        files.append(FileResult(file=file, sha256=digest, rows=len(record)))
+        results.append(FileResult(file=file, sha256=file_digest(path.parent / file), rows=len(record)))
         records.append(record)
     record = Record.join(records)
-    sources = (file for read, file in zip(records, part.files, strict=True) for _ in read.experiments)
+    sources = (file for read, file in zip(records, files, strict=True) for _ in read.experiments)
     told = tuple(replace(e, source=file) for e, file in zip(record.experiments, sources, strict=True))
     record = replace(record, experiments=told)
     warnings = (_thinned(name, part.every),) if part.every > 1 else ()
-    return Part(name, record, part.skip, tuple(files), warnings)
+    return Part(name, record, part.skip, tuple(results), warnings)
+
+
+def _left(path: Path, spec: Spec, part: PartSection, name: str, files: Sequence[str]) -> Part:
+    """A part whose rows stay in its Parquet files."""
+    if part.rows is not None or part.every > 1:
+        raise InputError(
+            f"{path}: 'data.{name}': `rows` and `every` need the rows in memory; write the files that way, or set "
+            'engine.kind = "memory".'
+        )
+    source = open_parquet(
+        [path.parent / file for file in files],
+        inputs=spec.channels(spec.data.inputs),
+        outputs=spec.channels(spec.data.outputs),
+        sampling_time=spec.data.sampling_time,
+        time=spec.data.time,
+        experiment=spec.data.experiment,
+        columns=part.columns,
+        missing=spec.data.missing,
+        partition_rows=spec.engine.partition_rows,
+    )
+    rows: dict[str, int] = {}
+    for partition in source.partitions:
+        rows[partition.path] = rows.get(partition.path, 0) + partition.rows
+    results = [
+        FileResult(file=file, sha256=file_digest(path.parent / file), rows=rows[str(path.parent / file)])
+        for file in files
+    ]
+    names = {str(path.parent / file): file for file in files}
+    record = witness(source)
+    record = replace(record, experiments=tuple(replace(e, source=names[e.source]) for e in record.experiments))
+    total, warnings = sum(rows.values()), ()
+    if len(record) < total:
+        told = f"{name}: findings and figures look at {len(record)} of {total} rows, in windows spread over them."
+        warnings = (Warning("witness", told),)
+    return Part(name, record, part.skip, tuple(results), warnings, source)
 
 
 def _thinned(name: str, every: int) -> Warning:

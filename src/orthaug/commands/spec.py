@@ -7,6 +7,7 @@ declare. Every error is one line that names the file, the key, what was found an
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from functools import lru_cache
 from pathlib import Path
@@ -17,6 +18,7 @@ from pydantic import Field, ValidationError, create_model, model_validator
 from orthaug._base.errors import InputError
 from orthaug._base.registry import resolve
 from orthaug.commands.data_sections import Data
+from orthaug.commands.engine_section import EngineSection
 from orthaug.commands.motion_spec import MotionSection
 from orthaug.commands.physical_section import PhysicalSection
 from orthaug.commands.sections import Count, Finite, KindSection, Positive, Section, with_kinds
@@ -211,6 +213,7 @@ class Spec(Section):
     training: TrainingSection = TrainingSection()
     validation: ValidationSection = ValidationSection()
     selection: SelectionSection = SelectionSection()
+    engine: EngineSection = EngineSection()
 
     @model_validator(mode="after")
     def _one_physics(self) -> Spec:
@@ -310,6 +313,20 @@ class Spec(Section):
     def declared_solver(self) -> Solver:
         """The solver."""
         return resolve(self.training.declared(SOLVERS, self.training.solver))
+
+    def engine_kind(self, files: Sequence[Path]) -> str:
+        """Who sums over rows that come from these files.
+
+        Raises:
+            InputError: rows that are not in memory, for training that flies over them.
+        """
+        flies = self.motion is not None or not self.declared_criterion().one_step
+        if flies and self.engine.kind not in ("auto", "memory"):
+            raise InputError(
+                f"`engine.kind`: found {self.engine.kind}; expected memory: a free run, and a motion, need their rows "
+                "in memory."
+            )
+        return "memory" if flies else self.engine.chosen(files)
 
     def regularizations(self, *, linear: bool, validated: bool) -> tuple[str | float, ...]:
         """Those that every start is run with."""

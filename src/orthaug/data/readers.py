@@ -37,6 +37,7 @@ def read_record(
     every: int = 1,
     columns: Mapping[str, str] | None = None,
     missing: str = "error",
+    experiment: str | None = None,
 ) -> Record:
     """Read one file; several row ranges are experiments of their own.
 
@@ -49,6 +50,7 @@ def read_record(
         columns: this file's column for a channel, `{"position": "yVal"}`.
         missing: "error", or "skip" to leave out rows with empty or NaN cells. Each stretch between them is then an
             experiment of its own, so that no lag reaches across a gap.
+        experiment: the column, of numbers, that tells experiments apart; each is in one piece.
 
     Raises:
         InputError: no such file, wrong type, missing columns, cells that are empty or no finite numbers.
@@ -59,13 +61,14 @@ def read_record(
     _check_time(time, sampling_time, {name: column_of[name] for name in (c.name for c in channels[1])})
     check_choice(missing, ("error", "skip"), "`missing`")
     check_count(every, "every")
-    wanted: list[str] = list(dict.fromkeys([*column_of.values(), *([time] if time else [])]))
-    if not wanted:
+    wanted: list[str] = list(dict.fromkeys([*column_of.values(), *(name for name in (time, experiment) if name)]))
+    if not column_of:
         raise InputError("no channels are asked for; name inputs, outputs or both.")
     table = _trim(read_table(path, wanted), uneven=missing == "skip")
     total = len(next(iter(table.columns.values())))
     experiments, steps, recorded = [], [], 0
-    for begin, end in _ranges(rows, total, path):
+    ranges = _ranges(rows, total, path)
+    for begin, end in ranges if experiment is None else _labelled(table, experiment, ranges):
         recorded += len(range(begin, end, every))
         for start, stop in _stretches(table, wanted, begin, end, every, missing):
             pick = slice(start, stop, every)
@@ -190,6 +193,23 @@ def _ranges(rows: RowRange | Sequence[RowRange] | None, total: int, path: Path) 
                 f"{path}: the row ranges {list(before)} and {list(after)} overlap; samples would count twice."
             )
     return [(int(start), int(stop)) for start, stop in pairs]
+
+
+def _labelled(table: Table, column: str, ranges: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """The ranges cut where the label of the experiment changes."""
+    found, seen, labels = [], set(), table.columns[column]
+    for start, stop in ranges:
+        _check_cells(table, [column], start, stop)
+        borders = [start, *(start + 1 + np.flatnonzero(np.diff(labels[start:stop]))).tolist(), stop]
+        for a, b in zip(borders, borders[1:], strict=False):
+            if labels[a] in seen:
+                raise InputError(
+                    f"{table.path}: {table.where(a)}: experiment {labels[a]:g} goes on after another has begun; sort "
+                    f"the rows by '{column}', then by time."
+                )
+            seen.add(labels[a])
+            found.append((a, b))
+    return found
 
 
 def _stretches(

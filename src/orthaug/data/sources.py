@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from orthaug._base.errors import InputError
 from orthaug.data.record import Channel, Experiment, Record
 
 WITNESS_ROWS = 200_000
@@ -48,10 +47,17 @@ class Partition(Protocol):
 class Source(Protocol):
     """Records whose rows are read when they are needed."""
 
-    inputs: tuple[Channel, ...]
-    outputs: tuple[Channel, ...]
-    sampling_time: float
-    time_column: str | None
+    @property
+    def inputs(self) -> tuple[Channel, ...]: ...
+
+    @property
+    def outputs(self) -> tuple[Channel, ...]: ...
+
+    @property
+    def sampling_time(self) -> float: ...
+
+    @property
+    def time_column(self) -> str | None: ...
 
     @property
     def partitions(self) -> Sequence[Partition]:
@@ -100,8 +106,12 @@ class HeldRows:
         return len(self.experiment) - self.start
 
     def pieces(self, lead: int) -> Iterator[Experiment]:
-        first = max(self.start - lead, 0)
-        yield self.experiment.rows(first, None) if first else self.experiment
+        yield _later(self.experiment, max(self.start - lead, 0), None)
+
+
+def _later(experiment: Experiment, start: int, stop: int | None) -> Experiment:
+    """Rows of an experiment that know how far into the recording they begin."""
+    return replace(experiment.rows(start, stop), offset=experiment.offset + start)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,22 +138,25 @@ class RecordSource:
     def time_column(self) -> str | None:
         return self.record.time_column
 
-    @cached_property
+    @property
     def partitions(self) -> tuple[HeldRows, ...]:
+        return self._held
+
+    @cached_property
+    def _held(self) -> tuple[HeldRows, ...]:
         held = []
         for experiment in self.record.experiments:
             for begin in range(0, len(experiment), self.size):
                 first = max(begin - self.lead, 0)
-                held.append(HeldRows(experiment.rows(first, begin + self.size), begin - first))
+                held.append(HeldRows(_later(experiment, first, begin + self.size), begin - first))
         return tuple(held)
 
     def window(self, start: int, stop: int) -> list[Experiment]:
         found, before = [], 0
         for experiment in self.record.experiments:
             a, b = max(start - before, 0), min(stop - before, len(experiment))
-            whole = a == 0 and b == len(experiment)
             if a < b:
-                found.append(experiment if whole else experiment.rows(a, b))
+                found.append(_later(experiment, a, b))
             before += len(experiment)
         return found
 
@@ -157,10 +170,4 @@ def stretches(experiment: Experiment, lead: int) -> Iterator[Experiment]:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int)))
     for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
         if end - begin > lead:
-            yield replace(experiment.rows(begin, end), offset=experiment.offset + begin)
-
-
-def same_channels(source: Source, record: Any) -> None:
-    """Raise InputError unless a record has the source's channels."""
-    if (source.inputs, source.outputs) != (record.inputs, record.outputs):
-        raise InputError(f"the channels of {record!r} are not those of the training data.")
+            yield _later(experiment, begin, end)

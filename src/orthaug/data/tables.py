@@ -283,6 +283,8 @@ _READERS: dict[str, Callable[[Path, Sequence[str]], Table]] = {
     ".xlsx": _read_excel,
     **dict.fromkeys(ENDINGS, _read_variables),
 }
+KNOWN = tuple(_READERS)
+"""Endings of the files that can be read."""
 
 
 def check_present(path: Path, columns: Sequence[str], header: Sequence[str]) -> None:

@@ -16,7 +16,9 @@ _COPIES = 32  # of regressors and outputs, in a fit with its scores and findings
 _FEWEST = 50  # iterations that are counted on where more are allowed: most runs converge
 
 
-def check_cost(learner: Any, *, rows: int, features: int, outputs: int, iterations: int, runs: int) -> None:
+def check_cost(
+    learner: Any, *, rows: int, features: int, outputs: int, iterations: int, runs: int, held: int | None = None
+) -> None:
     """Raise InputError where the normal equations do not fit into memory, or training takes longer than a month.
 
     Args:
@@ -25,15 +27,17 @@ def check_cost(learner: Any, *, rows: int, features: int, outputs: int, iteratio
         features, outputs: of the learner.
         iterations: of a run at most.
         runs: restarts times regularizations.
+        held: rows that are in memory; None for all.
     """
-    check_limit(8.0 * _COPIES * rows * (features + outputs), f"a fit of {rows} rows")
+    held = rows if held is None else held
+    check_limit(8.0 * _COPIES * held * (features + outputs), f"a fit of {held} rows")
     if not hasattr(learner, "weights"):
         return
     weights, cores = min(learner.weights(features, outputs), _MOST), os.cpu_count() or 1
     runs = min(runs, _MOST)
     side_by_side = min(runs, cores)
     what = f"training a learner of {weights} weights" + (f" in {runs} runs" if runs > 1 else "")
-    check_memory(8.0 * (3 * side_by_side * weights**2 + runs * weights + rows * (features + outputs)), what)
+    check_memory(8.0 * (3 * side_by_side * weights**2 + runs * weights + held * (features + outputs)), what)
     products = rows * outputs * weights**2 + weights**3 / 3
     seconds = runs * min(iterations, _FEWEST) * max(products / _RATE, _STEP) / cores
     if seconds > LONGEST_FIT:

@@ -244,7 +244,7 @@ def fit(
 def _check_cost(problem: Problem, learner: Learner | None, solver: Solver, runs: int) -> None:
     """Raise InputError for what would take more memory or time than there is."""
     sizes = {"rows": problem.count, "features": len(problem.features.entries), "outputs": len(problem.outputs)}
-    check_cost(learner, **sizes, iterations=solver.iterations, runs=runs)
+    check_cost(learner, **sizes, held=len(problem.rows), iterations=solver.iterations, runs=runs)
 
 
 def _starts(bound: Bound | None, seeds: range, choices: Sequence[Regularization]) -> list[PlannedRun]:

@@ -93,7 +93,7 @@ class Model(OnRecords):
 
     def learner_at(self, x: Float[np.ndarray, "M nx"]) -> Float[np.ndarray, "M ny"]:
         """f, before any split, at regressors of the form's layout; in the outputs' units."""
-        return self._predict_rows(x).raw
+        return self.parts_at(x).raw
 
     @property
     def theta_aux(self) -> Vector:
@@ -117,7 +117,7 @@ class Model(OnRecords):
             first = self.form.first_row + horizon - 1
             self.check_rows(experiment, first)
             if horizon == 1 or not self.form.states:
-                parts = self._predict_rows(self.form.regressors(experiment, record, first))
+                parts = self.parts_at(self.form.regressors(experiment, record, first))
             else:
                 parts = self._predict_ahead(experiment, record, horizon)
             trajectories.append(trajectory(parts, experiment, experiment.outputs, first))
@@ -140,7 +140,7 @@ class Model(OnRecords):
             self.check_rows(experiment, self.form.first_row)
             measured = experiment.outputs if record.outputs else None
             start = self._start(initial, measured)
-            parts = self._run(start, experiment, record)
+            _, parts = self.fly(start, self.form.inputs(experiment, record))
             outside = self._outside(start, parts, experiment, record)
             trajectories.append(replace(self.bounded(parts, experiment, measured), outside=outside))
         return Response(tuple(trajectories), None, self.outputs, record.sampling_time)
@@ -195,10 +195,11 @@ class Model(OnRecords):
             )
         return rows
 
-    def _run(self, state: Vector, experiment: Experiment, record: Record) -> Parts:
+    def fly(self, state: Vector, inputs: Matrix) -> tuple[Vector, Parts]:
+        """The free run from a state along lagged inputs (T, nu), with the state after the last."""
         if not self.form.states:
-            return self._predict_rows(self.form.regressors(experiment, record))
-        inputs = self.form.inputs(experiment, record)
+            return state, self.parts_at(inputs)
+        before = state.reshape(self.form.memory, len(self.outputs))[::-1]
         size, pieces = min(_BATCH, padded_length(len(inputs))), []
         for begin in range(0, len(inputs), size):
             steps = min(size, len(inputs) - begin)
@@ -206,9 +207,12 @@ class Model(OnRecords):
             padded[:steps] = inputs[begin : begin + steps]
             state, parts = _free_run(self.form, self.numbers, state, padded)
             pieces.append([np.asarray(part)[:steps] for part in parts])
-        return Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True)))
+        found = Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True)))
+        outputs = np.concatenate([before, np.asarray(found.total)])
+        return self.form.start(outputs, [len(outputs)])[0], found
 
-    def _predict_rows(self, x: Matrix) -> Parts:
+    def parts_at(self, x: Matrix) -> Parts:
+        """The prediction at measured regressors (T, nx), in parts."""
         return _in_batches(lambda rows: _predict_rows(self.form, self.numbers, rows), (x,))
 
     def _predict_ahead(self, experiment: Experiment, record: Record, horizon: int) -> Parts:

