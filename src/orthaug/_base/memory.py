@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import os
+import sys
+from contextlib import suppress
 
 from orthaug._base.errors import InputError
+
+_ARENA_MAX = -8  # glibc's name for the number of arenas
 
 
 def available() -> float:
@@ -35,6 +40,18 @@ def check_memory(size: float, what: str) -> None:
     there = available()
     if size > there:
         raise InputError(f"{what} would take {in_words(size)} of memory; {in_words(there)} are available.")
+
+
+def few_arenas() -> None:
+    """Let threads share what they allocate from, where the C library is glibc.
+
+    By default each thread has an arena of its own, which hardly shrinks: with the threads of XLA a streamed fit took a
+    fifth more memory. Threads that run already keep theirs.
+    """
+    if sys.platform != "linux":
+        return
+    with suppress(AttributeError, OSError):  # another C library
+        ctypes.CDLL(None).mallopt(_ARENA_MAX, 2)
 
 
 def in_words(size: float) -> str:

@@ -179,6 +179,7 @@ def _scored_along(model: Any, part: Part, warnings: list[Any]) -> PartScores:
     """Scores of all rows of a part of which only a witness is in memory."""
     from orthaug.models.long_runs import scores_along
 
+    assert part.source is not None
     found = scores_along(model, part.source, part.skip)
     if found.diverged is not None:
         file, row, output = found.diverged

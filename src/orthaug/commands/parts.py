@@ -9,6 +9,7 @@ from pathlib import Path
 
 from orthaug._base.errors import InputError
 from orthaug._base.manifest import file_digest
+from orthaug._base.memory import few_arenas
 from orthaug._base.warning import Warning
 from orthaug.commands.data_sections import PartSection
 from orthaug.commands.spec import Spec
@@ -168,6 +169,7 @@ def _left(path: Path, spec: Spec, part: PartSection, name: str, files: Sequence[
             f"{path}: 'data.{name}': `rows` and `every` need the rows in memory; write the files that way, or set "
             'engine.kind = "memory".'
         )
+    few_arenas()
     source = open_parquet(
         [path.parent / file for file in files],
         inputs=spec.channels(spec.data.inputs),

@@ -22,7 +22,7 @@ from orthaug.data.record import Channel, Experiment, check_step, same_step
 from orthaug.data.sources import stretches
 from orthaug.data.tables import check_present, check_readable, parquet_file
 
-BATCH_ROWS = 65_536
+BATCH_ROWS = 16_384  # what is laid out at once: several such blocks are in memory
 _FEWEST_STEPS = 1000  # that tell the rate of a batch
 PARTITION_ROWS = 1_000_000
 """Rows of a partition at least, where the file has as many: row groups are never cut."""
@@ -365,7 +365,9 @@ def _batches(path: Path, start: int, stop: int, reading: Reading) -> Iterator[tu
         first, last = np.searchsorted(ends, [start, stop - 1], side="right").tolist()
         position = int(ends[first - 1]) if first else 0
         groups = list(range(first, last + 1))
-        for batch in file.iter_batches(batch_size=BATCH_ROWS, row_groups=groups, columns=reading.distinct):
+        for batch in file.iter_batches(
+            batch_size=BATCH_ROWS, row_groups=groups, columns=reading.distinct, use_threads=False
+        ):
             begin, end = max(start - position, 0), min(stop - position, len(batch))
             if begin < end:
                 values = {name: _numbers(batch, name)[begin:end] for name in reading.distinct}

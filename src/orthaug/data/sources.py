@@ -15,9 +15,9 @@ import numpy as np
 
 from orthaug.data.record import Channel, Experiment, Record
 
-WITNESS_ROWS = 200_000
+WITNESS_ROWS = 50_000
 """Rows that are kept in memory to look at: for tests of residuals, findings and figures."""
-_WINDOWS = 20  # that they are taken from, where the source has more
+_WINDOWS = 10  # that they are taken from, where the source has more
 
 
 @runtime_checkable

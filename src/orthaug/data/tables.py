@@ -233,7 +233,7 @@ def parquet_file(path: Path) -> Iterator[Any]:
     except ImportError:
         raise InputError(f"{path}: reading Parquet needs pyarrow; install orthaug[parquet].") from None
     try:
-        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+        with pq.ParquetFile(path, page_checksum_verification=True, pre_buffer=False, buffer_size=1 << 20) as file:
             yield file
     except (pa.ArrowException, OSError) as error:
         raise InputError(f"{path}: not a readable Parquet file ({short(error)}).") from None
