@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from orthaug._base.errors import InputError
 from orthaug._base.memory import available
 from orthaug.commands.sections import Positive, Section
 
@@ -25,6 +24,7 @@ class EngineSection(Section):
     kind: Literal["auto", "memory", "stream", "devices", "dask"] = "auto"
     scheduler: str | None = None
     workers: Positive | None = None
+    devices: Positive | None = None
     partition_rows: Positive = 1_000_000
 
     def chosen(self, files: Sequence[Path]) -> str:
@@ -45,11 +45,15 @@ def engine_of(section: EngineSection, kind: str) -> Engine:
     Raises:
         InputError: one that is not installed, or cannot be reached.
     """
+    if kind == "dask":
+        from orthaug.models.cluster import Dask, connected
+
+        return Dask(connected(section.scheduler, section.workers))
+    if kind == "devices":
+        from orthaug.models.devices import Devices
+
+        return Devices(section.devices)
     from orthaug.models.rows import InMemory
     from orthaug.models.streaming import Stream
 
-    if kind == "stream":
-        return Stream()
-    if kind == "memory":
-        return InMemory()
-    raise InputError(f"the engine '{kind}' is not built.")
+    return Stream() if kind == "stream" else InMemory()

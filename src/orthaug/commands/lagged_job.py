@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from orthaug._base.errors import InputError, KeyedError
-from orthaug._base.parallel import in_threads
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.warning import Warning
 from orthaug.commands.engine_section import engine_of
@@ -47,7 +45,8 @@ class LaggedJob(Job):
     problem: Problem
     weighed: Weighed
     physics: PhysicsMap | None
-    engine_kind: str = "memory"
+    engine: Engine
+    """Who sums over the rows."""
     left_out: tuple[Warning, ...] = ()
     """What is told of terms that the learner was declared with, and that say nothing of their own."""
 
@@ -102,11 +101,6 @@ class LaggedJob(Job):
             return pose(variant.fold, baseline, output_weights=weights)
         return pose(variant.fold, baseline, spec.lag_orders(), spec.learner_inputs(), output_weights=weights)
 
-    @cached_property
-    def engine(self) -> Engine:
-        """Who sums over the rows."""
-        return engine_of(self.spec.engine, self.engine_kind)
-
     def run(self, variant: Variant = AS_DECLARED, progress: Progress = SILENT) -> Estimate:
         from orthaug.fitting.estimation import fit
 
@@ -150,11 +144,12 @@ def open_lagged(path: Path, spec: Spec, *, require_full_rank: bool = True) -> La
         validation = validation.without_short(first) if validation else None
         options = {"output_weights": spec.training.output_weights, "require_full_rank": require_full_rank}
         kind = spec.engine_kind([path.parent / entry.file for entry in train.files])
+        engine = engine_of(spec.engine, kind)
         if kind in ("memory", "devices"):
             problem = pose(train.record, baseline, lags, learner_inputs, **options)
         else:
             source = train.source or RecordSource(train.record, first, spec.engine.partition_rows)
-            problem = pose_streamed(source, train.record, in_threads, baseline, lags, learner_inputs, **options)
+            problem = pose_streamed(source, train.record, engine.passes, baseline, lags, learner_inputs, **options)
         learner, left_out = spec.declared_learner(), ()
         if learner is not None and problem.excitation.full_rank:
             problem, _, left_out = independent_terms(problem, learner)
@@ -163,8 +158,10 @@ def open_lagged(path: Path, spec: Spec, *, require_full_rank: bool = True) -> La
         _check_cost(spec, problem)
         weighed = weigh_problem(measure_of(spec, problem, path.parent), problem)
         _check_measure(weighed, problem)
-        named = {"path": path, "spec": spec, "train": train, "validation": validation, "tests": tests}
-        job = LaggedJob(**named, problem=problem, weighed=weighed, physics=physics, engine_kind=kind, left_out=left_out)
+        named: dict[str, Any] = {"path": path, "spec": spec, "train": train, "validation": validation, "tests": tests}
+        named |= {"problem": problem, "weighed": weighed, "engine": engine}
+        named["engine"] = engine
+        job = LaggedJob(**named, physics=physics, left_out=left_out)
         check_suspects(spec.suspects, problem)
         for part in job.parts:
             part.check_scorable(problem.rows.start, train.record.sampling_time)

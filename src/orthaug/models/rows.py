@@ -7,7 +7,7 @@ know where the rows are.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.parallel import in_threads
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
 from orthaug.models.learners import Bound
@@ -63,6 +64,10 @@ class Engine(Protocol):
         """Rows of a source (`data.sources.Source`), laid out by `laying` of each of its partitions."""
         ...
 
+    def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
+        """`[function(partition) for partition in partitions]`, wherever the partitions are read."""
+        ...
+
     def sum(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> Any:
         """Σ function(chunk, *arguments) over all chunks; `function` is hashable, its result any pytree of arrays."""
         ...
@@ -83,6 +88,9 @@ class InMemory:
     def draw(self, source: Any, laying: Callable[[Any], Any]) -> Chunk:
         pieces = [laid for partition in source.partitions for laid in laying(partition)]
         return self.lay(*(np.concatenate(parts) for parts in zip(*pieces, strict=True)))
+
+    def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
+        return in_threads(function, partitions)
 
     def sum(self, function: Callable[..., Any], rows: Chunk, *arguments: Any) -> Any:
         return _compiled_sum(function, rows, arguments)

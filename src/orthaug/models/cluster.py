@@ -1,0 +1,159 @@
+"""The engine of a Dask cluster: partitions stay on the workers, which sum over them; n_w² numbers come back.
+
+Each partition is laid out once, on the worker that keeps it. A pass is a task for each, and a tree of sums in the order
+of the partitions: whoever computes them, and however often after a worker was lost, the sum has the same bits.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug import __version__
+from orthaug._base.checks import Matrix
+from orthaug._base.errors import InputError
+from orthaug._base.jax import jax
+from orthaug.data.sources import Source
+from orthaug.models.rows import CHUNK_ROWS, Chunk, chunk_shape, in_chunks
+from orthaug.models.streaming import Laid, chunks_of, summed
+
+_SINGLE_THREADED = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
+}
+"""Of a worker of a local cluster: there is one for each core."""
+_BRANCHES = 8  # partial sums that one task adds up
+_PATIENCE = "20 s"  # to reach a scheduler
+
+
+@dataclass(frozen=True, eq=False)
+class Dask:
+    """Rows on the workers of a cluster.
+
+    `client` is a `distributed.Client`; `orthaug[dask]` brings it. `limit` is the rows of a chunk.
+    """
+
+    client: Any
+    limit: int = CHUNK_ROWS
+    resident: bool = False
+
+    def lay(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> list[Any]:
+        """Rows that are in memory here, sent to the workers."""
+        workers = max(len(self.client.scheduler_info()["workers"]), 1)
+        shape = chunk_shape(len(z), min(self.limit, -(-len(z) // workers)))
+        pieces = (in_chunks(z, shape, repeat=True), *(in_chunks(piece, shape) for piece in (q, e, gain)))
+        chunks = [Chunk(*parts) for parts in zip(*pieces, strict=True)]
+        each = -(-len(chunks) // workers)
+        with told():
+            groups = [chunks[i : i + each] for i in range(0, len(chunks), each)]
+            return [self.client.submit(_kept, group, pure=False) for group in groups]
+
+    def draw(self, source: Source, laying: Callable[[Any], Iterator[Laid]]) -> list[Any]:
+        """The partitions of a source, laid out where they will be summed."""
+        with told():
+            task = partial(_laid, laying=laying, size=self.limit)  # not scattered: what is lost can be made again
+            return [self.client.submit(task, partition, pure=False) for partition in source.partitions]
+
+    def sum(self, function: Callable[..., Any], rows: Sequence[Any], *arguments: Any) -> Any:
+        given = jax.tree.map(np.asarray, arguments)
+        with told():
+            parts = [self.client.submit(_partial_sum, function, part, given, pure=False) for part in rows]
+            while len(parts) > 1:
+                groups = [parts[i : i + _BRANCHES] for i in range(0, len(parts), _BRANCHES)]
+                parts = [self.client.submit(_added, group, pure=False) for group in groups]
+            return self.client.gather(parts[0])
+
+    def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
+        """A function of every partition, where the workers are."""
+        with told():
+            return self.client.gather(self.client.map(function, partitions, pure=False))
+
+
+def _laid(partition: Any, laying: Callable[[Any], Iterator[Laid]], size: int) -> list[Chunk]:
+    """The chunks of a partition."""
+    return list(chunks_of(laying(partition), chunk_shape(partition.rows, size)[1]))
+
+
+def _kept(chunks: list[Chunk]) -> list[Chunk]:
+    return chunks
+
+
+def _partial_sum(function: Callable[..., Any], chunks: Sequence[Chunk], arguments: tuple[Any, ...]) -> Any:
+    """One partition's share of a sum, as NumPy arrays."""
+    return jax.tree.map(np.asarray, summed(function, chunks, arguments))
+
+
+def _added(parts: Sequence[Any]) -> Any:
+    total = parts[0]
+    for part in parts[1:]:
+        total = jax.tree.map(np.add, total, part)
+    return total
+
+
+@contextmanager
+def told() -> Iterator[None]:
+    """Errors of the cluster in words."""
+    from distributed import CancelledError, KilledWorker
+    from distributed.comm.core import CommClosedError
+
+    try:
+        yield
+    except KilledWorker as error:
+        raise InputError(
+            f"the cluster gave up on a partition: its workers died {error.allowed_failures + 1} times, most often for "
+            "want of memory. Take smaller partitions (engine.partition_rows) or larger workers."
+        ) from None
+    except (CancelledError, CommClosedError, OSError, TimeoutError) as error:
+        told = f"the cluster is lost ({type(error).__name__}); start it again, and fit with --resume."
+        raise InputError(told) from None
+
+
+def connected(scheduler: str | None, workers: int | None) -> Any:
+    """A client of the scheduler at an address, or of a local cluster with a process for each core.
+
+    Raises:
+        InputError: without Dask, where no scheduler answers, and for workers with other versions.
+    """
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError:
+        raise InputError("the engine dask needs distributed; install orthaug[dask].") from None
+    from dask import config
+
+    if scheduler is None:
+        count = workers or os.cpu_count() or 1
+        with config.set({"distributed.nanny.pre-spawn-environ": _SINGLE_THREADED}):
+            options: dict[str, Any] = {"n_workers": count, "threads_per_worker": 1, "dashboard_address": None}
+            client = Client(LocalCluster(**options))
+    else:
+        try:
+            client = Client(scheduler, timeout=_PATIENCE)
+        except (OSError, TimeoutError, ValueError) as error:
+            raise InputError(f"no Dask scheduler answers at {scheduler} ({type(error).__name__}).") from None
+    check_versions(client)
+    return client
+
+
+def check_versions(client: Any) -> None:
+    """Raise InputError for workers with another orthaug or JAX: sums would not be the same."""
+    own = versions()
+    for worker, found in client.run(versions).items():
+        if found != own:
+            others = ", ".join(f"{name} {found.get(name)}" for name in own)
+            here = ", ".join(f"{name} {version}" for name, version in own.items())
+            raise InputError(f"the worker {worker} has {others}; here is {here}. Install the same versions on both.")
+
+
+def versions() -> dict[str, str]:
+    """Of orthaug and JAX, in this process."""
+    import jax
+
+    return {"orthaug": __version__, "jax": jax.__version__}

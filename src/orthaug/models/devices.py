@@ -1,0 +1,76 @@
+"""The engine of several devices: rows sharded over them, sums by all-reduce.
+
+It serves the GPUs of a machine, forced CPU devices, and the processes of a multi-host run, of which each makes its own
+shards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._base.checks import Matrix
+from orthaug._base.jax import jax
+from orthaug._base.parallel import in_threads
+from orthaug.models.rows import CHUNK_ROWS, Chunk, chunk_shape, in_chunks, row_sum
+
+_ROWS = "rows"
+
+
+@dataclass(frozen=True)
+class Devices:
+    """All rows in the memory of the devices, in equal shares; `count` of them, None for all there are."""
+
+    count: int | None = None
+    limit: int = CHUNK_ROWS
+    resident: bool = False
+
+    def lay(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Chunk:
+        mesh, shares = _mesh(self.count)
+        shape = _even(chunk_shape(-(-len(z) // shares), self.limit), shares)
+        sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec(_ROWS))
+
+        def sharded(values: Any, repeat: bool = False) -> Any:
+            chunks = in_chunks(np.asarray(values), shape, repeat=repeat)
+            return jax.make_array_from_callback(chunks.shape, sharding, lambda index: chunks[index])
+
+        return Chunk(sharded(z, repeat=True), *map(sharded, (q, e, gain)))
+
+    def draw(self, source: Any, laying: Callable[[Any], Any]) -> Chunk:
+        pieces = [laid for partition in source.partitions for laid in laying(partition)]
+        return self.lay(*(np.concatenate(parts) for parts in zip(*pieces, strict=True)))
+
+    def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
+        return in_threads(function, partitions)
+
+    def sum(self, function: Callable[..., Any], rows: Chunk, *arguments: Any) -> Any:
+        return _compiled(function, self.count, len(arguments))(rows, *arguments)
+
+
+def _even(shape: tuple[int, int], shares: int) -> tuple[int, int]:
+    """Chunks for all shares of chunks for one."""
+    return shape[0] * shares, shape[1]
+
+
+@cache
+def _mesh(count: int | None) -> tuple[Any, int]:
+    devices = jax.devices()[:count]
+    return jax.sharding.Mesh(np.array(devices), (_ROWS,)), len(devices)
+
+
+@cache
+def _compiled(function: Callable[..., Any], count: int | None, arguments: int) -> Any:
+    """Each device sums over its own chunks; then all of them have the sum."""
+    spec = jax.sharding.PartitionSpec
+    mesh, _ = _mesh(count)
+
+    def share(chunks: Chunk, *given: Any) -> Any:
+        return jax.lax.psum(row_sum(lambda chunk: function(chunk, *given), chunks), _ROWS)
+
+    specs = (spec(_ROWS), *(spec() for _ in range(arguments)))
+    return jax.jit(jax.shard_map(share, mesh=mesh, in_specs=specs, out_specs=spec(), check_vma=False))

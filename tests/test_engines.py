@@ -1,0 +1,245 @@
+"""Engines that share one result: the same spec in memory, streamed, on two devices and on a Dask cluster."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import orthaug as oa
+from orthaug.commands.fit import fit_job
+from orthaug.commands.opening import open_job
+
+pytest.importorskip("pyarrow")
+ROWS, GROUP = 1200, 170
+
+SPEC = """
+[data]
+sampling_time = 0.1
+inputs = ["u"]
+outputs = ["y"]
+experiment = "run"
+train = {{ files = ["runs/*.parquet"] }}
+tests = {{ held = {{ files = ["held.parquet"], skip = 30 }} }}
+[lags]
+na = 2
+nb = 2
+[learner]
+hidden = [3]
+[training]
+iterations = 20
+regularization = {regularization}
+[structure]
+kind = "{structure}"
+[validation]
+blocks = 0
+[[baseline.terms]]
+parameter = "a"
+initial = 1.4
+regressor = "y[k-1]"
+[[baseline.terms]]
+parameter = "b"
+initial = -0.6
+regressor = "y[k-2]"
+[[baseline.terms]]
+parameter = "c"
+initial = 0.1
+regressor = "u[k-1]"
+[engine]
+kind = "{kind}"
+partition_rows = 400
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two files of two experiments each, and a third that is held out."""
+    place = tmp_path_factory.mktemp("engines")
+    rng = np.random.default_rng(0)
+    u, y = rng.uniform(-1, 1, ROWS), np.zeros(ROWS)
+    for k in range(2, ROWS):
+        y[k] = 1.5 * y[k - 1] - 0.7 * y[k - 2] + 0.1 * u[k - 1] - 0.05 * math.tanh(8 * (y[k - 1] - y[k - 2]))
+        y[k] += 1e-3 * rng.normal()
+    frame = pd.DataFrame({"u": u, "y": y, "run": np.repeat([1, 2, 3, 4], ROWS // 4)})
+    (place / "runs").mkdir()
+    frame[:500].to_parquet(place / "runs" / "a.parquet", row_group_size=GROUP)
+    frame[500:1000].to_parquet(place / "runs" / "b.parquet", row_group_size=GROUP)
+    frame[1000:].to_parquet(place / "held.parquet", row_group_size=GROUP)
+    return place
+
+
+def fitted(folder, kind, structure="orthogonal", regularization='"none"', more=""):
+    path = folder / f"{kind}.toml"
+    text = SPEC.format(kind=kind, structure=structure, regularization=regularization)
+    path.write_text(text + more + "\n", encoding="utf-8")
+    job = open_job(path)
+    found = json.loads(fit_job(job).result.to_json())
+    if kind == "dask":
+        job.engine.client.close()
+    return found
+
+
+def differences(one, other, place=""):
+    """Where two results differ by more than rounding."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        keys = sorted({*one, *other})
+        return [d for key in keys for d in differences(one.get(key), other.get(key), f"{place}/{key}")]
+    if isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
+        return [d for i, pair in enumerate(zip(one, other, strict=True)) for d in differences(*pair, f"{place}[{i}]")]
+    numbers = isinstance(one, float) and isinstance(other, float)
+    same = np.isclose(one, other, rtol=1e-6, atol=1e-11) if numbers else one == other
+    return [] if same else [f"{place}: {one} {other}"]
+
+
+def check_same(found, expected):
+    for parameter, other in zip(found["parameters"], expected["parameters"], strict=True):
+        assert parameter["value"] == pytest.approx(other["value"], rel=1e-9)
+    assert found["status"]["loss"] == pytest.approx(expected["status"]["loss"], rel=1e-8)
+    told = [d for d in differences(found, expected) if not d.startswith(("/spec/engine", "/status/seconds"))]
+    assert told == []
+
+
+CASES = [("orthogonal", '"none"'), ("additive", "0.1"), ("orthogonal-penalty", '"evidence"'),
+         ("baseline-penalty", '"none"')]  # fmt: skip
+
+
+@pytest.mark.parametrize(("structure", "regularization"), CASES)
+def test_streamed_files_give_the_result_of_rows_in_memory(folder, structure, regularization):
+    check_same(*(fitted(folder, kind, structure, regularization) for kind in ("stream", "memory")))
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    pytest.importorskip("distributed")
+    from orthaug.models.cluster import connected
+
+    client = connected(None, 2)
+    yield client
+    client.close()
+    client.cluster.close()
+
+
+def on_cluster(folder, cluster, *choices):
+    return fitted(folder, "dask", *choices, more=f'scheduler = "{cluster.scheduler.address}"')
+
+
+@pytest.mark.parametrize(("structure", "regularization"), CASES[:2])
+def test_a_cluster_gives_the_result_of_rows_in_memory(folder, cluster, structure, regularization):
+    found = on_cluster(folder, cluster, structure, regularization)
+    check_same(found, fitted(folder, "memory", structure, regularization))
+
+
+def test_a_worker_that_is_killed_changes_nothing(folder, cluster):
+    """Its partitions are laid out again elsewhere; sums keep their order, so θ keeps its bits."""
+    before = on_cluster(folder, cluster)
+    workers = cluster.run(os.getpid)
+    timer = threading.Timer(0.4, os.kill, (next(iter(workers.values())), signal.SIGKILL))
+    timer.start()
+    after = on_cluster(folder, cluster)
+    timer.join()
+    assert set(cluster.run(os.getpid).values()) != set(workers.values())
+    assert [p["value"] for p in after["parameters"]] == [p["value"] for p in before["parameters"]]
+    assert after["status"]["loss"] == pytest.approx(before["status"]["loss"], rel=1e-12)
+
+
+DEVICES = """
+import sys
+sys.path.insert(0, {tests!r})
+import pathlib, json, test_engines as t
+folder = pathlib.Path({folder!r})
+for kind, more in (("memory", ""), ("devices", "devices = 2"), ("devices", "")):
+    result = t.fitted(folder, kind, more=more)
+    (folder / f"{{kind}}{{more[-1:]}}.json").write_text(json.dumps(result))
+from orthaug._base.jax import jax
+assert len(jax.devices()) == 4
+"""
+
+
+def test_devices_give_the_result_of_rows_in_memory(folder):
+    """Two of four, and all four."""
+    script = DEVICES.format(tests=os.path.dirname(__file__), folder=str(folder))
+    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=environment, check=False)
+    assert run.returncode == 0, run.stderr
+    expected, *found = (json.loads((folder / f"{kind}.json").read_text()) for kind in ("memory", "devices2", "devices"))
+    for result in found:
+        check_same(result, expected)
+
+
+def bad(folder, match, frame=None, name="c.parquet", **changes):
+    """A spec whose files are wrong is refused in words."""
+    text = SPEC.format(kind="stream", structure="orthogonal", regularization='"none"')
+    for old, new in changes.values():
+        text = text.replace(old, new)
+    extra = folder / "runs" / name
+    if frame is not None:
+        frame.to_parquet(extra)
+    path = folder / "bad.toml"
+    path.write_text(text, encoding="utf-8")
+    try:
+        with pytest.raises(oa.InputError, match=match):
+            open_job(path)
+    finally:
+        extra.unlink(missing_ok=True)
+
+
+def test_what_is_wrong_with_a_partition_is_named(folder):
+    good = pd.read_parquet(folder / "held.parquet")
+    bad(folder, r"c.parquet: no column 'y'", good.drop(columns="y"))
+    bad(folder, r"c.parquet: column 'u' holds float values, in .*a.parquet double", good.astype({"u": "float32"}))
+    bad(folder, r"c.parquet: column 'u' holds .*string.* values; expected numbers", good.astype({"u": str}))
+    bad(folder, r"c.parquet: there are no data rows", good[:0])
+    bad(folder, r"c.parquet: row 57, column 'y': the cell is empty; expected a finite number",
+        good.assign(y=good["y"].where(np.arange(len(good)) != 57)))  # fmt: skip
+    mixed = good.assign(run=np.where(np.arange(len(good)) < 100, 4, np.where(np.arange(len(good)) < 150, 5, 4)))
+    bad(folder, r"c.parquet: row 150: experiment 4 goes on after another has begun; sort the rows by 'run'", mixed)
+    timed = ("sampling_time = 0.1", 'time = "t"')
+    for file in ("runs/a.parquet", "runs/b.parquet"):
+        frame = pd.read_parquet(folder / file)
+        frame.assign(t=0.1 * np.arange(len(frame))).to_parquet(folder / file, row_group_size=GROUP)
+    swapped = good.assign(t=np.where(np.arange(len(good)) == 33, 0.2, 0.1 * np.arange(len(good))))
+    bad(folder, r"c.parquet: row 33, column 't': a step of .* s where 0.1 s is usual", swapped, timed=timed)
+    bad(folder, r"c.parquet: sampled every 0.2 s, .*a.parquet every 0.1 s", good.assign(t=0.2 * np.arange(len(good))),
+        timed=timed)  # fmt: skip
+    bad(folder, "no file fits 'nothing/", pattern=("runs/*", "nothing/*"))
+    bad(folder, "`rows` and `every` need the rows in memory", rows=('*.parquet"]', '*.parquet"], every = 2'))
+    bad(folder, "found stream; expected memory: a free run", focus=("[training]", '[training]\nfocus = "simulation"'))
+
+
+def test_a_file_that_changes_is_noticed(folder):
+    path = folder / "changing.toml"
+    path.write_text(SPEC.format(kind="stream", structure="orthogonal", regularization='"none"'), encoding="utf-8")
+    job = open_job(path)
+    file = folder / "runs" / "b.parquet"
+    content = file.read_bytes()
+    try:
+        file.write_bytes(content)  # the same bytes at another time
+        with pytest.raises(oa.InputError, match=r"b.parquet: the file has changed since it was opened"):
+            job.run()
+    finally:
+        file.write_bytes(content)
+
+
+def test_gaps_end_a_stretch_in_files_too(folder, tmp_path):
+    frame = pd.read_parquet(folder / "runs" / "a.parquet")[["u", "y", "run"]]
+    frame.loc[[3, 77, 78, 171, 340], "y"] = np.nan
+    (tmp_path / "runs").mkdir()
+    frame.to_parquet(tmp_path / "runs" / "a.parquet", row_group_size=GROUP)
+    pd.read_parquet(folder / "held.parquet").to_parquet(tmp_path / "held.parquet")
+    thetas = []
+    for kind in ("memory", "stream"):
+        text = SPEC.format(kind=kind, structure="orthogonal", regularization='"none"')
+        text = text.replace("[data]", '[data]\nmissing = "skip"')
+        (tmp_path / "spec.toml").write_text(text, encoding="utf-8")
+        problem = open_job(tmp_path / "spec.toml").problem
+        thetas.append((problem.count, problem.least_squares))
+    assert thetas[0][0] == thetas[1][0]
+    np.testing.assert_allclose(thetas[1][1], thetas[0][1], rtol=1e-12)
