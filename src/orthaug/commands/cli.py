@@ -75,9 +75,15 @@ def check(
 
 
 @app.command()
-def fit(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force: Force = False) -> None:
+def fit(
+    spec: SpecPath,
+    out: OutFolder = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from where an earlier fit was ended.")] = False,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
     """Fit a spec, print a summary and write the result folder."""
-    from orthaug.commands.fit import fit_job, write_result
+    from orthaug.commands.fit import fit_job, keeping, write_result
     from orthaug.commands.folder import check_folder, check_inputs_kept
     from orthaug.commands.opening import open_job
     from orthaug.reports.text import fit_text
@@ -87,6 +93,7 @@ def fit(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force: F
     job = open_job(spec)
     check_inputs_kept(job, folder)
     _prepare_jax()
+    job = keeping(job, folder, resume=resume)
     with training_bar(job.run_count, job.iterations, job.spec.declared_learner() is not None) as progress:
         fitted = fit_job(job, progress)
     write_result(fitted, folder, force=force)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import Field
 
 from orthaug._base.memory import available
 from orthaug.commands.sections import Positive, Section
@@ -26,6 +28,7 @@ class EngineSection(Section):
     workers: Positive | None = None
     devices: Positive | None = None
     partition_rows: Positive = 1_000_000
+    checkpoint: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 10.0
 
     def chosen(self, files: Sequence[Path]) -> str:
         """The kind; "auto" streams Parquet files that are too large for memory."""

@@ -68,10 +68,25 @@ def fit_job(job: Job, progress: Progress = SILENT) -> Fitted:
     return replace(fitted, result=result)
 
 
+def keeping(job: Job, folder: Path, *, resume: bool = False) -> Job:
+    """The job with the states of its training kept beside the result folder; with `resume` it goes on from them.
+
+    Raises:
+        InputError: states of another fit.
+    """
+    from orthaug.fitting.checkpoints import Checkpoints
+
+    place = folder.with_name(f"{folder.name}.training")
+    kept = Checkpoints(place, job.fingerprint, job.spec.engine.checkpoint)
+    return replace(job, checkpoints=kept.opened(resume=resume))
+
+
 def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitted:
     """Train a variant of a job and score every part; `judge_fit` asks whether the learner helps."""
     fit = job.run(variant, progress)
     warnings: list[Any] = [*job.warnings, *fit.warnings]
+    if job.checkpoints is not None and job.checkpoints.lost:
+        warnings.append(Warning("checkpoint_lost", f"the last state of training was not kept: {job.checkpoints.lost}."))
     scores, responses = {}, {}
     if fit.status.ok:
         for part in job.parts:
@@ -193,6 +208,8 @@ def write_result(fitted: Fitted, folder: Path, *, force: bool = False) -> None:
     """result.json, model/ and figures/, whole or not at all; without a model where training failed."""
     with whole_folder(folder, not_a_result, force=force) as partial:
         fill_result(fitted, partial)
+    if fitted.job.checkpoints is not None:
+        fitted.job.checkpoints.discard()
 
 
 def fill_result(fitted: Fitted, folder: Path) -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from orthaug import __version__
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.warning import Warning
 from orthaug.commands.parts import Part
@@ -16,6 +19,9 @@ from orthaug.commands.spec import Spec
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout
 from orthaug.reports.result import DataResult
+
+if TYPE_CHECKING:
+    from orthaug.fitting.checkpoints import Checkpoints
 
 DEFAULT_BLOCKS = 4
 ALONE = "physics alone"
@@ -60,6 +66,8 @@ class Job(ABC):
     validation: Part | None
     tests: tuple[Part, ...]
     problem: Any
+    checkpoints: Checkpoints | None = None
+    """Where the states of training are kept."""
 
     def __repr__(self) -> str:
         parts = ", ".join(f"{part.name} {len(part.record)} rows" for part in self.parts)
@@ -122,6 +130,12 @@ class Job(ABC):
     def declaration(self) -> dict[str, Any]:
         """The spec as it was given, without defaults."""
         return self.spec.model_dump(mode="json", exclude_unset=True)
+
+    @property
+    def fingerprint(self) -> str:
+        """Of everything that training depends on: the spec, its files, the program."""
+        content = {"spec": self.declaration, "data": self.data.model_dump(), "orthaug": __version__}
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     @property
     def data(self) -> DataResult:

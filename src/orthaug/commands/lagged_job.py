@@ -110,7 +110,7 @@ class LaggedJob(Job):
         options = self.training_options(variant)
         options["ensemble"] = self.spec.training.ensemble and variant.fold is None and options["learner"] is not None
         if variant.fold is None:  # a fold is small
-            options["engine"] = self.engine
+            options |= {"engine": self.engine, "checkpoints": self.checkpoints}
         return fit(self.posed(variant), structure=structure, progress=progress, **options)
 
 

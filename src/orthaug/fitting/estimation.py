@@ -14,6 +14,7 @@ from orthaug._base.jax import jax
 from orthaug._base.progress import SILENT, Tell
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
+from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.conclusion import conclude
 from orthaug.fitting.cost import check_cost
 from orthaug.fitting.criteria import Criterion, Prediction
@@ -186,6 +187,7 @@ def fit(
     validation: Record | None = None,
     progress: Tell = SILENT,
     engine: Engine = InMemory(),  # noqa: B008  (frozen)
+    checkpoints: Checkpoints | None = None,
 ) -> Estimate:
     """`estimate` for a problem that is posed already.
 
@@ -193,6 +195,7 @@ def fit(
         problem: record, physics and learner inputs; the other arguments as of `estimate`.
         learner: None for physics alone, on the rows of the problem.
         engine: where the rows of a one-step criterion are, and who sums over them.
+        checkpoints: where the states of its runs are kept, to go on from; None to keep none.
 
     Raises:
         InputError: as `estimate`.
@@ -223,6 +226,7 @@ def fit(
         status = replace(estimate.status, start_loss=estimate.status.loss)
         estimate = replace(estimate, status=status)
     else:
+        task = replace(task, checkpoints=checkpoints)
         trained = task if solved else FreeRunTask.of(task, criterion, warm)
         chosen = Choice(validation, blocks if initial is None else 0, fallback, ensemble, scored=auto and solved)
         estimate = train(trained, starts, structure, solver, chosen, progress)

@@ -15,6 +15,7 @@ from orthaug._base.progress import RunTell, quiet
 from orthaug._base.warning import Warning
 from orthaug.data.record import Record
 from orthaug.data.regressors import Features
+from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.elimination import Elimination, Fixed, eliminate
 from orthaug.fitting.learned import Learned
@@ -61,6 +62,7 @@ class OneStepTask:
     rows: Any
     criterion: Criterion = Prediction()  # noqa: RUF009  (frozen)
     physics_loss: float | None = None
+    checkpoints: Checkpoints | None = None
 
     @classmethod
     def of(
@@ -205,6 +207,8 @@ class OneStepTask:
             options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "progress": progress}
             if regularization == "ard":
                 options["groups"] = self.bound.groups()
+            if self.checkpoints is not None:
+                options["kept"] = self.checkpoints.of_run(np.asarray(w), regularization, structure.name, *hold)
             return self._least_squares(solver, w, hold, options)
         self._check_joint(solver, ridge, evidence)
         physics = Physics.of(self.problem, elimination, fixed, ridge, self.rms, solved=structure.projects)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -39,6 +39,18 @@ class State(NamedTuple):
     accepted: Int[Array, ""]
     small: Int[Array, ""]
     code: Int[Array, ""]
+
+
+class Keeper(Protocol):
+    """Where the states of a run are kept."""
+
+    def state(self) -> State | None:
+        """The last one; None for none."""
+        ...
+
+    def keep(self, state: State, *, ended: bool = False) -> None:
+        """Take a state, now and then; `ended` for the last one."""
+        ...
 
 
 class Options(NamedTuple):
@@ -81,6 +93,7 @@ def minimise(
     iterations: int,
     tolerance: float,
     progress: RunTell = quiet,
+    kept: Keeper | None = None,
 ) -> TrainingRun:
     """Minimise `‖r(w)‖² + α‖w‖²` from `w`.
 
@@ -92,9 +105,11 @@ def minimise(
         groups: which weights share an α, by number; None where all do.
         samples: residuals less the physics' own parameters, for the noise variance.
         iterations, tolerance: as of `LevenbergMarquardt`.
+        kept: where states are kept; a run goes on from the last one.
     """
     options, start = _prepared(w, ridge, evidence, groups, samples, tolerance)
-    state = _begun(w, linearise(criterion, w, arguments, overlap), start)
+    state = kept.state() if kept else None
+    state = _begun(w, linearise(criterion, w, arguments, overlap), start) if state is None else state
     if int(state.code) == Ending.RUNNING and iterations:  # a run beside this one may be compiling: no time of this one
         jax.block_until_ready(_advance(criterion, state, arguments, options, np.int64(0)))
     began = training_clock()
@@ -105,7 +120,7 @@ def minimise(
         state = jax.block_until_ready(_advance(criterion, state, arguments, options, np.int64(stop)))
         spent = training_clock() - tick
         burst = burst_length(burst, spent)
-        progress(int(state.iteration), float(state.normal.loss))
+        _tell(state, progress, kept)
     return _ended(state, ridge, evidence, groups, training_clock() - began)
 
 
@@ -121,6 +136,7 @@ def driven(
     iterations: int,
     tolerance: float,
     progress: RunTell = quiet,
+    kept: Keeper | None = None,
 ) -> TrainingRun:
     """`minimise` where every pass over the rows is asked for from here: the same steps, whoever makes the sums.
 
@@ -128,14 +144,24 @@ def driven(
         normal_at: the criterion at weights, with the overlap of the pass before.
     """
     options, start = _prepared(w, ridge, evidence, groups, samples, tolerance)
-    first = normal_at(w, overlap)  # compiles: no time of the run
-    began = training_clock()
-    state = _begun(w, normal_at(w, first.overlap), start)  # less what rounding left of J in the physics
+    state = kept.state() if kept else None
+    if state is None:
+        first = normal_at(w, overlap)  # compiles: no time of the run
+        began = training_clock()
+        state = _begun(w, normal_at(w, first.overlap), start)  # less what rounding left of J in the physics
+    else:
+        began = training_clock()
     while int(state.code) == Ending.RUNNING and int(state.iteration) < iterations:
         step = _proposed(state)
         state = _judged(state, step, normal_at(state.w + step, state.normal.overlap), options)
-        progress(int(state.iteration), float(state.normal.loss))
+        _tell(state, progress, kept)
     return _ended(state, ridge, evidence, groups, training_clock() - began)
+
+
+def _tell(state: State, progress: RunTell, kept: Keeper | None) -> None:
+    progress(int(state.iteration), float(state.normal.loss))
+    if kept is not None:
+        kept.keep(state, ended=int(state.code) != Ending.RUNNING)
 
 
 def _prepared(w: Any, ridge: float, evidence: bool, groups: Any, samples: int, tolerance: float) -> tuple[Options, Any]:

@@ -1,0 +1,144 @@
+"""States of training that outlive the process: written every so often, whole or not at all, and taken up again.
+
+A state is that of the Levenberg-Marquardt loop between two steps, so a resumed run takes the same steps, bit by bit.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.errors import InputError
+from orthaug._base.jax import jax
+from orthaug.fitting.normal_equations import Normal
+from orthaug.fitting.solvers.compiled import State
+from orthaug.models.rows import Overlap
+
+EVERY = 10.0  # s
+_ABOUT = "training.json"
+_ONE: Any = 0
+_LEAVES = State(_ONE, Normal(_ONE, _ONE, _ONE, Overlap(_ONE, _ONE)), _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE)
+
+
+@dataclass(eq=False)
+class Checkpoints:
+    """A folder with the state of every run of one fit; `fingerprint` is of all that the fit depends on.
+
+    `every` is the time [s] between two states of a run.
+    """
+
+    folder: Path
+    fingerprint: str
+    every: float = EVERY
+    lost: str = ""
+    """Why the last state could not be written; the one before it stays."""
+
+    def opened(self, *, resume: bool) -> Checkpoints:
+        """Ready to keep states: emptied, or with `resume` with those that are there.
+
+        Raises:
+            InputError: states of another fit, or something else in the folder.
+        """
+        about = self.folder / _ABOUT
+        known = _fingerprint(about)
+        if self.folder.exists() and known is None:
+            raise InputError(f"{self.folder}: holds no state of a training; give another --out.")
+        if resume and known not in (None, self.fingerprint):
+            raise InputError(
+                f"{self.folder}: is the state of another spec, other data or another version; fit without --resume."
+            )
+        if not resume:
+            self.discard()
+        return self
+
+    def of_run(self, *parts: Any) -> Kept:
+        """What is kept of a run that begins with these weights and choices."""
+        digest = hashlib.sha256(self.fingerprint.encode())
+        for part in parts:
+            digest.update(np.ascontiguousarray(part).tobytes() if isinstance(part, np.ndarray) else repr(part).encode())
+        return Kept(self, self.folder / f"{digest.hexdigest()[:24]}.safetensors")
+
+    def discard(self) -> None:
+        """Remove the states: the fit is done."""
+        if _fingerprint(self.folder / _ABOUT) is None:
+            return
+        for path in self.folder.iterdir():
+            if path.suffix in (".safetensors", ".partial") or path.name == _ABOUT:
+                path.unlink(missing_ok=True)
+        with suppress(OSError):  # somebody else's files are in it
+            self.folder.rmdir()
+
+
+@dataclass(eq=False)
+class Kept:
+    """The state of one run in a file."""
+
+    checkpoints: Checkpoints
+    path: Path
+    written: float = field(default_factory=time.monotonic)
+
+    def state(self) -> State | None:
+        """The last one that was written whole; None where there is none."""
+        from safetensors import SafetensorError
+        from safetensors.numpy import load_file
+
+        try:
+            held = load_file(self.path)
+            leaves = [held[str(i)] for i in range(len(held))]
+            return jax.tree.unflatten(jax.tree.structure(_LEAVES), leaves)
+        except (OSError, KeyError, ValueError, SafetensorError):
+            return None
+
+    def keep(self, state: State, *, ended: bool = False) -> None:
+        """Write the state if it is time, or the run has `ended`. A full disk leaves the one before."""
+        now = time.monotonic()
+        if now - self.written < self.checkpoints.every and not (ended and self.path.exists()):
+            return
+        self.written = now
+        try:
+            self._write(state)
+            self.checkpoints.lost = ""
+        except OSError as error:
+            self.checkpoints.lost = f"{self.checkpoints.folder}: {error.strerror or error}"
+
+    def _write(self, state: State) -> None:
+        from safetensors.numpy import save
+
+        folder = self.checkpoints.folder
+        folder.mkdir(parents=True, exist_ok=True)
+        if not (folder / _ABOUT).exists():
+            _replace(folder / _ABOUT, json.dumps({"fingerprint": self.checkpoints.fingerprint}).encode())
+        leaves = jax.tree.leaves(state)
+        _replace(
+            self.path, save({str(i): np.atleast_1d(leaf).reshape(np.shape(leaf)) for i, leaf in enumerate(leaves)})
+        )
+
+
+def _replace(path: Path, content: bytes) -> None:
+    """Write a file whole: it stands on the disk before it takes its place."""
+    partial = path.with_suffix(".partial")
+    try:
+        with partial.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except OSError:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
+        raise
+
+
+def _fingerprint(about: Path) -> str | None:
+    try:
+        return str(json.loads(about.read_text(encoding="utf-8"))["fingerprint"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

@@ -1,0 +1,148 @@
+"""Training that is ended at any step and taken up again ends at the same bits."""
+
+from __future__ import annotations
+
+import errno
+import os
+
+import numpy as np
+import pytest
+from test_engine import Streaming, posed
+from test_engines import SPEC, fitted, folder  # noqa: F401  (a fixture)
+from typer.testing import CliRunner
+
+import orthaug as oa
+from orthaug.commands.cli import app
+from orthaug.commands.fit import fit_job, keeping, write_result
+from orthaug.commands.opening import open_job
+from orthaug.fitting.checkpoints import Checkpoints
+from orthaug.fitting.estimation import fit
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.structures import BaselinePenalty, Orthogonal
+from orthaug.models.learners import MLP
+from orthaug.models.rows import InMemory
+
+
+class Killed(BaseException):
+    """Nothing is tidied up after it, as after a signal that ends the process."""
+
+
+def dies_at(step):
+    def tell(run, iteration, loss):
+        if iteration >= step:
+            raise Killed
+
+    return tell
+
+
+def options(engine, structure=None, regularization="evidence"):
+    return {
+        "learner": MLP(hidden=(3,)),
+        "solver": LevenbergMarquardt(25, tolerance=1e-13),
+        "structure": structure or Orthogonal(),
+        "regularization": regularization,
+        "engine": engine,
+    }
+
+
+@pytest.mark.parametrize("step", [1, 7, 24])
+@pytest.mark.parametrize("engine", [Streaming(), InMemory()], ids=["stream", "memory"])
+def test_a_run_that_was_ended_goes_on_bit_by_bit(tmp_path, engine, step):
+    chosen = options(engine)
+    whole = fit(posed(1), **chosen)
+    kept = Checkpoints(tmp_path / "kept", "this fit", every=0.0)
+    with pytest.raises(Killed):
+        fit(posed(1), **chosen, checkpoints=kept.opened(resume=False), progress=dies_at(step))
+    steps = []
+    again = Checkpoints(tmp_path / "kept", "this fit", every=0.0).opened(resume=True)
+    found = fit(posed(1), **chosen, checkpoints=again, progress=lambda run, i, loss: steps.append(i))
+    np.testing.assert_array_equal(found.model.numbers.weights, whole.model.numbers.weights)
+    np.testing.assert_array_equal(found.theta, whole.theta)
+    assert found.status.loss == whole.status.loss and found.status.iterations == whole.status.iterations
+    assert steps[0] > 1 or step == 1
+
+
+def test_runs_that_were_done_are_not_made_again(tmp_path):
+    """Several starts and a bound that is met: each run, and each set of active bounds, has its own state."""
+    chosen = options(Streaming(), BaselinePenalty(1.0), "auto") | {"restarts": 2}
+    kept = Checkpoints(tmp_path / "kept", "this fit", every=0.0)
+    whole = fit(posed(1, 0.9), **chosen, checkpoints=kept.opened(resume=False))
+    engine = Streaming()
+    again = Checkpoints(tmp_path / "kept", "this fit", every=0.0).opened(resume=True)
+    found = fit(posed(1, 0.9), **(chosen | {"engine": engine}), checkpoints=again)
+    np.testing.assert_array_equal(found.theta, whole.theta)
+    assert len(engine.asked) < len(chosen["engine"].asked) / 4
+
+
+def test_a_full_disk_leaves_the_last_good_state(tmp_path, monkeypatch):
+    kept = Checkpoints(tmp_path / "kept", "this fit", every=0.0).opened(resume=False)
+    whole = fit(posed(1), **options(Streaming()))
+
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def tell(run, iteration, loss):
+        if iteration == 5:
+            monkeypatch.setattr(os, "fsync", full)
+        if iteration == 9:
+            raise Killed
+
+    with pytest.raises(Killed):
+        fit(posed(1), **options(Streaming()), checkpoints=kept, progress=tell)
+    assert "No space left on device" in kept.lost
+    monkeypatch.undo()
+    assert not list((tmp_path / "kept").glob("*.partial"))
+    steps = []
+    again = Checkpoints(tmp_path / "kept", "this fit", every=0.0).opened(resume=True)
+    found = fit(posed(1), **options(Streaming()), checkpoints=again, progress=lambda run, i, loss: steps.append(i))
+    assert steps[0] == 5  # the state after the fourth step stood
+    np.testing.assert_array_equal(found.theta, whole.theta)
+
+
+def test_a_spoilt_state_is_none(tmp_path):
+    kept = Checkpoints(tmp_path / "kept", "this fit", every=0.0).opened(resume=False)
+    with pytest.raises(Killed):
+        fit(posed(1), **options(Streaming()), checkpoints=kept, progress=dies_at(5))
+    (file,) = (tmp_path / "kept").glob("*.safetensors")
+    file.write_bytes(file.read_bytes()[:100])
+    found = fit(posed(1), **options(Streaming()), checkpoints=kept)
+    np.testing.assert_array_equal(found.theta, fit(posed(1), **options(Streaming())).theta)
+
+
+def test_states_of_another_fit_are_refused(tmp_path):
+    place = tmp_path / "kept"
+    with pytest.raises(Killed):
+        kept = Checkpoints(place, "one fit", every=0.0).opened(resume=False)
+        fit(posed(1), **options(Streaming()), checkpoints=kept, progress=dies_at(3))
+    with pytest.raises(oa.InputError, match="is the state of another spec, other data or another version"):
+        Checkpoints(place, "another fit").opened(resume=True)
+    Checkpoints(place, "another fit").opened(resume=False)
+    assert not place.exists()
+    place.mkdir()
+    (place / "thesis.tex").touch()
+    with pytest.raises(oa.InputError, match="holds no state of a training"):
+        Checkpoints(place, "another fit").opened(resume=False)
+
+
+def test_a_command_that_was_killed_goes_on(folder, tmp_path):  # noqa: F811
+    expected = fitted(folder, "stream")
+    path = folder / "kept.toml"
+    text = SPEC.format(kind="stream", structure="orthogonal", regularization='"none"')
+    path.write_text(f"{text}checkpoint = 0.0\n", encoding="utf-8")
+    out = tmp_path / "out"
+    with pytest.raises(Killed):
+        fit_job(keeping(open_job(path), out), dies_at(11))
+    assert (tmp_path / "out.training" / "training.json").exists()
+    run = CliRunner().invoke(app, ["fit", str(path), "--out", str(out), "--resume"])
+    assert run.exit_code == 0, run.output
+    assert not (tmp_path / "out.training").exists() and (out / "result.json").exists()
+    model = oa.load(out / "model")
+    assert [p["value"] for p in expected["parameters"]] == list(model.theta)
+    with pytest.raises(Killed):
+        fit_job(keeping(open_job(path), out), dies_at(11))
+    path.write_text(f"{text}checkpoint = 1.0\n", encoding="utf-8")
+    run = CliRunner().invoke(app, ["fit", str(path), "--out", str(out), "--force", "--resume"])
+    assert run.exit_code == 2 or isinstance(run.exception, oa.InputError)
+    fitted_again = fit_job(keeping(open_job(path), out))
+    write_result(fitted_again, out, force=True)
+    assert not (tmp_path / "out.training").exists()
