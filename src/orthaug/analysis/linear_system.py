@@ -14,7 +14,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Complex, Float
 
-from orthaug._base.checks import Matrix, Vector
+from orthaug._base.checks import Matrix
 
 _ZERO = 1e-12  # of a balanced matrix's norm: a direction that one step forgets
 _DEFECTIVE = 1e-6  # |wᴴv| of eigenvectors below which a pole has no derivative

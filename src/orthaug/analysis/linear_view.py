@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import scipy.special
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     import control
 
 Interval = tuple[float, float] | None
+COHERENT = 0.5  # coherence from which a measured response is looked at
 _REAL = 1e-9  # imaginary part beside the magnitude: a real pole
 
 
@@ -256,7 +257,9 @@ def _matched(z: Any, own: System, step: float) -> list[tuple[complex, Any]]:
     modes = own.modes
     values = np.concatenate([modes.values, np.zeros(modes.at_zero)])
     moved = [*modes.moved, *([None] * modes.at_zero)]
-    apart = np.abs(np.exp(values[None] * step) - z[:, None]) + 1e-9 * np.abs(np.sign(values.imag) - np.sign(z.imag)[:, None])
+    apart = np.abs(np.exp(values[None] * step) - z[:, None]) + 1e-9 * np.abs(
+        np.sign(values.imag) - np.sign(z.imag)[:, None]
+    )
     rows, columns = linear_sum_assignment(apart)
     return [(complex(values[j]), moved[j]) for _, j in sorted(zip(rows, columns, strict=True))]
 
@@ -264,7 +267,7 @@ def _matched(z: Any, own: System, step: float) -> list[tuple[complex, Any]]:
 def _pole(z: complex, relative: Any, s: complex, moved: Any, exact: bool, freedom: float) -> Pole:
     """With `relative` = δz/z and `moved` = δs along the covariance."""
     size = lambda part: float(np.sqrt(np.sum(part**2)))  # noqa: E731
-    magnitude = abs(z)
+    magnitude = float(abs(z))
     radius = None if relative is None else _pair(about(magnitude, size(relative.real), freedom))
     alternates = z.real < 0 and abs(z.imag) <= _REAL * magnitude and not exact
     if alternates or abs(s) <= 1e-12:
@@ -285,6 +288,14 @@ def _pair(ends: Any) -> Interval:
     return (float(ends[0]), float(ends[1])) if np.isfinite(ends).all() else None
 
 
+class Agreement(NamedTuple):
+    """Medians of the differences in magnitude [dB] and phase [deg] over so many `points` of frequencies and pairs."""
+
+    decibel: float
+    degrees: float
+    points: int
+
+
 @dataclass(frozen=True, eq=False)
 class Linearization:
     """What `linearize` returns: a `LinearView` for each point of rest, and what data alone say of the response.
@@ -294,6 +305,8 @@ class Linearization:
 
     views: tuple[LinearView, ...]
     measured: MeasuredResponse | None
+    held: str
+    """What inputs that nobody named are held at: "zero", "mean" (over the record), "found"; "given" if all are named."""
     warnings: tuple[Warning, ...]
 
     def __len__(self) -> int:
@@ -304,6 +317,20 @@ class Linearization:
 
     def __iter__(self) -> Any:
         return iter(self.views)
+
+    def agreement(self, view: LinearView) -> Agreement | None:
+        """How near a view comes to what data alone say, where coherence is at least a half; None without any."""
+        if self.measured is None:
+            return None
+        known = self.measured.coherence[:, :, None] >= COHERENT
+        value = view.system.response(np.exp(2j * np.pi * self.measured.frequency * view.sampling_time)).value
+        with np.errstate(all="ignore"):
+            ratio = value / self.measured.value
+            ratio = ratio[known & np.isfinite(ratio) & (np.abs(ratio) > 0)]
+        if not len(ratio):
+            return None
+        decibel = 20 * np.median(np.abs(np.log10(np.abs(ratio))))
+        return Agreement(float(decibel), float(np.degrees(np.median(np.abs(np.angle(ratio))))), len(ratio))
 
     def to_control(self, time: str = "discrete") -> control.StateSpace:
         """That of its only view.

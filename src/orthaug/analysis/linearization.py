@@ -24,7 +24,7 @@ from orthaug.analysis.linear_steps import (
     unrest_along,
 )
 from orthaug.analysis.linear_system import System
-from orthaug.analysis.linear_view import LinearView, Linearization, bode_of, gain_of, poles_of
+from orthaug.analysis.linear_view import Linearization, LinearView, bode_of, gain_of, poles_of
 from orthaug.analysis.measured_response import measured_response
 from orthaug.analysis.operating_points import OperatingPoint, Search, operating_points, parse_point
 from orthaug.data.record import Record
@@ -61,8 +61,8 @@ def linearize(
 
     Args:
         model: a fitted model; of a fit the record is that of training.
-        at: inputs that are held, and outputs or states that are fixed, `"force=0, position=1"` or a mapping. Inputs that
-            are not named are 0, or their means over the record; where outputs or states are fixed, they are looked for.
+        at: inputs that are held, and outputs or states that are fixed, `"force=0, position=1"` or a mapping. Inputs
+            that nobody names are 0, or their means over the record; with outputs or states fixed, they are looked for.
         record: measured data whose own frequency response is put beside.
         frequencies: of the frequency response [Hz]; by default 200 up to Nyquist's, on a logarithmic grid.
         continuous: how a lagged model is converted to continuous time, zoh or tustin.
@@ -88,7 +88,8 @@ def linearize(
         held = np.concatenate([experiment.inputs for experiment in record.experiments]).mean(axis=0)
     outputs = [channel.name for channel in model.outputs]
     size = sizes_of(model)
-    points, warnings = operating_points(Search.of(step, model.numbers, size, outputs, given, held))
+    search = Search.of(step, model.numbers, size, outputs, given, held)
+    points, warnings = operating_points(search)
     spread, told = _spread(model, fit)
     warnings += told
     if isinstance(model, MotionModel) and model.form.motion.hold == "spline" and model.inputs:
@@ -96,7 +97,16 @@ def linearize(
         warnings.append(Warning("hold_replaced", text))
     views = tuple(_view(model, step, point, size, spread, frequency, continuous) for point in points)
     measured = None if record is None else measured_response(record)
-    return Linearization(views, measured, tuple(warnings))
+    return Linearization(views, measured, _held(search, given, record), tuple(warnings))
+
+
+def _held(search: Search, given: Mapping[str, float], record: Record | None) -> str:
+    """Where inputs come from that nobody named."""
+    if all(name in given for name in search.step.inputs):
+        return "given"
+    if search.free[len(search.step.rest) :].any():
+        return "found"
+    return "zero" if record is None else "mean"
 
 
 def _frequencies(given: Any, step: float) -> Vector | None:
@@ -143,11 +153,13 @@ def _view(
 ) -> LinearView:
     sampled = _system(model, step, point, size, spread, field=False)
     warnings = _kinks(model, step, point, size, sampled)
-    n, freedom = len(step.states), np.inf if spread is None else spread.freedom
+    freedom = np.inf if spread is None else spread.freedom
     names = step.states
     if isinstance(step, MotionStep) and step.ends == 2:
         sampled = _without_next(sampled)
-        text = "inputs run straight between samples: the sampled states are those of the motion less B₁ times the input."
+        text = (
+            "inputs run straight between samples: the sampled states are those of the motion less B₁ times the input."
+        )
         warnings.append(Warning("shifted_states", text))
     own: System | None = None
     if isinstance(step, MotionStep) and step.continuous:
@@ -218,7 +230,9 @@ def _without_next(system: System) -> System:
 
     moved = None
     if system.moved is not None:
-        moved = np.array([rewritten(system.matrix, one) for one in system.moved]).reshape(len(system.moved), *_shape(system))
+        moved = np.array([rewritten(system.matrix, one) for one in system.moved]).reshape(
+            len(system.moved), *_shape(system)
+        )
     return System(rewritten(system.matrix), system.states, system.step, moved)
 
 

@@ -24,6 +24,7 @@ _SOLVED = 1e-9  # of what is zero at rest over the starts
 _SAME = 1e-6  # of sizes: points that are as near are one
 _SINGULAR = 1e-10  # of singular values: directions along which rest does not end
 _FAR = 2.0  # times what the training data reached: an equilibrium beyond is told only where there is no other
+_NOTHING = 1e-13  # of sizes: rounding of 0
 _POLISH = 5  # Newton steps
 
 
@@ -48,8 +49,8 @@ class Slopes:
 class OperatingPoint:
     """A point of rest: `values` of states or outputs and inputs by name, `outputs` likewise.
 
-    `outside` tells whether the learner's features are beyond those of training, or, where that is not known, whether it
-    lies beyond what training reached; `line` whether it is one of a continuum.
+    `outside` tells whether it lies beyond what training reached, or the learner's features do; `line` whether it is one
+    of a continuum.
     """
 
     rest: Vector
@@ -82,7 +83,7 @@ def parse_point(at: str | Mapping[str, float] | None) -> dict[str, float]:
                 raise InputError(f"the operating point gives '{name}' twice.")
             given[name] = _number(value)
         at = given
-    wanted = "names with finite numbers, such as \"force=0, position=1\""
+    wanted = 'names with finite numbers, such as "force=0, position=1"'
     if not isinstance(at, Mapping):
         raise InputError(f"the operating point must be {wanted}; got {shown(at)}.")
     for name, value in at.items():
@@ -214,7 +215,8 @@ def _within_reach(search: Search, found: list[OperatingPoint]) -> tuple[list[Ope
         told = "the equilibrium is one of a continuum (the model integrates, or too little is fixed); one is taken."
         warnings.append(Warning("continuum_of_equilibria", told))
     if any(one.outside for one in near):
-        told = "an operating point lies outside of the training data, where nothing is known of what was learned."
+        where = "the operating point lies" if len(near) == 1 else "operating points so marked lie"
+        told = f"{where} outside of the training data, which do not tell what the model is worth there."
         warnings.append(Warning("outside_training", told))
     return near, warnings
 
@@ -247,7 +249,9 @@ def _solved(search: Search, start: Vector, unit: Vector) -> Vector | None:
                 value, slope = at(begin)
                 begin = begin - np.linalg.pinv(slope, rcond=_SINGULAR) @ value
         value = at(begin)[0]
-    return point.copy() if np.all(np.abs(value) <= _SOLVED) else None
+    if not np.all(np.abs(value) <= _SOLVED):
+        return None
+    return np.where(free & (np.abs(point) < _NOTHING * search.scale), 0.0, point)
 
 
 def _point(search: Search, point: Vector) -> OperatingPoint:
@@ -257,14 +261,13 @@ def _point(search: Search, point: Vector) -> OperatingPoint:
     outputs = dict(zip(step.form.outputs, map(float, y), strict=True))
     values = dict(zip((*step.rest, *step.inputs), map(float, point), strict=True))
     seen = step.seen(search.numbers, rest, inputs)
-    outside = np.abs(rest) > _FAR * search.size if seen is None else np.abs(seen) > 1 + 1e-9
+    beyond = np.abs(seen) > 1 + 1e-9 if seen is not None else np.zeros(0, dtype=bool)
+    outside = bool(np.any(np.abs(rest) > search.size) or beyond.any())
     free = search.free
     scaled = slope[:, free] * search.scale[free]
     sizes = np.linalg.svd(scaled, compute_uv=False) if scaled.size else np.ones(1)
     line = bool(free.any()) and (free.sum() > len(scaled) or sizes[-1] <= _SINGULAR * max(sizes[0], 1e-300))
-    return OperatingPoint(
-        rest, inputs, values, outputs, bool(outside.any()), line, Slopes(slope, free, tuple(search.wanted))
-    )
+    return OperatingPoint(rest, inputs, values, outputs, outside, line, Slopes(slope, free, tuple(search.wanted)))
 
 
 def _nothing(search: Search, starts: Matrix, unit: Vector) -> str:
@@ -278,5 +281,5 @@ def _nothing(search: Search, starts: Matrix, unit: Vector) -> str:
         return f"the model does not rest{at}: {moves} would move. Fix less, so that the rest can be found."
     return (
         f"no equilibrium was found{at}, from {len(starts)} starts: either the model integrates (it rests at other "
-        "inputs only) or these values exclude each other. Give other inputs, or fix an output and leave the inputs open."
+        "inputs only), or these values exclude each other. Give other inputs, or fix an output and leave inputs open."
     )
