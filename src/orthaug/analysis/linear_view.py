@@ -306,7 +306,7 @@ class Linearization:
     views: tuple[LinearView, ...]
     measured: MeasuredResponse | None
     held: str
-    """What inputs that nobody named are held at: "zero", "mean" (over the record), "found"; "given" if all are named."""
+    """What inputs that nobody named are held at: "zero", "mean" (of the record), "found"; "given" if all are named."""
     warnings: tuple[Warning, ...]
 
     def __len__(self) -> int:

@@ -169,6 +169,9 @@ def _view(
     else:
         found = converted(sampled, method, None if isinstance(step, MotionStep) else step.memory, names)
     poles = poles_of(sampled, own, freedom)
+    if any(pole.magnitude_ci95 and pole.magnitude_ci95[0] < 1 < pole.magnitude_ci95[1] for pole in poles):
+        text = "the 95 % interval of a pole contains magnitude 1: whether the point is stable is not sure."
+        warnings.append(Warning("stability_not_sure", text))
     gain, gain_ci95 = gain_of(sampled, freedom)
     bode = None
     if step.inputs:

@@ -17,7 +17,7 @@ from orthaug.data.record import Experiment, Record
 
 _LONGEST, _SHORTEST, _SEGMENTS = 4096, 64, 8
 _OVERLAP = 1.056  # of Hann windows by half: so many fewer of them are independent
-_EXCITED = 1e-8  # of the largest power of an input
+_EXCITED = 1e-6  # of the largest power of an input
 _LINES = 1e-3  # of the largest line of a periodic input
 _REPEATS = 1e-9  # of the input's deviation: periods that differ by less are equal
 _FEWEST_ROWS = 128

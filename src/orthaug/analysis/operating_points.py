@@ -281,5 +281,6 @@ def _nothing(search: Search, starts: Matrix, unit: Vector) -> str:
         return f"the model does not rest{at}: {moves} would move. Fix less, so that the rest can be found."
     return (
         f"no equilibrium was found{at}, from {len(starts)} starts: either the model integrates (it rests at other "
-        "inputs only), or these values exclude each other. Give other inputs, or fix an output and leave inputs open."
+        "inputs only), or these values exclude each other. Give other inputs, data (their mean inputs are held), or fix "
+        "an output and leave inputs open."
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from orthaug.analysis.linear_view import COHERENT, Linearization, phase_of
+from orthaug.analysis.linear_view import COHERENT, Linearization, LinearView
 from orthaug.reports.drawing import (
     BLACK,
     BLUE,
@@ -25,36 +25,27 @@ from orthaug.reports.linear import gain_unit
 
 _COLOURS = (BLUE, ORANGE, GREEN, BLACK)
 _DECADES = 50.0  # an axis that reaches further has labels at powers of ten alone
+_DEEP = 1e-6  # of the largest gain: what is drawn
 _WIDE = 4.2  # inches of a column of several
 
 
 @plain
 def bode_figure(found: Linearization) -> Figure:
-    """Magnitude and phase from every input to every output, with 95 % bands; grey: data alone."""
+    """Magnitude and phase from every input to every output, with 95 % bands; grey: data alone.
+
+    Points of rest outside of the training data are drawn where there is no other.
+    """
     first = found[0]
+    views = {i + 1: view for i, view in enumerate(found) if not view.point.outside} or {1: first}
     ny, nu = first.d.shape
     figure = Figure(figsize=(max(SIZE[0], _WIDE * nu), TOP + BOTTOM + 1.9 * 2 * ny))
     axes = grid(figure, 2 * ny, nu, sharex=True, gap=(0.3, 0.95))
     for i, j in np.ndindex(ny, nu):
         upper, lower = axes[2 * i, j], axes[2 * i + 1, j]
-        _draw_measured(found, upper, lower, i, j)
-        for number, view in enumerate(found):
-            bode, colour = view.bode, _COLOURS[number % len(_COLOURS)]
-            if bode is None:
-                continue
-            name = "model" if len(found) == 1 else f"model at point {number + 1}"
-            upper.plot(bode.frequency, bode.magnitude[:, i, j], color=colour, linewidth=1.2, label=name)
-            lower.plot(bode.frequency, bode.phase[:, i, j], color=colour, linewidth=1.2)
-            for axis, band in ((upper, bode.magnitude_ci95), (lower, bode.phase_ci95)):
-                if band is not None:
-                    low, high = band[:, i, j, 0], band[:, i, j, 1]
-                    axis.fill_between(bode.frequency, low, high, color=colour, alpha=0.3, linewidth=0)
-            _limits(upper, lower, bode, i, j)
-        unit = gain_unit(first, first.outputs[i], first.inputs[j])
         upper.set_xscale("log")
         upper.set_yscale("log")
-        _log_labels(lower.xaxis, sparse=True)
-        _log_labels(upper.yaxis, sparse=np.divide(*upper.get_ylim()[::-1]) > _DECADES)
+        unit = gain_unit(first, first.outputs[i], first.inputs[j])
+        _draw_pair(found, views, upper, lower, (i, j))
         label(upper, y=f"gain [{unit}]" if unit else "gain")
         label(lower, y="phase [°]", x="frequency [Hz]" if i == ny - 1 else None)
         if ny * nu > 1:
@@ -67,43 +58,56 @@ def bode_figure(found: Linearization) -> Figure:
     return figure
 
 
-def _draw_measured(found: Linearization, upper, lower, i: int, j: int) -> None:
-    if found.measured is None:
+def _draw_pair(found: Linearization, views: dict[int, LinearView], upper, lower, pair: tuple[int, int]) -> None:
+    """One input and output; bands that leave all bounds do not hide the curves."""
+    place = (slice(None), *pair)
+    curves, turns = [], []
+    for number, view in views.items():
+        bode, colour = view.bode, _COLOURS[(number - 1) % len(_COLOURS)]
+        assert bode is not None
+        size, phase = bode.magnitude[place], bode.phase[place]
+        turn = 360 * np.round((turns[0][0] - phase[0]) / 360) if turns and np.isfinite(phase[0]) else 0.0
+        phase = phase + turn
+        upper.plot(bode.frequency, size, color=colour, linewidth=1.2, label=f"model{_at(found, number)}")
+        lower.plot(bode.frequency, phase, color=colour, linewidth=1.2)
+        if bode.magnitude_ci95 is not None and bode.phase_ci95 is not None:
+            for axis, band in ((upper, bode.magnitude_ci95[place]), (lower, bode.phase_ci95[place] + turn)):
+                axis.fill_between(bode.frequency, *band.T, color=colour, alpha=0.3, linewidth=0)
+        curves.append(size)
+        turns.append(phase)
+    size, phase = np.concatenate(curves), np.concatenate(turns)
+    size = size[np.isfinite(size) & (size > 0)]
+    if len(size):
+        upper.set_ylim(max(size.min(), size.max() * _DEEP) / 1.3, size.max() * 1.6)
+        _log_labels(upper.yaxis, sparse=np.divide(*upper.get_ylim()[::-1]) > _DECADES)
+    if np.isfinite(phase).any():
+        lower.set_ylim(np.nanmin(phase) - 15, np.nanmax(phase) + 15)
+    _log_labels(lower.xaxis, sparse=True)
+    _draw_measured(found, upper, lower, pair, turns[0])
+
+
+def _at(found: Linearization, number: int) -> str:
+    return "" if len(found) == 1 else f" at point {number}"
+
+
+def _draw_measured(found: Linearization, upper, lower, pair: tuple[int, int], model: np.ndarray) -> None:
+    """What data alone say, on the turn that the model's phase is on."""
+    measured, bode = found.measured, found[0].bode
+    if measured is None or bode is None:
         return
-    measured = found.measured
+    i, j = pair
     shown = (measured.coherence[:, i] >= COHERENT) & np.isfinite(measured.value[:, i, j])
-    value = np.where(shown[:, None, None], measured.value, np.nan)
-    how = "whole periods" if measured.method == "periods" else "Welch"
-    name = f"data ({how}, coherence ≥ {COHERENT})"
-    upper.plot(measured.frequency, np.abs(value[:, i, j]), ".", color=GREY, markersize=3, label=name)
-    phase = phase_of(value)[:, i, j]
-    bode = found[0].bode
-    if bode is not None and np.isfinite(phase).any():  # the turn that the model is on
-        there = np.flatnonzero(np.isfinite(phase))
-        near = np.interp(measured.frequency[there], bode.frequency, bode.phase[:, i, j])
-        phase = phase.copy()
-        phase[there] += 360 * np.round((near - phase[there]) / 360)
-    lower.plot(measured.frequency, phase, ".", color=GREY, markersize=3)
+    frequency, value = measured.frequency[shown], measured.value[shown, i, j]
+    how = "periods" if measured.method == "periods" else "Welch"
+    upper.plot(frequency, np.abs(value), ".", color=GREY, markersize=3, zorder=1, label=f"data ({how})")
+    phase, near = np.degrees(np.angle(value)), np.interp(frequency, bode.frequency, np.nan_to_num(model))
+    lower.plot(frequency, phase + 360 * np.round((near - phase) / 360), ".", color=GREY, markersize=3, zorder=1)
 
 
 def _log_labels(axis, *, sparse: bool) -> None:
     """Numbers as they are written in text; of a short axis those between powers of ten too."""
     axis.set_major_formatter(lambda value, _: f"{value:g}")
     axis.set_minor_formatter(lambda value, _: "" if sparse or f"{value:.0e}"[0] not in "235" else f"{value:g}")
-
-
-def _limits(upper, lower, bode, i: int, j: int) -> None:
-    """Bands that leave all bounds do not hide the curve."""
-    size = bode.magnitude[:, i, j]
-    size = size[np.isfinite(size) & (size > 0)]
-    if len(size):
-        low, high = upper.get_ylim() if upper.get_ylim()[0] > 0 else (size.min(), size.max())
-        upper.set_ylim(max(low, size.min() / 30), min(max(high, size.max() * 1.2), size.max() * 30))
-    phase = bode.phase[:, i, j]
-    phase = phase[np.isfinite(phase)]
-    if len(phase):
-        low, high = lower.get_ylim()
-        lower.set_ylim(max(low, phase.min() - 200), min(high, phase.max() + 200))
 
 
 @plain
