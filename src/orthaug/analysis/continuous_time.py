@@ -50,7 +50,8 @@ def converted(system: System, method: str, memory: Memory | None, names: tuple[s
     if poles.at_zero:
         count = "a pole" if poles.at_zero == 1 else f"{poles.at_zero} poles"
         return f"{count} at 0 (what is forgotten within a sample) has no counterpart under a hold; tustin gives one."
-    negative = poles.values[(poles.values.real < 0) & (np.abs(poles.values.imag) < 1e-9 * np.abs(poles.values))]
+    values: Any = poles.values
+    negative = values[(values.real < 0) & (np.abs(values.imag) < 1e-9 * np.abs(values))]
     if len(negative):
         told = ", ".join(f"{value.real:.4g}" for value in negative)
         return f"a real pole below 0 ({told}) alternates from sample to sample, which no real system does under a hold; tustin gives one."  # noqa: E501
@@ -107,7 +108,7 @@ def _logarithm(system: System, step: float) -> Matrix | None:
     whole = np.eye(n + nu)
     whole[:n] = system.matrix[:n]
     with np.errstate(all="ignore"):
-        found = np.asarray(scipy.linalg.logm(whole)) if n else np.zeros((nu, nu))
+        found: Any = np.asarray(scipy.linalg.logm(whole)) if n else np.zeros((nu, nu))
     if not np.isfinite(found).all() or np.abs(found.imag).max(initial=0.0) > _ROUNDING * np.abs(found).max(initial=0.0):
         return None
     back = scipy.linalg.expm(found.real)

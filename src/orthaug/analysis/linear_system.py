@@ -123,7 +123,9 @@ def modes_of(a: Matrix, moved: Float[np.ndarray, "r n n"] | None) -> Modes:
         return Modes(np.zeros(0, dtype=complex), (), 0)
     balanced, scale = scipy.linalg.matrix_balance(a, permute=False, separate=True)
     core, basis = _core(balanced)
-    values, left = scipy.linalg.eig(core, left=True, right=False) if len(core) else (np.zeros(0, dtype=complex), core)
+    nothing = np.zeros(0, dtype=complex), core
+    found: Any = scipy.linalg.eig(core, left=True, right=False) if len(core) else nothing
+    values, left = found
     order = np.lexsort((-np.sign(values.imag), np.round(np.abs(np.angle(values)), 9), -np.round(np.abs(values), 12)))
     slopes: list[Any] = []
     for i in order:

@@ -33,7 +33,7 @@ from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 
-_POINTS = 200  # of the frequency grid
+_POINTS = 400  # of the frequency grid
 _DECADES = 3  # below Nyquist's frequency at least
 _BELOW = 10  # times below the slowest pole
 _LOWEST = 1e-5  # of Nyquist's frequency
@@ -64,7 +64,7 @@ def linearize(
         at: inputs that are held, and outputs or states that are fixed, `"force=0, position=1"` or a mapping. Inputs
             that nobody names are 0, or their means over the record; with outputs or states fixed, they are looked for.
         record: measured data whose own frequency response is put beside.
-        frequencies: of the frequency response [Hz]; by default 200 up to Nyquist's, on a logarithmic grid.
+        frequencies: of the frequency response [Hz]; by default 400 up to Nyquist's, on a logarithmic grid.
         continuous: how a lagged model is converted to continuous time, zoh or tustin.
 
     Raises:
@@ -133,10 +133,10 @@ def _spread(model: Model | MotionModel, fit: Any) -> tuple[_Spread | None, list[
         if np.isfinite(root).all():
             return _Spread(root, model.statistics.freedom, False), []
     covariance = None if fit is None or isinstance(model, MotionModel) else fit.covariance
-    if covariance is not None and np.isfinite(covariance).all() and nt:
+    if fit is not None and covariance is not None and np.isfinite(covariance).all() and nt:
         values, vectors = np.linalg.eigh(covariance)
         text = "there is no joint covariance with the learner's weights; intervals are those of θ, the learner frozen."
-        spread = _Spread(vectors * np.sqrt(np.maximum(values, 0.0)), fit.freedom, True)
+        spread = _Spread(vectors * np.sqrt(np.maximum(values, 0.0)), float(fit.freedom), True)
         return spread, [Warning("learner_frozen", text)]
     text = "the model carries no covariance (an ensemble, or trained elsewhere); there are no intervals."
     return None, [Warning("no_intervals", text)]

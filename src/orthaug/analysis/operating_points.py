@@ -231,7 +231,7 @@ def _solved(search: Search, start: Vector, unit: Vector) -> Vector | None:
 
     free, point = search.free, start.copy()
 
-    def at(values: Vector) -> tuple[Vector, Matrix]:
+    def at(values: Any) -> tuple[Any, Any]:
         point[free] = start[free] + values * search.scale[free]
         value, slope, _ = search.equations(point)
         return value / unit, slope[:, free] / unit[:, None] * search.scale[free]
@@ -242,7 +242,8 @@ def _solved(search: Search, start: Vector, unit: Vector) -> Vector | None:
             return None
         if free.any():
             try:
-                begin = least_squares(lambda v: at(v)[0], begin, lambda v: at(v)[1], xtol=1e-14, ftol=1e-14).x
+                jacobian: Any = lambda v: at(v)[1]  # noqa: E731
+                begin = least_squares(lambda v: at(v)[0], begin, jacobian, xtol=1e-14, ftol=1e-14).x
             except ValueError:  # a residual that is not finite on the way
                 return None
             for _ in range(_POLISH):
@@ -281,6 +282,6 @@ def _nothing(search: Search, starts: Matrix, unit: Vector) -> str:
         return f"the model does not rest{at}: {moves} would move. Fix less, so that the rest can be found."
     return (
         f"no equilibrium was found{at}, from {len(starts)} starts: either the model integrates (it rests at other "
-        "inputs only), or these values exclude each other. Give other inputs, data (their mean inputs are held), or fix "
-        "an output and leave inputs open."
+        "inputs only), or these values exclude each other. Give other inputs, or data whose mean inputs are held, or "
+        "fix an output and leave inputs open."
     )

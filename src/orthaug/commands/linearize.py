@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 _FIGURES = (".png", ".pdf", ".svg")
 
 
-def not_a_linearization(folder: Path, names: list[str]) -> str | None:
+def not_a_linearization(folder: Path, names: Sequence[str]) -> str | None:
     """A file in a folder without manifest: every result of this command has one."""
     return names[0]
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
+from orthaug._base.checks import Vector
 from orthaug.analysis.linear_view import COHERENT, Linearization, LinearView
 from orthaug.reports.drawing import (
     BLACK,
@@ -25,6 +28,7 @@ from orthaug.reports.linear import gain_unit
 
 _COLOURS = (BLUE, ORANGE, GREEN, BLACK)
 _DECADES = 50.0  # an axis that reaches further has labels at powers of ten alone
+_NEAR = 10.0  # times beyond the curves: gains from data alone that are drawn
 _DEEP = 1e-6  # of the largest gain: what is drawn
 _WIDE = 4.2  # inches of a column of several
 
@@ -39,7 +43,7 @@ def bode_figure(found: Linearization) -> Figure:
     views = {i + 1: view for i, view in enumerate(found) if not view.point.outside} or {1: first}
     ny, nu = first.d.shape
     figure = Figure(figsize=(max(SIZE[0], _WIDE * nu), TOP + BOTTOM + 1.9 * 2 * ny))
-    axes = grid(figure, 2 * ny, nu, sharex=True, gap=(0.3, 0.95))
+    axes: Any = grid(figure, 2 * ny, nu, sharex=True, gap=(0.3, 0.95))
     for i, j in np.ndindex(ny, nu):
         upper, lower = axes[2 * i, j], axes[2 * i + 1, j]
         upper.set_xscale("log")
@@ -50,7 +54,9 @@ def bode_figure(found: Linearization) -> Figure:
         label(lower, y="phase [°]", x="frequency [Hz]" if i == ny - 1 else None)
         if ny * nu > 1:
             upper.set_title(f"{first.outputs[i]} / {first.inputs[j]}", fontsize=9, loc="left", y=1.0)
-        if (i, j) == (0, nu - 1):
+        if (i, j) == (0, 0) and ny * nu > 1:
+            upper.legend(loc="lower left", fontsize=8, frameon=False)
+        elif (i, j) == (0, 0):
             legend(upper)
     pair = f" from {first.inputs[0]} to {first.outputs[0]}" if ny * nu == 1 else ""
     banded = ", 95 % bands" if first.bode is not None and first.bode.magnitude_ci95 is not None else ""
@@ -58,7 +64,9 @@ def bode_figure(found: Linearization) -> Figure:
     return figure
 
 
-def _draw_pair(found: Linearization, views: dict[int, LinearView], upper, lower, pair: tuple[int, int]) -> None:
+def _draw_pair(
+    found: Linearization, views: dict[int, LinearView], upper: Any, lower: Any, pair: tuple[int, int]
+) -> None:
     """One input and output; bands that leave all bounds do not hide the curves."""
     place = (slice(None), *pair)
     curves, turns = [], []
@@ -76,35 +84,42 @@ def _draw_pair(found: Linearization, views: dict[int, LinearView], upper, lower,
         curves.append(size)
         turns.append(phase)
     size, phase = np.concatenate(curves), np.concatenate(turns)
-    size = size[np.isfinite(size) & (size > 0)]
+    size, phase = size[np.isfinite(size) & (size > 0)], phase[np.isfinite(phase)]
+    own, turned = _draw_measured(found, upper, lower, pair, turns[0])
     if len(size):
-        upper.set_ylim(max(size.min(), size.max() * _DEEP) / 1.3, size.max() * 1.6)
-        _log_labels(upper.yaxis, sparse=np.divide(*upper.get_ylim()[::-1]) > _DECADES)
-    if np.isfinite(phase).any():
-        lower.set_ylim(np.nanmin(phase) - 15, np.nanmax(phase) + 15)
+        own = own[(own > size.min() / _NEAR) & (own < size.max() * _NEAR)]
+        low, high = (end([*own, end(size)]) for end in (min, max))
+        low = max(low, high * _DEEP) / 1.3
+        upper.set_ylim(low, high * 1.6)
+        _log_labels(upper.yaxis, sparse=high / low > _DECADES)
+    if len(phase):
+        lower.set_ylim(*(end([*turned, end(phase)]) + more for end, more in ((min, -15), (max, 15))))
     _log_labels(lower.xaxis, sparse=True)
-    _draw_measured(found, upper, lower, pair, turns[0])
 
 
 def _at(found: Linearization, number: int) -> str:
     return "" if len(found) == 1 else f" at point {number}"
 
 
-def _draw_measured(found: Linearization, upper, lower, pair: tuple[int, int], model: np.ndarray) -> None:
-    """What data alone say, on the turn that the model's phase is on."""
+def _draw_measured(
+    found: Linearization, upper: Any, lower: Any, pair: tuple[int, int], model: Vector
+) -> tuple[Vector, Vector]:
+    """What data alone say of gain and phase, on the turn that the model's phase is on."""
     measured, bode = found.measured, found[0].bode
     if measured is None or bode is None:
-        return
+        return np.zeros(0), np.zeros(0)
     i, j = pair
     shown = (measured.coherence[:, i] >= COHERENT) & np.isfinite(measured.value[:, i, j])
     frequency, value = measured.frequency[shown], measured.value[shown, i, j]
     how = "periods" if measured.method == "periods" else "Welch"
     upper.plot(frequency, np.abs(value), ".", color=GREY, markersize=3, zorder=1, label=f"data ({how})")
     phase, near = np.degrees(np.angle(value)), np.interp(frequency, bode.frequency, np.nan_to_num(model))
-    lower.plot(frequency, phase + 360 * np.round((near - phase) / 360), ".", color=GREY, markersize=3, zorder=1)
+    phase = phase + 360 * np.round((near - phase) / 360)
+    lower.plot(frequency, phase, ".", color=GREY, markersize=3, zorder=1)
+    return np.abs(value), phase
 
 
-def _log_labels(axis, *, sparse: bool) -> None:
+def _log_labels(axis: Any, *, sparse: bool) -> None:
     """Numbers as they are written in text; of a short axis those between powers of ten too."""
     axis.set_major_formatter(lambda value, _: f"{value:g}")
     axis.set_minor_formatter(lambda value, _: "" if sparse or f"{value:.0e}"[0] not in "235" else f"{value:g}")
@@ -125,7 +140,7 @@ def poles_figure(found: Linearization) -> Figure:
             if pole.magnitude_ci95 is not None and pole.magnitude > 0:
                 ends = np.array(pole.magnitude_ci95) * pole.z / pole.magnitude
                 axis.plot(ends.real, ends.imag, color=colour, linewidth=2.5, alpha=0.4, solid_capstyle="butt")
-        z = np.array([pole.z for pole in view.poles])
+        z: Any = np.array([pole.z for pole in view.poles], dtype=complex)
         name = "poles" if len(found) == 1 else f"point {number + 1}"
         axis.plot(z.real, z.imag, "x", color=colour, markersize=7, label=name)
         if view.at_zero:
