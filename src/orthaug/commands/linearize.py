@@ -32,6 +32,9 @@ def check_place(out: Path | None, *read: Path, force: bool = False) -> None:
     if out is None:
         return
     suffix = out.suffix.lower()
+    for folder in read:
+        if folder.is_dir() and out.resolve().is_relative_to(folder.resolve()):
+            raise InputError(f"{out}: is inside of {folder}, which is read; give another name.")
     if suffix in _FIGURES:
         check_figure(out, *read, force=force)
     elif suffix == ".json":
