@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import control
 import numpy as np
@@ -396,3 +397,17 @@ def test_bad_arguments_end_in_words_and_nothing_is_written(cubic, tmp_path, monk
         assert (done.code, done.out) == (2, ""), arguments
         assert one_line(done.err, "error: ", *words), (arguments, done.err)
         assert sorted(map(str, tmp_path.rglob("*"))) == before
+
+
+def test_the_example_of_silverbox_gives_its_resonance(data_folder, tmp_path, monkeypatch):
+    monkeypatch.setenv("ORTHAUG_DATA", str(data_folder))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "examples"))
+    import silverbox_bode
+
+    found = silverbox_bode.main(tmp_path)
+    resonance = found[0].poles[0]
+    low, high = resonance.hertz_ci95
+    assert 67.8 < low < resonance.hertz < high < 68.8 and high - low < 0.2
+    assert 0.04 < resonance.damping < 0.055
+    assert found.measured.method == "Welch" and found.agreement(found[0]).decibel < 0.5
+    assert (tmp_path / "silverbox_bode.png").stat().st_size > 10_000
