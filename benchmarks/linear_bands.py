@@ -3,7 +3,7 @@
 ARX: a resonant second-order system with white noise in its equation, fitted one step ahead. Output error: the same
 system with white noise on the sensor, fitted on the free run. Augmented: a cubic spring besides, left to a learner of
 terms that holds it, and to six neurons that do not; the truth is the linear system about rest at the input 0.3.
-Also the bands of poles and static gain. A band covers where gain and phase, each by itself, lie within.
+Also the bands of poles and static gain. Gain and phase count each by itself.
 Run: python benchmarks/linear_bands.py [draws, default 500; of neurons a fifth]
 """
 
