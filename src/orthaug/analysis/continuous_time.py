@@ -48,13 +48,16 @@ def converted(system: System, method: str, memory: Memory | None, names: tuple[s
             return "a pole at -1 has no counterpart under Tustin's rule."
         return Continuous(System(_tustin(system, step), system.states, None), dead * step, method, names)
     if poles.at_zero:
-        count = "a pole" if poles.at_zero == 1 else f"{poles.at_zero} poles"
-        return f"{count} at 0 (what is forgotten within a sample) has no counterpart under a hold; tustin gives one."
+        count = "a pole at 0 has" if poles.at_zero == 1 else f"{poles.at_zero} poles at 0 have"
+        return f"{count} no counterpart under a hold (what is forgotten within a sample); tustin gives one."
     values: Any = poles.values
     negative = values[(values.real < 0) & (np.abs(values.imag) < 1e-9 * np.abs(values))]
     if len(negative):
         told = ", ".join(f"{value.real:.4g}" for value in negative)
-        return f"a real pole below 0 ({told}) alternates from sample to sample, which no real system does under a hold; tustin gives one."  # noqa: E501
+        return (
+            f"a real pole below 0 ({told}) alternates from sample to sample, which no real system does under a hold; "
+            "tustin gives one."
+        )
     found = _logarithm(system, step)
     if found is None:
         return "the matrix logarithm cannot be computed to the digits that are needed; tustin gives a system."

@@ -26,7 +26,7 @@ def linear_text(found: Linearization) -> str:
     for i, view in enumerate(found):
         head = "operating point" if len(found) == 1 else f"operating point {i + 1} of {len(found)}"
         outside = ", outside of the training data" if view.point.outside else ""
-        blocks.append([f"{head}: {_at(view)} ({'stable' if view.stable else 'not stable'}{outside})"])
+        blocks.append([f"{head}: {_at(view)} ({_stability(view)}{outside})"])
         if i == 0 and found.held in _HELD:
             blocks[0].append(_HELD[found.held])
         blocks += [_gains(view), _poles(view), *_matrices(view), _continuous(view), _agreement(found, view)]
@@ -35,6 +35,13 @@ def linear_text(found: Linearization) -> str:
         blocks.append(["Numbers after ± and in brackets are 95 % (delta method, joint covariance of θ and weights)."])
     blocks.append([f"warning: {warning.text}" for warning in found.warnings])
     return "\n\n".join("\n".join(lines) for lines in blocks if lines)
+
+
+def _stability(view: LinearView) -> str:
+    if view.stable:
+        return "stable"
+    largest = max(pole.magnitude for pole in view.poles)
+    return "not stable" if largest > 1 + 1e-9 else "at the limit of stability"
 
 
 def _at(view: LinearView) -> str:
@@ -74,7 +81,13 @@ def _poles(view: LinearView) -> list[str]:
         last = spans[2] if pole.time_constant is None else f"time constant {pole.time_constant:.5g} s"
         rows.append([_z(pole), f"{pole.magnitude:.6g}", spans[0], hertz, spans[1], rate, damping, last])
     if view.at_zero:
-        rows.append([f"0, {view.at_zero} times", "0", "dead time, and what the state remembers of inputs"])
+        rows.append(
+            [
+                "0, once" if view.at_zero == 1 else f"0, {view.at_zero} times",
+                "0",
+                "dead time, and what the state remembers of inputs",
+            ]
+        )
     width = max(map(len, rows))
     return _table([row + [""] * (width - len(row)) for row in rows]) if len(rows) > 1 else ["no poles"]
 
@@ -108,7 +121,9 @@ def _continuous(view: LinearView) -> list[str]:
     found = view.continuous
     if not isinstance(found, Continuous):
         return [f"no system in continuous time: {found}"]
-    how = {"equations": "from the equations", "zoh": "for inputs held between samples", "tustin": "by Tustin's rule"}
+    how = {"equations": "from the equations", "zoh": "by the matrix logarithm", "tustin": "by Tustin's rule"}
+    if view.inputs:
+        how["zoh"] = "for inputs held between samples"
     n, (ny, nu) = found.system.states, found.system.d.shape
     lines = [f"in continuous time, {how[found.method]}:"]
     if n > _MOST or nu > _MOST or ny > _MOST:
