@@ -3,8 +3,9 @@
     python examples/silverbox_bode.py
 
 Linear physics with a learned cubic spring, trained on the free run over 2000 rows; the data alone are all rows of the
-training part, whose larger swings stiffen the spring: their resonance lies higher than that at rest. The data are not part of this project: see examples/README.md. They are
-read from the folder ORTHAUG_DATA, or from where examples/silverbox.toml reads them.
+training part, whose larger swings stiffen the spring: their resonance lies higher than that at rest. The data are not
+part of this project: see examples/README.md. They are read from the folder ORTHAUG_DATA, or from where
+examples/silverbox.toml reads them.
 """
 
 from __future__ import annotations

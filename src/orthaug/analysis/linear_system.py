@@ -14,7 +14,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Complex, Float
 
-from orthaug._base.checks import Matrix
+from orthaug._base.checks import Matrix, Vector
 
 _ZERO = 1e-12  # of a balanced matrix's norm: a direction that one step forgets
 _DEFECTIVE = 1e-6  # |wᴴv| of eigenvectors below which a pole has no derivative
@@ -86,6 +86,11 @@ class System:
         return bool(np.any(np.abs(self.modes.values - rest) < _UNIT * size)) or (
             self.step is None and self.modes.at_zero > 0
         )
+
+    def at(self, frequency: Vector) -> Response:
+        """The response to sines at frequencies [Hz]."""
+        turn = 2j * np.pi * frequency
+        return self.response(turn if self.step is None else np.exp(turn * self.step))
 
     def gain(self) -> Response | None:
         """The static gain (1, ny, nu); None for a system that integrates."""

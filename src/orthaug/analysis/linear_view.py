@@ -126,6 +126,13 @@ class LinearView:
     units: dict[str, str]
     freedom: float
     warnings: tuple[Warning, ...]
+    smooth: bool = False
+    """Whether inputs run smoothly between samples (a spline), so that `bode` is the response of the equations."""
+
+    @property
+    def responding(self) -> System:
+        """The system whose response `bode` is: the sampled one, or under smooth inputs that in continuous time."""
+        return self.continuous.system if self.smooth and isinstance(self.continuous, Continuous) else self.system
 
     @property
     def a(self) -> Matrix:
@@ -214,8 +221,7 @@ def about(value: Any, relative: Any, freedom: float) -> Any:
 
 def bode_of(system: System, frequency: Vector, freedom: float) -> Bode:
     """The response on a grid, with bands of `ln G`: `δ ln|G| = Re(δG/G)`, `δ arg G = Im(δG/G)`."""
-    assert system.step is not None
-    found = system.response(np.exp(2j * np.pi * frequency * system.step))
+    found = system.at(frequency)
     if found.moved is None:
         return Bode(frequency, found.value, None, None)
     with np.errstate(all="ignore"):
@@ -323,7 +329,7 @@ class Linearization:
         if self.measured is None:
             return None
         known = self.measured.coherence[:, :, None] >= COHERENT
-        value = view.system.response(np.exp(2j * np.pi * self.measured.frequency * view.sampling_time)).value
+        value = view.responding.at(self.measured.frequency).value
         with np.errstate(all="ignore"):
             ratio = value / self.measured.value
             ratio = ratio[known & np.isfinite(ratio) & (np.abs(ratio) > 0)]

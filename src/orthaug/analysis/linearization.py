@@ -92,8 +92,11 @@ def linearize(
     points, warnings = operating_points(search)
     spread, told = _spread(model, fit)
     warnings += told
-    if isinstance(model, MotionModel) and model.form.motion.hold == "spline" and model.inputs:
-        text = "a spline through the record has no step; the sampled system is that of straight lines between samples."
+    if _smooth(model):
+        text = (
+            "a spline through the record has no step: the sampled system is that of straight lines between samples, "
+            "the frequency response that of the equations."
+        )
         warnings.append(Warning("hold_replaced", text))
     views = tuple(_view(model, step, point, size, spread, frequency, continuous) for point in points)
     measured = None if record is None else measured_response(record)
@@ -173,10 +176,10 @@ def _view(
         text = "the 95 % interval of a pole contains magnitude 1: whether the point is stable is not sure."
         warnings.append(Warning("stability_not_sure", text))
     gain, gain_ci95 = gain_of(sampled, freedom)
-    bode = None
+    bode, smooth = None, _smooth(model)
     if step.inputs:
         grid = _grid(poles, model.sampling_time) if frequency is None else frequency
-        bode = bode_of(sampled, grid, freedom)
+        bode = bode_of(own if smooth and own is not None else sampled, grid, freedom)
         warnings += _rough(bode)
     channels = (*model.outputs, *model.inputs)
     units = {channel.name: channel.unit for channel in channels}
@@ -184,7 +187,7 @@ def _view(
         units |= {state.name: state.unit for state in model.form.motion.states}
     return LinearView(
         point, sampled, found, poles, sampled.modes.at_zero, gain, gain_ci95, bode, names, step.inputs,
-        tuple(channel.name for channel in model.outputs), units, freedom, tuple(warnings),
+        tuple(channel.name for channel in model.outputs), units, freedom, tuple(warnings), smooth,
     )  # fmt: skip
 
 
@@ -209,6 +212,13 @@ def _system(
         )
         moved = np.where(np.isfinite(moved), moved, 0.0)
     return System(matrix, len(step.states), None if field and _in_time(step) else model.sampling_time, moved)
+
+
+def _smooth(model: Model | MotionModel) -> bool:
+    """Whether inputs run on a spline between samples."""
+    if not isinstance(model, MotionModel) or not model.inputs:
+        return False
+    return model.form.motion.hold == "spline" and model.form.motion.integrator != "discrete"
 
 
 def _in_time(step: Step) -> bool:
