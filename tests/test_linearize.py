@@ -12,6 +12,7 @@ import pytest
 import scipy.linalg
 from scipy.signal import lfilter
 from test_cli import one_line, run
+from test_surface import WRONG, tried
 
 import orthaug as oa
 from orthaug._base.errors import InputError
@@ -413,3 +414,14 @@ def test_the_example_of_silverbox_gives_its_resonance(data_folder, tmp_path, mon
     assert 0.04 < resonance.damping < 0.055
     assert found.measured.method == "Welch" and found.agreement(found[0]).decibel < 0.5
     assert (tmp_path / "silverbox_bode.png").stat().st_size > 10_000
+
+
+def test_whatever_is_given_ends_in_words(cubic):
+    model = cubic.model
+    for name, least in (("at", 20), ("record", 20), ("frequencies", 14), ("continuous", 20)):
+        assert tried(lambda value, name=name: oa.linearize(model, **{"at": {"y": 0.5}, name: value})) >= least, name
+    assert tried(oa.linearize) == len(WRONG)
+    view = oa.linearize(model, "y = 0.5", frequencies=[1.0])
+    assert tried(view.to_control) == len(WRONG)
+    with pytest.raises(InputError, match="`kind` must be one of bode, poles; got 'residual'"):
+        oa.plot(view, "residual")

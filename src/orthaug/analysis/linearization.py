@@ -117,7 +117,7 @@ def _frequencies(given: Any, step: float) -> Vector | None:
         return None
     try:
         found = np.array(given, dtype=float).reshape(-1)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         found = np.zeros(0)
     nyquist = 0.5 / step
     if not len(found) or not np.isfinite(found).all() or np.any(found <= 0) or np.any(found > nyquist * (1 + 1e-9)):
