@@ -1,12 +1,15 @@
 from ._base import InputError as InputError
 from ._base import RankError as RankError
 from ._base import TrainingError as TrainingError
+from .analysis import Linearization as Linearization
+from .analysis import LinearView as LinearView
 from .analysis import MotionSuspect as MotionSuspect
 from .analysis import Suspect as Suspect
 from .analysis import bias_budget as bias_budget
 from .analysis import design_input as design_input
 from .analysis import design_motion_input as design_motion_input
 from .analysis import diagnose as diagnose
+from .analysis import linearize as linearize
 from .analysis import stability as stability
 from .analysis import substep_bias as substep_bias
 from .analysis import suspected_bias as suspected_bias

@@ -2,6 +2,9 @@ from . import signals as signals
 from .budget import bias_budget as bias_budget
 from .design import design_input as design_input
 from .free_run_stability import stability as stability
+from .linear_view import Linearization as Linearization
+from .linear_view import LinearView as LinearView
+from .linearization import linearize as linearize
 from .motion_design import design_motion_input as design_motion_input
 from .motion_ground import suspected_bias as suspected_bias
 from .motion_substeps import substep_bias as substep_bias

@@ -244,6 +244,40 @@ def export(
 
 
 @app.command()
+def linearize(
+    model: ModelPath,
+    at: Annotated[
+        str | None, typer.Option("--at", metavar="'NAME=VALUE, …'", help="Held inputs; outputs or states to fix.")
+    ] = None,
+    data: Annotated[
+        Path | None, typer.Option("--data", metavar="DATA|SPEC", help="Measured data to compare with.")
+    ] = None,
+    continuous: Annotated[
+        str, typer.Option("--continuous", metavar="zoh|tustin", help="How to convert to continuous time.")
+    ] = "zoh",
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR|FILE", help="Folder; or a .json, .png, .pdf or .svg.")
+    ] = None,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
+    """Operating points of a saved model, and its poles, gains and frequency response there with intervals."""
+    from orthaug.commands import linearize as linearizing
+
+    linearizing.check_place(out, model, *([data] if data else []), force=force)
+    opened, record = linearizing.open_linear(model, data)
+    _prepare_jax()
+    from orthaug.analysis.linearization import linearize as linearized
+
+    found = linearized(opened, at, record, continuous=continuous)
+    if out is not None:
+        linearizing.write(found, out, force=force)
+    streams.echo(linearizing.told(found, as_json=as_json))
+    if out is not None and not as_json:
+        streams.echo(f"\nwritten to {out}")
+
+
+@app.command()
 def design(
     spec: SpecPath,
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="CSV file for the input.")],
@@ -291,7 +325,8 @@ def select(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force
 @app.command()
 def schema(
     command: Annotated[
-        str, typer.Argument(metavar="[COMMAND]", help="fit, check, compare, split, design, select or explain.")
+        str,
+        typer.Argument(metavar="[COMMAND]", help="fit, check, compare, split, design, select, explain or linearize."),
     ] = "fit",
 ) -> None:
     """The JSON schema of what a command writes."""

@@ -1,4 +1,4 @@
-"""Figures from Python: of responses, of suspects and of comparisons, as the result folders have them."""
+"""Figures from Python: of responses, suspects, comparisons and linear views, as the result folders have them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from orthaug._base.checks import check_choice, check_type
 from orthaug._base.errors import InputError
+from orthaug.analysis.linear_view import Linearization
 from orthaug.models.response import Response
 from orthaug.reports.result import CheckResult, CompareResult, FitResult
 
@@ -15,11 +16,12 @@ if TYPE_CHECKING:
     from orthaug.reports.drawing import Figure
 
 _OF_RESPONSES = ("output", "residual", "components")
+_OF_VIEWS = ("bode", "poles")
 
 
 def plot(
-    what: Response | FitResult | CheckResult | CompareResult,
-    kind: str = "output",
+    what: Response | Linearization | FitResult | CheckResult | CompareResult,
+    kind: str | None = None,
     *,
     title: str | None = None,
     path: str | os.PathLike | None = None,
@@ -27,9 +29,11 @@ def plot(
     """A matplotlib figure; also written as a PNG where there is a `path`.
 
     Args:
-        what: a response, of `model.simulate` or `model.predict`; or the `result` of `fit_spec` or `compare`.
-        kind: of a response "output" (measured and model), "residual" or "components" (physics and learner). A result
-            has one figure: the biases by suspected terms of a fit, or the comparison.
+        what: a response, of `model.simulate` or `model.predict`; what `linearize` returns; or the `result` of
+            `fit_spec` or `compare`.
+        kind: of a response "output" (measured and model; the default), "residual" or "components" (physics and
+            learner); of linear views "bode" (the default) or "poles". A result has one figure: the biases by suspected
+            terms of a fit, or the comparison.
         title: of a response's figure; by default what kind of response it is.
         path: PNG file to write; a file of that name is replaced.
 
@@ -37,9 +41,10 @@ def plot(
         InputError: nothing that has a figure, an unknown kind, outputs that were not measured, a path that cannot be
             written.
     """
-    wanted = "a Response, such as model.simulate(record), or the `result` of fit_spec or compare"
-    check_type(what, Response | FitResult | CheckResult | CompareResult, "what", wanted)
-    check_choice(kind, _OF_RESPONSES, "`kind`")
+    wanted = "a Response, such as model.simulate(record), what linearize gives, or the `result` of fit_spec or compare"
+    check_type(what, Response | Linearization | FitResult | CheckResult | CompareResult, "what", wanted)
+    kinds = _OF_VIEWS if isinstance(what, Linearization) else _OF_RESPONSES
+    kind = check_choice(kinds[0] if kind is None else kind, kinds, "`kind`")
     check_type(title, str | None, "title", "text")
     check_type(path, str | os.PathLike | None, "path", "a file's name")
     if path is not None and Path(path).suffix.lower() != ".png":
@@ -56,8 +61,12 @@ def plot(
 
 
 def _drawn(what: Any, kind: str, title: str | None) -> Figure:
-    from orthaug.reports import plots
+    from orthaug.reports import linear_plots, plots
 
+    if isinstance(what, Linearization):
+        if kind == "bode" and not what[0].inputs:
+            raise InputError("the model has no inputs, so that it has no frequency response to draw.")
+        return linear_plots.bode_figure(what) if kind == "bode" else linear_plots.poles_figure(what)
     if isinstance(what, CompareResult):
         return plots.comparison_figure(what.comparison)
     if not isinstance(what, Response):

@@ -6,6 +6,7 @@ from typing import Any
 
 from orthaug.reports.explanation import ExplainResult
 from orthaug.reports.fields import Content
+from orthaug.reports.linear import LinearizeResult
 from orthaug.reports.result import CheckResult, CompareResult, DesignResult, FitResult, SplitResult
 from orthaug.reports.selection import SelectResult
 
@@ -17,6 +18,7 @@ RESULTS: dict[str, type[Content]] = {
     "design": DesignResult,
     "select": SelectResult,
     "explain": ExplainResult,
+    "linearize": LinearizeResult,
 }
 """By command."""
 

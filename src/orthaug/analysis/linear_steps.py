@@ -1,0 +1,243 @@
+"""A model's step as a function to linearise: of its own state and inputs, and what that state holds at rest.
+
+The state of a lagged model is its memory of outputs and inputs, that of a motion its states. At rest the first is made
+of the outputs, so that these are what is looked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._base.checks import Vector
+from orthaug._base.jax import Array, jax, jnp
+from orthaug.analysis.local_dynamics import by_differences
+from orthaug.fitting.motion_course import LOOSE
+from orthaug.models.dynamics import Numbers
+from orthaug.models.lagged import Lagged
+from orthaug.models.model import Model
+from orthaug.models.motion_model import MotionModel
+from orthaug.models.moving import Moving
+from orthaug.models.stepping import Memory, step_inputs, step_lagged
+
+_WIDTH = 1e-3  # of differences, in sizes: bears a learner in single precision
+
+
+@dataclass(frozen=True)
+class LaggedStep:
+    """The step of a lagged model; it rests where an output repeats itself."""
+
+    form: Lagged
+    memory: Memory
+
+    ends = 1
+    continuous = False
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the state's entries."""
+        return self.memory.names
+
+    @property
+    def rest(self) -> tuple[str, ...]:
+        """Names of what is looked for at rest."""
+        return self.form.outputs
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return self.memory.inputs
+
+    def state_at(self, rest: Any, inputs: Any) -> Any:
+        """The state that keeps outputs `rest` and inputs for long."""
+        now = dict(zip((*self.rest, *self.inputs), (*rest, *inputs), strict=True))
+        return jnp.stack([now[lag.channel] for lag in self.memory.lags] or [jnp.zeros(())])[: len(self.memory.lags)]
+
+    def advance(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any]:
+        """The next state and the outputs."""
+        return step_lagged(self.form, numbers, self.memory, state, inputs)
+
+    def unrest(self, numbers: Numbers, rest: Any, inputs: Any) -> tuple[Any, Any]:
+        """What is zero at rest, and the outputs."""
+        y = self.advance(numbers, self.state_at(rest, inputs), inputs)[1]
+        return y - rest, y
+
+    def seen(self, numbers: Numbers, rest: Vector, inputs: Vector) -> Vector | None:
+        """The learner's features at rest, in [-1, 1] over the training data; None where that is not known."""
+        if self.form.bound is None or not self.form.differentiable:
+            return None
+        now = dict(zip((*self.rest, *self.inputs), (*rest, *inputs), strict=True))
+        x = np.array([[now[lag.channel] for lag in self.form.layout]])
+        z = np.asarray(self.form.features.evaluate(x, self.form.layout, np))[0]
+        return (z - numbers.centre) / numbers.halfwidth
+
+
+@dataclass(frozen=True)
+class MotionStep:
+    """A sample of a motion; it rests where no state changes."""
+
+    form: Moving
+
+    @property
+    def continuous(self) -> bool:
+        """Whether its equations are derivatives in time."""
+        return self.form.motion.integrator != "discrete"
+
+    @property
+    def ends(self) -> int:
+        """At how many instants a step reads the inputs."""
+        return 2 if self.form.motion.hold == "first-order" and self.inputs else 1
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the state's entries."""
+        return self.form.motion.names_of_states
+
+    @property
+    def rest(self) -> tuple[str, ...]:
+        """Names of what is looked for at rest."""
+        return self.states
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return self.form.motion.inputs
+
+    def state_at(self, rest: Any, inputs: Any) -> Any:
+        """The state itself."""
+        return jnp.asarray(rest)
+
+    def advance(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any]:
+        """The next state and the outputs."""
+        following, parts = self.form.step(numbers, state, inputs)
+        return following, parts.total
+
+    def field(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any]:
+        """The derivatives in time, or the next state of a discrete motion, and the outputs."""
+        return sum(self.form.rates(numbers, state, inputs)), self.form.observed(numbers, state, inputs)
+
+    def unrest(self, numbers: Numbers, rest: Any, inputs: Any) -> tuple[Any, Any]:
+        """What is zero at rest, and the outputs."""
+        rates, y = self.field(numbers, rest, inputs)
+        return (rates if self.continuous else rates - rest), y
+
+    def seen(self, numbers: Numbers, rest: Vector, inputs: Vector) -> Vector | None:
+        """The learner's features at rest, in [-1, 1] over the training data; None where that is not known."""
+        if self.form.bound is None or not self.form.differentiable:
+            return None
+        z = np.asarray(self.form.seen(rest[:, None], inputs[:, None], np))[:, 0]
+        return (z - numbers.centre) / numbers.halfwidth
+
+
+Step = LaggedStep | MotionStep
+
+
+def step_of(model: Model | MotionModel) -> Step:
+    """The step to linearise; a spline through the record is replaced by straight lines between samples."""
+    if isinstance(model, Model):
+        return LaggedStep(model.form, model.memory)
+    form = model.form
+    if form.motion.hold == "spline":
+        form = replace(form, motion=replace(form.motion, hold="first-order"))
+    step_inputs(form)  # whatever else has no step is refused there
+    return MotionStep(form)
+
+
+def sizes_of(model: Model | MotionModel) -> Vector:
+    """How large what is looked for at rest is over the training data."""
+    if isinstance(model, Model):
+        size = np.asarray(model.largest_output, dtype=float)
+    else:
+        size = np.asarray(model.loose, dtype=float) / LOOSE
+    return np.where(np.isfinite(size) & (size > 0), size, 1.0)
+
+
+@partial(jax.jit, static_argnames="step")
+def at_rest(step: Step, numbers: Numbers, rest: Any, inputs: Any, width: Any) -> tuple[Any, Any, Any]:
+    """What is zero at rest (ne,), the outputs (ny,), and how both follow rest and inputs (ne + ny, ne + nu)."""
+    both, point = partial(_unrest, step, numbers), jnp.concatenate([rest, inputs])
+    value = both(point)
+    slope = jax.jacfwd(both)(point) if step.form.differentiable else by_differences(both, point, width)
+    ne = len(step.rest)
+    return value[:ne], value[ne:], slope
+
+
+def _unrest(step: Step, numbers: Numbers, point: Any) -> Any:
+    rest, inputs = point[: len(step.rest)], point[len(step.rest) :]
+    return jnp.concatenate(step.unrest(numbers, rest, inputs))
+
+
+def _moved(numbers: Numbers, unknowns: Any) -> Numbers:
+    """The numbers with others for (θ, weights), or for θ alone."""
+    nt = len(numbers.theta)
+    weights = unknowns[nt:] if len(unknowns) > nt else numbers.weights
+    return numbers._replace(theta=unknowns[:nt], weights=weights)
+
+
+@partial(jax.jit, static_argnames="step")
+def unrest_along(step: Step, numbers: Numbers, rest: Any, inputs: Any, unknowns: Any, root: Any) -> Float[Array, "m r"]:
+    """How what is zero at rest, and the outputs, move along the columns of `root` (n, r)."""
+
+    def of(p: Any) -> Any:
+        return _unrest(step, _moved(numbers, p), jnp.concatenate([rest, inputs]))
+
+    return jax.vmap(lambda d: jax.jvp(of, (unknowns,), (d,))[1], -1, -1)(root)
+
+
+def _of_point(step: Step, field: bool, numbers: Numbers) -> Callable[[Any], Any]:
+    """A step, or the field, as a function of state and inputs in one vector."""
+    n = len(step.states)
+    function = step.field if field and isinstance(step, MotionStep) else step.advance
+    return lambda point: jnp.concatenate(function(numbers, point[:n], point[n:]))
+
+
+def _laid_out(step: Step, field: bool, rest: Any, inputs: Any) -> Any:
+    """State and inputs of a step in one vector; of the field the inputs stand at one instant."""
+    return jnp.concatenate([step.state_at(rest, inputs), *([inputs] * (1 if field else step.ends))])
+
+
+def _slope(step: Step, field: bool, numbers: Numbers, rest: Any, inputs: Any, width: Any) -> Any:
+    """`[[A, B], [C, D]]` of a step, or of the field."""
+    both, point = _of_point(step, field, numbers), _laid_out(step, field, rest, inputs)
+    if step.form.differentiable:
+        return jax.jacfwd(both)(point)
+    return by_differences(both, point, _laid_out(step, field, width[: len(rest)], width[len(rest) :]))
+
+
+@partial(jax.jit, static_argnames="step")
+def one_sided(step: Step, numbers: Numbers, rest: Any, inputs: Any, width: Any) -> tuple[Any, Any]:
+    """`[A B]` by differences to each side, (2, n, k), and how far these reach, (k,)."""
+    both, point = _of_point(step, False, numbers), _laid_out(step, False, rest, inputs)
+    full = _laid_out(step, False, width[: len(rest)], width[len(rest) :])
+    each, middle, n = jax.vmap(both), both(point), len(step.states)
+    sides = [(each(point + sign * jnp.diag(full)) - middle) / (sign * full[:, None]) for sign in (-1, 1)]
+    return jnp.stack([side.T[:n] for side in sides]), full
+
+
+@partial(jax.jit, static_argnames=("step", "field"))
+def slope_at(step: Step, field: bool, numbers: Numbers, rest: Any, inputs: Any, width: Any) -> Float[Array, "m n"]:
+    """`[[A, B], [C, D]]` at a point of rest."""
+    return _slope(step, field, numbers, rest, inputs, width)
+
+
+@partial(jax.jit, static_argnames=("step", "field"))
+def slope_along(
+    step: Step, field: bool, numbers: Numbers, rest: Any, inputs: Any, unknowns: Any, along: tuple[Any, Any, Any]
+) -> Float[Array, "r m n"]:
+    """How `[[A, B], [C, D]]` moves where (rest, inputs, unknowns) move along the columns of `along`."""
+
+    def of(rest: Any, inputs: Any, p: Any) -> Any:
+        return _slope(step, field, _moved(numbers, p), rest, inputs, None)
+
+    point = (rest, inputs, unknowns)
+    return jax.vmap(lambda *d: jax.jvp(of, point, d)[1], -1, 0)(*along)
+
+
+def difference_widths(size: Vector, inputs: Vector) -> Vector:
+    """How far differences reach, for rest and inputs."""
+    return _WIDTH * np.concatenate([size, np.maximum(np.abs(inputs), 1.0)])

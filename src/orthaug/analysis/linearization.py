@@ -1,0 +1,292 @@
+"""`linearize`: where a model rests with its inputs held, and what linear system it is there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._base.checks import Vector, check_choice, check_type
+from orthaug._base.errors import InputError
+from orthaug._base.warning import Warning
+from orthaug.analysis.continuous_time import METHODS, Continuous, converted
+from orthaug.analysis.linear_steps import (
+    MotionStep,
+    Step,
+    difference_widths,
+    one_sided,
+    sizes_of,
+    slope_along,
+    slope_at,
+    step_of,
+    unrest_along,
+)
+from orthaug.analysis.linear_system import System
+from orthaug.analysis.linear_view import Linearization, LinearView, bode_of, gain_of, poles_of
+from orthaug.analysis.measured_response import measured_response
+from orthaug.analysis.operating_points import OperatingPoint, Search, operating_points, parse_point
+from orthaug.data.record import Record
+from orthaug.fitting.estimates import Estimate
+from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.models.model import Model
+from orthaug.models.motion_model import MotionModel
+
+_POINTS = 400  # of the frequency grid
+_DECADES = 3  # below Nyquist's frequency at least
+_BELOW = 10  # times below the slowest pole
+_LOWEST = 1e-5  # of Nyquist's frequency
+_STEEP = 0.1  # of its matrix: what differences may change before a kink is told
+_WIDE = 0.5  # standard error of ln G beyond which the delta method is rough
+
+
+class _Spread(NamedTuple):
+    """Cov(c, w) = root rootᵀ, of θ alone where the learner is `frozen`."""
+
+    root: Float[np.ndarray, "n r"]
+    freedom: float
+    frozen: bool
+
+
+def linearize(
+    model: Model | MotionModel | Estimate | MotionEstimate,
+    at: str | Mapping[str, float] | None = None,
+    record: Record | None = None,
+    *,
+    frequencies: Any = None,
+    continuous: str = "zoh",
+) -> Linearization:
+    """The model about its points of rest as linear systems, with 95 % intervals from its joint covariance.
+
+    Args:
+        model: a fitted model; of a fit the record is that of training.
+        at: inputs that are held, and outputs or states that are fixed, `"force=0, position=1"` or a mapping. Inputs
+            that nobody names are 0, or their means over the record; with outputs or states fixed, they are looked for.
+        record: measured data whose own frequency response is put beside.
+        frequencies: of the frequency response [Hz]; by default 400 up to Nyquist's, on a logarithmic grid.
+        continuous: how a lagged model is converted to continuous time, zoh or tustin.
+
+    Raises:
+        InputError: no point of rest, a name that the model does not have, a record that does not fit.
+    """
+    kinds = Model | MotionModel | Estimate | MotionEstimate
+    check_type(model, kinds, "model", "a fitted model, or what estimate returns")
+    check_type(record, Record | None, "record", "a Record, or None")
+    check_choice(continuous, METHODS, "`continuous`")
+    fit = None if isinstance(model, Model | MotionModel) else model
+    if fit is not None:
+        record = fit.problem.record if record is None else record
+        model = fit.model
+    assert isinstance(model, Model | MotionModel)
+    if record is not None:
+        record = model.fitting(record, need_outputs=False)
+    frequency = _frequencies(frequencies, model.sampling_time)
+    step, given = step_of(model), parse_point(at)
+    held = np.zeros(len(model.inputs))
+    if record is not None and record.inputs:
+        held = np.concatenate([experiment.inputs for experiment in record.experiments]).mean(axis=0)
+    outputs = [channel.name for channel in model.outputs]
+    size = sizes_of(model)
+    search = Search.of(step, model.numbers, size, outputs, given, held)
+    points, warnings = operating_points(search)
+    spread, told = _spread(model, fit)
+    warnings += told
+    if _smooth(model):
+        text = (
+            "a spline through the record has no step: the sampled system is that of straight lines between samples, "
+            "the frequency response that of the equations."
+        )
+        warnings.append(Warning("hold_replaced", text))
+    views = tuple(_view(model, step, point, size, spread, frequency, continuous) for point in points)
+    measured = None if record is None else measured_response(record)
+    return Linearization(views, measured, _held(search, given, record), tuple(warnings))
+
+
+def _held(search: Search, given: Mapping[str, float], record: Record | None) -> str:
+    """Where inputs come from that nobody named."""
+    if all(name in given for name in search.step.inputs):
+        return "given"
+    if search.free[len(search.step.rest) :].any():
+        return "found"
+    return "zero" if record is None else "mean"
+
+
+def _frequencies(given: Any, step: float) -> Vector | None:
+    if given is None:
+        return None
+    try:
+        found = np.array(given, dtype=float).reshape(-1)
+    except (TypeError, ValueError, OverflowError):
+        found = np.zeros(0)
+    nyquist = 0.5 / step
+    if not len(found) or not np.isfinite(found).all() or np.any(found <= 0) or np.any(found > nyquist * (1 + 1e-9)):
+        raise InputError(f"`frequencies` must be numbers above 0 up to half the sampling rate, {nyquist:.6g} Hz.")
+    return found
+
+
+def _spread(model: Model | MotionModel, fit: Any) -> tuple[_Spread | None, list[Warning]]:
+    """The covariance to take intervals from, and what is to be said of it."""
+    joint, nt = model.statistics.joint(len(model.theta)), len(model.theta)
+    if not model.form.differentiable:
+        text = "the learner has no derivatives (a function from another toolbox): differences stand in, no intervals."
+        return None, [Warning("no_intervals", text)]
+    if joint is not None and model.numbers.tilt is None:
+        root = joint.root()
+        if np.isfinite(root).all():
+            return _Spread(root, model.statistics.freedom, False), []
+    covariance = None if fit is None or isinstance(model, MotionModel) else fit.covariance
+    if fit is not None and covariance is not None and np.isfinite(covariance).all() and nt:
+        values, vectors = np.linalg.eigh(covariance)
+        text = "there is no joint covariance with the learner's weights; intervals are those of θ, the learner frozen."
+        spread = _Spread(vectors * np.sqrt(np.maximum(values, 0.0)), float(fit.freedom), True)
+        return spread, [Warning("learner_frozen", text)]
+    text = "the model carries no covariance (an ensemble, or trained elsewhere); there are no intervals."
+    return None, [Warning("no_intervals", text)]
+
+
+def _view(
+    model: Model | MotionModel,
+    step: Step,
+    point: OperatingPoint,
+    size: Vector,
+    spread: _Spread | None,
+    frequency: Vector | None,
+    method: str,
+) -> LinearView:
+    sampled = _system(model, step, point, size, spread, field=False)
+    warnings = _kinks(model, step, point, size, sampled)
+    freedom = np.inf if spread is None else spread.freedom
+    names = step.states
+    if isinstance(step, MotionStep) and step.ends == 2:
+        sampled = _without_next(sampled)
+        text = (
+            "inputs run straight between samples: the sampled states are those of the motion less B₁ times the input."
+        )
+        warnings.append(Warning("shifted_states", text))
+    own: System | None = None
+    if isinstance(step, MotionStep) and step.continuous:
+        own = _system(model, step, point, size, spread, field=True)
+        dead = np.zeros(len(step.inputs))
+        found: Continuous | str = Continuous(own, dead, "equations", names)
+    else:
+        found = converted(sampled, method, None if isinstance(step, MotionStep) else step.memory, names)
+    poles = poles_of(sampled, own, freedom)
+    if any(pole.magnitude_ci95 and pole.magnitude_ci95[0] < 1 < pole.magnitude_ci95[1] for pole in poles):
+        text = "the 95 % interval of a pole contains magnitude 1: whether the point is stable is not sure."
+        warnings.append(Warning("stability_not_sure", text))
+    gain, gain_ci95 = gain_of(sampled, freedom)
+    bode, smooth = None, _smooth(model)
+    if step.inputs:
+        grid = _grid(poles, model.sampling_time) if frequency is None else frequency
+        bode = bode_of(own if smooth and own is not None else sampled, grid, freedom)
+        warnings += _rough(bode)
+    channels = (*model.outputs, *model.inputs)
+    units = {channel.name: channel.unit for channel in channels}
+    if isinstance(model, MotionModel):
+        units |= {state.name: state.unit for state in model.form.motion.states}
+    return LinearView(
+        point, sampled, found, poles, sampled.modes.at_zero, gain, gain_ci95, bode, names, step.inputs,
+        tuple(channel.name for channel in model.outputs), units, freedom, tuple(warnings), smooth,
+    )  # fmt: skip
+
+
+def _system(
+    model: Model | MotionModel, step: Step, point: OperatingPoint, size: Vector, spread: _Spread | None, *, field: bool
+) -> System:
+    """The matrices of a step, or of the equations, and how they move along the covariance."""
+    numbers, width = model.numbers, difference_widths(size, point.inputs)
+    matrix = np.asarray(slope_at(step, field, numbers, point.rest, point.inputs, width))
+    if not np.isfinite(matrix).all():
+        raise InputError(f"the model has no finite derivative at {point}; give another operating point.")
+    moved = None
+    if spread is not None:
+        weights = [] if spread.frozen else [np.asarray(numbers.weights)]
+        unknowns = np.concatenate([np.asarray(numbers.theta), *weights])
+        ne, root = len(point.rest), spread.root
+        change = np.asarray(unrest_along(step, numbers, point.rest, point.inputs, unknowns, root))
+        rows = [*range(ne), *(ne + i for i in point.slopes.outputs)]
+        along = point.slopes.following(change[rows])
+        moved = np.asarray(
+            slope_along(step, field, numbers, point.rest, point.inputs, unknowns, (along[:ne], along[ne:], root))
+        )
+        moved = np.where(np.isfinite(moved), moved, 0.0)
+    return System(matrix, len(step.states), None if field and _in_time(step) else model.sampling_time, moved)
+
+
+def _smooth(model: Model | MotionModel) -> bool:
+    """Whether inputs run on a spline between samples."""
+    if not isinstance(model, MotionModel) or not model.inputs:
+        return False
+    return model.form.motion.hold == "spline" and model.form.motion.integrator != "discrete"
+
+
+def _in_time(step: Step) -> bool:
+    return isinstance(step, MotionStep) and step.continuous
+
+
+def _without_next(system: System) -> System:
+    """A step that reads the inputs of the next sample as one that does not: `z = x − B₁ u` (first-order hold)."""
+
+    def rewritten(matrix: Any, moved: Any = None) -> Any:
+        """Of the matrices, or of their change `moved`."""
+        n = system.states
+        nu = (matrix.shape[1] - n) // 2
+        a, b1, c = matrix[:n, :n], matrix[:n, n + nu :], matrix[n:, :n]
+        first = matrix if moved is None else moved
+        found = first[:, : n + nu].copy()
+        if moved is None:
+            return found + np.block([[np.zeros((n, n)), a @ b1], [np.zeros((len(c), n)), c @ b1]])
+        da, db1, dc = moved[:n, :n], moved[:n, n + nu :], moved[n:, :n]
+        added = [[np.zeros((n, n)), da @ b1 + a @ db1], [np.zeros((len(c), n)), dc @ b1 + c @ db1]]
+        return found + np.block(added)
+
+    moved = None
+    if system.moved is not None:
+        moved = np.array([rewritten(system.matrix, one) for one in system.moved]).reshape(
+            len(system.moved), *_shape(system)
+        )
+    return System(rewritten(system.matrix), system.states, system.step, moved)
+
+
+def _shape(system: System) -> tuple[int, int]:
+    n = system.states
+    return len(system.matrix), n + (system.matrix.shape[1] - n) // 2
+
+
+def _kinks(
+    model: Model | MotionModel, step: Step, point: OperatingPoint, size: Vector, system: System
+) -> list[Warning]:
+    """Whether differences tell of another slope than the derivative: then the view holds in no neighbourhood."""
+    if not model.form.differentiable:
+        return []
+    width, n = difference_widths(size, point.inputs), system.states
+    sides, full = map(np.asarray, one_sided(step, model.numbers, point.rest, point.inputs, width))
+    unit = full[:n] / full[:n, None]  # entries in sizes of the states
+    apart = np.abs(sides[:, :, :n] - system.a) * unit
+    if np.all(apart <= _STEEP * np.abs(system.a * unit).max(initial=1e-300)):
+        return []
+    text = (
+        "the slope changes abruptly at this point, within a thousandth of the training data's size (such as dry "
+        "friction at rest): the linear system holds for smaller movements only."
+    )
+    return [Warning("kink", text)]
+
+
+def _grid(poles: Any, step: float) -> Vector:
+    nyquist = 0.5 / step
+    slow = [pole.hertz / _BELOW for pole in poles if pole.hertz]
+    lowest = min([nyquist * 10.0**-_DECADES, *slow])
+    return np.geomspace(max(lowest, _LOWEST * nyquist), nyquist, _POINTS)
+
+
+def _rough(bode: Any) -> list[Warning]:
+    if bode.magnitude_ci95 is None:
+        return []
+    with np.errstate(all="ignore"):
+        wide = np.log(bode.magnitude_ci95[..., 1] / bode.magnitude_ci95[..., 0]) > 4 * _WIDE
+    share = float(np.mean(wide))
+    if share < 0.05:
+        return []
+    text = f"at {100 * share:.2g} % of the frequencies the band is so wide that the delta method is rough there."
+    return [Warning("wide_band", text)]

@@ -1,0 +1,118 @@
+"""A saved model as linear systems: what `orthaug linearize` does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from orthaug._base.errors import InputError
+from orthaug._base.folders import check_replaceable, whole_file, whole_folder
+from orthaug.commands.folder import check_figure, check_file
+from orthaug.commands.parts import load_parts
+from orthaug.commands.run import open_run
+from orthaug.commands.spec import load_spec
+from orthaug.data.record import Record
+
+if TYPE_CHECKING:
+    from orthaug.analysis.linear_view import Linearization
+    from orthaug.models.model import Model
+    from orthaug.models.motion_model import MotionModel
+
+_FIGURES = (".png", ".pdf", ".svg")
+
+
+def not_a_linearization(folder: Path, names: Sequence[str]) -> str | None:
+    """A file in a folder without manifest: every result of this command has one."""
+    return names[0]
+
+
+def check_place(out: Path | None, *read: Path, force: bool = False) -> None:
+    """Raise InputError early where the folder or file could not be written, or would replace what is read."""
+    if out is None:
+        return
+    suffix = out.suffix.lower()
+    for folder in read:
+        if folder.is_dir() and out.resolve().is_relative_to(folder.resolve()):
+            raise InputError(f"{out}: is inside of {folder}, which is read; give another name.")
+    if suffix in _FIGURES:
+        check_figure(out, *read, force=force)
+    elif suffix == ".json":
+        check_file(out, *read, force=force)
+    elif suffix in (".txt", ".csv", ".toml", ".html"):
+        raise InputError(f"{out}: found the ending '{out.suffix}'; give a folder, or .json, .png, .pdf or .svg.")
+    else:
+        check_replaceable(out, not_a_linearization, force=force)
+        for file in read:
+            if file.exists() and file.resolve().is_relative_to(out.resolve()):
+                raise InputError(f"{out}: holds {file}, which is read; give another folder.")
+
+
+def open_linear(model: Path, data: Path | None) -> tuple[Model | MotionModel, Record | None]:
+    """The model, and the record of a data file, or of the training data of a spec.
+
+    Raises:
+        InputError: no model, no file, missing columns.
+    """
+    if data is None:
+        from orthaug.models.storage import load
+
+        return load(model), None
+    if data.suffix.lower() != ".toml":
+        opened = open_run(model, data, need_outputs=True)
+        return opened.model, opened.record
+    from orthaug.models.storage import load
+
+    loaded = load(model)
+    record = load_parts(data, load_spec(data))[0].record
+    try:
+        return loaded, loaded.fitting(record, need_outputs=True)
+    except InputError as error:
+        raise InputError(f"{data}: {error}") from None
+
+
+def write(found: Linearization, out: Path, *, force: bool = False) -> None:
+    """A folder with result.json, linear.txt and figures/; or one file, by its ending JSON or the frequency response.
+
+    Whole or not at all.
+    """
+    from orthaug.reports.linear import LinearizeResult
+    from orthaug.reports.linear_text import linear_text
+
+    suffix = out.suffix.lower()
+    if suffix in _FIGURES:
+        with whole_file(out, force=force) as partial:
+            _bode(found, partial, suffix[1:])
+    elif suffix == ".json":
+        with whole_file(out, force=force) as partial:
+            partial.write_text(LinearizeResult.of(found).to_json() + "\n", encoding="utf-8")
+    else:
+        with whole_folder(out, not_a_linearization, force=force) as partial:
+            (partial / "result.json").write_text(LinearizeResult.of(found).to_json() + "\n", encoding="utf-8")
+            (partial / "linear.txt").write_text(linear_text(found) + "\n", encoding="utf-8")
+            (partial / "figures").mkdir()
+            if found[0].inputs:
+                _bode(found, partial / "figures" / "bode.png", "png")
+            _poles(found, partial / "figures" / "poles.png")
+
+
+def told(found: Linearization, *, as_json: bool) -> str:
+    """What the command prints."""
+    from orthaug.reports.linear import LinearizeResult
+    from orthaug.reports.linear_text import linear_text
+
+    return LinearizeResult.of(found).to_json() if as_json else linear_text(found)
+
+
+def _bode(found: Linearization, path: Path, kind: str) -> None:
+    from orthaug.reports import drawing, linear_plots
+
+    if not found[0].inputs:
+        raise InputError("the model has no inputs, so that it has no frequency response to draw; give a folder.")
+    drawing.save(linear_plots.bode_figure(found), path, kind)
+
+
+def _poles(found: Linearization, path: Path) -> None:
+    from orthaug.reports import drawing, linear_plots
+
+    drawing.save(linear_plots.poles_figure(found), path, "png")
