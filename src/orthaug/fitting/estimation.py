@@ -223,11 +223,9 @@ def fit(
     _check_ensemble(ensemble, problem)
     if task.bound is None and solved:
         estimate = conclude(task, structure, task.physics_learned())
-        status = replace(estimate.status, start_loss=estimate.status.loss)
-        estimate = replace(estimate, status=status)
+        estimate = replace(estimate, status=replace(estimate.status, start_loss=estimate.status.loss))
     else:
-        task = replace(task, checkpoints=checkpoints)
-        trained = task if solved else FreeRunTask.of(task, criterion, warm)
+        trained = replace(task, checkpoints=checkpoints) if solved else FreeRunTask.of(task, criterion, warm)
         chosen = Choice(validation, blocks if initial is None else 0, fallback, ensemble, scored=auto and solved)
         estimate = train(trained, starts, structure, solver, chosen, progress)
         if _splits(structure) and estimate.status.ok and estimate.model.form.bound is not None:
