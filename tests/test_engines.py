@@ -137,6 +137,47 @@ def test_a_cluster_gives_the_result_of_rows_in_memory(folder, cluster, structure
     check_same(found, fitted(folder, "memory", structure, regularization))
 
 
+BASELINE = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "y[k-2]"), oa.Term("c", "u[k-1]")])
+OPTIONS = {"lags": oa.Lags(na=2, nb=2), "learner": oa.MLP(hidden=(3,)), "solver": oa.LevenbergMarquardt(20),
+           "regularization": "none"}  # fmt: skip
+COLUMNS = {"inputs": ["u"], "outputs": ["y"], "sampling_time": 0.1, "experiment": "run"}
+
+
+def from_files(folder):
+    files = sorted((folder / "runs").glob("*.parquet"))
+    return oa.Record.join([oa.read_record(file, **COLUMNS) for file in files])
+
+
+def test_files_as_a_record(folder):
+    """From Python: what is handed in chooses the engine."""
+    expected = oa.estimate(from_files(folder), BASELINE, **OPTIONS)
+    source = oa.open_parquet(sorted((folder / "runs").glob("*.parquet")), partition_rows=300, **COLUMNS)
+    found = oa.estimate(source, BASELINE, **OPTIONS)
+    np.testing.assert_allclose(found.theta, expected.theta, rtol=1e-10)
+    assert found.status.loss == pytest.approx(expected.status.loss, rel=1e-8)
+    with pytest.raises(oa.InputError, match="a free run, and a motion, need their rows in memory"):
+        oa.estimate(source, BASELINE, criterion=oa.Simulation(50), **OPTIONS)
+
+
+def test_a_frame_on_a_cluster_as_a_record(folder, cluster):
+    """Partitions of another length than the experiments; the rows stay on the workers."""
+    import dask.dataframe as dd
+
+    frame = pd.concat([pd.read_parquet(file) for file in sorted((folder / "runs").glob("*.parquet"))])
+    frame = frame.reset_index(drop=True)
+    frame.to_parquet(folder / "whole.parquet")
+    expected = oa.estimate(oa.read_record(folder / "whole.parquet", **COLUMNS), BASELINE, **OPTIONS)
+    frame = dd.from_pandas(frame, chunksize=130)
+    found = oa.estimate(oa.open_frame(frame, client=cluster, **COLUMNS), BASELINE, **OPTIONS)
+    assert found.problem.count == expected.problem.count == 1000 - 4 * 2
+    np.testing.assert_allclose(found.theta, expected.theta, rtol=1e-10)
+    with pytest.raises(oa.InputError, match="the DataFrame has no column 'z'; it has u, y, run"):
+        oa.open_frame(frame, client=cluster, inputs=["u"], outputs=["z"])
+    emptied = dd.concat([frame, frame[frame["u"] > 9]])
+    with pytest.raises(oa.InputError, match="partition .* of the DataFrame is empty"):
+        oa.open_frame(emptied, client=cluster, **COLUMNS)
+
+
 def test_a_worker_that_is_killed_changes_nothing(folder, cluster):
     """Its partitions are laid out again elsewhere; sums keep their order, so θ keeps its bits."""
     before = on_cluster(folder, cluster)

@@ -21,6 +21,8 @@ from .data import Channel as Channel
 from .data import Experiment as Experiment
 from .data import Lags as Lags
 from .data import Record as Record
+from .data import open_frame as open_frame
+from .data import open_parquet as open_parquet
 from .data import read_record as read_record
 from .export import export as export
 from .export import numpy_step as numpy_step
@@ -44,12 +46,15 @@ from .inference import Uniform as Uniform
 from .inference import Weighted as Weighted
 from .inference import prediction_std as prediction_std
 from .models import MLP as MLP
+from .models import Dask as Dask
+from .models import Devices as Devices
 from .models import EquinoxModule as EquinoxModule
 from .models import External as External
 from .models import Function as Function
 from .models import Model as Model
 from .models import MotionModel as MotionModel
 from .models import Response as Response
+from .models import Stream as Stream
 from .models import Terms as Terms
 from .models import Trajectory as Trajectory
 from .models import load as load

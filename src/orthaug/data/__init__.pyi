@@ -1,3 +1,5 @@
+from .dask_source import open_frame as open_frame
+from .parquet_source import open_parquet as open_parquet
 from .readers import read_record as read_record
 from .record import Channel as Channel
 from .record import Experiment as Experiment

@@ -18,8 +18,8 @@ import numpy as np
 
 from orthaug._base.errors import InputError
 from orthaug.data.readers import DRIFT, JITTER
-from orthaug.data.record import Channel, Experiment, check_step, same_step
-from orthaug.data.sources import stretches
+from orthaug.data.record import Channel, Experiment, as_channels, check_channels, check_step, same_step
+from orthaug.data.sources import joined, stretches
 from orthaug.data.tables import check_present, check_readable, parquet_file
 
 BATCH_ROWS = 16_384  # what is laid out at once: several such blocks are in memory
@@ -157,7 +157,7 @@ class ParquetSource:
                 shift = partition.start - before
                 found += partition.between(a + shift, b + shift, 0)
         step = self.sampling_time
-        return [replace(e, start_time=e.start_time + step * e.offset) for e in _joined(found)]
+        return [replace(e, start_time=e.start_time + step * e.offset) for e in joined(found)]
 
     def check_unchanged(self) -> None:
         """Raise InputError where a file is not the one that was opened."""
@@ -165,31 +165,11 @@ class ParquetSource:
             partition.check_unchanged()
 
 
-def _joined(pieces: Sequence[Experiment]) -> list[Experiment]:
-    """Pieces that follow one another within an experiment as one."""
-    joined: list[list[Experiment]] = []
-    for piece in pieces:
-        last = joined[-1][-1] if joined else None
-        follows = last is not None and (last.source, last.first_row + len(last)) == (piece.source, piece.first_row)
-        if follows and last is not None and piece.offset == last.offset + len(last):
-            joined[-1].append(piece)
-        else:
-            joined.append([piece])
-    return [
-        replace(
-            group[0],
-            inputs=np.concatenate([piece.inputs for piece in group]),
-            outputs=np.concatenate([piece.outputs for piece in group]),
-        )
-        for group in joined
-    ]
-
-
 def open_parquet(
     paths: Sequence[str | Path],
     *,
-    inputs: Sequence[Channel],
-    outputs: Sequence[Channel],
+    inputs: Sequence[str | Channel] = (),
+    outputs: Sequence[str | Channel] = (),
     sampling_time: float | None = None,
     time: str | None = None,
     experiment: str | None = None,
@@ -207,9 +187,10 @@ def open_parquet(
         InputError: a file that cannot be read, has no rows, lacks a column or holds another type in it; experiments
             that are not in one piece; time that does not rise evenly within one.
     """
-    given = dict(columns or {})
-    own = tuple(given.get(c.name, c.file_column) for c in (*outputs, *inputs))
-    reading = Reading(tuple(inputs), tuple(outputs), own, missing)
+    given, groups = dict(columns or {}), (as_channels(inputs, "inputs"), as_channels(outputs, "outputs"))
+    check_channels(*groups)
+    own = tuple(given.get(c.name, c.file_column) for c in (*groups[1], *groups[0]))
+    reading = Reading(*groups, own, missing)
     partitions, steps, types = [], [], {}
     for path in map(Path, paths):
         check_readable(path)

@@ -171,3 +171,23 @@ def stretches(experiment: Experiment, lead: int) -> Iterator[Experiment]:
     for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
         if end - begin > lead:
             yield _later(experiment, begin, end)
+
+
+def joined(pieces: Sequence[Experiment]) -> list[Experiment]:
+    """Pieces that follow one another within an experiment as one."""
+    joined: list[list[Experiment]] = []
+    for piece in pieces:
+        last = joined[-1][-1] if joined else None
+        follows = last is not None and (last.source, last.first_row + len(last)) == (piece.source, piece.first_row)
+        if follows and last is not None and piece.offset == last.offset + len(last):
+            joined[-1].append(piece)
+        else:
+            joined.append([piece])
+    return [
+        replace(
+            group[0],
+            inputs=np.concatenate([piece.inputs for piece in group]),
+            outputs=np.concatenate([piece.outputs for piece in group]),
+        )
+        for group in joined
+    ]

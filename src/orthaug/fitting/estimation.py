@@ -14,6 +14,7 @@ from orthaug._base.jax import jax
 from orthaug._base.progress import SILENT, Tell
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
+from orthaug.data.sources import Source
 from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.conclusion import conclude
 from orthaug.fitting.cost import check_cost
@@ -25,6 +26,7 @@ from orthaug.fitting.learned import Learned
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_estimation import DEFAULT, fit_motion, pose_for
 from orthaug.fitting.one_step import OneStepTask
+from orthaug.fitting.posing import check_record, posed_on
 from orthaug.fitting.reweighting import reweighted
 from orthaug.fitting.rules import check_solver, check_starts, tried
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
@@ -61,14 +63,15 @@ class Options(TypedDict, total=False):
     validation: Record | None
     output_weights: str | Sequence[float]
     progress: Tell
+    engine: Engine | None
 
 
 @overload
-def estimate(record: Record, baseline: Baseline, **options: Unpack[Options]) -> Estimate: ...
+def estimate(record: Record | Source, baseline: Baseline, **options: Unpack[Options]) -> Estimate: ...
 @overload
 def estimate(record: Record, baseline: Motion, **options: Unpack[Options]) -> MotionEstimate: ...
 def estimate(
-    record: Record,
+    record: Record | Source,
     baseline: Baseline | Motion,
     *,
     lags: Lags | None = None,
@@ -86,6 +89,7 @@ def estimate(
     validation: Record | None = None,
     output_weights: str | Sequence[float] = "auto",
     progress: Tell = SILENT,
+    engine: Engine | None = None,
 ) -> Estimate | MotionEstimate:
     """Fit `y_k = φ(x_k)θ + learner(x_k) + e_k` by prediction error (eq:cost_fun) or by the error of a free run.
 
@@ -93,7 +97,7 @@ def estimate(
     motion (`Motion`) are fitted on their free run, and their parameters are the physics nearest to the fitted motion.
 
     Args:
-        record: measured inputs and outputs.
+        record: measured inputs and outputs; or `open_parquet(…)`, `open_frame(…)`, whose rows stay where they are.
         baseline: the physics; a `Motion` has no `lags`, `ensemble` and `initial`.
         lags: the learner's regressor; None for the raw lags that the baseline's expressions use.
         learner: a declaration such as `MLP(hidden=(16,))`; None for physics alone.
@@ -123,6 +127,7 @@ def estimate(
             of their errors, fit and weights in turn until they agree; numbers for the weights of the squared errors.
             "auto" is "std" one step ahead and "covariance" on the free run.
         progress: called about twice a second with (restart, iteration, loss).
+        engine: who sums over the rows: `Stream()`, `Devices()`, `Dask(client)`; None for what suits the record.
 
     Raises:
         InputError: data and physics that do not fit together; RankError where θ is not determined.
@@ -139,6 +144,8 @@ def estimate(
     if isinstance(baseline, Motion):
         if lags is not None or initial is not None or ensemble:
             raise InputError("a motion has no `lags`, no `initial` and no `ensemble`; leave them out.")
+        check_record(record, flies=True)
+        assert isinstance(record, Record)
         learner = over_states(learner, baseline)
         problem = pose_for(record, baseline, learner, output_weights)
         options = {"structure": structure, "criterion": criterion or DEFAULT, "solver": solver, "fallback": fallback}
@@ -152,8 +159,10 @@ def estimate(
     inputs = None if learner is None else learner.inputs
     if model is not None:
         inputs = tuple(str(entry) for entry in model.form.features.entries)
+    check_record(record, flies=not criterion.one_step)
+    problem, engine = posed_on(record, engine, baseline, lags, inputs, output_weights=output_weights)
     return fit(
-        pose(record, baseline, lags, inputs, output_weights=output_weights),
+        problem,
         learner=learner,
         structure=structure,
         criterion=criterion,
@@ -167,6 +176,7 @@ def estimate(
         initial=model,
         validation=validation,
         progress=progress,
+        engine=engine,
     )
 
 
@@ -341,7 +351,7 @@ def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStep
 
 
 def _check_record(record: Any, baseline: Any, lags: Any, learner: Any, initial: Any) -> None:
-    check_type(record, Record, "record", "a Record")
+    check_record(record, flies=False)
     check_type(baseline, Baseline, "baseline", "a Baseline or a Motion")
     check_type(lags, Lags | None, "lags", "Lags(…) or None")
     check_type(learner, Learner | None, "learner", "a learner such as MLP(), or None")

@@ -1,3 +1,5 @@
+from .cluster import Dask as Dask
+from .devices import Devices as Devices
 from .learners import MLP as MLP
 from .learners import EquinoxModule as EquinoxModule
 from .learners import External as External
@@ -9,4 +11,5 @@ from .response import Trajectory as Trajectory
 from .response import scores as scores
 from .storage import load as load
 from .storage import save as save
+from .streaming import Stream as Stream
 from .terms import Terms as Terms

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -60,7 +60,7 @@ class Dask:
         """The partitions of a source, laid out where they will be summed."""
         with told():
             task = partial(_laid, laying=laying, size=self.limit)  # not scattered: what is lost can be made again
-            return [self.client.submit(task, partition, pure=False) for partition in source.partitions]
+            return [self._on(task, partition) for partition in source.partitions]
 
     def sum(self, function: Callable[..., Any], rows: Sequence[Any], *arguments: Any) -> Any:
         given = jax.tree.map(np.asarray, arguments)
@@ -74,12 +74,23 @@ class Dask:
     def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
         """A function of every partition, where the workers are."""
         with told():
-            return self.client.gather(self.client.map(function, partitions, pure=False))
+            return self.client.gather([self._on(function, partition) for partition in partitions])
+
+    def _on(self, function: Callable[[Any], Any], partition: Any) -> Any:
+        """A task; rows that the cluster holds already go to it by their futures."""
+        held = getattr(partition, "held", ())
+        if not held:
+            return self.client.submit(function, partition, pure=False)
+        return self.client.submit(_where_held, function, replace(partition, held=()), *held, pure=False)
 
 
 def _laid(partition: Any, laying: Callable[[Any], Iterator[Laid]], size: int) -> list[Chunk]:
     """The chunks of a partition."""
     return list(chunks_of(laying(partition), chunk_shape(partition.rows, size)[1]))
+
+
+def _where_held(function: Callable[[Any], Any], partition: Any, *held: Any) -> Any:
+    return function(partition.on(*held))
 
 
 def _kept(chunks: list[Chunk]) -> list[Chunk]:
