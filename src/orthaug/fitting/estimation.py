@@ -159,6 +159,7 @@ def estimate(
     inputs = None if learner is None else learner.inputs
     if model is not None:
         inputs = tuple(str(entry) for entry in model.form.features.entries)
+    check_type(criterion, Criterion, "criterion", "Prediction(…) or Simulation(…)")
     check_record(record, flies=not criterion.one_step)
     problem, engine = posed_on(record, engine, baseline, lags, inputs, output_weights=output_weights)
     return fit(
