@@ -48,7 +48,8 @@ def read_record(
         every: keep each n-th row (no filter); the sampling time is multiplied.
         columns: this file's column for a channel, `{"position": "yVal"}`.
         missing: "error", or "skip" to leave out rows with empty or NaN cells. Each stretch between them is then an
-            experiment of its own, so that no lag reaches across a gap.
+            experiment of its own, so that no lag reaches across a gap. "keep" does so where inputs are missing, and
+            keeps missing outputs as NaN: an `Observer` takes them.
 
     Raises:
         InputError: no such file, wrong type, missing columns, cells that are empty or no finite numbers.
@@ -57,17 +58,20 @@ def read_record(
     channels = [as_channels(inputs, "inputs"), as_channels(outputs, "outputs")]
     column_of = _columns(channels, columns)
     _check_time(time, sampling_time, {name: column_of[name] for name in (c.name for c in channels[1])})
-    check_choice(missing, ("error", "skip"), "`missing`")
+    check_choice(missing, ("error", "skip", "keep"), "`missing`")
     check_count(every, "every")
     wanted: list[str] = list(dict.fromkeys([*column_of.values(), *([time] if time else [])]))
     if not wanted:
         raise InputError("no channels are asked for; name inputs, outputs or both.")
-    table = _trim(read_table(path, wanted), uneven=missing == "skip")
+    table = _trim(read_table(path, wanted), uneven=missing != "error")
+    needed = wanted
+    if missing == "keep":
+        needed = [*(column_of[c.name] for c in channels[0]), *([time] if time else [])]
     total = len(next(iter(table.columns.values())))
     experiments, steps, recorded = [], [], 0
     for begin, end in _ranges(rows, total, path):
         recorded += len(range(begin, end, every))
-        for start, stop in _stretches(table, wanted, begin, end, every, missing):
+        for start, stop in _stretches(table, wanted, needed, begin, end, every, missing):
             pick = slice(start, stop, every)
             signals = [
                 np.stack([c.scale * table.columns[column_of[c.name]][pick] + c.offset for c in group], axis=-1)
@@ -193,18 +197,21 @@ def _ranges(rows: RowRange | Sequence[RowRange] | None, total: int, path: Path) 
 
 
 def _stretches(
-    table: Table, columns: Sequence[str], begin: int, end: int, every: int, missing: str
+    table: Table, columns: Sequence[str], needed: Sequence[str], begin: int, end: int, every: int, missing: str
 ) -> list[tuple[int, int]]:
-    """Half-open row ranges without missing cells; the whole range where missing cells are errors."""
+    """Half-open row ranges without missing cells in the needed columns; the whole range where they are errors."""
     if missing == "error":
         _check_cells(table, columns, begin, end)
         return [(begin, end)]
     kept = np.arange(begin, end, every)
-    there = np.all([np.isfinite(table.columns[name][kept]) for name in columns], axis=0)
-    for row in kept[~there]:
+    full = np.all([np.isfinite(table.columns[name][kept]) for name in columns], axis=0)
+    for row in kept[~full]:
         for name in columns:
             if not np.isfinite(table.columns[name][row]) and table.cell(name, row).strip().lower() not in _MISSING:
                 _check_cells(table, [name], row, row + 1)
+    there = np.ones(len(kept), dtype=bool)
+    for name in needed:
+        there &= np.isfinite(table.columns[name][kept])
     edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int)))
     if not len(edges):
         raise InputError(f"{table.path}: every row from {begin} to {end - 1} has a missing cell; nothing is left.")

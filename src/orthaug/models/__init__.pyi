@@ -1,3 +1,4 @@
+from .kalman import Noise as Noise
 from .learners import MLP as MLP
 from .learners import EquinoxModule as EquinoxModule
 from .learners import External as External

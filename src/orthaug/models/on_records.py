@@ -55,11 +55,12 @@ class OnRecords:
         arguments = ", ".join([*arrays, *names, f"sampling_time={self.sampling_time:g}"])
         return f"a Record, such as Record.from_arrays({arguments})"
 
-    def fitting(self, record: Record, *, need_outputs: bool) -> Record:
+    def fitting(self, record: Record, *, need_outputs: bool, gaps: bool = False) -> Record:
         """The record's channels in the model's order, by name.
 
         Raises:
-            InputError: a channel is missing, or the sampling time differs by more than 0.1 %.
+            InputError: a channel is missing, the sampling time differs by more than 0.1 %, or outputs are missing
+                samples and `gaps` are not allowed.
         """
         check_type(record, Record, "record", self._wanted(need_outputs))
         if not same_step(record.sampling_time, self.sampling_time):
@@ -80,6 +81,13 @@ class OnRecords:
             replace(e, inputs=e.inputs[:, order["inputs"]], outputs=e.outputs[:, order["outputs"]])
             for e in record.experiments
         )
+        for experiment in () if gaps else experiments:
+            bad = np.flatnonzero(~np.isfinite(experiment.outputs).all(axis=1))
+            if bad.size:
+                raise InputError(
+                    f"{experiment.where(int(bad[0]))}: an output is missing there; an Observer takes such records, "
+                    "others split the experiment there."
+                )
         return Record(self.inputs, wanted["outputs"], record.sampling_time, experiments)
 
 
