@@ -44,7 +44,7 @@ class Observer:
         check_type(self.model, Model | MotionModel | Estimate | MotionEstimate, "model", "a fitted model or a fit")
         given, noise = self.model, self.noise
         fit = given if isinstance(given, Estimate | MotionEstimate) else None
-        model = given if fit is None else fit.model
+        model: Any = given if fit is None else fit.model
         if not model.form.differentiable:
             raise InputError("the learner is a function without derivatives; an observer needs them.")
         if noise is None:
@@ -137,10 +137,10 @@ class Observer:
         _, before, inputs = self._along(experiment, record)
         parts, std = ahead(form, numbers, self.noise, before, inputs, horizon)
         if form.hidden:
-            alone = self.model.alone
+            alone = self.model.alone.filtering
             known = parts
             if self.model.form.bound is not None:
-                known = ahead(*alone.filtering[:2], self.noise, before, inputs, horizon)[0]
+                known = ahead(alone[0], alone[1], self.noise, before, inputs, horizon)[0]
             parts = Parts(known.total, parts.total - known.total, parts.total - known.total)
         skip = first - form.first_row - horizon + 1
         told = trajectory(Parts(*(part[skip:] for part in parts)), experiment, experiment.outputs, first)

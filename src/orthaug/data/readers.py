@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Vector, check_choice, check_count, check_type
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, MissingSampleError, shown
 from orthaug.data.record import Channel, Experiment, Record, as_channels, check_step, same_step
 from orthaug.data.tables import Table, check_readable, has_column, read_table
 
@@ -79,8 +79,9 @@ def read_record(
                 else np.empty((len(range(start, stop, every)), 0))
                 for group in channels
             ]
-            began = float(table.columns[time][start]) if time else 0.0
-            place = (str(path), start, every, table.first_line, began, (start - begin) // every)
+            offset = (start - begin) // every
+            began = float(table.columns[time][start]) if time else offset * every * (sampling_time or 1.0)
+            place = (str(path), start, every, table.first_line, began, offset)
             experiments.append(Experiment(signals[0], signals[1], *place))
             if time and (stop - start > 1 or missing == "error"):
                 steps.append(_uniform_step(table, time, start, stop))
@@ -225,7 +226,8 @@ def _check_cells(table: Table, columns: Sequence[str], start: int, stop: int) ->
             row = start + int(bad[0])
             text = table.cell(name, row)
             what = f"found '{text}'" if text else "the cell is empty"
-            raise InputError(f"{table.path}: {table.where(row)}, column '{name}': {what}; expected a finite number.")
+            error = MissingSampleError if text.strip().lower() in _MISSING else InputError
+            raise error(f"{table.path}: {table.where(row)}, column '{name}': {what}; expected a finite number.")
 
 
 def _uniform_step(table: Table, time: str, start: int, stop: int) -> float:

@@ -78,9 +78,8 @@ class LaggedFilter:
         enters = jnp.concatenate([jnp.asarray(self._newest), jnp.eye(ny)])
         covariance = derivative @ belief.covariance @ derivative.T + enters @ noise.state @ enters.T
         mean, after, spread, square, likelihood = corrected(value, covariance, noise.output, measured)
-        following = Belief(mean[:n], after[:n, :n])
-        told = (value[n:], spread, mean[n:], after[n:, n:], *following, square, likelihood)
-        return following, Told(*told)
+        told = Told(value[n:], spread, mean[n:], after[n:, n:], mean[:n], after[:n, :n], square, likelihood)
+        return Belief(told.state, told.state_covariance), told
 
     @property
     def _newest(self) -> Matrix:

@@ -55,8 +55,9 @@ class MotionFilter:
         mean = jnp.concatenate([belief.state, value])
         mean, after, spread, square, likelihood = corrected(mean, covariance, noise.output, measured)
         following, moved = slope(lambda x: self.step(numbers, x, inputs)[0], mean[:n])
-        told = (value, spread, mean[n:], after[n:, n:], mean[:n], after[:n, :n], square, likelihood)
-        return Belief(following, moved @ after[:n, :n] @ moved.T + noise.state), Told(*told)
+        own = after[:n, :n]
+        told = Told(value, spread, mean[n:], after[n:, n:], mean[:n], own, square, likelihood)
+        return Belief(following, moved @ own @ moved.T + noise.state), told
 
     def unit(self, noise: Matrix, size: Vector) -> Matrix:
         """A disturbance (nx, nx) as large as the states; none where a rate is another state: that is exact."""
