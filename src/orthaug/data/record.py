@@ -258,6 +258,16 @@ class Record:
         """Outputs first, then inputs: the order of the regressor."""
         return self.outputs + self.inputs
 
+    def check_measured(self) -> None:
+        """Raise InputError where an output is missing, as a record for an `Observer` may have it."""
+        for experiment in self.experiments:
+            bad = np.flatnonzero(np.isnan(experiment.outputs).any(axis=1))
+            if bad.size:
+                raise InputError(
+                    f"{experiment.where(int(bad[0]))}: an output is missing there, which only an Observer takes; leave "
+                    'such rows out (`missing = "skip"`), or split the experiment there.'
+                )
+
     def rows(self, start: int | None = None, stop: int | None = None) -> Record:
         """The half-open range of rows `[start, stop)` of a single experiment; negative ones count from its end."""
         for name, value in (("start", start), ("stop", stop)):

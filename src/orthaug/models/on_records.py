@@ -81,14 +81,10 @@ class OnRecords:
             replace(e, inputs=e.inputs[:, order["inputs"]], outputs=e.outputs[:, order["outputs"]])
             for e in record.experiments
         )
-        for experiment in () if gaps else experiments:
-            bad = np.flatnonzero(~np.isfinite(experiment.outputs).all(axis=1))
-            if bad.size:
-                raise InputError(
-                    f"{experiment.where(int(bad[0]))}: an output is missing there; an Observer takes such records, "
-                    "others split the experiment there."
-                )
-        return Record(self.inputs, wanted["outputs"], record.sampling_time, experiments)
+        fitting = Record(self.inputs, wanted["outputs"], record.sampling_time, experiments)
+        if not gaps:
+            fitting.check_measured()
+        return fitting
 
 
 def trajectory(parts: Parts, experiment: Experiment, measured: Matrix | None, first: int) -> Trajectory:

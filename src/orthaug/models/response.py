@@ -43,13 +43,14 @@ class Scores:
 def scores(measured: Matrix, model: Matrix) -> Scores:
     """RMSE, NRMSE (population standard deviation of the scored samples) and FIT of each column, (N, ny)."""
     with np.errstate(all="ignore"):
-        scored = True if (there := np.isfinite(measured)).all() else there  # what is missing is not scored
+        there = np.isfinite(measured)  # what is missing is not scored
+        scored = True if there.all() else there
         rmse = np.sqrt(np.mean((measured - model) ** 2, axis=0, where=scored))
         deviation = measured.std(axis=0, where=scored)
     rmse = np.where(np.isfinite(rmse), rmse, np.nan)
     moves = (deviation > 0) & np.isfinite(deviation)
     nrmse = np.where(moves, rmse / np.where(moves, deviation, 1.0), np.nan)
-    return Scores(rmse, nrmse, 100 * (1 - nrmse), len(measured))
+    return Scores(rmse, nrmse, 100 * (1 - nrmse), int(np.count_nonzero(there.any(axis=1))))
 
 
 @dataclass(frozen=True, eq=False)
