@@ -133,7 +133,7 @@ class Controller:
 
 
 def reference(steps: int) -> np.ndarray:
-    """Slow swings, a rest, and steps that are smoothed, in m; nothing like the training data."""
+    """Slow swings, then ramps between levels, in m; nothing like the training data."""
     t = TS * np.arange(steps)
     swing = 0.04 * np.sin(2 * np.pi * 0.5 * t) + 0.02 * np.sin(2 * np.pi * 0.23 * t)
     levels = np.interp(t, [0, 3.0, 3.2, 4.0, 4.2, 9.0], [0, 0, 0.05, 0.05, -0.03, -0.03])
