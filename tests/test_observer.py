@@ -282,7 +282,7 @@ def system(q, r, seed=0, rows=1500):
 def test_the_residual_tells_where_the_noise_enters(q, r, criterion):
     fit = oa.estimate(system(q, r), PHYSICS, learner=None, criterion=criterion)
     noise = oa.Observer(fit).noise
-    assert noise.state[0, 0] == pytest.approx(q**2, rel=0.15, abs=2e-3 * r**2)
+    assert noise.state[0, 0] == pytest.approx(q**2, rel=0.15, abs=5e-3 * r**2)
     assert noise.output[0, 0] == pytest.approx(r**2, rel=0.1)
     told = oa.Observer(fit).run(system(q, r, seed=1)).consistency()
     assert told.consistent and told.whiteness[0].p > 0.01
@@ -293,8 +293,8 @@ def test_a_model_by_itself_goes_by_how_it_was_trained():
     model = oa.estimate(system(0.1, 0.3), PHYSICS, learner=None, criterion=oa.Simulation()).model
     sensor = by_verdict(model)
     both = by_verdict(replace(model, statistics=replace(model.statistics, verdict="equation_noise")))
-    assert both.state[0, 0] == pytest.approx(90 * sensor.state[0, 0])
-    assert both.output[0, 0] == pytest.approx(sensor.output[0, 0] * 0.1 / 0.99)
+    assert both.state[0, 0] == pytest.approx(30 * sensor.state[0, 0])
+    assert both.output[0, 0] == pytest.approx(sensor.output[0, 0] * 0.1 / 0.97)
     free = replace(model.statistics, flown=False)
     assert by_verdict(replace(model, statistics=free)).output == 0
 

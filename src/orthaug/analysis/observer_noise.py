@@ -2,7 +2,8 @@
 
 Noise in the equations moves the state; noise on a sensor does not. The residual tells which (`diagnose`): a white one
 one step ahead is the equation's, R = 0 and Q its covariance; a white one of a free run is the sensors', R its
-covariance, and Q so small that it makes a hundredth of the free run's variance. Otherwise both are there.
+covariance, and Q so small that it makes 3 % of the free run's variance: that is for a model that is not exact.
+Otherwise both are there.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from orthaug.models.kalman import Noise, log_likelihood
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 
-_LITTLE, _MOST = 0.01, 0.9  # shares of a free run's variance that disturbances make
+_LITTLE, _MOST = 0.03, 0.9  # shares of a free run's variance that disturbances make
 BOTH = ("equation_noise", "unmodelled")  # verdicts on a free run that tell of disturbances
 _STEPS = 400  # that a disturbance is followed
 _TUNED_ROWS = 4000

@@ -1,0 +1,173 @@
+"""Are the innovations of an observer white and of the expected size, and do its bands hold 95 %? By simulation.
+
+A Duffing oscillator with a disturbance and a noisy sensor, as lagged physics and as a motion. With the noises known and
+the model exact, the filter itself is asked; with the noises that the residual of a fit tells, all of it is: θ, the
+learned part (the cube is not in the physics) and the noises come from one record, the observer runs on another.
+Run: python benchmarks/observer.py [draws, default 20]
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from machine import describe
+
+import orthaug as oa
+
+ROWS, TS = 1000, 0.1
+SPRING = [oa.Term("a", "y[k-1]"), oa.Term("b", "y[k-2]"), oa.Term("g", "u[k-1]")]
+TRUE = {"a": 1.6, "b": -0.8, "g": 0.2, "h": -0.05}
+LEVELS = {"equation": (0.1, 0.0), "sensor": (0.0, 0.1), "both": (0.1, 0.1)}
+
+
+def lagged(baseline: list[oa.Term], learner: Any, record: oa.Record, sensor: bool) -> Any:
+    """A fit of lagged physics, on the free run where the sensor is noisy."""
+    criterion = oa.Simulation(segment=0, washout=0) if sensor else oa.Prediction()
+    return oa.estimate(record, oa.Baseline.from_terms(baseline), learner=learner, criterion=criterion)
+
+
+def motion(*, cube: bool) -> oa.Motion:
+    """The oscillator with its cube, or without."""
+    force = "u - c*v - k*x - h*x**3" if cube else "u - c*v - k*x"
+    given = (("c", 0.6), ("k", 4.0), *((("h", 2.0),) if cube else ()))
+    return oa.Motion.from_equations(
+        states=[oa.State("x", "v", start="y"), oa.State("v", force, start="derivative of y", learned=not cube)],
+        outputs=[oa.Output("y", "x")],
+        parameters=[oa.PhysicalParameter(name, value) for name, value in given],
+        inputs=["u"],
+    )
+
+
+class Draw(NamedTuple):
+    """A record, and what is true along it: outputs without the sensor's noise, states of a motion."""
+
+    record: oa.Record
+    outputs: np.ndarray
+    states: np.ndarray
+
+
+class Plant(NamedTuple):
+    """A model that is exact, and how it is disturbed: from a random input to a record."""
+
+    model: Any
+    enters: Callable[[np.ndarray, np.ndarray, float], tuple[np.ndarray, np.ndarray]]
+
+    def draw(self, seed: int, disturbance: float, sensor: float) -> Draw:
+        rng, step = np.random.default_rng([seed, 5]), oa.numpy_step(self.model)
+        u = np.repeat(rng.normal(size=-(-ROWS // 4)), 4)[:ROWS]
+        state, states, outputs = np.zeros(len(self.model.state_names)), [], []
+        for value, w in zip(u, disturbance * rng.normal(size=ROWS), strict=True):
+            states.append(state)
+            state, y = self.enters(*map(np.array, step(state, np.array([value]))), w)
+            outputs.append(y)
+        measured = np.array(outputs) + sensor * rng.normal(size=(ROWS, 1))
+        return Draw(oa.Record.from_arrays(u, measured, sampling_time=TS), np.array(outputs), np.array(states))
+
+
+def lagged_plant() -> Plant:
+    """Of lagged physics with the cube; the disturbance goes on in the lags."""
+    rng, y = np.random.default_rng(0), np.zeros(200)
+    u = rng.normal(size=200)
+    for k in range(2, 200):
+        y[k] = TRUE["a"] * y[k - 1] + TRUE["b"] * y[k - 2] + TRUE["g"] * u[k - 1] + TRUE["h"] * y[k - 1] ** 3
+    record = oa.Record.from_arrays(u, y, sampling_time=TS)
+
+    def enters(state: np.ndarray, y: np.ndarray, w: float) -> tuple[np.ndarray, np.ndarray]:
+        state[0] = y[0] + w
+        return state, y + w
+
+    return Plant(lagged([*SPRING, oa.Term("h", "y[k-1]**3")], None, record, False).model, enters)
+
+
+def motion_plant() -> Plant:
+    """Of the motion with the cube; the disturbance moves its velocity."""
+    u = np.repeat(np.random.default_rng(0).normal(size=50), 4)
+    exact = motion(cube=True)
+    begun = oa.estimate(oa.Record.from_arrays(u, np.sin(np.arange(200.0)), sampling_time=TS), exact, learner=None).model
+    model = begun.__class__(**{**vars(begun), "numbers": begun.numbers._replace(theta=exact.coordinates.initial)})
+
+    def enters(state: np.ndarray, y: np.ndarray, w: float) -> tuple[np.ndarray, np.ndarray]:
+        return state + [0.0, w], y
+
+    return Plant(model, enters)
+
+
+def judged(observer: oa.Observer, draw: Draw) -> list[float]:
+    """NIS, whether it lies in its interval, whether white at 5 %, coverage of outputs, of measurements, of states."""
+    found = observer.run(draw.record)
+    told, (one,) = found.consistency(), found.experiments
+    rows = slice(max(one.start, found.settled), None)
+
+    def inside(true: np.ndarray, value: np.ndarray, std: np.ndarray) -> float:
+        return float(np.mean(np.abs(true - value)[rows] <= 1.96 * std[rows] + 1e-12))
+
+    white = told.whiteness[0]
+    states = inside(draw.states, one.states, one.states_std) if found.state_names else np.nan
+    return [
+        told.nis,
+        100.0 * told.consistent,
+        100.0 * (white is not None and white.p > 0.05),
+        100 * inside(draw.outputs, one.outputs, one.outputs_std),
+        100 * inside(one.measured, one.predicted, one.predicted_std),
+        100 * states,
+    ]
+
+
+def known(plant: Plant, draws: int) -> list[list[float]]:
+    """With the model exact and the noises known."""
+    q, r = LEVELS["both"]
+    hidden = len(plant.model.state_names) == 2
+    state = np.diag([0.0, q**2]) if hidden else np.array([[q**2]])
+    observer = oa.Observer(plant.model, oa.Noise(state, np.array([[r**2]])))
+    return [judged(observer, plant.draw(seed, q, r)) for seed in range(draws)]
+
+
+def told_by_a_fit(plant: Plant, levels: tuple[float, float], draws: int) -> list[list[float]]:
+    """With all that a fit of another record tells; the cube is learned."""
+    rows, cube = [], motion(cube=False)
+    for seed in range(draws):
+        record = plant.draw(1000 + seed, *levels).record
+        if len(plant.model.state_names) == 2:
+            fit = oa.estimate(record, cube, learner=oa.MLP((6,), inputs=("x",)))
+        else:
+            fit = lagged(SPRING, oa.MLP((6,), inputs=("y[k-1]",)), record, levels[1] > 0)
+        rows.append(judged(oa.Observer(fit), plant.draw(seed, *levels)))
+    return rows
+
+
+def table(draws: int = 20) -> list[list[float]]:
+    """Per case: mean NIS, and in per cent draws whose NIS lies in its 95 % interval, draws that are white at 5 %, and
+    coverage of the outputs, of the next measurement, and of the states of a motion."""
+    plants = {"lagged": lagged_plant(), "motion": motion_plant()}
+    found = [known(plant, 10 * draws) for plant in plants.values()]
+    for name, level in (("lagged", "equation"), ("lagged", "sensor"), ("lagged", "both")):
+        found.append(told_by_a_fit(plants[name], LEVELS[level], draws))
+    for name, level in (("motion", "sensor"), ("motion", "both")):
+        found.append(told_by_a_fit(plants[name], LEVELS[level], max(draws // 3, 2)))
+    means = [np.mean(rows, axis=0) for rows in found]
+    return [[None if np.isnan(value) else float(value) for value in row] for row in means]
+
+
+CASES = (
+    *("lagged, exact, noises known", "motion, exact, noises known"),
+    *(f"lagged, fitted, {level}" for level in LEVELS),
+    *("motion, fitted, sensor", "motion, fitted, both"),
+)
+
+
+def main(draws: int) -> None:
+    print(describe())
+    began = time.perf_counter()
+    print("| case | NIS | in its interval | white | outputs | measurements | states |\n|---|---|---|---|---|---|---|")
+    for case, row in zip(CASES, table(draws), strict=True):
+        cells = ["–" if value is None else f"{value:.1f} %" for value in row[1:]]
+        print(f"| {case} | {row[0]:.3f} | {' | '.join(cells)} |")
+    print(f"{time.perf_counter() - began:.0f} s")
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 20)
