@@ -17,10 +17,12 @@ import numpy as np
 from machine import describe
 
 import orthaug as oa
+from orthaug.analysis.observer_noise import with_share
 
 ROWS, TS = 1000, 0.1
 SPRING = [oa.Term("a", "y[k-1]"), oa.Term("b", "y[k-2]"), oa.Term("g", "u[k-1]")]
 TRUE = {"a": 1.6, "b": -0.8, "g": 0.2, "h": -0.05}
+SHARES = (0.01, 0.03, 0.1)
 LEVELS = {"equation": (0.1, 0.0), "sensor": (0.0, 0.1), "both": (0.1, 0.1)}
 
 
@@ -128,15 +130,31 @@ def known(plant: Plant, draws: int) -> list[list[float]]:
 
 def told_by_a_fit(plant: Plant, levels: tuple[float, float], draws: int) -> list[list[float]]:
     """With all that a fit of another record tells; the cube is learned."""
-    rows, cube = [], motion(cube=False)
-    for seed in range(draws):
-        record = plant.draw(1000 + seed, *levels).record
-        if len(plant.model.state_names) == 2:
-            fit = oa.estimate(record, cube, learner=oa.MLP((6,), inputs=("x",)))
-        else:
-            fit = lagged(SPRING, oa.MLP((6,), inputs=("y[k-1]",)), record, levels[1] > 0)
-        rows.append(judged(oa.Observer(fit), plant.draw(seed, *levels)))
-    return rows
+    records = (plant.draw(1000 + seed, *levels).record for seed in range(draws))
+    observers = (oa.Observer(fitted(plant, record, levels[1] > 0)) for record in records)
+    return [judged(observer, plant.draw(seed, *levels)) for seed, observer in enumerate(observers)]
+
+
+def fitted(plant: Plant, record: oa.Record, sensor: bool) -> Any:
+    """A fit of either kind of physics without the cube, which is learned."""
+    if len(plant.model.state_names) == 2:
+        return oa.estimate(record, motion(cube=False), learner=oa.MLP((6,), inputs=("x",)))
+    return lagged(SPRING, oa.MLP((6,), inputs=("y[k-1]",)), record, sensor)
+
+
+def shares(draws: int = 5) -> list[list[float]]:
+    """Noise on the sensor alone, per share of its variance that is given to disturbances: of lagged physics, then of
+    the motion, NIS, coverage in per cent of the outputs, and RMSE of the next measurement over its noise."""
+    found, (_, sensor) = [], LEVELS["sensor"]
+    for plant in (lagged_plant(), motion_plant()):
+        rows = []
+        for seed in range(draws):
+            model = fitted(plant, plant.draw(1000 + seed, 0.0, sensor).record, True).model
+            held = plant.draw(seed, 0.0, sensor)
+            observers = [oa.Observer(model, with_share(model, model.statistics.noise, share)) for share in SHARES]
+            rows.append([[*judged(o, held)[::3], o.predict(held.record).scores().rmse[0] / sensor] for o in observers])
+        found.append(np.mean(rows, axis=0))
+    return np.concatenate(found, axis=1).tolist()
 
 
 def table(draws: int = 20) -> list[list[float]]:
@@ -166,6 +184,8 @@ def main(draws: int) -> None:
     for case, row in zip(CASES, table(draws), strict=True):
         cells = ["–" if value is None else f"{value:.1f} %" for value in row[1:]]
         print(f"| {case} | {row[0]:.3f} | {' | '.join(cells)} |")
+    for share, row in zip(SHARES, shares(), strict=True):
+        print(f"disturbances make {100 * share:.0f} %:", *(f"{value:.3f}" for value in row))
     print(f"{time.perf_counter() - began:.0f} s")
 
 

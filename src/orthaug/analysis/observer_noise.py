@@ -46,10 +46,10 @@ def by_verdict(model: Model | MotionModel, verdict: str | None = None) -> Noise:
     verdict, nothing = kept.verdict if verdict is None else verdict, np.zeros_like(kept.noise)
     if not kept.flown and verdict != "sensor_noise":
         return Noise(np.array(kept.noise), nothing)
-    return _shared(model, kept.noise, _MOST if verdict in BOTH else _LITTLE)
+    return with_share(model, kept.noise, _MOST if verdict in BOTH else _LITTLE)
 
 
-def _shared(model: Model | MotionModel, noise: Matrix, share: float) -> Noise:
+def with_share(model: Model | MotionModel, noise: Matrix, share: float) -> Noise:
     """Disturbances that make a share of a free run's variance `noise`, about the origin; the sensors make the rest."""
     form, numbers, size = model.filtering
     unit = form.unit(noise, size)
