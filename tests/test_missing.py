@@ -149,8 +149,8 @@ def test_missing_cells_are_errors_by_default(tmp_path):
         read_record(path, inputs=["u"], outputs=["y"])
 
 
-def test_only_two_ways_are_known(tmp_path):
-    with pytest.raises(InputError, match="`missing` must be one of error, skip; got 'drop'"):
+def test_other_ways_are_unknown(tmp_path):
+    with pytest.raises(InputError, match="`missing` must be one of error, skip, keep; got 'drop'"):
         read(write(tmp_path / "run.csv"), missing="drop")
 
 

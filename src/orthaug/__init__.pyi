@@ -4,6 +4,7 @@ from ._base import TrainingError as TrainingError
 from .analysis import Linearization as Linearization
 from .analysis import LinearView as LinearView
 from .analysis import MotionSuspect as MotionSuspect
+from .analysis import Observer as Observer
 from .analysis import Suspect as Suspect
 from .analysis import bias_budget as bias_budget
 from .analysis import design_input as design_input
@@ -53,6 +54,7 @@ from .models import External as External
 from .models import Function as Function
 from .models import Model as Model
 from .models import MotionModel as MotionModel
+from .models import Noise as Noise
 from .models import Response as Response
 from .models import Stream as Stream
 from .models import Terms as Terms

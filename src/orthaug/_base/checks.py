@@ -17,8 +17,8 @@ Vector = Float[np.ndarray, "_"]
 Matrix = Float[np.ndarray, "_ _"]
 
 
-def as_signal(values: Any, name: str) -> Matrix:
-    """Samples as a float matrix (N, channels); a vector is one channel.
+def as_signal(values: Any, name: str, *, gaps: bool = False) -> Matrix:
+    """Samples as a float matrix (N, channels); a vector is one channel. NaN may stand for missing ones if `gaps`.
 
     Raises:
         InputError: not numeric, more than two axes, or a cell that is not finite (named by its row).
@@ -34,7 +34,7 @@ def as_signal(values: Any, name: str) -> Matrix:
         array = array[:, None]
     if array.ndim != 2:
         raise InputError(f"`{name}` has {array.ndim} axes; expected (samples,) or (samples, channels).")
-    bad = np.argwhere(~np.isfinite(array))
+    bad = np.argwhere(np.isinf(array) if gaps else ~np.isfinite(array))
     if bad.size:
         row, column = bad[0]
         raise InputError(

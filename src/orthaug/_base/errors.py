@@ -79,6 +79,10 @@ class MissingColumnError(InputError):
     """A data file lacks a column or variable that is asked for."""
 
 
+class MissingSampleError(InputError):
+    """A data file has a cell without a sample where every cell must have one."""
+
+
 class RankError(InputError):
     """The physics columns are linearly dependent on the data; names the parameters involved."""
 

@@ -15,18 +15,23 @@ from orthaug.commands import streams
 from orthaug.commands.bars import study_bars, training_bar
 from orthaug.commands.program import (
     AsJson,
+    Columns,
     DataPath,
+    Every,
     Force,
     Initial,
+    Missing,
     ModelPath,
     OutFile,
     OutFolder,
+    Rows,
     SpecPath,
     app,
     main,
 )
 
 if TYPE_CHECKING:
+    from orthaug.commands.run import ModelOnData
     from orthaug.models.response import Response
 
 __all__ = ["main"]
@@ -141,17 +146,22 @@ def simulate(
     data: DataPath,
     out: OutFile = None,
     initial: Initial = None,
+    missing: Missing = "error",
+    rows: Rows = None,
+    every: Every = 1,
+    column: Columns = None,
     force: Force = False,
 ) -> None:
     """Free run of a saved model on a data file."""
     from orthaug.commands import run
     from orthaug.commands.folder import check_file
 
-    opened = run.open_run(model, data)
+    opened = run.open_run(model, data, reading=run.Reading.of(missing, rows, every, column or ()))
     start = run.read_initial(initial, opened)
     check_file(out, model, data, Path(initial or data), force=force)
     _prepare_jax()
-    _write_response(opened.model.simulate(opened.record, initial=start), out, force, run.notes(opened, initial))
+    response = opened.model.simulate(opened.record, initial=start)
+    _write_response(response, opened, out, force, run.notes(opened, initial))
 
 
 @app.command()
@@ -161,17 +171,24 @@ def predict(
     horizon: Annotated[int, typer.Option("--horizon", metavar="H", help="Steps ahead.")] = 1,
     out: OutFile = None,
     initial: Initial = None,
+    observer: Annotated[
+        bool, typer.Option("--observer", help="From an estimated state, with 95 % bands; outputs may be missing.")
+    ] = False,
+    missing: Missing = "error",
+    rows: Rows = None,
+    every: Every = 1,
+    column: Columns = None,
     force: Force = False,
 ) -> None:
     """H-step-ahead prediction of a saved model."""
     from orthaug.commands import run
     from orthaug.commands.folder import check_file
 
-    opened = run.open_run(model, data, need_outputs=True)
-    record = run.with_initial(opened, run.read_initial(initial, opened))
+    reading = run.Reading.of(missing, rows, every, column or ())
+    opened = run.open_ahead(model, data, reading, horizon, initial, observer=observer)
     check_file(out, model, data, Path(initial or data), force=force)
     _prepare_jax()
-    _write_response(opened.model.predict(record, horizon=horizon), out, force)
+    _write_response(run.predicted(opened, horizon, observer=observer), opened, out, force, opened.notes)
 
 
 @app.command()
@@ -194,9 +211,10 @@ def split(
     """Parameters of a saved model under another measure, without training again."""
     from orthaug.commands import split as splitting
     from orthaug.commands.measure_options import read_measure, split_place
+    from orthaug.commands.run import read_rows
     from orthaug.reports.text import split_text
 
-    opened = splitting.open_training(model, data, splitting.read_rows(rows))
+    opened = splitting.open_training(model, data, read_rows(rows))
     given = {"box": box or [], "samples": [samples] if samples else [], "weights": [weights] if weights else []}
     chosen = read_measure(measure, given, split_place(opened.model, opened.record))
     _prepare_jax()
@@ -365,14 +383,16 @@ def _prepare_jax() -> None:
     use_compilation_cache()
 
 
-def _write_response(response: Response, out: Path | None, force: bool, notes: Sequence[str] = ()) -> None:
+def _write_response(
+    response: Response, opened: ModelOnData, out: Path | None, force: bool, notes: Sequence[str] = ()
+) -> None:
     """The CSV and what is to say about it: scores go where the CSV does not."""
     from orthaug.commands import run
     from orthaug.reports.text import response_text
 
     for line in (*notes, *(f"warning: {warning.text}" for warning in run.warnings(response))):
         streams.say(line)
-    run.write_csv(response, out, force=force)
+    run.write_csv(response, opened, out, force=force)
     told = response_text(response)
     if told:
         (streams.say if out is None else streams.echo)(told)

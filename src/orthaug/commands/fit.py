@@ -92,6 +92,9 @@ def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitt
         for part in job.parts:
             scores[part.name], responses[part.name] = score_part(fit.model, part, warnings)
     fit, told = kind_of(job).content(job, fit, responses, warnings)
+    if fit.status.ok and told["residuals"] is not None:  # an observer of the saved model asks for it
+        kept = replace(fit.model.statistics, verdict=told["residuals"].verdict)
+        fit = replace(fit, model=replace(fit.model, statistics=kept))
     content = told | {
         "spec": job.declaration,
         "data": job.data,

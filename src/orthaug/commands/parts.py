@@ -40,28 +40,11 @@ class Part:
         Args:
             least: rows of a stretch that has a use.
         """
-        record = self.record
-        if not record.missing:
+        if not self.record.missing:
             return self
-        pairs = zip(record.experiments, self.skips, strict=True)
-        long = tuple(e for e, skip in pairs if len(e) > max(first, skip) and len(e) >= least)
-        if not long:
-            most = max(len(e) for e in record.experiments)
-            needed = f"the first {max(first, self.skip)} are lags or skipped"
-            needed = f"at least {least} are needed" if most < least else needed
-            raise InputError(
-                f"{record.experiments[0].source}: data.{self.name}: the longest stretch between missing samples has "
-                f"{_count(most, 'row')}, too few: {needed}."
-            )
-        record = replace(record, experiments=long)
-        usable = sum(len(experiment) - first for experiment in record.experiments)
-        lost = "row has missing cells and is" if record.missing == 1 else "rows have missing cells and are"
-        gaps = Warning(
-            "missing_rows",
-            f"{self.name}: {record.missing} {lost} left out with all windows that touch them; "
-            f"{_count(usable, 'usable row')} remain, in {_count(len(record.experiments), 'stretch', 'stretches')}.",
-        )
-        return replace(self, record=record, warnings=(*self.warnings, gaps))
+        record, gaps = long_stretches(self.record, self.skips, first, least, f"data.{self.name}: ", self.skip)
+        told = Warning("missing_rows", f"{self.name}: {gaps}")
+        return replace(self, record=record, warnings=(*self.warnings, told))
 
     @property
     def skips(self) -> tuple[int, ...]:
@@ -94,6 +77,38 @@ class Part:
                     f"{experiment.source}: data.{self.name} has {len(experiment)} rows, too few; the first {first} are "
                     f"lags or skipped, so at least {first + 1} are needed."
                 )
+
+
+def long_stretches(
+    record: Record, skips: Sequence[int], first: int, least: int = 0, what: str = "", skip: int = 0
+) -> tuple[Record, str]:
+    """A record without stretches that are too short for a row after the first ones, and what was left out, in words.
+
+    Args:
+        skips: leading samples of each stretch that are not scored.
+        least: rows of a stretch that has a use.
+        what: stands before what is wrong; `skip` is the largest of the skips as it was asked for.
+
+    Raises:
+        InputError: no stretch is long enough.
+    """
+    pairs = zip(record.experiments, skips, strict=True)
+    long = tuple(e for e, own in pairs if len(e) > max(first, own) and len(e) >= least)
+    if not long:
+        most = max(len(e) for e in record.experiments)
+        needed = f"the first {max(first, skip)} are lags or skipped"
+        needed = f"at least {least} are needed" if most < least else needed
+        raise InputError(
+            f"{record.experiments[0].source}: {what}the longest stretch between missing samples has "
+            f"{_count(most, 'row')}, too few: {needed}."
+        )
+    kept = replace(record, experiments=long)
+    usable = sum(len(experiment) - first for experiment in long)
+    lost = "row has missing cells and is" if record.missing == 1 else "rows have missing cells and are"
+    return kept, (
+        f"{record.missing} {lost} left out with all windows that touch them; "
+        f"{_count(usable, 'usable row')} remain, in {_count(len(long), 'stretch', 'stretches')}."
+    )
 
 
 def load_parts(path: Path, spec: Spec) -> tuple[Part, Part | None, tuple[Part, ...]]:

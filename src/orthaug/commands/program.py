@@ -46,6 +46,15 @@ Initial = Annotated[
     str | None,
     typer.Option("--initial", metavar="measured|zero|INIT", help="Outputs before the first step; INIT is a CSV."),
 ]
+Missing = Annotated[
+    str, typer.Option("--missing", metavar="error|skip", help="Rows with missing cells; skip leaves them out.")
+]
+Rows = Annotated[str | None, typer.Option("--rows", metavar="A:B", help="Rows of the file, half-open.")]
+Every = Annotated[int, typer.Option("--every", metavar="N", help="Keep each N-th row.")]
+Columns = Annotated[
+    list[str] | None,
+    typer.Option("--column", metavar="NAME=COLUMN", help="The file's column of a channel; any number."),
+]
 Force = Annotated[bool, typer.Option("--force", help="Replace what is there, whoever wrote it.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the summary.")]
 

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orthaug._base.errors import InputError
+from orthaug._base.checks import check_choice, nearest
+from orthaug._base.errors import InputError, MissingSampleError
 from orthaug._base.folders import whole_file
 from orthaug._base.warning import Warning
+from orthaug.commands.parts import long_stretches
 from orthaug.data.readers import read_record
 from orthaug.data.record import Record
 from orthaug.data.tables import check_readable, has_column
@@ -22,40 +25,108 @@ if TYPE_CHECKING:
     from orthaug.models.response import Response
 
 
+@dataclass(frozen=True)
+class Reading:
+    """Which rows and columns of a data file are read, as a part of a spec says it."""
+
+    missing: str = "error"
+    rows: tuple[int, int] | None = None
+    every: int = 1
+    columns: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, missing: str, rows: str | None, every: int, columns: Sequence[str]) -> Reading:
+        """Of the options of a command.
+
+        Raises:
+            InputError: an option that is none.
+        """
+        check_choice(missing, ("error", "skip"), "--missing")
+        if every < 1:
+            raise InputError(f"--every: found {every}; expected 1 or more.")
+        named = {}
+        for text in columns:
+            name, equal, column = text.partition("=")
+            if not (name and equal and column):
+                raise InputError(f"--column: found '{text}'; expected NAME=COLUMN, such as position=yVal.")
+            named[name] = column
+        return cls(missing, read_rows(rows), every, named)
+
+
 @dataclass(frozen=True, eq=False)
 class ModelOnData:
-    """A saved model with the record of a data file."""
+    """A saved model with the record of a data file, and how many rows of it were read, missing ones too."""
 
     model: Model | MotionModel
     record: Record
     source: Path
+    rows: int = 0
+    notes: tuple[str, ...] = ()
 
 
-def open_run(model: Path, data: Path, *, need_outputs: bool = False) -> ModelOnData:
+def read_rows(text: str | None) -> tuple[int, int] | None:
+    """`A:B` as a half-open range of rows."""
+    if text is None:
+        return None
+    start, _, stop = text.partition(":")
+    if not (start.isdecimal() and stop.isdecimal() and text.isascii()):
+        raise InputError(f"--rows: found '{text}'; expected a half-open range of rows such as 0:1000.")
+    return int(start), int(stop)
+
+
+def open_run(
+    model: Path, data: Path, *, need_outputs: bool = False, reading: Reading | None = None, ahead: int = 0
+) -> ModelOnData:
     """Load a model and read its channels from a file; outputs only where the file has them, unless needed.
 
+    Args:
+        ahead: rows behind the first usable one before a stretch between missing samples has a value.
+
     Raises:
-        InputError: no model, no file, missing columns.
+        InputError: no model, no file, missing columns, no stretch that is long enough.
     """
     check_readable(data)
     from orthaug.models.storage import load
 
-    loaded = load(model)
-    held = [c for c in loaded.outputs if has_column(data, c.file_column)]
+    loaded, reading = load(model), reading or Reading()
+    names = [c.name for c in (*loaded.inputs, *loaded.outputs)]
+    for name in reading.columns:
+        if name not in names:
+            raise InputError(
+                f"--column: '{name}' is no channel of the model{nearest(name, names)}; it has {', '.join(names)}."
+            )
+    held = [c for c in loaded.outputs if has_column(data, reading.columns.get(c.name, c.file_column))]
     if need_outputs or not loaded.inputs or len(held) == len(loaded.outputs):
         held = list(loaded.outputs)
     elif held:
         missing = [c.name for c in loaded.outputs if c not in held]
         raise InputError(f"{data}: has some of the model's outputs but not {', '.join(missing)}; give all or none.")
-    step = None if loaded.time_column else loaded.sampling_time
-    record = read_record(data, inputs=loaded.inputs, outputs=held, sampling_time=step, time=loaded.time_column)
-    return ModelOnData(loaded, record, data)
+    step = None if loaded.time_column else loaded.sampling_time / reading.every
+    options = {"rows": reading.rows, "every": reading.every, "columns": reading.columns, "missing": reading.missing}
+    channels = {"inputs": loaded.inputs, "outputs": held}
+    try:
+        record = read_record(data, **channels, sampling_time=step, time=loaded.time_column, **options)
+    except MissingSampleError as error:
+        raise InputError(f"{error} --missing skip leaves such rows out.") from None
+    rows, told = len(record) + record.missing, ()
+    if record.missing:
+        estimated = need_outputs and loaded.form.states and not loaded.form.memory  # a state to predict from
+        first = loaded.form.first_row + ahead + bool(estimated)
+        record, text = long_stretches(record, [0] * len(record.experiments), first)
+        told = (f"note: {data}: {text}",)
+    return ModelOnData(loaded, record, data, rows, told)
 
 
 def read_initial(initial: str | None, opened: ModelOnData) -> str | Any:
     """The `initial` of `Model.simulate`: measured where the data have outputs, zero otherwise, or a CSV's rows."""
+    gaps, measured = len(opened.record.experiments) > 1, bool(opened.record.outputs)
+    if gaps and not (measured and initial in (None, "measured")):
+        remedy = "leave --initial out" if measured else "a free run without measured outputs cannot go on behind them"
+        raise InputError(
+            f"{opened.source}: has missing samples, and each stretch starts from its own outputs; {remedy}."
+        )
     if initial is None:
-        return "measured" if opened.record.outputs else "zero"
+        return "measured" if measured else "zero"
     if initial in ("measured", "zero"):
         if initial == "measured" and not opened.record.outputs:
             raise InputError(f"{opened.source}: has no measured outputs to start from; use --initial zero or a CSV.")
@@ -73,25 +144,53 @@ def read_initial(initial: str | None, opened: ModelOnData) -> str | Any:
 def notes(opened: ModelOnData, initial: str | None) -> list[str]:
     """What a user may not expect of a free run: where it starts when nothing says so."""
     if initial is not None or opened.record.outputs or not opened.model.form.states:
-        return []
+        return [*opened.notes]
     names = ", ".join(channel.name for channel in opened.model.outputs)
-    return [f"note: {opened.source} has no {names}: the free run starts from 0; --initial CSV gives other outputs."]
+    return [
+        *opened.notes,
+        f"note: {opened.source} has no {names}: the free run starts from 0; --initial CSV gives other outputs.",
+    ]
 
 
 def with_initial(opened: ModelOnData, initial: str | Any) -> Record:
     """The record with the outputs of its first rows replaced, for predictions that start from others."""
     if isinstance(initial, str) and initial == "measured":
         return opened.record
-    start, experiment = opened.model.form.first_row, opened.record.experiments[0]
+    start = opened.model.form.first_row
     if opened.model.form.states and not opened.model.form.memory:
         raise InputError(
             "--initial: found with a motion, whose predictions start from states that are estimated from the rows "
             "before them; leave it out."
         )
+    (experiment,) = opened.record.experiments
     outputs = experiment.outputs.copy()
     rows = np.zeros((start, outputs.shape[1])) if isinstance(initial, str) else initial[:start]
     outputs[start - len(rows) : start] = rows
     return replace(opened.record, experiments=(replace(experiment, outputs=outputs),))
+
+
+def open_ahead(
+    model: Path, data: Path, reading: Reading, horizon: int, initial: str | None, *, observer: bool = False
+) -> ModelOnData:
+    """As `open_run` for predictions `horizon` steps ahead; an observer's record keeps missing outputs.
+
+    Raises:
+        InputError: as there; other first outputs for an observer.
+    """
+    if observer and initial is not None:
+        raise InputError("--initial: found with --observer, which estimates where it starts; leave one of them out.")
+    reading = replace(reading, missing="keep") if observer else reading
+    opened = open_run(model, data, need_outputs=True, reading=reading, ahead=max(horizon, 1) - 1)
+    return opened if observer else replace(opened, record=with_initial(opened, read_initial(initial, opened)))
+
+
+def predicted(opened: ModelOnData, horizon: int, *, observer: bool = False) -> Response:
+    """The prediction `horizon` steps ahead, from measured outputs or from an observer's state."""
+    if not observer:
+        return opened.model.predict(opened.record, horizon=horizon)
+    from orthaug.analysis.observer import Observer
+
+    return Observer(opened.model).predict(opened.record, horizon=horizon)
 
 
 def warnings(response: Response) -> list[Warning]:
@@ -101,11 +200,26 @@ def warnings(response: Response) -> list[Warning]:
     return [Warning("free_run_diverged", told.format(output, step)) for step, output in ends]
 
 
-def write_csv(response: Response, out: Path | None, *, force: bool = False) -> None:
+def write_csv(response: Response, opened: ModelOnData, out: Path | None, *, force: bool = False) -> None:
     """One row per data row, empty cells where there is no value; to a file (whole or not at all) or standard output."""
-    frame = response.to_frame()
+    frame = _table(response, opened)
     if out is None:
         frame.to_csv(sys.stdout, index=False)
         return
     with whole_file(out, force=force) as partial:
         frame.to_csv(partial, index=False)
+
+
+def _table(response: Response, opened: ModelOnData) -> Any:
+    """The tables of all stretches in the rows of the file; of rows that were left out the time alone."""
+    stretches = opened.record.experiments
+    frames = [response.to_frame(i) for i in range(len(stretches))]
+    if len(stretches[0]) == opened.rows:
+        return frames[0]
+    import pandas as pd
+
+    placed = [frame.set_axis(range(e.offset, e.offset + len(e))) for frame, e in zip(frames, stretches, strict=True)]
+    whole = pd.concat(placed).reindex(range(opened.rows))
+    first = stretches[0]
+    time = first.start_time + (np.arange(opened.rows) - first.offset) * response.sampling_time
+    return whole.assign(time=whole["time"].fillna(pd.Series(time)))

@@ -35,16 +35,6 @@ def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | Non
     return ModelOnData(loaded, Record.join(records), data[0])
 
 
-def read_rows(text: str | None) -> tuple[int, int] | None:
-    """`A:B` as a half-open range of rows."""
-    if text is None:
-        return None
-    start, _, stop = text.partition(":")
-    if not (start.isdecimal() and stop.isdecimal() and text.isascii()):
-        raise InputError(f"--rows: found '{text}'; expected a half-open range of rows such as 0:1000.")
-    return int(start), int(stop)
-
-
 def split_model(opened: ModelOnData, measure: Measure) -> SplitResult:
     """The parameters of a saved model under a measure.
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Vector, check_choice, check_count, check_type
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, MissingSampleError, shown
 from orthaug.data.record import Channel, Experiment, Record, as_channels, check_step, same_step
 from orthaug.data.tables import Table, check_readable, has_column, read_table
 
@@ -49,7 +49,8 @@ def read_record(
         every: keep each n-th row (no filter); the sampling time is multiplied.
         columns: this file's column for a channel, `{"position": "yVal"}`.
         missing: "error", or "skip" to leave out rows with empty or NaN cells. Each stretch between them is then an
-            experiment of its own, so that no lag reaches across a gap.
+            experiment of its own, so that no lag reaches across a gap. "keep" does so where inputs are missing, and
+            keeps missing outputs as NaN: an `Observer` takes them.
         experiment: the column, of numbers, that tells experiments apart; each is in one piece.
 
     Raises:
@@ -59,18 +60,21 @@ def read_record(
     channels = [as_channels(inputs, "inputs"), as_channels(outputs, "outputs")]
     column_of = _columns(channels, columns)
     _check_time(time, sampling_time, {name: column_of[name] for name in (c.name for c in channels[1])})
-    check_choice(missing, ("error", "skip"), "`missing`")
+    check_choice(missing, ("error", "skip", "keep"), "`missing`")
     check_count(every, "every")
     wanted: list[str] = list(dict.fromkeys([*column_of.values(), *(name for name in (time, experiment) if name)]))
     if not column_of:
         raise InputError("no channels are asked for; name inputs, outputs or both.")
-    table = _trim(read_table(path, wanted), uneven=missing == "skip")
+    table = _trim(read_table(path, wanted), uneven=missing != "error")
+    needed = wanted
+    if missing == "keep":
+        needed = [*(column_of[c.name] for c in channels[0]), *([time] if time else [])]
     total = len(next(iter(table.columns.values())))
     experiments, steps, recorded = [], [], 0
     ranges = _ranges(rows, total, path)
     for begin, end in ranges if experiment is None else _labelled(table, experiment, ranges):
         recorded += len(range(begin, end, every))
-        for start, stop in _stretches(table, wanted, begin, end, every, missing):
+        for start, stop in _stretches(table, wanted, needed, begin, end, every, missing):
             pick = slice(start, stop, every)
             signals = [
                 np.stack([c.scale * table.columns[column_of[c.name]][pick] + c.offset for c in group], axis=-1)
@@ -78,8 +82,9 @@ def read_record(
                 else np.empty((len(range(start, stop, every)), 0))
                 for group in channels
             ]
-            began = float(table.columns[time][start]) if time else 0.0
-            place = (str(path), start, every, table.first_line, began, (start - begin) // every)
+            offset = (start - begin) // every
+            began = float(table.columns[time][start]) if time else offset * every * (sampling_time or 1.0)
+            place = (str(path), start, every, table.first_line, began, offset)
             experiments.append(Experiment(signals[0], signals[1], *place))
             if time and (stop - start > 1 or missing == "error"):
                 steps.append(_uniform_step(table, time, start, stop))
@@ -213,18 +218,21 @@ def _labelled(table: Table, column: str, ranges: Sequence[tuple[int, int]]) -> l
 
 
 def _stretches(
-    table: Table, columns: Sequence[str], begin: int, end: int, every: int, missing: str
+    table: Table, columns: Sequence[str], needed: Sequence[str], begin: int, end: int, every: int, missing: str
 ) -> list[tuple[int, int]]:
-    """Half-open row ranges without missing cells; the whole range where missing cells are errors."""
+    """Half-open row ranges without missing cells in the needed columns; the whole range where they are errors."""
     if missing == "error":
         _check_cells(table, columns, begin, end)
         return [(begin, end)]
     kept = np.arange(begin, end, every)
-    there = np.all([np.isfinite(table.columns[name][kept]) for name in columns], axis=0)
-    for row in kept[~there]:
+    full = np.all([np.isfinite(table.columns[name][kept]) for name in columns], axis=0)
+    for row in kept[~full]:
         for name in columns:
             if not np.isfinite(table.columns[name][row]) and table.cell(name, row).strip().lower() not in _MISSING:
                 _check_cells(table, [name], row, row + 1)
+    there = np.ones(len(kept), dtype=bool)
+    for name in needed:
+        there &= np.isfinite(table.columns[name][kept])
     edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int)))
     if not len(edges):
         raise InputError(f"{table.path}: every row from {begin} to {end - 1} has a missing cell; nothing is left.")
@@ -238,7 +246,8 @@ def _check_cells(table: Table, columns: Sequence[str], start: int, stop: int) ->
             row = start + int(bad[0])
             text = table.cell(name, row)
             what = f"found '{text}'" if text else "the cell is empty"
-            raise InputError(f"{table.path}: {table.where(row)}, column '{name}': {what}; expected a finite number.")
+            error = MissingSampleError if text.strip().lower() in _MISSING else InputError
+            raise error(f"{table.path}: {table.where(row)}, column '{name}': {what}; expected a finite number.")
 
 
 def _uniform_step(table: Table, time: str, start: int, stop: int) -> float:

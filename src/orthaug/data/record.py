@@ -13,6 +13,7 @@ from orthaug._base.errors import LONGEST, InputError, shown, visible
 from orthaug.data.expressions import RESERVED, is_name
 
 _LONGEST_STEP = 1e12  # s; a longer one overflows somewhere in a time axis
+_DERIVED = ("model", "baseline", "learner", "model_low", "model_high")  # columns of result tables
 
 
 def same_step(step: float, other: float) -> bool:
@@ -84,7 +85,7 @@ def check_step(value: Any) -> float:
 def check_channels(inputs: Sequence[Channel], outputs: Sequence[Channel]) -> None:
     """Raise InputError for a name that stands twice, or an output named like a column of result tables."""
     check_unique((channel.name for channel in (*inputs, *outputs)), "channel")
-    derived = [f"{c.name}_{part}" for c in outputs for part in ("model", "baseline", "learner")]
+    derived = [f"{c.name}_{part}" for c in outputs for part in _DERIVED]
     for channel in outputs:
         if channel.name in ("time", *derived):
             raise InputError(f"an output cannot be called '{channel.name}': results have a column of that name.")
@@ -185,6 +186,7 @@ class Record:
         inputs: Sequence[str | Channel] | None = None,
         outputs: Sequence[str | Channel] | None = None,
         source: str = "",
+        missing: str = "error",
     ) -> Record:
         """One experiment from arrays.
 
@@ -194,13 +196,15 @@ class Record:
             sampling_time: seconds between rows.
             inputs, outputs: names (or `Channel`s with units); default `u`, `y`, or `u1, u2, …`.
             source: where it came from, for messages.
+            missing: "error", or "keep" where outputs may be NaN for an `Observer`.
 
         Raises:
             InputError: lengths that differ, cells that are not finite, names that do not fit.
         """
         if u is None and y is None:
             raise InputError("a record needs `u`, `y` or both; got neither.")
-        y_signal = None if y is None else as_signal(y, "y")
+        check_choice(missing, ("error", "keep"), "`missing`")
+        y_signal = None if y is None else as_signal(y, "y", gaps=missing == "keep")
         u_signal = None if u is None else as_signal(u, "u")
         rows = len(u_signal) if u_signal is not None else len(y_signal)  # type: ignore[arg-type]
         u_signal = np.empty((rows, 0)) if u_signal is None else u_signal
@@ -253,6 +257,16 @@ class Record:
     def channels(self) -> tuple[Channel, ...]:
         """Outputs first, then inputs: the order of the regressor."""
         return self.outputs + self.inputs
+
+    def check_measured(self) -> None:
+        """Raise InputError where an output is missing, as a record for an `Observer` may have it."""
+        for experiment in self.experiments:
+            bad = np.flatnonzero(np.isnan(experiment.outputs).any(axis=1))
+            if bad.size:
+                raise InputError(
+                    f"{experiment.where(int(bad[0]))}: an output is missing there, which only an Observer takes; leave "
+                    'such rows out (`missing = "skip"`), or split the experiment there.'
+                )
 
     def rows(self, start: int | None = None, stop: int | None = None) -> Record:
         """The half-open range of rows `[start, stop)` of a single experiment; negative ones count from its end."""

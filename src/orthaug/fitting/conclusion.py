@@ -90,7 +90,7 @@ def _model(
         deviation=problem.deviation,
         weight=problem.weight.matrix,
         shared=directions(structure, problem),
-        statistics=Statistics(learned.gram, middle, noise, learned.ridge, errors.freedom),
+        statistics=Statistics(learned.gram, middle, noise, learned.ridge, errors.freedom, learned.errors is not None),
     )
 
 

@@ -21,10 +21,8 @@ from orthaug.models.dynamics import Numbers
 from orthaug.models.learners import Bound, Scaling
 from orthaug.models.motion_model import FIRST_ROWS
 from orthaug.models.moving import Moving
-from orthaug.models.settling import Windows, settle
+from orthaug.models.settling import LOOSE, Windows, settle
 from orthaug.physics.motion_problem import MotionProblem
-
-LOOSE = 1e3  # times the size of a state: how far a start may be from its guess before that counts as one error
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -14,9 +14,10 @@ from orthaug._base.checks import Vector
 from orthaug._base.progress import RunTell, quiet
 from orthaug.fitting.course import Flight
 from orthaug.fitting.initial_states import Start
-from orthaug.fitting.motion_course import LOOSE, MotionCourse
+from orthaug.fitting.motion_course import MotionCourse
 from orthaug.fitting.segments import respond
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.models.settling import LOOSE
 from orthaug.physics.motion import MOST_SUBSTEPS
 
 _SHORTEST = 15  # steps of a segment

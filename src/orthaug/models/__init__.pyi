@@ -1,5 +1,6 @@
 from .cluster import Dask as Dask
 from .devices import Devices as Devices
+from .kalman import Noise as Noise
 from .learners import MLP as MLP
 from .learners import EquinoxModule as EquinoxModule
 from .learners import External as External

@@ -16,6 +16,7 @@ from orthaug._base.jax import Array, jax, jnp, padded_length
 from orthaug.data.record import Channel, Experiment, Record
 from orthaug.models.dynamics import Dynamics, Numbers, Parts
 from orthaug.models.lagged import Lagged
+from orthaug.models.lagged_filter import LaggedFilter
 from orthaug.models.on_records import OnRecords, trajectory
 from orthaug.models.response import Response
 from orthaug.models.statistics import Statistics
@@ -177,6 +178,11 @@ class Model(OnRecords):
         output, put that in the place of the model's own.
         """
         return step_lagged(self.form, self.numbers, self.memory, state, inputs)
+
+    @property
+    def filtering(self) -> tuple[LaggedFilter, Numbers, Vector]:
+        """The model as a filter: its dynamics, its numbers, and how large an unknown output is (ny,)."""
+        return LaggedFilter(self.form, self.memory), self.numbers, self.deviation
 
     def check_initial(self, initial: Any) -> Matrix:
         """Outputs before the first usable row, (rows, ny).

@@ -17,13 +17,14 @@ _SAID = ("structure", "measure", "sampling_time", "time_column")
 def said_of(model: Any) -> dict[str, Any]:
     """What a file says of every model, whatever its physics."""
     channels = {kind: [asdict(channel) for channel in getattr(model, kind)] for kind in ("outputs", "inputs")}
-    return {name: getattr(model, name) for name in _SAID} | channels
+    kept = model.statistics
+    return {name: getattr(model, name) for name in _SAID} | channels | {"flown": kept.flown, "verdict": kept.verdict}
 
 
 def fields_from(declared: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict[str, Any]:
     """The fields that every model has, from its file."""
     channels = {kind: tuple(Channel(**c) for c in declared[kind]) for kind in ("outputs", "inputs")}
-    numbers = {"numbers": numbers_from(arrays), "statistics": statistics_from(arrays)}
+    numbers = {"numbers": numbers_from(arrays), "statistics": statistics_from(arrays, declared)}
     return {name: declared[name] for name in _SAID} | channels | numbers | {"largest_output": arrays["largest_output"]}
 
 
@@ -49,7 +50,7 @@ def numbers_from(arrays: dict[str, np.ndarray]) -> Numbers:
     return Numbers(**{name: arrays.get(f"numbers.{name}") for name in Numbers._fields})  # type: ignore[arg-type]
 
 
-def statistics_from(arrays: dict[str, np.ndarray]) -> Statistics:
+def statistics_from(arrays: dict[str, np.ndarray], declared: dict[str, Any]) -> Statistics:
     """What training left."""
     return Statistics(
         gram=arrays.get("gram"),
@@ -57,4 +58,6 @@ def statistics_from(arrays: dict[str, np.ndarray]) -> Statistics:
         noise=arrays.get("noise"),
         ridge=arrays["ridge"] if "ridge" in arrays else float(arrays["scalars"][0]),
         freedom=float(arrays["scalars"][1]),
+        flown=bool(declared.get("flown", declared.get("kind") == "motion")),
+        verdict=str(declared.get("verdict", "")),
     )

@@ -19,11 +19,12 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, padded_length
 from orthaug.data.record import Channel, Experiment, Record
 from orthaug.models.dynamics import Numbers, Parts
+from orthaug.models.motion_filter import MotionFilter
 from orthaug.models.motion_parts import parts_at
 from orthaug.models.moving import Moving
 from orthaug.models.on_records import RUNAWAY, OnRecords, trajectory
 from orthaug.models.response import Response, Trajectory
-from orthaug.models.settling import Windows, settle
+from orthaug.models.settling import LOOSE, Windows, settle
 from orthaug.models.statistics import Statistics
 from orthaug.models.stepping import checked_row, one_experiment, step_arguments, step_inputs, with_scheme
 from orthaug.physics.parameters import PhysicalParameter
@@ -228,6 +229,11 @@ class MotionModel(OnRecords):
         arguments = step_arguments(state, inputs, self.form.states, len(self.step_inputs))
         following, parts = self.form.step(self._stepping, *arguments)
         return following, parts.total
+
+    @property
+    def filtering(self) -> tuple[MotionFilter, Numbers, Vector]:
+        """The model as a filter: its dynamics, its numbers, and how large an unknown state is (nx,)."""
+        return MotionFilter(self.form), self._stepping, np.asarray(self.loose) / LOOSE
 
     def reach(self, record: Record) -> Matrix:
         """The states and inputs (N, nx + nu) of the free run on a record, where they are finite."""

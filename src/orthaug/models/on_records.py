@@ -55,11 +55,12 @@ class OnRecords:
         arguments = ", ".join([*arrays, *names, f"sampling_time={self.sampling_time:g}"])
         return f"a Record, such as Record.from_arrays({arguments})"
 
-    def fitting(self, record: Record, *, need_outputs: bool) -> Record:
+    def fitting(self, record: Record, *, need_outputs: bool, gaps: bool = False) -> Record:
         """The record's channels in the model's order, by name.
 
         Raises:
-            InputError: a channel is missing, or the sampling time differs by more than 0.1 %.
+            InputError: a channel is missing, the sampling time differs by more than 0.1 %, or outputs are missing
+                samples and `gaps` are not allowed.
         """
         check_type(record, Record, "record", self._wanted(need_outputs))
         if not same_step(record.sampling_time, self.sampling_time):
@@ -80,7 +81,10 @@ class OnRecords:
             replace(e, inputs=e.inputs[:, order["inputs"]], outputs=e.outputs[:, order["outputs"]])
             for e in record.experiments
         )
-        return Record(self.inputs, wanted["outputs"], record.sampling_time, experiments)
+        fitting = Record(self.inputs, wanted["outputs"], record.sampling_time, experiments)
+        if not gaps:
+            fitting.check_measured()
+        return fitting
 
 
 def trajectory(parts: Parts, experiment: Experiment, measured: Matrix | None, first: int) -> Trajectory:

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+BAND = 1.959963984540054  # standard deviations: 95 % of a normal distribution
+
+
 @dataclass(frozen=True, eq=False)
 class Scores:
     """Per output: `rmse` in the output's unit, `nrmse` = RMSE / std(y), `fit` = 100 (1 − NRMSE) in %, not clipped.
@@ -40,12 +43,14 @@ class Scores:
 def scores(measured: Matrix, model: Matrix) -> Scores:
     """RMSE, NRMSE (population standard deviation of the scored samples) and FIT of each column, (N, ny)."""
     with np.errstate(all="ignore"):
-        rmse = np.sqrt(np.mean((measured - model) ** 2, axis=0))
-        deviation = measured.std(axis=0)
+        there = np.isfinite(measured)  # what is missing is not scored
+        scored = True if there.all() else there
+        rmse = np.sqrt(np.mean((measured - model) ** 2, axis=0, where=scored))
+        deviation = measured.std(axis=0, where=scored)
     rmse = np.where(np.isfinite(rmse), rmse, np.nan)
     moves = (deviation > 0) & np.isfinite(deviation)
     nrmse = np.where(moves, rmse / np.where(moves, deviation, 1.0), np.nan)
-    return Scores(rmse, nrmse, 100 * (1 - nrmse), len(measured))
+    return Scores(rmse, nrmse, 100 * (1 - nrmse), int(np.count_nonzero(there.any(axis=1))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +61,8 @@ class Trajectory:
     `diverged` is the row and output at which a free run left all bounds; None where it did not. `outside` (N,) marks
     the rows of a free run on which the learner's features lie outside those of training: there it extrapolates. None
     without a learner, and where the features of training are not known. `whole` (N, ny) is the model's output where its
-    parts may lack a value: a motion whose physics alone runs away; None where it is their sum.
+    parts may lack a value: a motion whose physics alone runs away; None where it is their sum. `std` (N, ny) is the
+    standard deviation of measured less model where an observer predicts.
     """
 
     baseline: Matrix
@@ -68,6 +74,7 @@ class Trajectory:
     diverged: tuple[int, str] | None = None
     outside: Bool[np.ndarray, "N"] | None = None
     whole: Matrix | None = None
+    std: Matrix | None = None
 
     def __repr__(self) -> str:
         samples, outputs = self.baseline.shape
@@ -125,7 +132,10 @@ class Response:
         return scores(np.concatenate(measured), np.concatenate(model))
 
     def to_frame(self, experiment: int = 0) -> pd.DataFrame:
-        """A table with `time` and, per output, measured, model, baseline and learner; of a free run `extrapolates`."""
+        """A table with `time` and, per output, measured, model, baseline and learner; of a free run `extrapolates`.
+
+        Of an observer's prediction also the 95 % band of what is measured.
+        """
         import pandas as pd
 
         trajectory = self.trajectories[experiment]
@@ -136,6 +146,9 @@ class Response:
             if trajectory.measured is not None:
                 columns[channel.name] = trajectory.measured[:, i]
             columns[f"{channel.name}_model"] = trajectory.model[:, i]
+            if trajectory.std is not None:
+                columns[f"{channel.name}_model_low"] = trajectory.model[:, i] - BAND * trajectory.std[:, i]
+                columns[f"{channel.name}_model_high"] = trajectory.model[:, i] + BAND * trajectory.std[:, i]
             columns[f"{channel.name}_baseline"] = trajectory.baseline[:, i]
             columns[f"{channel.name}_learner"] = trajectory.learner[:, i]
         if trajectory.outside is not None:

@@ -15,6 +15,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.models.dynamics import Dynamics, Numbers
 
+LOOSE = 1e3  # times the size of a state: how far a start may be from its guess before that counts as one error
 _FIRST_DAMPING = 1e-3
 _SETTLED = 1e-10  # relative decrease that is not worth a step
 

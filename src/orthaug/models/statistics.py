@@ -77,6 +77,10 @@ class Statistics:
     noise: Matrix | None = None
     ridge: float | Vector = 0.0
     freedom: float = np.inf
+    flown: bool = False
+    """Whether `noise` is of a free run's errors, and not of those one step ahead."""
+    verdict: str = ""
+    """What the residual says of the noise (`analysis.Diagnosis`); empty where nobody asked."""
 
     def joint(self, nt: int) -> JointCovariance | None:
         """Cov(c, w), θ in front with nt entries."""

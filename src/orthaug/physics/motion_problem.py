@@ -104,6 +104,7 @@ def pose_motion(
     inputs, outputs = (tuple(c.name for c in group) for group in (record.inputs, record.outputs))
     motion = motion.sampled(record.sampling_time)
     motion.check_channels(inputs, outputs)
+    record.check_measured()
     check_output_weights(output_weights, len(outputs))
     for i, name in enumerate(outputs):
         if (

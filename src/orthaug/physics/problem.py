@@ -193,6 +193,7 @@ def pose(
     outputs, inputs = (tuple(c.name for c in group) for group in (record.outputs, record.inputs))
     if not outputs:
         raise InputError("the record has no outputs; there is nothing to fit.")
+    record.check_measured()
     check_output_weights(output_weights, len(outputs))
     baseline.check_initial()
     baseline = baseline.sampled(record.sampling_time)

@@ -1,0 +1,115 @@
+"""How large the noises of an observer are: by what the residual says of them, or by the likelihood of a record.
+
+Noise in the equations moves the state; noise on a sensor does not. The residual tells which (`diagnose`): a white one
+one step ahead is the equation's, R = 0 and Q its covariance; a white one of a free run is the sensors', R its
+covariance, and Q so small that it makes 3 % of the free run's variance: that is for a model that is not exact.
+Otherwise both are there.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.optimize
+
+from orthaug._base.checks import Matrix
+from orthaug._base.errors import InputError
+from orthaug.analysis.verdict_on_residuals import diagnose
+from orthaug.data.record import Record
+from orthaug.fitting.estimates import Estimate
+from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.models.kalman import Noise, log_likelihood
+from orthaug.models.model import Model
+from orthaug.models.motion_model import MotionModel
+
+_LITTLE, _MOST = 0.03, 0.9  # shares of a free run's variance that disturbances make
+BOTH = ("equation_noise", "unmodelled")  # verdicts on a free run that tell of disturbances
+_STEPS = 400  # that a disturbance is followed
+_TUNED_ROWS = 4000
+_REACH = 14.0  # of the search, in e-folds
+_LARGE = 1e12
+
+
+def by_verdict(model: Model | MotionModel, verdict: str | None = None) -> Noise:
+    """The noises of a fitted model as the verdict on its residual says, by default the one that it carries.
+
+    Raises:
+        InputError: a model without an estimate of its noise.
+    """
+    kept = model.statistics
+    if kept.noise is None or not np.all(np.diag(kept.noise) > 0):
+        raise InputError(
+            "the model has no estimate of its noise (few rows, or trained elsewhere); give the observer `noise=`, "
+            "such as oa.Noise(state, output) with two covariances."
+        )
+    verdict, nothing = kept.verdict if verdict is None else verdict, np.zeros_like(kept.noise)
+    if not kept.flown and verdict != "sensor_noise":
+        return Noise(np.array(kept.noise), nothing)
+    return with_share(model, kept.noise, _MOST if verdict in BOTH else _LITTLE)
+
+
+def with_share(model: Model | MotionModel, noise: Matrix, share: float) -> Noise:
+    """Disturbances that make a share of a free run's variance `noise`, about the origin; the sensors make the rest."""
+    form, numbers, size = model.filtering
+    unit = form.unit(noise, size)
+    a, c, enters, direct = form.linearised(numbers)
+    made, moved = direct @ unit @ direct.T, enters @ unit @ enters.T
+    for _ in range(_STEPS):
+        made = made + c @ moved @ c.T
+        moved = a @ moved @ a.T
+        if not np.trace(made) < _LARGE * np.trace(noise):
+            break
+    ratio = float(np.mean(np.diag(made) / np.diag(noise)))
+    factor = share / ratio if 0 < ratio < np.inf else share / _LARGE
+    return Noise(factor * unit, (1 - share) * np.array(noise))
+
+
+def of_fit(fit: Estimate | MotionEstimate) -> Noise:
+    """The noises of a fit by the verdict on its residual; where both are there, by the likelihood of its data.
+
+    Raises:
+        InputError: a fit that failed, or without an estimate of its noise.
+    """
+    if not fit.status.ok:
+        raise InputError(f"`fit` has no model: {fit.status.message}.")
+    diagnosis = diagnose(fit)
+    verdict = "" if diagnosis is None else diagnosis.verdict
+    begun = by_verdict(fit.model, verdict)
+    if begun.output.any() and verdict in BOTH:
+        return most_likely(fit.model, begun, fit.problem.record)
+    return begun
+
+
+def most_likely(model: Model | MotionModel, begun: Noise, record: Record) -> Noise:
+    """The noises of most likelihood for a record among `(q Q, r R)`, over its first rows.
+
+    Where an R or Q that is zero begins, it stays zero.
+    """
+    form, numbers, size = model.filtering
+    record = model.fitting(record, need_outputs=True, gaps=True)
+    stretches, rows = [], _TUNED_ROWS
+    for experiment in record.experiments:
+        piece = experiment.rows(0, rows)
+        if len(piece) > form.first_row:
+            belief = form.start(piece, record, form.first_row, begun, size)
+            stretches.append((belief, form.inputs(piece, record), piece.outputs[form.first_row :]))
+            rows -= len(piece)
+        if rows <= 0:
+            break
+    free = [bool(part.any()) for part in begun]
+
+    def noise(exponents: Any) -> Noise:
+        factor = np.ones(2)
+        factor[free] = np.exp(np.clip(exponents, -_REACH, _REACH))
+        return Noise(factor[0] * begun.state, factor[1] * begun.output)
+
+    def cost(exponents: Any) -> float:
+        tried = noise(exponents)
+        value = -sum(log_likelihood(form, numbers, tried, *stretch) for stretch in stretches)
+        return value if np.isfinite(value) else _LARGE
+
+    if not any(free) or not stretches:
+        return begun
+    options = {"xatol": 0.02, "fatol": 0.02, "maxiter": 80}
+    return noise(scipy.optimize.minimize(cost, np.zeros(sum(free)), method="Nelder-Mead", options=options).x)

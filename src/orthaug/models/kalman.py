@@ -1,0 +1,221 @@
+"""An extended Kalman filter over the rows of a record: where a model stands, told by what is measured.
+
+`x_{k+1} = f(x_k, u_k) + w_k`, `y_k = h(x_k, u_k) + v_k` with Cov w = Q and Cov v = R (Anderson and Moore 1979). A
+lagged model has its disturbance in the equation of its newest output (`models.lagged_filter`), a motion in the rates of
+its states (`models.motion_filter`). Outputs that are NaN are missing: they tell nothing, and the estimate runs free.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.jax import jax, jnp, padded_length
+from orthaug.data.record import Experiment, Record
+from orthaug.models.dynamics import Numbers, Parts
+
+_SIDE_BY_SIDE = 2048  # starts of predictions
+
+
+class Noise(NamedTuple):
+    """`state` Q: what disturbs the outputs of a lagged model (ny, ny), or the states of a motion in a sample (nx, nx).
+
+    `output` R (ny, ny) is added by the sensors; both in squared units of what they disturb.
+    """
+
+    state: Matrix
+    output: Matrix
+
+
+class Belief(NamedTuple):
+    """The state (n,) before a row, and its covariance (n, n)."""
+
+    state: Any
+    covariance: Any
+
+
+class Told(NamedTuple):
+    """What a row tells: the outputs as they were expected, and outputs and state (n,) once they are measured."""
+
+    predicted: Any
+    """(ny,), from the rows before."""
+    spread: Any
+    """Covariance S (ny, ny) of measured less predicted outputs."""
+    outputs: Any
+    """(ny,), without the sensors' noise."""
+    outputs_covariance: Any
+    state: Any
+    state_covariance: Any
+    square: Any
+    """`νᵀS⁻¹ν` of the innovation ν; 0 where nothing is measured."""
+    log_likelihood: Any
+    """`−(νᵀS⁻¹ν + log det S + count log 2π)/2` of what is measured."""
+
+
+class Filter(Protocol):
+    """The dynamics of a filter without numbers; hashable, so that compiled programs are reused."""
+
+    @property
+    def first_row(self) -> int:
+        """The first row of an experiment that is estimated."""
+        ...
+
+    @property
+    def hidden(self) -> bool:
+        """Whether states are more than past outputs, so that some rows must tell them."""
+        ...
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    @property
+    def disturbances(self) -> int:
+        """Rows of Q."""
+        ...
+
+    def inputs(self, experiment: Experiment, record: Record) -> Matrix:
+        """What the steps read (T, nu), from the first row on."""
+        ...
+
+    def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
+        """One step without noise."""
+        ...
+
+    def row(self, numbers: Numbers, noise: Noise, belief: Belief, inputs: Any, measured: Any) -> tuple[Belief, Told]:
+        """A row: what its outputs (ny,) tell, and the belief before the next one."""
+        ...
+
+
+def slope(function: Any, at: Any) -> tuple[Any, Any]:
+    """A function's value (m,) and derivative (m, n); a kink without one counts as flat."""
+    value, derivative = function(at), jax.jacfwd(function)(at)
+    return value, jnp.where(jnp.isfinite(derivative), derivative, 0.0)
+
+
+def corrected(mean: Any, covariance: Any, noise: Any, measured: Any) -> tuple[Any, Any, Any, Any, Any]:
+    """Mean (n + ny,) and covariance of (state, outputs) once the outputs are measured with `noise` (ny, ny).
+
+    By Joseph's form, which stays positive where R is zero. Also S, `νᵀS⁻¹ν` and the log likelihood.
+    """
+    ny = len(measured)
+    there = jnp.isfinite(measured)
+    both = there[:, None] & there[None, :]
+    innovation = jnp.where(there, measured - mean[-ny:], 0.0)
+    spread = covariance[-ny:, -ny:] + noise
+    own = jnp.where(both, spread, jnp.eye(ny))
+    gain = jnp.linalg.solve(own, jnp.where(there, covariance[:, -ny:], 0.0).T).T
+    left = jnp.eye(len(mean)).at[:, -ny:].add(-gain)
+    after = left @ covariance @ left.T + gain @ jnp.where(both, noise, 0.0) @ gain.T
+    square = innovation @ jnp.linalg.solve(own, innovation)
+    count = jnp.sum(there)
+    likelihood = -0.5 * (square + jnp.linalg.slogdet(own)[1] + count * jnp.log(2 * jnp.pi))
+    return mean + gain @ innovation, (after + after.T) / 2, spread, square, likelihood
+
+
+@partial(jax.jit, static_argnames="form")
+def one_row(
+    form: Filter, numbers: Numbers, noise: Noise, belief: Belief, inputs: Any, measured: Any
+) -> tuple[Belief, Told]:
+    """One row of a filter."""
+    return form.row(numbers, noise, belief, inputs, measured)
+
+
+@partial(jax.jit, static_argnames="form")
+def _all_rows(
+    form: Filter, numbers: Numbers, noise: Noise, belief: Belief, inputs: Any, measured: Any
+) -> tuple[Belief, Told]:
+    """What is believed before the rows, and what they tell."""
+
+    def row(belief: Belief, given: tuple[Any, Any]) -> tuple[Belief, tuple[Belief, Told]]:
+        following, told = form.row(numbers, noise, belief, *given)
+        return following, (belief, told)
+
+    return jax.lax.scan(row, belief, (inputs, measured))[1]
+
+
+@partial(jax.jit, static_argnames="form")
+def _likelihood(form: Filter, numbers: Numbers, noise: Noise, belief: Belief, inputs: Any, measured: Any) -> Any:
+    def row(carry: tuple[Belief, Any], given: tuple[Any, Any]) -> tuple[tuple[Belief, Any], None]:
+        following, told = form.row(numbers, noise, carry[0], *given)
+        return (following, carry[1] + told.log_likelihood), None
+
+    return jax.lax.scan(row, (belief, jnp.zeros(())), (inputs, measured))[0][1]
+
+
+def filtered(
+    form: Filter, numbers: Numbers, noise: Noise, belief: Belief, inputs: Matrix, measured: Matrix
+) -> tuple[Belief, Told]:
+    """A filter over all rows (T): what is believed before them, and what they tell."""
+    rows = len(inputs)
+    found = _all_rows(form, numbers, noise, belief, *_padded(inputs, measured))
+    before, told = ([np.asarray(part)[:rows] for part in one] for one in found)
+    return Belief(*before), Told(*told)
+
+
+def log_likelihood(
+    form: Filter, numbers: Numbers, noise: Noise, belief: Belief, inputs: Matrix, measured: Matrix
+) -> float:
+    """Of the innovations (Schweppe 1965)."""
+    return float(_likelihood(form, numbers, noise, belief, *_padded(inputs, measured)))
+
+
+def _padded(inputs: Matrix, measured: Matrix) -> tuple[Matrix, Matrix]:
+    """Rows behind the last are copies of it with nothing measured: they add nothing."""
+    more = padded_length(len(inputs)) - len(inputs)
+    behind = np.full((more, measured.shape[1]), np.nan)
+    return np.concatenate([inputs, np.repeat(inputs[-1:], more, axis=0)]), np.concatenate([measured, behind])
+
+
+@partial(jax.jit, static_argnames="form")
+def _ahead(
+    form: Filter, numbers: Numbers, noise: Noise, beliefs: Belief, inputs: Any, horizon: Any
+) -> tuple[Parts, Any]:
+    """The outputs of the last of `horizon` steps from each of m beliefs, under inputs (m, h, nu), and their S."""
+    unknown = jnp.full(len(noise.output), jnp.nan)
+
+    def one(belief: Belief, rows: Any) -> tuple[Parts, Any]:
+        def step(i: Any, belief: Belief) -> Belief:
+            return form.row(numbers, noise, belief, rows[i], unknown)[0]
+
+        belief = jax.lax.fori_loop(0, horizon - 1, step, belief)
+        spread = form.row(numbers, noise, belief, rows[horizon - 1], unknown)[1].spread
+        return form.step(numbers, belief.state, rows[horizon - 1])[1], spread
+
+    return jax.vmap(one)(beliefs, inputs)
+
+
+def ahead(
+    form: Filter, numbers: Numbers, noise: Noise, beliefs: Belief, inputs: Matrix, horizon: int
+) -> tuple[Parts, Matrix]:
+    """The outputs `horizon` steps on from what is believed before the rows (T), and their deviations; (T − h + 1, ny).
+
+    The deviations are those of what would be measured.
+    """
+    windows = np.lib.stride_tricks.sliding_window_view(inputs, horizon, axis=0).swapaxes(1, 2)
+    pieces, deviations = [], []
+    for begin in range(0, len(windows), _SIDE_BY_SIDE):
+        rows = slice(begin, min(begin + _SIDE_BY_SIDE, len(windows)))
+        count = len(windows[rows])
+        more = min(_SIDE_BY_SIDE, padded_length(len(windows))) - count
+        chosen = [np.concatenate([a[rows], np.repeat(a[rows][-1:], more, axis=0)]) for a in (*beliefs, windows)]
+        parts, spread = _ahead(form, numbers, noise, Belief(*chosen[:2]), chosen[2], horizon)
+        pieces.append([np.asarray(part)[:count] for part in parts])
+        deviations.append(spread_of(np.asarray(spread)[:count]))
+    return Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True))), np.concatenate(deviations)
+
+
+def without_gaps(outputs: Matrix) -> Matrix:
+    """Outputs with missing samples by straight lines between those that are there; zero where there are none."""
+    filled = outputs.copy()
+    for column in filled.T:
+        there = np.isfinite(column)
+        column[~there] = np.interp(np.flatnonzero(~there), np.flatnonzero(there), column[there]) if there.any() else 0.0
+    return filled
+
+
+def spread_of(covariance: Any) -> Vector:
+    """Standard deviations, of one covariance or of many."""
+    return np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
