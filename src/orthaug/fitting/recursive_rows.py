@@ -1,0 +1,119 @@
+"""New rows of a fitted lagged model: their regressors across calls, φ, and what the model adds with the learner fixed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from orthaug._base.checks import Matrix, as_signal
+from orthaug._base.errors import InputError
+from orthaug._base.jax import Array, jax, jnp, padded_length
+from orthaug.models.dynamics import Numbers
+from orthaug.models.lagged import Lagged
+from orthaug.models.model import Model
+from orthaug.physics.output_weights import times
+
+_BATCH = 1024
+
+
+@partial(jax.jit, static_argnames="form")
+def _evaluated(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"]) -> Float[Array, "m ny ntp"]:
+    """`[φ, known + f − φθ_aux]` of every row."""
+
+    def one(row: Any) -> Any:
+        phi = form.baseline.phi(row, form.layout, form.outputs, jnp)
+        known = form.baseline.known(row, form.layout, form.outputs, jnp)
+        added = known + form.at(numbers, row).learner
+        return jnp.concatenate([phi, added[:, None]], axis=1)
+
+    return jax.vmap(one)(x)
+
+
+def whitened_rows(model: Model, x: Matrix, y: Matrix) -> tuple[Float[np.ndarray, "n ny nt"], Matrix]:
+    """φ and `y − known − (f − φθ_aux)` in whitened outputs: what θ is the least-squares solution of.
+
+    Raises:
+        InputError: physics or learner that is not finite on a row.
+    """
+    pieces = []
+    size = 1 if len(x) == 1 else min(_BATCH, padded_length(len(x)))
+    for begin in range(0, len(x), size):
+        rows = x[begin : begin + size]
+        padded = np.concatenate([rows, np.repeat(rows[-1:], size - len(rows), axis=0)]) if len(rows) < size else rows
+        pieces.append(np.asarray(_evaluated(model.form, model.numbers, padded))[: len(rows)])
+    values = np.concatenate(pieces) if len(pieces) > 1 else pieces[0]
+    bad = ~np.isfinite(values).all(axis=(1, 2))
+    if bad.any():
+        row = x[int(np.argmax(bad))]
+        at = ", ".join(f"{lag} = {value:.6g}" for lag, value in zip(model.form.layout, row, strict=True))
+        raise InputError(f"physics or learner has no finite value at {at}; give NaN for such a row, or mend the data.")
+    phi = times(model.weight, values[..., :-1])
+    return phi, times(model.weight, y - values[..., -1])
+
+
+@dataclass(frozen=True, eq=False)
+class Lagging:
+    """Regressors of rows that are handed in a few at a time, from the rows before them."""
+
+    model: Model
+
+    @cached_property
+    def nothing(self) -> Matrix:
+        """The tail (largest lag, ny + nu) behind which there is a gap."""
+        return np.full((self.model.form.first_row, len(self.model.outputs) + len(self.model.inputs)), np.nan)
+
+    @cached_property
+    def _read(self) -> tuple[Int[np.ndarray, "nx"], Int[np.ndarray, "nx"]]:
+        """Lag and column of every entry of the regressor."""
+        names = [channel.name for channel in (*self.model.outputs, *self.model.inputs)]
+        layout = self.model.form.layout
+        return np.array([e.lag for e in layout], dtype=int), np.array(
+            [names.index(e.channel) for e in layout], dtype=int
+        )
+
+    def regressors(self, tail: Matrix, rows: Matrix) -> tuple[Matrix, Bool[np.ndarray, "n"], Matrix]:
+        """x (n, nx) of new rows (n, ny + nu), which of them are complete, and the tail after them."""
+        whole = np.concatenate([tail, rows])
+        lag, column = self._read
+        x = whole[(len(tail) + np.arange(len(rows)))[:, None] - lag, column]
+        complete = np.isfinite(x).all(axis=1) & np.isfinite(rows[:, : len(self.model.outputs)]).all(axis=1)
+        return x, complete, whole[len(whole) - len(tail) :]
+
+
+def as_rows(values: Any, channels: int, name: str) -> Matrix:
+    """One row or many (n, channels); NaN is a missing sample.
+
+    Raises:
+        InputError: no numbers, another number of channels, or an infinite one.
+    """
+    try:
+        array = np.asarray(values, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        array = as_signal(values, name)  # says what is wrong
+    if array.ndim == 0 or (array.ndim == 1 and channels != 1):
+        array = array.reshape(1, -1)
+    missing = np.isnan(array)
+    array = as_signal(np.where(missing, 0.0, array), name)
+    if array.shape[1] != channels:
+        raise InputError(f"`{name}` has {array.shape[1]} columns; expected {channels}, one for each channel.")
+    return np.where(missing.reshape(array.shape), np.nan, array)
+
+
+def joined_rows(u: Any, y: Any, inputs: int, outputs: int) -> Matrix:
+    """Outputs and inputs side by side (n, ny + nu), as they are handed in.
+
+    Raises:
+        InputError: one of them missing, or of another length.
+    """
+    if y is None or (u is None and inputs):
+        what = "`y`" if y is None else "`u`"
+        raise InputError(f"{what} is missing; give the measured outputs `y`{' and inputs `u`' if inputs else ''}.")
+    right = as_rows(y, outputs, "y")
+    left = as_rows(u, inputs, "u") if inputs else np.zeros((len(right), 0))
+    if len(left) != len(right):
+        raise InputError(f"`y` has {len(right)} rows but `u` has {len(left)}. Give both the same length.")
+    return np.concatenate([right, left], axis=1)
