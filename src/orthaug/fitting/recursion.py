@@ -1,7 +1,8 @@
 """Weighted least squares row by row: a triangular factor that each row updates by QR, with exponential forgetting.
 
-With weights `w_i = λ^(k−i)` the factor has `[R z]ᵀ[R z] = Σ w [φ y]ᵀ[φ y]`, so `θ = R⁻¹z`; `ΦᵀΦ` is never formed. The
-covariance needs the squared weights too: `Cov θ = s² I⁻¹ M I⁻¹`, `I = RᵀR`, `M = Σ w² φᵀφ`.
+With weights `w_i = λ^(k−i)` and `e₀ = y − φθ₀` the factor has `[R z]ᵀ[R z] = Σ w [φ e₀]ᵀ[φ e₀]`, so `θ = θ₀ + R⁻¹z`:
+`ΦᵀΦ` is never formed, and rounding adds up against the change of θ only. The covariance needs the squared weights too:
+`Cov θ = s² I⁻¹ M I⁻¹`, `I = RᵀR`, `M = Σ w² φᵀφ`.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.linalg.lapack import dtpqrt, dtrtrs
+from scipy.linalg.lapack import dtpqrt, dtrtrs  # pyright: ignore[reportAttributeAccessIssue]  (made at build)
 
 from orthaug._base.checks import Matrix, Vector
 
@@ -35,7 +36,7 @@ class Recursion:
     shape: Matrix
     """Covariance of whitened errors (ny, ny), with a mean of 1 on its diagonal."""
     start: Vector
-    """θ where the rows do not tell it yet (nθ,)."""
+    """θ₀ (nθ,), which stays where rows do not tell θ."""
     forgetting: float
     floor: Matrix | None
     errors: float
@@ -81,7 +82,7 @@ class Recursion:
         self.rows_squared += 1.0
         self.squared += phi.T @ (self.shape @ phi if self._own_noise else phi)
         rows = np.empty((len(error), len(self.theta) + 1), order="F")
-        rows[:, :-1], rows[:, -1] = phi, target
+        rows[:, :-1], rows[:, -1] = phi, target - phi @ self.start
         self.factor = dtpqrt(0, 1, self.factor, rows, overwrite_a=1, overwrite_b=1)[0]
         self.theta = self._solve()
         return error, spread
@@ -99,14 +100,12 @@ class Recursion:
             return self.start
         r, z = self.factor[:-1, :-1], self.factor[:-1, -1]
         if self.determined:
-            return dtrtrs(r, z)[0]
+            return self.start + dtrtrs(r, z)[0]
         norms = np.linalg.norm(r, axis=0)
         scaled = r / np.where(norms > 0, norms, 1.0)
         size = np.linalg.svd(scaled, compute_uv=False)
         self.determined = bool(size[-1] > _DETERMINED * size[0])
-        if self.determined:
-            return dtrtrs(r, z)[0]
-        change = np.linalg.lstsq(scaled, z - r @ self.start, rcond=_DETERMINED)[0]  # the least that explains the rows
+        change = np.linalg.lstsq(scaled, z, rcond=_DETERMINED)[0]  # the least that explains the rows
         return self.start + change / np.where(norms > 0, norms, 1.0)
 
     def _forget(self) -> None:
@@ -166,13 +165,23 @@ def started(
         empty: begin without them; they still say what the floor is.
     """
     count, ny, nt = phi.shape
-    whole = np.linalg.qr(np.column_stack([phi.reshape(-1, nt), target.ravel()]), mode="r")
+    whole = np.linalg.qr(np.column_stack([phi.reshape(-1, nt), (target - phi @ theta).ravel()]), mode="r")
     factor = np.zeros((nt + 1, nt + 1))
     factor[: len(whole)] = whole
     memory = 1 / (1 - forgetting) if forgetting < 1 else np.inf
     share = 0.0 if empty else min(1.0, memory / count)
     floor = np.sqrt(_KEPT * memory / count) * factor[:nt, :nt] if forgetting < 1 else None
     squared = np.einsum("kit,ij,kjs->ts", phi, shape, phi) if ny > 1 else phi[:, 0].T @ phi[:, 0]
-    sums = {"errors": share * level * freedom, "freedom": share * freedom}
-    sums |= {"rows": share * count, "rows_squared": share**2 * count, "oldest": share}
-    return Recursion(np.sqrt(share) * factor, share**2 * squared, shape, theta, forgetting, floor, **sums)
+    return Recursion(
+        np.sqrt(share) * factor,
+        share**2 * squared,
+        shape,
+        theta,
+        forgetting,
+        floor,
+        errors=share * level * freedom,
+        freedom=share * freedom,
+        rows=share * count,
+        rows_squared=share**2 * count,
+        oldest=share,
+    )

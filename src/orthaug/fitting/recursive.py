@@ -1,8 +1,8 @@
 """θ followed online: recursive least squares with the learner fixed, intervals, and an alarm.
 
 With f and θ_aux fixed, the fitted model is linear in θ: `y − known − (f − φθ_aux) = φθ + e`. Over the training rows its
-least-squares solution is the fit's θ, whatever the structure's split: `Φ⁺(Y − F) + θ_aux = c + θ_aux` (F1, F2). New rows
-go on from there.
+least-squares solution is the fit's θ, whatever the structure's split: `Φ⁺(Y − F) + θ_aux = c + θ_aux` (F1, F2). New
+rows go on from there.
 """
 
 from __future__ import annotations
@@ -188,7 +188,7 @@ class Recursive:
 
     def _follow(self, used: Any, phi: Any, target: Any) -> list[Alarm]:
         recursion, watch, course = self._recursion, self._watch, self._course
-        told, lines = [], []
+        told = []
         for i, k in enumerate(used):
             if i and k != used[i - 1] + 1:
                 watch.gap()
@@ -198,8 +198,7 @@ class Recursive:
             if level > 1 >= before:
                 told.append(Alarm(row, row * self._fitted.sampling_time))
             if row % course.stride == 0:
-                lines.append(course.line(row, level, self._freedom, error, recursion))
-        course.add(lines)
+                course.add(course.line(row, level, self._freedom, error, recursion))
         return told
 
     @property
@@ -271,14 +270,15 @@ class Recursive:
         import pandas as pd
 
         course, model = self._course, self._fitted
+        rows = course.rows
         residual = course.residual @ np.linalg.inv(model.weight).T
         ci = course.intervals(self._inflation)
-        columns: dict[str, Any] = {"time": course.rows[:, 0] * model.sampling_time}
+        columns: dict[str, Any] = {"time": rows[:, 0] * model.sampling_time}
         columns |= {f"residual_{c.name}": residual[:, i] for i, c in enumerate(model.outputs)}
         for i, name in enumerate(model.form.baseline.names):
             columns |= {name: course.theta[:, i], f"{name}_low": ci[:, i, 0], f"{name}_high": ci[:, i, 1]}
         columns["alarm"] = course.alarm
-        return pd.DataFrame(columns, index=pd.Index(course.rows[:, 0].astype(int), name="row"))
+        return pd.DataFrame(columns, index=pd.Index(rows[:, 0].astype(int), name="row"))
 
     def physical(self, physics: PhysicsMap) -> PhysicalEstimate:
         """The physical parameters that θ is made of now, with intervals by the delta method."""
@@ -296,20 +296,20 @@ class Recursive:
         import pandas as pd
 
         order, course = self._in_order_of(physics), self._course
-        chosen = np.unique(np.linspace(0, len(course.rows) - 1, check_count(points, "points")).round().astype(int))
-        chosen = chosen[chosen >= 0] if len(course.rows) else chosen[:0]
-        spread = course.covariances(self._inflation)
+        rows, theta, spread = course.rows, course.theta, course.covariances(self._inflation)
+        places = np.linspace(len(rows) - 1, 0, check_count(points, "points")) if len(rows) else np.zeros(0)
+        chosen = np.unique(places.round().astype(int))
         lines = []
         for k in chosen:
             known = np.isfinite(spread[k]).all()
             covariance = spread[k][np.ix_(order, order)] if known else None
-            at = solve(physics, course.theta[k][order], covariance, freedom=course.rows[k, 3])
+            at = solve(physics, theta[k][order], covariance, freedom=rows[k, 3])
             ends = [(np.nan, np.nan) if ci is None else ci for ci in at.ci95]
-            line: dict[str, Any] = {"time": course.rows[k, 0] * self._fitted.sampling_time}
+            line: dict[str, Any] = {"time": rows[k, 0] * self._fitted.sampling_time}
             for name, value, (low, high) in zip(at.names, at.value, ends, strict=True):
                 line |= {name: value, f"{name}_low": low, f"{name}_high": high}
             lines.append(line)
-        return pd.DataFrame(lines, index=pd.Index(course.rows[chosen, 0].astype(int), name="row"))
+        return pd.DataFrame(lines, index=pd.Index(rows[chosen, 0].astype(int), name="row"))
 
     def _in_order_of(self, physics: PhysicsMap) -> list[int]:
         return order_of(physics, self._fitted.form.baseline.names, self._fitted.sampling_time)

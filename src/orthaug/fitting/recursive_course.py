@@ -25,15 +25,17 @@ class Course:
 
     ny: int
     nt: int
-    rows: Matrix = field(init=False)
     stride: int = 1
+    _lines: list[Vector] = field(default_factory=list)
 
-    def __post_init__(self) -> None:
-        self.rows = np.zeros((0, 5 + self.ny + self.nt + 2 * self.nt**2))
+    @property
+    def rows(self) -> Matrix:
+        """All that is kept (k, columns)."""
+        return np.reshape(self._lines, (-1, 5 + self.ny + self.nt + 2 * self.nt**2))
 
     def line(self, row: int, level: float, freedom: float, residual: Vector, recursion: Recursion) -> Vector:
         """What is kept of a row."""
-        line = np.empty(self.rows.shape[1])
+        line = np.empty(5 + self.ny + self.nt + 2 * self.nt**2)
         first, second = 5 + self.ny, 5 + self.ny + self.nt
         line[:5] = row, level, recursion.level, freedom, recursion.determined
         line[5:first] = residual
@@ -42,15 +44,14 @@ class Course:
         line[second + self.nt**2 :] = recursion.squared.ravel()
         return line
 
-    def add(self, lines: list[Vector]) -> None:
-        """Keep some more."""
-        if not lines:
+    def add(self, line: Vector) -> None:
+        """Keep one more."""
+        if int(line[0]) % self.stride:
             return
-        kept = [line for line in lines if int(line[0]) % self.stride == 0]
-        self.rows = np.concatenate([self.rows, np.reshape(kept, (-1, self.rows.shape[1]))])
-        while len(self.rows) > MOST:
+        self._lines.append(line)
+        if len(self._lines) > MOST:
             self.stride *= 2
-            self.rows = self.rows[self.rows[:, 0] % self.stride == 0]
+            self._lines = [line for line in self._lines if not int(line[0]) % self.stride]
 
     @property
     def theta(self) -> Float[np.ndarray, "k nt"]:

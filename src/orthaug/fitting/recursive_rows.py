@@ -1,4 +1,4 @@
-"""New rows of a fitted lagged model: their regressors across calls, φ, and what the model adds with the learner fixed."""
+"""New rows of a fitted lagged model: regressors across calls, φ, and what else the model adds, learner fixed."""
 
 from __future__ import annotations
 
@@ -80,7 +80,8 @@ class Lagging:
         whole = np.concatenate([tail, rows])
         lag, column = self._read
         x = whole[(len(tail) + np.arange(len(rows)))[:, None] - lag, column]
-        complete = np.isfinite(x).all(axis=1) & np.isfinite(rows[:, : len(self.model.outputs)]).all(axis=1)
+        needed = np.concatenate([x, rows[:, : len(self.model.outputs)]], axis=1)
+        complete = np.asarray(np.isfinite(needed).all(axis=1))
         return x, complete, whole[len(whole) - len(tail) :]
 
 

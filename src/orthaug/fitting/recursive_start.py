@@ -62,17 +62,17 @@ def trained(fit: Any, training: Record | None) -> Trained:
         if fit.at_bound:
             names = ", ".join(fit.at_bound)
             raise InputError(f"{names} stand at a bound, which new rows would leave; fit without the bound.")
-        model, covariance, training = fit.model, fit.covariance, fit.problem.record
+        model, covariance, record = fit.model, fit.covariance, fit.problem.record
     else:
         model = fit
         if training is None:
             raise InputError("a saved model does not hold its training data; give them, Recursive(model, training=…).")
-        training = model.fitting(training, need_outputs=True)
+        record = model.fitting(training, need_outputs=True)
     if not len(model.theta):
         raise InputError("the physics has no parameter to follow.")
-    rows = stack_rows(training, model.form.layout)
+    rows = stack_rows(record, model.form.layout)
     phi, target = whitened_rows(model, rows.x, rows.y)
-    lengths = tuple(len(experiment) - rows.start for experiment in training.experiments)
+    lengths = tuple(len(experiment) - rows.start for experiment in record.experiments)
     freedom = fit.freedom if isinstance(fit, Estimate) else model.statistics.freedom
     used = target.size - len(model.theta) - freedom * target.shape[1] if np.isfinite(freedom) else 0.0
     began = Trained(model, phi, target, lengths, covariance, max(used, 0.0))
@@ -89,9 +89,9 @@ def _check_solved(began: Trained) -> None:
     rounding = 1e-10 * np.linalg.norm(began.target)
     if np.linalg.norm(basis.T @ left) > _SOLVED * np.linalg.norm(left) + rounding:
         raise InputError(
-            f"θ of the {began.model.structure} model is not the least-squares estimate of these {count} rows beside its "
-            "learner: they are not those of its training, or a penalty, a bound, the free run or the paper's pipeline "
-            "has moved it. Give the training data, or fit with the orthogonal structure one step ahead."
+            f"θ of the {began.model.structure} model is not the least-squares estimate of these {count} rows beside "
+            "its learner: they are not those of its training, or a penalty, a bound, the free run or the paper's "
+            "pipeline has moved it. Give the training data, or fit with the orthogonal structure one step ahead."
         )
 
 
@@ -101,7 +101,7 @@ def _saved_covariance(began: Trained) -> Matrix | None:
     joint = model.statistics.joint(nt)
     if joint is None or model.structure != "orthogonal":
         return None
-    r = np.linalg.qr(began.phi.reshape(-1, nt), mode="r")
+    r = np.asarray(np.linalg.qr(began.phi.reshape(-1, nt), mode="r"))
     overlap = np.linalg.solve(r.T, joint.gram[:nt, nt:])  # QᵀJ
     along = np.eye(nt)
     if model.shared is not None:
@@ -131,5 +131,5 @@ def begin(
     share = (nt + began.used) / (count * ny)
     grown = [stretch * np.sqrt(count * ny / freedom) for stretch in stretches]
     reference = Reference.of(grown, white, share, quiet)
-    r = np.linalg.qr(phi.reshape(-1, nt), mode="r")
+    r = np.asarray(np.linalg.qr(phi.reshape(-1, nt), mode="r"))
     return recursion, reference, inflation_of(r, level, began.covariance)

@@ -82,6 +82,8 @@ class Watch:
     sums: Matrix = field(init=False)
     counts: list[int] = field(init=False)
     totals: list[float] = field(init=False)
+    level: float = 0.0
+    """The largest g over its limit, above 1 for an alarm."""
 
     def __post_init__(self) -> None:
         reference = self.reference
@@ -98,7 +100,7 @@ class Watch:
         self.counts = [0] * len(self.reference.scales)
 
     def step(self, error: Vector, spread: float) -> float:
-        """Add whitened outputs' errors (ny,) of a row: the largest g over its limit, above 1 for an alarm."""
+        """Add whitened outputs' errors (ny,) of a row, whose variance is `spread` times that of training: the level."""
         reference = self.reference
         residual = reference.white @ error / math.sqrt(spread)
         left = residual
@@ -115,12 +117,8 @@ class Watch:
                 self.totals[i] = min(max(0.0, self.totals[i] + step), 2 * self._limits[i])
                 self.counts[i] = 0
                 self.sums[i] = 0.0
+        self.level = max(total / limit for total, limit in zip(self.totals, self._limits, strict=True))
         return self.level
-
-    @property
-    def level(self) -> float:
-        """The largest g over its limit."""
-        return max(total / limit for total, limit in zip(self.totals, self._limits, strict=True))
 
 
 def _steps(blocks: Matrix) -> Vector:
