@@ -1,4 +1,4 @@
-"""Recursive least squares: equality with the batch fit, drift, steps of friction, false alarms, coverage, wind-up, time.
+"""Recursive least squares: the batch fit again, drift, steps of friction, false alarms, coverage, wind-up, time.
 
 Run: python benchmarks/recursive.py [NAME] (equal, drift, friction, quiet, coverage, windup, or times; all without it)
 """
@@ -50,7 +50,7 @@ def equal() -> list[float]:
 
 
 def drift(draws: int = 20) -> list[float]:
-    """Mass grows by 20 % over a record: per memory the median and largest error of m along it in per cent, and alarms."""
+    """Mass grows by 20 %: per memory [s] median and largest error of m along it, share with an alarm; per cent."""
     mass = np.linspace(MASS, 1.2 * MASS, ROWS)
     told = []
     for memory in (0.5, 1.0, 2.0, 5.0):

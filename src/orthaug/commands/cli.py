@@ -237,6 +237,47 @@ def export(
 
 
 @app.command()
+def track(
+    model: ModelPath,
+    data: Annotated[
+        list[Path] | None, typer.Option("--data", metavar="FILE", help="New data; any number, a gap between them.")
+    ] = None,
+    training: Annotated[
+        list[Path] | None, typer.Option("--training", metavar="FILE", help="The files that the model was trained on.")
+    ] = None,
+    rows: Annotated[str | None, typer.Option("--rows", metavar="A:B", help="Rows of each training file.")] = None,
+    forgetting: Annotated[
+        float | None, typer.Option("--forgetting", metavar="λ", help="Weight of a row against the next one.")
+    ] = None,
+    memory: Annotated[float | None, typer.Option("--memory", metavar="S", help="The same in seconds.")] = None,
+    state: Annotated[
+        Path | None, typer.Option("--state", metavar="DIR", help="Result of an earlier run, to go on from.")
+    ] = None,
+    follows: Annotated[
+        bool, typer.Option("--follows", help="The new data follow on the state's last row without a gap.")
+    ] = False,
+    out: OutFolder = None,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
+    """Parameters of a saved model over new data by recursive least squares, with an alarm."""
+    from orthaug.commands import track as tracking
+    from orthaug.commands.folder import check_folder, check_kept
+    from orthaug.commands.split import read_rows
+    from orthaug.reports.tracking import track_text
+
+    folder = out or Path("orthaug-out/track")
+    check_folder(folder, force=force)
+    check_kept(folder, *(data or ()), *(training or ()), model)
+    opened = tracking.open_track(model, data or (), training or (), read_rows(rows), state)
+    _prepare_jax()
+    tracked = tracking.track(opened, forgetting=forgetting, memory=memory, state=state, follows=follows)
+    text = track_text(tracked.result)
+    tracking.write_tracked(tracked, folder, text, force=force)
+    streams.echo(tracked.result.to_json() if as_json else f"{text}\n\nwritten to {folder}")
+
+
+@app.command()
 def design(
     spec: SpecPath,
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="CSV file for the input.")],
@@ -284,7 +325,7 @@ def select(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force
 @app.command()
 def schema(
     command: Annotated[
-        str, typer.Argument(metavar="[COMMAND]", help="fit, check, compare, split, design, select or explain.")
+        str, typer.Argument(metavar="[COMMAND]", help="fit, check, compare, split, design, select, explain or track.")
     ] = "fit",
 ) -> None:
     """The JSON schema of what a command writes."""

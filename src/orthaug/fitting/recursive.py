@@ -127,11 +127,17 @@ class Recursive:
         Raises:
             InputError: the folder cannot be written, or holds something else.
         """
-        kept = recursive_storage.Kept(
+        recursive_storage.save(self._kept(), folder, force=force)
+
+    def fill(self, folder: Path) -> None:
+        """Write the files of `save` into an existing folder."""
+        recursive_storage.write(self._kept(), folder)
+
+    def _kept(self) -> recursive_storage.Kept:
+        return recursive_storage.Kept(
             self._fitted, self._recursion, self._watch, self._inflation, self._used,
             self._tail, self._course, self.rows, np.array([alarm.row for alarm in self.alarms], dtype=float),
         )  # fmt: skip
-        recursive_storage.save(kept, folder, force=force)
 
     def update(
         self, record: Record | None = None, *, u: Any = None, y: Any = None, gap: bool = False
@@ -237,7 +243,17 @@ class Recursive:
     @property
     def alarmed(self) -> bool:
         """Whether the residual is out of its band now."""
-        return self._watch.level > 1
+        return self.alarm_level > 1
+
+    @property
+    def alarm_level(self) -> float:
+        """The largest sum over its limit: above 1 the residual is out of its band."""
+        return self._watch.level
+
+    @property
+    def fitted(self) -> Model:
+        """The model as it was fitted."""
+        return self._fitted
 
     @property
     def forgetting(self) -> float:

@@ -23,6 +23,10 @@ from orthaug.models.motion_model import MotionModel
 
 _SOLVED = 1e-6  # of the residual's norm: how far Φθ may be from that of least squares
 _SMALLEST = 1e-10  # of an output's deviation: a residual is at least rounding
+MOTION = (
+    "equations of motion cannot be followed by least squares: their outputs are not linear in the parameters. Write "
+    "the physics as terms of lagged signals and fit one step ahead, or fit the motion again on new data."
+)
 
 
 class Trained(NamedTuple):
@@ -48,10 +52,7 @@ def trained(fit: Any, training: Record | None) -> Trained:
         fit, Estimate | Model | MotionEstimate | MotionModel, "fit", "what `estimate` returned, or a saved model"
     )
     if isinstance(fit, MotionEstimate | MotionModel):
-        raise InputError(
-            "equations of motion cannot be followed by least squares: their outputs are not linear in the parameters. "
-            "Write the physics as terms of lagged signals and fit one step ahead, or fit the motion again on new data."
-        )
+        raise InputError(MOTION)
     covariance = None
     if isinstance(fit, Estimate):
         if fit.criterion.flown is not None:

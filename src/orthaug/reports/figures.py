@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from orthaug._base.checks import check_choice, check_type
 from orthaug._base.errors import InputError
+from orthaug.fitting.recursive import Recursive
 from orthaug.models.response import Response
 from orthaug.reports.result import CheckResult, CompareResult, FitResult
 
@@ -18,7 +19,7 @@ _OF_RESPONSES = ("output", "residual", "components")
 
 
 def plot(
-    what: Response | FitResult | CheckResult | CompareResult,
+    what: Response | FitResult | CheckResult | CompareResult | Recursive,
     kind: str = "output",
     *,
     title: str | None = None,
@@ -27,18 +28,19 @@ def plot(
     """A matplotlib figure; also written as a PNG where there is a `path`.
 
     Args:
-        what: a response, of `model.simulate` or `model.predict`; or the `result` of `fit_spec` or `compare`.
+        what: a response, of `model.simulate` or `model.predict`; the `result` of `fit_spec` or `compare`; or a
+            `Recursive`, for θ over time.
         kind: of a response "output" (measured and model), "residual" or "components" (physics and learner). A result
             has one figure: the biases by suspected terms of a fit, or the comparison.
-        title: of a response's figure; by default what kind of response it is.
+        title: of the figure of a response or of a `Recursive`; by default what kind it is.
         path: PNG file to write; a file of that name is replaced.
 
     Raises:
         InputError: nothing that has a figure, an unknown kind, outputs that were not measured, a path that cannot be
             written.
     """
-    wanted = "a Response, such as model.simulate(record), or the `result` of fit_spec or compare"
-    check_type(what, Response | FitResult | CheckResult | CompareResult, "what", wanted)
+    wanted = "a Response, such as model.simulate(record), a Recursive, or the `result` of fit_spec or compare"
+    check_type(what, Response | FitResult | CheckResult | CompareResult | Recursive, "what", wanted)
     check_choice(kind, _OF_RESPONSES, "`kind`")
     check_type(title, str | None, "title", "text")
     check_type(path, str | os.PathLike | None, "path", "a file's name")
@@ -58,6 +60,12 @@ def plot(
 def _drawn(what: Any, kind: str, title: str | None) -> Figure:
     from orthaug.reports import plots
 
+    if isinstance(what, Recursive):
+        from orthaug.reports.tracking_plot import THETA, labels, tracking_figure
+
+        named = labels(what.fitted.form.baseline.parameters)
+        alarms = [alarm.time for alarm in what.alarms]
+        return tracking_figure(what.history, named, alarms, THETA if title is None else title)
     if isinstance(what, CompareResult):
         return plots.comparison_figure(what.comparison)
     if not isinstance(what, Response):

@@ -8,6 +8,7 @@ from orthaug.reports.explanation import ExplainResult
 from orthaug.reports.fields import Content
 from orthaug.reports.result import CheckResult, CompareResult, DesignResult, FitResult, SplitResult
 from orthaug.reports.selection import SelectResult
+from orthaug.reports.tracking import TrackResult
 
 RESULTS: dict[str, type[Content]] = {
     "fit": FitResult,
@@ -17,6 +18,7 @@ RESULTS: dict[str, type[Content]] = {
     "design": DesignResult,
     "select": SelectResult,
     "explain": ExplainResult,
+    "track": TrackResult,
 }
 """By command."""
 
