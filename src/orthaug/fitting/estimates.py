@@ -288,8 +288,9 @@ def order_of(physics: PhysicsMap, names: Sequence[str], sampling_time: float) ->
     """Where the θ that the physics gives are among `names`.
 
     Raises:
-        InputError: a θ that is not among them, a constant `Ts` that is not the sampling time.
+        InputError: no PhysicsMap, a θ that is not among them, a constant `Ts` that is not the sampling time.
     """
+    check_type(physics, PhysicsMap, "physics", "a PhysicsMap, such as PhysicsMap.of(…)")
     check_sampling_constant(physics.constants, sampling_time)
     missing = [name for name in physics.theta_names if name not in names]
     if missing:

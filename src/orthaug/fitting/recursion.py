@@ -171,7 +171,7 @@ def started(
     memory = 1 / (1 - forgetting) if forgetting < 1 else np.inf
     share = 0.0 if empty else min(1.0, memory / count)
     floor = np.sqrt(_KEPT * memory / count) * factor[:nt, :nt] if forgetting < 1 else None
-    squared = np.einsum("kit,ij,kjs->ts", phi, shape, phi) if ny > 1 else phi[:, 0].T @ phi[:, 0]
+    squared = squares(phi, shape)
     return Recursion(
         np.sqrt(share) * factor,
         share**2 * squared,
@@ -185,3 +185,8 @@ def started(
         rows_squared=share**2 * count,
         oldest=share,
     )
+
+
+def squares(phi: Float[np.ndarray, "N ny nt"], shape: Matrix) -> Matrix:
+    """M of rows of equal weight (nθ, nθ)."""
+    return phi[:, 0].T @ phi[:, 0] if len(shape) == 1 else np.einsum("kit,ij,kjs->ts", phi, shape, phi)

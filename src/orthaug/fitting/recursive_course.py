@@ -85,23 +85,30 @@ def covariances(
     told: Bool[np.ndarray, "k"],
     inflation: Matrix | None,
 ) -> Float[np.ndarray, "k nt nt"]:
-    """`s² S G Sᵀ` with `S Sᵀ = I⁻¹ M I⁻¹`: G, the inflation, is by how much the fit's own covariance exceeds s²I⁻¹."""
+    """`s² S G Sᵀ` with `S Sᵀ = I⁻¹ M I⁻¹`: G, the inflation, is by how much the fit's own covariance exceeds that."""
     result = np.full(r.shape, np.nan)
     if inflation is None or not told.any():
         return result
-    r, squared = upright(r[told]), squared[told]
-    unit = np.linalg.norm(r, axis=1, keepdims=True)  # of the columns
-    inverse = np.swapaxes(unit, 1, 2) ** -1 * np.linalg.inv(r / unit)
-    values, vectors = np.linalg.eigh(np.swapaxes(inverse, 1, 2) @ squared @ inverse)
-    root = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ np.swapaxes(vectors, 1, 2)
-    half = inverse @ root
+    half = _half(r[told], squared[told])
     result[told] = level[told, None, None] * (half @ inflation @ np.swapaxes(half, 1, 2))
     return result
 
 
-def inflation_of(r: Matrix, level: float, covariance: Matrix | None) -> Matrix | None:
-    """G of a fit: its covariance in units of `s² I⁻¹`, in coordinates of R; None where it has none."""
+def inflation_of(r: Matrix, squared: Matrix, level: float, covariance: Matrix | None) -> Matrix | None:
+    """G of a fit: its covariance in units of `s² I⁻¹ M I⁻¹`; None where it has none.
+
+    It holds what else makes θ uncertain: the learner beside it, or the colour of the errors (`fit.robust()`).
+    """
     if covariance is None or not np.isfinite(covariance).all() or not level > 0:
         return None
+    half = _half(r[None], squared[None])[0]
+    return np.linalg.solve(half, np.linalg.solve(half, covariance).T) / level
+
+
+def _half(r: Float[np.ndarray, "k nt nt"], squared: Float[np.ndarray, "k nt nt"]) -> Float[np.ndarray, "k nt nt"]:
+    """`S = R⁻¹ (R⁻ᵀ M R⁻¹)^½` of factors that are made unique by a positive diagonal."""
     r = upright(r)
-    return r @ covariance @ r.T / level
+    unit = np.linalg.norm(r, axis=1, keepdims=True)  # of the columns
+    inverse = np.swapaxes(unit, 1, 2) ** -1 * np.linalg.inv(r / unit)
+    values, vectors = np.linalg.eigh(np.swapaxes(inverse, 1, 2) @ squared @ inverse)
+    return inverse @ ((vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ np.swapaxes(vectors, 1, 2))

@@ -13,7 +13,7 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import stack_rows
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.motion_estimates import MotionEstimate
-from orthaug.fitting.recursion import Recursion, started
+from orthaug.fitting.recursion import Recursion, squares, started
 from orthaug.fitting.recursive_course import inflation_of
 from orthaug.fitting.recursive_rows import whitened_rows
 from orthaug.fitting.residual_band import Reference
@@ -133,4 +133,4 @@ def begin(
     grown = [stretch * np.sqrt(count * ny / freedom) for stretch in stretches]
     reference = Reference.of(grown, white, share, quiet)
     r = np.asarray(np.linalg.qr(phi.reshape(-1, nt), mode="r"))
-    return recursion, reference, inflation_of(r, level, began.covariance)
+    return recursion, reference, inflation_of(r, squares(phi, noise / level), level, began.covariance)
