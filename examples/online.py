@@ -18,7 +18,7 @@ CHANNELS = {"inputs": [oa.Channel("force", "N")], "outputs": [oa.Channel("positi
 
 
 def measured(seed: int, mass, friction) -> oa.Record:
-    """`m a = u − 2 v − 100 x − F tanh(v / 0.05) + noise` under random steps of force; mass and friction of every row."""
+    """`m a = u − 2 v − 100 x − F tanh(v / 0.05) + noise` under random steps of force; m and F of every row."""
     rng = np.random.default_rng(seed)
     force = np.repeat(rng.normal(0, 20.0, ROWS // 10), 10)
     noise, x = rng.normal(0, 1.0, ROWS), np.zeros(ROWS)

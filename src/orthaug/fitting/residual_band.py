@@ -103,13 +103,16 @@ class Watch:
         """Add whitened outputs' errors (ny,) of a row, whose variance is `spread` times that of training: the level."""
         reference = self.reference
         residual = reference.white @ error / math.sqrt(spread)
-        left = residual
-        if len(reference.colour):
-            left = residual - np.sum(reference.colour * self.past, axis=0)
-            self.past = np.concatenate([residual[None], self.past[:-1]])
-            if math.isnan(left[0]):  # the filter is not filled yet
-                return self.level
-        self.sums += np.minimum(np.maximum(left / reference.deviation, -_LARGEST), _LARGEST)
+        expected = np.sum(reference.colour * self.past, axis=0)
+        left = (residual - expected) / reference.deviation
+        clipped = np.minimum(np.maximum(left, -_LARGEST), _LARGEST)
+        known = not math.isnan(left[0])
+        if len(reference.colour):  # what is remembered of an outlier is what it counts
+            now = expected + clipped * reference.deviation if known else residual
+            self.past = np.concatenate([now[None], self.past[:-1]])
+        if not known:  # the filter is not filled yet
+            return self.level
+        self.sums += clipped
         for i, scale in enumerate(reference.scales):
             self.counts[i] += 1
             if self.counts[i] == scale:
