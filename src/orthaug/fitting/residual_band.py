@@ -107,8 +107,8 @@ class Watch:
         left = (residual - expected) / reference.deviation
         clipped = np.minimum(np.maximum(left, -_LARGEST), _LARGEST)
         known = not math.isnan(left[0])
-        if len(reference.colour):  # what is remembered of an outlier is what it counts
-            now = expected + clipped * reference.deviation if known else residual
+        if len(reference.colour):  # an outlier is not remembered, so that it counts once
+            now = np.where(np.abs(left) > _LARGEST, expected, residual)
             self.past = np.concatenate([now[None], self.past[:-1]])
         if not known:  # the filter is not filled yet
             return self.level
