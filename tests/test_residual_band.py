@@ -27,8 +27,11 @@ def watched(kind: str, seed: int = 0, used: float = 0.0) -> tuple[Reference, np.
 
 
 def loudest(reference: Reference, rows: np.ndarray) -> float:
-    watch = Watch(reference)
-    return max(watch.step(row, 1.0) for row in rows)
+    return max(levels(Watch(reference), rows))
+
+
+def levels(watch: Watch, rows: np.ndarray) -> list[float]:
+    return [watch.level for row in rows if watch.step(row, 1.0) in (True, False)]
 
 
 @pytest.mark.parametrize("kind", ["white", "coloured", "heavy"])
@@ -67,10 +70,19 @@ def test_one_outlier_is_no_alarm_and_a_gap_begins_anew():
     rows = residuals("coloured", 3, 300)
     rows[150] += 1e6
     watch = Watch(reference)
-    assert max(watch.step(row, 1.0) for row in rows) < 1
+    assert max(levels(watch, rows)) < 1
     watch.gap()
     assert np.isnan(watch.past).all() and not any(watch.counts)
-    assert watch.step(rows[0], 1.0) == watch.level
+    assert not watch.step(rows[0], 1.0)
+
+
+def test_an_alarm_is_raised_once_stands_and_ends():
+    reference, _ = watched("white")
+    watch, rows = Watch(reference), residuals("white", 60, 6000)
+    rows[500:900] *= 2.0
+    raised = [k for k, row in enumerate(rows) if watch.step(row, 1.0)]
+    assert len(raised) == 1 and 500 < raised[0] < 560
+    assert watch.level < 1
 
 
 def test_few_rows_take_fewer_scales():

@@ -97,12 +97,12 @@ def open_track(
 
 def _physics_of(model: Path, sampling_time: float) -> PhysicsMap | None:
     """What θ is made of, from the result beside a model; None where there is none."""
-    from orthaug.commands.spec import Spec
+    from orthaug.commands.spec import spec_model
 
     for folder in (model, model.parent):
         try:
             content = json.loads((folder / "result.json").read_text(encoding="utf-8"))
-            return Spec.model_validate(content["spec"]).physics_map(sampling_time) if content["spec"] else None
+            return spec_model().model_validate(content["spec"]).physics_map(sampling_time)
         except (OSError, ValueError, KeyError, TypeError, RecursionError, ValidationError):
             continue
     return None

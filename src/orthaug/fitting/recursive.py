@@ -198,13 +198,12 @@ class Recursive:
         for i, k in enumerate(used):
             if i and k != used[i - 1] + 1:
                 watch.gap()
-            row, before = self.rows + int(k), watch.level
+            row = self.rows + int(k)
             error, spread = recursion.update(phi[i], target[i])
-            level = watch.step(error, spread)
-            if level > 1 >= before:
+            if watch.step(error, spread):
                 told.append(Alarm(row, row * self._fitted.sampling_time))
             if row % course.stride == 0:
-                course.add(course.line(row, level, self._freedom, error, recursion))
+                course.add(course.line(row, watch.level, self._freedom, error, recursion))
         return told
 
     @property

@@ -23,6 +23,9 @@ from orthaug._base.checks import Matrix, Vector
 SCALES = (1, 4, 16, 64)
 _RATIO = 2.0  # of the variance that is looked for
 _LARGEST = 4.0  # deviations: what is beyond counts as that, so that no single outlier raises an alarm
+_GROSS = 10.0
+_HIGHEST = 1.2  # of the limit: so that an alarm ends soon after its cause
+_ARMED = 0.5
 _FEWEST_BLOCKS = 30
 _MOST_LAGS = 10
 _ROWS_PER_LAG = 20
@@ -84,6 +87,8 @@ class Watch:
     totals: list[float] = field(init=False)
     level: float = 0.0
     """The largest g over its limit, above 1 for an alarm."""
+    armed: bool = True
+    """Whether the next level above 1 is a new alarm: one that has come back below a half."""
 
     def __post_init__(self) -> None:
         reference = self.reference
@@ -99,29 +104,31 @@ class Watch:
         self.sums = np.zeros((len(self.reference.scales), ny))
         self.counts = [0] * len(self.reference.scales)
 
-    def step(self, error: Vector, spread: float) -> float:
-        """Add whitened outputs' errors (ny,) of a row, whose variance is `spread` times that of training: the level."""
+    def step(self, error: Vector, spread: float) -> bool:
+        """Add whitened outputs' errors (ny,) of a row, of `spread` times the variance of training: is it a new alarm?"""
         reference = self.reference
         residual = reference.white @ error / math.sqrt(spread)
         expected = np.sum(reference.colour * self.past, axis=0)
         left = (residual - expected) / reference.deviation
         clipped = np.minimum(np.maximum(left, -_LARGEST), _LARGEST)
         known = not math.isnan(left[0])
-        if len(reference.colour):  # an outlier is not remembered, so that it counts once
-            now = np.where(np.abs(left) > _LARGEST, expected, residual)
+        if len(reference.colour):  # no innovation is that large: an outlier is not remembered, so that it counts once
+            now = np.where(np.abs(left) > _GROSS, expected, residual) if known else residual
             self.past = np.concatenate([now[None], self.past[:-1]])
         if not known:  # the filter is not filled yet
-            return self.level
+            return False
         self.sums += clipped
         for i, scale in enumerate(reference.scales):
             self.counts[i] += 1
             if self.counts[i] == scale:
                 step = float(_steps(self.sums[i][None] / self._root[i])[0])
-                self.totals[i] = min(max(0.0, self.totals[i] + step), 2 * self._limits[i])
+                self.totals[i] = min(max(0.0, self.totals[i] + step), _HIGHEST * self._limits[i])
                 self.counts[i] = 0
                 self.sums[i] = 0.0
         self.level = max(total / limit for total, limit in zip(self.totals, self._limits, strict=True))
-        return self.level
+        raised = self.armed and self.level > 1
+        self.armed = not raised and (self.armed or self.level < _ARMED)
+        return raised
 
 
 def _steps(blocks: Matrix) -> Vector:
