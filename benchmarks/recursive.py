@@ -153,7 +153,7 @@ def windup(draws: int = 20) -> list[float]:
                 inner = online._recursion
                 if floor is None:
                     x = oa.data.regressors.stack_rows(record, fit.model.form.layout)
-                    phi, target = whitened_rows(fit.model, x.x, x.y)
+                    phi, target, _ = whitened_rows(fit.model, x.x, x.y)
                     course = directional(phi[:, 0], target[:, 0], start, inner.factor_now.copy(), inner.forgetting)
                 else:
                     inner.floor = np.sqrt(floor / 0.1) * inner.floor if floor else None
@@ -170,7 +170,7 @@ def times() -> list[float]:
     """Time of a row over that of a bare NumPy update of the same size: in a block of rows, and one row a call."""
     fit, record = fits(draws=1)[0] if DRAWS == 1 else fitted(), Plant().record(1)
     rows = oa.data.regressors.stack_rows(record, fit.model.form.layout)
-    phi, target = whitened_rows(fit.model, rows.x, rows.y)
+    phi, target, _ = whitened_rows(fit.model, rows.x, rows.y)
     experiment = record.experiments[0]
     online = oa.Recursive(fit, memory=MEMORY)
     online.update(record)

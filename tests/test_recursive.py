@@ -63,7 +63,7 @@ FITS = {
 def batch(fit: oa.Estimate, *records: oa.Record) -> np.ndarray:
     """θ of least squares on rows of several records, the learner fixed; by the QR of all of them."""
     rows = stack_rows(oa.Record.join(records), fit.model.form.layout)
-    phi, target = whitened_rows(fit.model, rows.x, rows.y)
+    phi, target, _ = whitened_rows(fit.model, rows.x, rows.y)
     return Projection.factor(phi).solve(target)
 
 
@@ -141,7 +141,7 @@ def test_forgetting_is_weighted_least_squares(fit):
     age = np.arange(len(rows))[::-1]
     share = min(1.0, 1 / (1 - factor) / len(fit.problem.rows)) * factor ** len(rows)
     root = np.sqrt(np.concatenate([np.full(len(fit.problem.rows), share), factor**age]))
-    phi, target = (np.concatenate([one, other]) for one, other in zip(old, new, strict=True))
+    phi, target = (np.concatenate([one, other]) for one, other in zip(old[:2], new[:2], strict=True))
     weighted = Projection.factor(phi * root[:, None, None]).solve(target * root[:, None])
     np.testing.assert_allclose(online.theta, weighted, rtol=1e-10)
     assert online.effective_rows == pytest.approx((1 + factor) / (1 - factor), rel=1e-3)

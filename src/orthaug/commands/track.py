@@ -138,6 +138,7 @@ def track(
 
 
 def _result(opened: Opened, online: Recursive) -> TrackResult:
+    from orthaug.fitting.recursive import outside_text
     from orthaug.models.storage import digest
 
     step, factor = opened.model.sampling_time, online.forgetting
@@ -146,6 +147,9 @@ def _result(opened: Opened, online: Recursive) -> TrackResult:
     if online.std is None:
         text = "no standard errors: the fit has none, or the rows do not tell θ."
         warnings.append(Warning("no_standard_errors", text))
+    if online.outside:
+        text = outside_text(online.outside, online.rows)
+        warnings.append(Warning("learner_extrapolates", f"{text[0].upper()}{text[1:]}."))
     physical: Any = None
     if opened.physics is not None:
         estimate = online.physical(opened.physics)
@@ -156,6 +160,7 @@ def _result(opened: Opened, online: Recursive) -> TrackResult:
             "files": opened.files,
             "model": digest(opened.model),
             "rows": online.rows,
+            "outside": online.outside,
             "time": online.rows * step,
             "forgetting": factor,
             "memory": None if factor == 1 else -step / math.log(factor),

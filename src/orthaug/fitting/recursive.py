@@ -22,7 +22,7 @@ from orthaug.fitting import recursive_start, recursive_storage
 from orthaug.fitting.estimates import Estimate, order_of
 from orthaug.fitting.parameter_table import parameter_frame, parameter_lines
 from orthaug.fitting.recursive_course import Course, covariances
-from orthaug.fitting.recursive_rows import Lagging, joined_rows, whitened_rows
+from orthaug.fitting.recursive_rows import Lagging, Whitened, joined_rows, whitened_rows
 from orthaug.fitting.residual_band import Watch
 from orthaug.inference.covariance import interval
 from orthaug.inference.physical import PhysicalEstimate, solve
@@ -101,7 +101,7 @@ class Recursive:
         self._lagging = Lagging(model)
         self._tail = self._lagging.nothing
         self._course = Course(len(model.outputs), len(model.theta))
-        self.rows = 0
+        self.rows = self.outside = 0
         self.alarms: tuple[Alarm, ...] = ()
 
     @classmethod
@@ -118,6 +118,7 @@ class Recursive:
         one = cls.__new__(cls)
         one._set(kept.model, kept.recursion, kept.watch, kept.inflation, kept.used)
         one._tail, one._course, one.rows = kept.tail, kept.course, kept.rows
+        one.outside = kept.outside
         one.alarms = tuple(Alarm(int(row), row * kept.model.sampling_time) for row in kept.alarms)
         return one
 
@@ -136,7 +137,7 @@ class Recursive:
     def _kept(self) -> recursive_storage.Kept:
         return recursive_storage.Kept(
             self._fitted, self._recursion, self._watch, self._inflation, self._used,
-            self._tail, self._course, self.rows, np.array([alarm.row for alarm in self.alarms], dtype=float),
+            self._tail, self._course, self.rows, self.outside, np.array([alarm.row for alarm in self.alarms], dtype=float),
         )  # fmt: skip
 
     def update(
@@ -165,10 +166,10 @@ class Recursive:
             x, complete, tail = self._lagging.regressors(self._lagging.nothing if begins[-1] else tail, rows)
             prepared.append(self._whitened(x, complete, rows))
         told = []
-        for begun, (used, phi, target, count) in zip(begins, prepared, strict=True):
+        for begun, (used, whitened, count) in zip(begins, prepared, strict=True):
             if begun:
                 self._watch.gap()
-            told += self._follow(used, phi, target)
+            told += self._follow(used, whitened)
             self.rows += count
         self._tail = tail
         self.alarms = (*self.alarms, *told)
@@ -184,23 +185,27 @@ class Recursive:
         record = model.fitting(record, need_outputs=True)
         return [np.concatenate([e.outputs, e.inputs], axis=1) for e in record.experiments]
 
-    def _whitened(self, x: Matrix, complete: Any, rows: Matrix) -> tuple[Any, Any, Any, int]:
-        """Which rows are used, and their φ and target."""
+    def _whitened(self, x: Matrix, complete: Any, rows: Matrix) -> tuple[Any, Whitened | None, int]:
+        """Which rows are used, and what θ is least squares of in them."""
         used = np.flatnonzero(complete)
         if not len(used):
-            return used, None, None, len(rows)
-        phi, target = whitened_rows(self._fitted, x[used], rows[used, : len(self._fitted.outputs)])
-        return used, phi, target, len(rows)
+            return used, None, len(rows)
+        return used, whitened_rows(self._fitted, x[used], rows[used, : len(self._fitted.outputs)]), len(rows)
 
-    def _follow(self, used: Any, phi: Any, target: Any) -> list[Alarm]:
+    def _follow(self, used: Any, whitened: Whitened | None) -> list[Alarm]:
         recursion, watch, course = self._recursion, self._watch, self._course
-        told = []
-        for i, k in enumerate(used):
+        told: list[Alarm] = []
+        if whitened is None:
+            return told
+        for i, (k, phi, target, inside) in enumerate(zip(used, *whitened, strict=True)):
             if i and k != used[i - 1] + 1:
                 watch.gap()
             row = self.rows + int(k)
-            error, spread = recursion.update(phi[i], target[i])
-            if watch.step(error, spread):
+            error, spread = recursion.update(phi, target)
+            if not inside:
+                watch.skip()
+                self.outside += 1
+            elif watch.step(error, spread):
                 told.append(Alarm(row, row * self._fitted.sampling_time))
             if row % course.stride == 0:
                 course.add(course.line(row, watch.level, self._freedom, error, recursion))
@@ -343,10 +348,18 @@ class Recursive:
             f"memory      {memory} (forgetting {self.forgetting:.8g}), worth {self.effective_rows:.0f} rows",
             f"alarms      {'; '.join(map(str, self.alarms)) or 'none'}{' (it stands)' if self.alarmed else ''}",
         ]
+        if self.outside:
+            lines.append(f"outside     {outside_text(self.outside, self.rows)}")
         if self.std is None:
             lines.append("intervals   none: the fit has no standard errors, or the rows do not tell θ yet")
         rows = parameter_lines(self._fitted.form.baseline.parameters, self.theta, self.std, self.interval)
         return "\n".join([*lines, "", *rows])
+
+
+def outside_text(outside: int, rows: int) -> str:
+    """How many rows the learner extrapolates on."""
+    share = f"{100 * outside / rows:.2g} % of the rows"
+    return f"the learner's inputs leave those of training on {share}: it extrapolates there, which raises no alarm"
 
 
 def forgetting_factor(forgetting: Any, memory: Any, sampling_time: float) -> float:

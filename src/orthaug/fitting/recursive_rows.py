@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -18,23 +18,39 @@ from orthaug.models.model import Model
 from orthaug.physics.output_weights import times
 
 _BATCH = 1024
+_RIM = 1e-9  # the largest of training is no extrapolation
 
 
 @partial(jax.jit, static_argnames="form")
 def _evaluated(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"]) -> Float[Array, "m ny ntp"]:
-    """`[φ, known + f − φθ_aux]` of every row."""
+    """`[φ, known + f − φθ_aux]` of every row, and the largest of its scaled features: 1 at the rim of training."""
 
     def one(row: Any) -> Any:
         phi = form.baseline.phi(row, form.layout, form.outputs, jnp)
         known = form.baseline.known(row, form.layout, form.outputs, jnp)
         added = known + form.at(numbers, row).learner
-        return jnp.concatenate([phi, added[:, None]], axis=1)
+        reach = jnp.zeros_like(added)
+        if form.bound is not None and form.differentiable:
+            z = (form.features.evaluate(row, form.layout, jnp) - numbers.centre) / numbers.halfwidth
+            reach = reach + jnp.max(jnp.abs(z), initial=0.0)
+        return jnp.concatenate([phi, added[:, None], reach[:, None]], axis=1)
 
     return jax.vmap(one)(x)
 
 
-def whitened_rows(model: Model, x: Matrix, y: Matrix) -> tuple[Float[np.ndarray, "n ny nt"], Matrix]:
-    """φ and `y − known − (f − φθ_aux)` in whitened outputs: what θ is the least-squares solution of.
+class Whitened(NamedTuple):
+    """φ (n, ny, nθ) and `y − known − (f − φθ_aux)` (n, ny) in whitened outputs: what θ is least squares of.
+
+    `inside` (n,) is where the learner's features lie within those of training.
+    """
+
+    phi: Float[np.ndarray, "n ny nt"]
+    target: Matrix
+    inside: Bool[np.ndarray, "n"]
+
+
+def whitened_rows(model: Model, x: Matrix, y: Matrix) -> Whitened:
+    """Rows of measured regressors x (n, nx) and outputs y (n, ny).
 
     Raises:
         InputError: physics or learner that is not finite on a row.
@@ -51,8 +67,8 @@ def whitened_rows(model: Model, x: Matrix, y: Matrix) -> tuple[Float[np.ndarray,
         row = x[int(np.argmax(bad))]
         at = ", ".join(f"{lag} = {value:.6g}" for lag, value in zip(model.form.layout, row, strict=True))
         raise InputError(f"physics or learner has no finite value at {at}; give NaN for such a row, or mend the data.")
-    phi = times(model.weight, values[..., :-1])
-    return phi, times(model.weight, y - values[..., -1])
+    inside = np.asarray(values[:, 0, -1] <= 1 + _RIM)
+    return Whitened(times(model.weight, values[..., :-2]), times(model.weight, y - values[..., -2]), inside)
 
 
 @dataclass(frozen=True, eq=False)

@@ -72,7 +72,7 @@ def trained(fit: Any, training: Record | None) -> Trained:
     if not len(model.theta):
         raise InputError("the physics has no parameter to follow.")
     rows = stack_rows(record, model.form.layout)
-    phi, target = whitened_rows(model, rows.x, rows.y)
+    phi, target, _ = whitened_rows(model, rows.x, rows.y)
     lengths = tuple(len(experiment) - rows.start for experiment in record.experiments)
     freedom = fit.freedom if isinstance(fit, Estimate) else model.statistics.freedom
     used = target.size - len(model.theta) - freedom * target.shape[1] if np.isfinite(freedom) else 0.0

@@ -38,6 +38,7 @@ class Kept(NamedTuple):
     tail: Matrix
     course: Course
     rows: int
+    outside: int
     alarms: Vector
 
 
@@ -75,7 +76,7 @@ def _arrays(kept: Kept) -> dict[str, Any]:
         "totals": np.array(watch.totals),
         "tail": kept.tail,
         "course": course.rows,
-        "counted": np.array([kept.used, kept.rows, course.stride, watch.level, watch.armed]),
+        "counted": np.array([kept.used, kept.rows, kept.outside, course.stride, watch.level, watch.armed]),
         "alarms": kept.alarms,
         **{name: value for name, value in optional.items() if value is not None},
     }
@@ -117,8 +118,8 @@ def _rebuilt(model: Model, arrays: dict[str, np.ndarray]) -> Kept:
     watch = Watch(Reference(**{name: arrays[name] for name in _REFERENCE}, scales=scales))
     watch.past, watch.sums = arrays["past"].copy(), arrays["blocks"].copy()
     watch.counts, watch.totals = [int(n) for n in arrays["counts"]], arrays["totals"].tolist()
-    used, rows, stride, watch.level, armed = arrays["counted"].tolist()
+    used, rows, outside, stride, watch.level, armed = arrays["counted"].tolist()
     watch.armed = bool(armed)
     course = Course(len(model.outputs), len(model.theta), int(stride), list(arrays["course"]))
     tail, alarms = arrays["tail"].copy(), arrays["alarms"]
-    return Kept(model, recursion, watch, arrays.get("inflation"), used, tail, course, int(rows), alarms)
+    return Kept(model, recursion, watch, arrays.get("inflation"), used, tail, course, int(rows), int(outside), alarms)

@@ -104,8 +104,13 @@ class Watch:
         self.sums = np.zeros((len(self.reference.scales), ny))
         self.counts = [0] * len(self.reference.scales)
 
+    def skip(self) -> None:
+        """A row whose residual says nothing about the band."""
+        if len(self.past):
+            self.past = np.concatenate([np.full_like(self.past[:1], np.nan), self.past[:-1]])
+
     def step(self, error: Vector, spread: float) -> bool:
-        """Add whitened outputs' errors (ny,) of a row, of `spread` times the variance of training: is it a new alarm?"""
+        """Add whitened outputs' errors (ny,) of a row, of `spread` times training's variance: is it a new alarm?"""
         reference = self.reference
         residual = reference.white @ error / math.sqrt(spread)
         expected = np.sum(reference.colour * self.past, axis=0)

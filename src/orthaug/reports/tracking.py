@@ -20,6 +20,7 @@ class TrackResult(Headed):
     files: list[FileResult]
     model: str
     rows: Whole
+    outside: Whole
     time: Number
     forgetting: Number
     memory: Number
