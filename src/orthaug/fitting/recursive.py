@@ -135,10 +135,9 @@ class Recursive:
         recursive_storage.write(self._kept(), folder)
 
     def _kept(self) -> recursive_storage.Kept:
-        return recursive_storage.Kept(
-            self._fitted, self._recursion, self._watch, self._inflation, self._used,
-            self._tail, self._course, self.rows, self.outside, np.array([alarm.row for alarm in self.alarms], dtype=float),
-        )  # fmt: skip
+        alarms = np.array([alarm.row for alarm in self.alarms], dtype=float)
+        state = (self._fitted, self._recursion, self._watch, self._inflation, self._used, self._tail, self._course)
+        return recursive_storage.Kept(*state, self.rows, self.outside, alarms)
 
     def update(
         self, record: Record | None = None, *, u: Any = None, y: Any = None, gap: bool = False
