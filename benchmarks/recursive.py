@@ -26,9 +26,9 @@ BEFORE = 1500  # rows before a step
 
 
 @cache
-def fits(case: str = "white", draws: int = DRAWS) -> list[oa.Estimate]:
-    """A fit for every draw, of a record of its own."""
-    return [fitted(draw, Plant(**CASES[case])) for draw in range(draws)]
+def fit_of(draw: int, case: str = "white") -> oa.Estimate:
+    """The fit of a draw, of a record of its own."""
+    return fitted(draw, Plant(**CASES[case]))
 
 
 def batch(fit: oa.Estimate, record: oa.Record) -> np.ndarray:
@@ -40,7 +40,7 @@ def batch(fit: oa.Estimate, record: oa.Record) -> np.ndarray:
 
 def equal() -> list[float]:
     """Largest relative difference to the batch fit after 3000 new rows, and to the fit itself when fed its own rows."""
-    fit, new = fits()[0], Plant().record(10_000)
+    fit, new = fit_of(0), Plant().record(10_000)
     more, again = oa.Recursive(fit), oa.Recursive(fit, start="empty")
     more.update(new)
     again.update(fit.problem.record)
@@ -56,7 +56,7 @@ def drift(draws: int = 20) -> list[float]:
     for memory in (0.5, 1.0, 2.0, 5.0):
         errors, alarms = [], 0
         for draw in range(draws):
-            online = oa.Recursive(fits()[draw], memory=memory)
+            online = oa.Recursive(fit_of(draw), memory=memory)
             alarms += bool(online.update(Plant(m=mass).record(20_000 + draw)))
             course = online.physical_history(physics(), points=60)
             errors.append(100 * np.abs(course.m / mass[course.index] - 1))
@@ -75,7 +75,7 @@ def friction(draws: int = DRAWS) -> list[float]:
             delays = []
             for draw in range(draws):
                 level = np.where(np.arange(ROWS) < BEFORE, FRICTION, step * FRICTION)
-                online = oa.Recursive(fits()[draw], memory=memory)
+                online = oa.Recursive(fit_of(draw), memory=memory)
                 alarms = online.update(Plant(f=level).record(30_000 + draw))
                 after = [alarm.time - BEFORE * TS for alarm in alarms if alarm.row >= BEFORE]
                 delays.append(after[0] if after else np.inf)
@@ -95,7 +95,7 @@ def quiet(draws: int = DRAWS) -> list[float]:
         for memory in (None, MEMORY):
             raised = 0
             for draw in range(draws):
-                online = oa.Recursive(fits(case)[draw], memory=memory)
+                online = oa.Recursive(fit_of(draw, case), memory=memory)
                 raised += bool(online.update(Plant(**options).record(40_000 + draw)))
             told.append(100 * raised / draws)
             print(f"no change, noise {case}, memory {memory}: {told[-1]:.1f} % of {draws} records raise an alarm")
@@ -109,7 +109,7 @@ def coverage(draws: int = DRAWS) -> list[float]:
         for memory in (None, MEMORY):
             hits = []
             for draw in range(draws):
-                online = oa.Recursive(fits(case)[draw], memory=memory)
+                online = oa.Recursive(fit_of(draw, case), memory=memory)
                 online.update(Plant(**options).record(50_000 + draw))
                 told_now = dict(zip(("m", "c", "ks"), online.physical(physics()).ci95, strict=True))
                 hits.append([low <= truth <= high for truth, (low, high) in
@@ -145,7 +145,7 @@ def windup(draws: int = 20) -> list[float]:
     for name, floor in (("none", 0.0), ("0.01", 0.01), ("0.1", 0.1), ("0.3", 0.3), ("directional", None)):
         idle, slow = [], []
         for draw in range(draws):
-            fit = fits()[draw]
+            fit = fit_of(draw)
             for scale, truth, kept in ((rest, np.full(rows, MASS), idle), (1.0, mass, slow)):
                 record = Plant(m=truth).record(60_000 + draw, rows, scale)
                 online = oa.Recursive(fit, memory=MEMORY)
@@ -168,7 +168,7 @@ def windup(draws: int = 20) -> list[float]:
 
 def times() -> list[float]:
     """Time of a row over that of a bare NumPy update of the same size: in a block of rows, and one row a call."""
-    fit, record = fits(draws=1)[0] if DRAWS == 1 else fitted(), Plant().record(1)
+    fit, record = fit_of(0), Plant().record(1)
     rows = oa.data.regressors.stack_rows(record, fit.model.form.layout)
     phi, target, _ = whitened_rows(fit.model, rows.x, rows.y)
     experiment = record.experiments[0]

@@ -17,6 +17,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_choice, check_count, check_number, check_type, is_number
 from orthaug._base.errors import InputError, shown
+from orthaug._base.jax import jax
 from orthaug.data.record import Record
 from orthaug.fitting import recursive_start, recursive_storage
 from orthaug.fitting.estimates import Estimate, order_of
@@ -98,6 +99,7 @@ class Recursive:
     def _set(self, model: Model, recursion: Any, watch: Watch, inflation: Matrix | None, used: float) -> None:
         self._fitted, self._recursion, self._watch = model, recursion, watch
         self._inflation, self._used = inflation, used
+        self._numbers = jax.device_put(model.numbers)
         self._lagging = Lagging(model)
         self._tail = self._lagging.nothing
         self._course = Course(len(model.outputs), len(model.theta))
@@ -189,7 +191,8 @@ class Recursive:
         used = np.flatnonzero(complete)
         if not len(used):
             return used, None, len(rows)
-        return used, whitened_rows(self._fitted, x[used], rows[used, : len(self._fitted.outputs)]), len(rows)
+        y = rows[used, : len(self._fitted.outputs)]
+        return used, whitened_rows(self._fitted, x[used], y, self._numbers), len(rows)
 
     def _follow(self, used: Any, whitened: Whitened | None) -> list[Alarm]:
         recursion, watch, course = self._recursion, self._watch, self._course

@@ -49,18 +49,21 @@ class Whitened(NamedTuple):
     inside: Bool[np.ndarray, "n"]
 
 
-def whitened_rows(model: Model, x: Matrix, y: Matrix) -> Whitened:
+def whitened_rows(model: Model, x: Matrix, y: Matrix, numbers: Numbers | None = None) -> Whitened:
     """Rows of measured regressors x (n, nx) and outputs y (n, ny).
+
+    Args:
+        numbers: the model's, where JAX has them already: a call with few rows is faster.
 
     Raises:
         InputError: physics or learner that is not finite on a row.
     """
-    pieces = []
+    pieces, numbers = [], model.numbers if numbers is None else numbers
     size = 1 if len(x) == 1 else min(_BATCH, padded_length(len(x)))
     for begin in range(0, len(x), size):
         rows = x[begin : begin + size]
         padded = np.concatenate([rows, np.repeat(rows[-1:], size - len(rows), axis=0)]) if len(rows) < size else rows
-        pieces.append(np.asarray(_evaluated(model.form, model.numbers, padded))[: len(rows)])
+        pieces.append(np.asarray(_evaluated(model.form, numbers, padded))[: len(rows)])
     values = np.concatenate(pieces) if len(pieces) > 1 else pieces[0]
     bad = ~np.isfinite(values).all(axis=(1, 2))
     if bad.any():
@@ -108,16 +111,18 @@ def as_rows(values: Any, channels: int, name: str) -> Matrix:
         InputError: no numbers, another number of channels, or an infinite one.
     """
     try:
-        array = np.asarray(values, dtype=float)
+        array = as_signal(values, name) if np.iscomplexobj(values) else np.asarray(values, dtype=float)
     except (TypeError, ValueError, OverflowError):
         array = as_signal(values, name)  # says what is wrong
     if array.ndim == 0 or (array.ndim == 1 and channels != 1):
         array = array.reshape(1, -1)
-    missing = np.isnan(array)
-    array = as_signal(np.where(missing, 0.0, array), name)
+    if array.ndim == 1:
+        array = array[:, None]
+    if array.ndim != 2 or np.isinf(array).any():
+        as_signal(np.where(np.isnan(array), 0.0, array), name)
     if array.shape[1] != channels:
         raise InputError(f"`{name}` has {array.shape[1]} columns; expected {channels}, one for each channel.")
-    return np.where(missing.reshape(array.shape), np.nan, array)
+    return array
 
 
 def joined_rows(u: Any, y: Any, inputs: int, outputs: int) -> Matrix:
