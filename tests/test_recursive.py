@@ -189,6 +189,21 @@ def test_physical_parameters_over_time(fit):
     assert list(online.parameters.index) == ["a", "b", "g"]
 
 
+def test_intervals_count_the_colour_of_the_errors():
+    """As the robust errors of the fit do, of a saved model too."""
+    rng = np.random.default_rng(3)
+    u, e = np.repeat(rng.normal(size=200), 10), rng.normal(size=2000)
+    for k in range(1, 2000):
+        e[k] += 0.9 * e[k - 1]
+    record = oa.Record.from_arrays(u, 2 * u + e)
+    fit = oa.estimate(record, oa.Baseline.from_terms([oa.Term("g", "u[k]")]), learner=None)
+    robust = fit.robust(60)
+    for online in (oa.Recursive(fit), oa.Recursive(fit.model, training=record)):
+        assert online.std is not None and online.std[0] > 2 * fit.std[0]
+        assert online.std[0] == pytest.approx(robust.std[0], rel=0.25)
+    np.testing.assert_allclose(oa.Recursive(robust).std, robust.std, rtol=1e-9)
+
+
 def test_a_saved_model_needs_its_training_data(fit):
     with pytest.raises(oa.InputError, match="a saved model does not hold its training data; give them"):
         oa.Recursive(fit.model)

@@ -11,6 +11,7 @@ from orthaug._base.checks import Matrix, check_type
 from orthaug._base.errors import InputError
 from orthaug.data.record import Record
 from orthaug.data.regressors import stack_rows
+from orthaug.fitting.colour import correlation_length
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.recursion import Recursion, squares, started
@@ -18,10 +19,12 @@ from orthaug.fitting.recursive_course import inflation_of
 from orthaug.fitting.recursive_rows import whitened_rows
 from orthaug.fitting.residual_band import Reference
 from orthaug.inference.covariance import whitening
+from orthaug.inference.intervals import newey_west
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 
 _SOLVED = 1e-6  # of the residual's norm: how far Φθ may be from that of least squares
+_LENGTHS, _ROWS_PER_LAG = 3, 20  # of the correlation of errors; of what tells it
 _SMALLEST = 1e-10  # of an output's deviation: a residual is at least rounding
 MOTION = (
     "equations of motion cannot be followed by least squares: their outputs are not linear in the parameters. Write "
@@ -40,6 +43,8 @@ class Trained(NamedTuple):
     covariance: Matrix | None
     used: float
     """Degrees of freedom that the learner has used up."""
+    robust: bool
+    """Whether the covariance counts the colour of the errors."""
 
 
 def trained(fit: Any, training: Record | None) -> Trained:
@@ -76,7 +81,8 @@ def trained(fit: Any, training: Record | None) -> Trained:
     lengths = tuple(len(experiment) - rows.start for experiment in record.experiments)
     freedom = fit.freedom if isinstance(fit, Estimate) else model.statistics.freedom
     used = target.size - len(model.theta) - freedom * target.shape[1] if np.isfinite(freedom) else 0.0
-    began = Trained(model, phi, target, lengths, covariance, max(used, 0.0))
+    robust = isinstance(fit, Estimate) and fit.plain_covariance is not None
+    began = Trained(model, phi, target, lengths, covariance, max(used, 0.0), robust)
     _check_solved(began)
     return began if isinstance(fit, Estimate) else began._replace(covariance=_saved_covariance(began))
 
@@ -128,9 +134,37 @@ def begin(
     white = np.diag(1 / np.sqrt(np.diag(noise))) if white is None else white
     level = float(np.trace(noise)) / ny
     recursion = started(phi, target, model.theta, noise / level, level, freedom, forgetting, empty=empty)
-    stretches = np.split(residual, np.cumsum(began.lengths)[:-1])
+    ends = np.cumsum(began.lengths)[:-1]
+    stretches = np.split(residual, ends)
     share = (nt + began.used) / (count * ny)
     grown = [stretch * np.sqrt(count * ny / freedom) for stretch in stretches]
     reference = Reference.of(grown, white, share, quiet)
+    squared = squares(phi, noise / level)
     r = np.asarray(np.linalg.qr(phi.reshape(-1, nt), mode="r"))
-    return recursion, reference, inflation_of(r, squares(phi, noise / level), level, began.covariance)
+    inflation = inflation_of(r, squared, level, began.covariance)
+    if inflation is not None and len(reference.colour) and not began.robust:
+        scores = [np.einsum("kit,ki->kt", *pair) for pair in zip(np.split(phi, ends), grown, strict=True)]
+        widened = inflation_of(r, squared, level, _sandwich(r, newey_west(scores, _memory(grown, white))))
+        inflation = None if widened is None else _root(widened) @ inflation @ _root(widened)
+    return recursion, reference, inflation
+
+
+def _sandwich(r: Matrix, middle: Matrix) -> Matrix:
+    """`(RᵀR)⁻¹ Ω (RᵀR)⁻¹`."""
+    unit = np.linalg.norm(r, axis=0)
+    inverse = np.linalg.inv(r / unit) / unit[:, None]
+    return inverse @ (inverse.T @ middle @ inverse) @ inverse.T
+
+
+def _root(matrix: Matrix) -> Matrix:
+    values, vectors = np.linalg.eigh(matrix)
+    return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+
+
+def _memory(stretches: list[Matrix], white: Matrix) -> int:
+    """How many lags the colour of the errors takes: three times as many as their correlation lasts."""
+    longest, rows = max(map(len, stretches)), sum(map(len, stretches))
+    padded = [np.pad(stretch @ white.T, ((0, longest - len(stretch)), (0, 0))) for stretch in stretches]
+    lasting = [correlation_length(np.stack([p[:, i] for p in padded])) for i in range(len(white))]
+    most = rows // _ROWS_PER_LAG
+    return max(1, min(most, _LENGTHS * max(most if length is None else length for length in lasting)))
