@@ -81,9 +81,9 @@ def friction(draws: int = DRAWS) -> list[float]:
                 delays.append(after[0] if after else np.inf)
             seen, soon = (100 * np.mean(np.array(delays) <= end) for end in (1e9, 2.0))
             found = [d for d in delays if np.isfinite(d)] or [np.nan]
-            told += [round(100 * (step - 1)), float(np.median(found)), float(np.max(found)), float(soon), float(seen)]
+            told += [float(np.median(found)), float(np.max(found)), float(soon), float(seen)]
             which = "forgets nothing" if memory is None else f"memory {memory} s"
-            print(f"friction +{told[-5]} %, {which}: {told[-4]:.2f} s median, {told[-3]:.2f} s largest, "
+            print(f"friction +{100 * (step - 1):.0f} %, {which}: {told[-4]:.2f} s median, {told[-3]:.2f} s largest, "
                   f"{soon:.1f} % within 2 s, {seen:.1f} % at all")  # fmt: skip
     return told
 

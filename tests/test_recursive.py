@@ -78,10 +78,10 @@ def test_without_forgetting_it_is_the_batch_fit(name):
     np.testing.assert_allclose(again.theta, fit.theta, rtol=1e-10)
     if fit.std is None:
         assert online.std is None and "intervals   none" in online.summary()
-    else:
-        np.testing.assert_allclose(
-            oa.Recursive(fit).covariance, fit.covariance, rtol=1e-9, atol=1e-12 * fit.std.max() ** 2
-        )
+    else:  # of coloured errors the robust ones
+        told = fit.robust() if len(online._watch.reference.colour) else fit
+        found, atol = oa.Recursive(told).covariance, 1e-12 * told.std.max() ** 2
+        np.testing.assert_allclose(found, told.covariance, rtol=1e-9, atol=atol)
 
 
 def test_statistics_are_those_of_physics_alone_on_all_rows():
@@ -199,7 +199,7 @@ def test_intervals_count_the_colour_of_the_errors():
     fit = oa.estimate(record, oa.Baseline.from_terms([oa.Term("g", "u[k]")]), learner=None)
     robust = fit.robust(60)
     for online in (oa.Recursive(fit), oa.Recursive(fit.model, training=record)):
-        assert online.std is not None and online.std[0] > 2 * fit.std[0]
+        assert online.std is not None and online.std[0] > 1.8 * fit.std[0]
         assert online.std[0] == pytest.approx(robust.std[0], rel=0.25)
     np.testing.assert_allclose(oa.Recursive(robust).std, robust.std, rtol=1e-9)
 
