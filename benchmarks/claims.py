@@ -1,6 +1,6 @@
 """Every measured number of the documents against the function that gives it.
 
-    python benchmarks/claims.py                        all of them: about half an hour
+    python benchmarks/claims.py                        all of them: about an hour
     python benchmarks/claims.py output_unit measure    those of some files; also file.function
     python benchmarks/claims.py --list                 which there are, and how long each took last
     python benchmarks/claims.py --last                 compute nothing, compare with what was computed last

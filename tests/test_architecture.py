@@ -35,7 +35,7 @@ NUMERICAL = ROOMS[: ROOMS.index("reports")]  # these know no pictures and no use
 NOT_NUMERICAL = ("matplotlib", "typer", "rich", "pandas.io")
 ONLY_IN = {
     "matplotlib": {"reports.drawing", "studies"},
-    "typer": {"commands.cli", "commands.program"},
+    "typer": {"commands.cli", "commands.model_cli", "commands.program"},
 }  # a room, or a file
 UNSAFE_MODULES = ("pickle", "cPickle", "_pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve")
 UNSAFE_CALLS = ("eval", "exec", "read_pickle", "to_pickle")

@@ -69,7 +69,9 @@ def run(*arguments: object) -> Done:
     out, err = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         patch.setattr(sys, "argv", ["orthaug", *map(str, arguments)])
-        patch.setattr(cli, "_prepare_jax", lambda: None)  # the cache on disk is tested by subprocesses
+        patch.setattr(
+            "orthaug._base.jax.use_compilation_cache", lambda: None
+        )  # the cache on disk is tested by subprocesses
         with pytest.raises(SystemExit) as stop:
             cli.main()
     return Done(stop.value.code, out.getvalue(), err.getvalue())  # type: ignore[arg-type]

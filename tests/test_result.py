@@ -143,7 +143,8 @@ def test_the_schema_of_another_command_is_refused():
     done = run("schema", "simulate")
     assert (
         done.code == 2
-        and "must be one of fit, check, compare, split, design, select, explain, linearize; got 'simulate'" in done.err
+        and "must be one of fit, check, compare, split, design, select, explain, linearize, track; got 'simulate'"
+        in done.err
     )
 
 

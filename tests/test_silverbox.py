@@ -47,7 +47,7 @@ def result(data_folder, tmp_path_factory):
     (folder / "silverbox.toml").write_text(SPEC.format(file=file) + "".join(terms))
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()):
         patch.setattr(sys, "argv", ["orthaug", "fit", str(folder / "silverbox.toml"), "--out", str(folder / "out")])
-        patch.setattr(cli, "_prepare_jax", lambda: None)
+        patch.setattr("orthaug._base.jax.use_compilation_cache", lambda: None)
         with pytest.raises(SystemExit) as stop:
             cli.main()
     assert stop.value.code == 0

@@ -36,6 +36,7 @@ from .fitting import MotionEstimate as MotionEstimate
 from .fitting import Orthogonal as Orthogonal
 from .fitting import OrthogonalPenalty as OrthogonalPenalty
 from .fitting import Prediction as Prediction
+from .fitting import Recursive as Recursive
 from .fitting import Simulation as Simulation
 from .fitting import Status as Status
 from .fitting import estimate as estimate

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,24 +14,16 @@ from orthaug.commands import streams
 from orthaug.commands.bars import study_bars, training_bar
 from orthaug.commands.program import (
     AsJson,
-    Columns,
-    DataPath,
-    Every,
     Force,
-    Initial,
-    Missing,
-    ModelPath,
-    OutFile,
     OutFolder,
-    Rows,
     SpecPath,
     app,
     main,
+    prepare_jax,
 )
 
 if TYPE_CHECKING:
-    from orthaug.commands.run import ModelOnData
-    from orthaug.models.response import Response
+    pass
 
 __all__ = ["main"]
 
@@ -44,7 +35,7 @@ def demo(out: OutFolder = None, force: Force = False) -> None:
 
     folder = out or Path("orthaug-out/demo")
     check_folder(folder, force=force)
-    _prepare_jax()
+    prepare_jax()
     from orthaug.commands import demo as demonstration
 
     with training_bar(2 * demonstration.RESTARTS, demonstration.ITERATIONS) as progress:
@@ -69,7 +60,7 @@ def check(
     job = open_job(spec, require_full_rank=False)
     check_figure(figure, *job.files, force=force)
     if job.spec.motion is not None:  # its runs are computed
-        _prepare_jax()
+        prepare_jax()
     result = check_job(job)
     streams.echo(result.to_json() if as_json else check_text(result))
     if figure is not None and result.bias:
@@ -97,7 +88,7 @@ def fit(
     check_folder(folder, force=force)
     job = open_job(spec)
     check_inputs_kept(job, folder)
-    _prepare_jax()
+    prepare_jax()
     job = keeping(job, folder, resume=resume)
     with training_bar(job.run_count, job.iterations, job.spec.declared_learner() is not None) as progress:
         fitted = fit_job(job, progress)
@@ -130,7 +121,7 @@ def compare(
     check_folder(folder, force=force)
     job = open_job(spec)
     check_inputs_kept(job, folder, model or ())
-    _prepare_jax()
+    prepare_jax()
     from orthaug.commands import compare as comparing
 
     with training_bar(job.run_count * len(job.compared), job.iterations) as progress:
@@ -138,161 +129,6 @@ def compare(
     comparing.write(comparison, folder, force=force)
     text = compare_text(comparison.result, comparison.verdicts)
     streams.echo(comparison.result.to_json() if as_json else f"{text}\n\nwritten to {folder}")
-
-
-@app.command()
-def simulate(
-    model: ModelPath,
-    data: DataPath,
-    out: OutFile = None,
-    initial: Initial = None,
-    missing: Missing = "error",
-    rows: Rows = None,
-    every: Every = 1,
-    column: Columns = None,
-    force: Force = False,
-) -> None:
-    """Free run of a saved model on a data file."""
-    from orthaug.commands import run
-    from orthaug.commands.folder import check_file
-
-    opened = run.open_run(model, data, reading=run.Reading.of(missing, rows, every, column or ()))
-    start = run.read_initial(initial, opened)
-    check_file(out, model, data, Path(initial or data), force=force)
-    _prepare_jax()
-    response = opened.model.simulate(opened.record, initial=start)
-    _write_response(response, opened, out, force, run.notes(opened, initial))
-
-
-@app.command()
-def predict(
-    model: ModelPath,
-    data: DataPath,
-    horizon: Annotated[int, typer.Option("--horizon", metavar="H", help="Steps ahead.")] = 1,
-    out: OutFile = None,
-    initial: Initial = None,
-    observer: Annotated[
-        bool, typer.Option("--observer", help="From an estimated state, with 95 % bands; outputs may be missing.")
-    ] = False,
-    missing: Missing = "error",
-    rows: Rows = None,
-    every: Every = 1,
-    column: Columns = None,
-    force: Force = False,
-) -> None:
-    """H-step-ahead prediction of a saved model."""
-    from orthaug.commands import run
-    from orthaug.commands.folder import check_file
-
-    reading = run.Reading.of(missing, rows, every, column or ())
-    opened = run.open_ahead(model, data, reading, horizon, initial, observer=observer)
-    check_file(out, model, data, Path(initial or data), force=force)
-    _prepare_jax()
-    _write_response(run.predicted(opened, horizon, observer=observer), opened, out, force, opened.notes)
-
-
-@app.command()
-def split(
-    model: ModelPath,
-    data: Annotated[list[Path], typer.Argument(metavar="DATA…", help="The files that the model was trained on.")],
-    measure: Annotated[
-        str, typer.Option("--measure", metavar="KIND", help="As `kind` in the spec's [structure.measure].")
-    ] = "training",
-    rows: Annotated[str | None, typer.Option("--rows", metavar="A:B", help="Rows of each file, half-open.")] = None,
-    box: Annotated[
-        list[str] | None, typer.Option("--box", metavar="LAG=LOW:HIGH", help="Limits of the uniform measure.")
-    ] = None,
-    samples: Annotated[str | None, typer.Option("--samples", metavar="FILE", help="Points, a column per lag.")] = None,
-    weights: Annotated[
-        str | None, typer.Option("--weights", metavar="FILE", help="A column `weight`, a row per row of DATA.")
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Parameters of a saved model under another measure, without training again."""
-    from orthaug.commands import split as splitting
-    from orthaug.commands.measure_options import read_measure, split_place
-    from orthaug.commands.run import read_rows
-    from orthaug.reports.text import split_text
-
-    opened = splitting.open_training(model, data, read_rows(rows))
-    given = {"box": box or [], "samples": [samples] if samples else [], "weights": [weights] if weights else []}
-    chosen = read_measure(measure, given, split_place(opened.model, opened.record))
-    _prepare_jax()
-    result = splitting.split_model(opened, chosen)
-    streams.echo(result.to_json() if as_json else split_text(result))
-
-
-@app.command()
-def explain(
-    model: ModelPath,
-    data: DataPath,
-    degree: Annotated[int, typer.Option("--degree", metavar="D", help="Of products of what the learner sees.")] = 3,
-    functions: Annotated[
-        list[str] | None, typer.Option("--function", metavar="NAME", help="In products, such as abs; any number.")
-    ] = None,
-    most: Annotated[int, typer.Option("--terms", metavar="N", help="Terms at most.")] = 6,
-    as_json: AsJson = False,
-) -> None:
-    """Which terms the learner of a saved model has found, and what to write into the physics."""
-    from orthaug.commands.explain import explain_model
-    from orthaug.commands.run import open_run
-    from orthaug.reports.explanation_text import explain_text
-
-    opened = open_run(model, data)
-    _prepare_jax()
-    result = explain_model(opened, degree=degree, functions=functions or (), most=most)
-    streams.echo(result.to_json() if as_json else explain_text(result))
-
-
-@app.command()
-def export(
-    model: ModelPath,
-    to: Annotated[str, typer.Option("--to", metavar="TARGET", help="c, casadi, control, fmu, numpy, onnx or latex.")],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the code.")],
-    name: Annotated[str, typer.Option("--name", help="Of files and functions.")] = "model",
-    force: Force = False,
-) -> None:
-    """A saved model as code that needs no orthaug."""
-    from orthaug.commands import export as exporting
-
-    exporting.check(model, to, out, name, force=force)
-    _prepare_jax()
-    exporting.run(model, to, out, name, force=force)
-    streams.echo(f"written to {out}")
-
-
-@app.command()
-def linearize(
-    model: ModelPath,
-    at: Annotated[
-        str | None, typer.Option("--at", metavar="'NAME=VALUE, …'", help="Held inputs; outputs or states to fix.")
-    ] = None,
-    data: Annotated[
-        Path | None, typer.Option("--data", metavar="DATA|SPEC", help="Measured data to compare with.")
-    ] = None,
-    continuous: Annotated[
-        str, typer.Option("--continuous", metavar="zoh|tustin", help="How to convert to continuous time.")
-    ] = "zoh",
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR|FILE", help="Folder; or a .json, .png, .pdf or .svg.")
-    ] = None,
-    as_json: AsJson = False,
-    force: Force = False,
-) -> None:
-    """Operating points of a saved model, and its poles, gains and frequency response there with intervals."""
-    from orthaug.commands import linearize as linearizing
-
-    linearizing.check_place(out, model, *([data] if data else []), force=force)
-    opened, record = linearizing.open_linear(model, data)
-    _prepare_jax()
-    from orthaug.analysis.linearization import linearize as linearized
-
-    found = linearized(opened, at, record, continuous=continuous)
-    if out is not None:
-        linearizing.write(found, out, force=force)
-    streams.echo(linearizing.told(found, as_json=as_json))
-    if out is not None and not as_json:
-        streams.echo(f"\nwritten to {out}")
 
 
 @app.command()
@@ -329,7 +165,7 @@ def select(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force
     check_folder(folder, force=force)
     job, given = open_select(spec)
     check_inputs_kept(job, folder)
-    _prepare_jax()
+    prepare_jax()
     with selection_bar(steps_at_most(given.selection.terms)) as told:
         selected = select_for(job, given, folder, told)
     write_selected(selected, folder, force=force)
@@ -344,7 +180,9 @@ def select(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force
 def schema(
     command: Annotated[
         str,
-        typer.Argument(metavar="[COMMAND]", help="fit, check, compare, split, design, select, explain or linearize."),
+        typer.Argument(
+            metavar="[COMMAND]", help="fit, check, compare, split, design, select, explain, linearize or track."
+        ),
     ] = "fit",
 ) -> None:
     """The JSON schema of what a command writes."""
@@ -370,35 +208,15 @@ def reproduce(
     reproduction.check_output(folder, force=force)
     entries = reproduction.chosen(name)
     check_choice(pipeline, reproduction.PIPELINES, "--pipeline")
-    _prepare_jax()
+    prepare_jax()
     with study_bars() as progress:
         reproduced = reproduction.reproduce(entries, pipeline=pipeline, small=small, progress=progress)
     reproduction.write(reproduced, folder, pipeline, force=force)
     streams.echo(f"{reproduction.text(reproduced)}\n\nwritten to {folder}/index.html")
 
 
-def _prepare_jax() -> None:
-    from orthaug._base.jax import use_compilation_cache
-
-    use_compilation_cache()
-
-
-def _write_response(
-    response: Response, opened: ModelOnData, out: Path | None, force: bool, notes: Sequence[str] = ()
-) -> None:
-    """The CSV and what is to say about it: scores go where the CSV does not."""
-    from orthaug.commands import run
-    from orthaug.reports.text import response_text
-
-    for line in (*notes, *(f"warning: {warning.text}" for warning in run.warnings(response))):
-        streams.say(line)
-    run.write_csv(response, opened, out, force=force)
-    told = response_text(response)
-    if told:
-        (streams.say if out is None else streams.echo)(told)
-    if out is not None:
-        streams.echo(f"written to {out}")
-
-
 def _json(content: Any) -> str:
     return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
+
+
+from orthaug.commands import model_cli  # noqa: E402, F401  (its commands stand behind these)

@@ -41,6 +41,17 @@ def check_inputs_kept(job: Job, folder: Path, models: Iterable[Path] = ()) -> No
             raise InputError(f"{folder}: holds {what}, which this fit reads; give another folder.")
 
 
+def check_kept(folder: Path, *read: Path) -> None:
+    """Raise InputError where a result folder would take the place of what is read."""
+    for path in read:
+        try:
+            inside = path.exists() and path.resolve().is_relative_to(folder.resolve())
+        except (OSError, ValueError):  # reading it will say what is wrong
+            continue
+        if inside:
+            raise InputError(f"{folder}: holds {path}, which is read; give another folder.")
+
+
 def check_file(out: Path | None, *read: Path, force: bool = False) -> None:
     """Raise InputError early where a file could not be written, is there, or is one of those that are read."""
     if out is None:

@@ -120,3 +120,10 @@ def _fail(message: str, code: int) -> None:
     WATCH.hold()
     streams.say(message)
     sys.exit(code)
+
+
+def prepare_jax() -> None:
+    """Keep compiled programs for the next command."""
+    from orthaug._base.jax import use_compilation_cache
+
+    use_compilation_cache()

@@ -267,12 +267,7 @@ class Estimate:
         return profile(physics, self.theta[order], covariance, name, freedom=max(self.freedom, 1.0))
 
     def _in_order_of(self, physics: PhysicsMap) -> tuple[list[int], Matrix | None]:
-        check_sampling_constant(physics.constants, self.problem.record.sampling_time)
-        names = self.problem.baseline.names
-        missing = [name for name in physics.theta_names if name not in names]
-        if missing:
-            raise InputError(f"the physics gives {', '.join(missing)}, which the baseline does not have.")
-        order = [names.index(name) for name in physics.theta_names]
+        order = order_of(physics, self.problem.baseline.names, self.problem.record.sampling_time)
         return order, None if self.covariance is None else self.covariance[np.ix_(order, order)]
 
     def __repr__(self) -> str:
@@ -287,6 +282,20 @@ class Estimate:
         """A page of text: status, parameters, excitation, warnings."""
         warnings = ["", *(f"warning: {warning}" for warning in self.warnings)] if self.warnings else []
         return "\n".join([*self.lines(), *warnings])
+
+
+def order_of(physics: PhysicsMap, names: Sequence[str], sampling_time: float) -> list[int]:
+    """Where the θ that the physics gives are among `names`.
+
+    Raises:
+        InputError: no PhysicsMap, a θ that is not among them, a constant `Ts` that is not the sampling time.
+    """
+    check_type(physics, PhysicsMap, "physics", "a PhysicsMap, such as PhysicsMap.of(…)")
+    check_sampling_constant(physics.constants, sampling_time)
+    missing = [name for name in physics.theta_names if name not in names]
+    if missing:
+        raise InputError(f"the physics gives {', '.join(missing)}, which the baseline does not have.")
+    return [names.index(name) for name in physics.theta_names]
 
 
 def summary_lines(fit: Estimate) -> Sequence[str]:

@@ -5,20 +5,12 @@ The JSON carries checksums of itself and of the arrays. A file that was cut or a
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import numpy as np
-from safetensors import SafetensorError
-from safetensors.numpy import load as load_arrays
-from safetensors.numpy import save as save_arrays
-
-from orthaug import __version__
 from orthaug._base.checks import check_type
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
@@ -26,6 +18,7 @@ from orthaug.models import lagged_storage, motion_storage
 from orthaug.models.learners import Learner
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
+from orthaug.models.packing import pack, read_packed, write_packed
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.motion import Motion
 
@@ -59,9 +52,7 @@ def save(model: Model | MotionModel, folder: str | Path, *, force: bool = False)
 
 def write(model: Model | MotionModel, folder: Path) -> None:
     """Write the two files into an existing folder."""
-    declaration, packed = _packed(model)
-    (folder / _ARRAYS).write_bytes(packed)
-    (folder / _DECLARATION).write_text(json.dumps(declaration, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    write_packed(_packed(model), folder / _DECLARATION, folder / _ARRAYS)
 
 
 def digest(model: Model | MotionModel) -> str:
@@ -73,11 +64,7 @@ def _packed(model: Model | MotionModel) -> tuple[dict[str, Any], bytes]:
     """What the two files hold."""
     kind = _KINDS[type(model)]
     declared, arrays = kind.declare(model)
-    packed = save_arrays({name: np.ascontiguousarray(value, dtype=np.float64) for name, value in arrays.items()})
-    declaration = {"format": FORMAT, "orthaug": __version__, **declared} | {
-        "arrays_sha256": hashlib.sha256(packed).hexdigest()
-    }
-    return declaration | {"checksum": _checksum(declaration)}, packed
+    return pack(FORMAT, declared, arrays)
 
 
 def load(
@@ -104,30 +91,10 @@ def load(
         there = False
     if not there:
         raise InputError(f"{folder}: no saved model there; expected {_DECLARATION} and {_ARRAYS}.")
+    declared, arrays = read_packed(
+        folder / _DECLARATION, folder / _ARRAYS, FORMAT, "model", "fit again, or copy it again"
+    )
     path = folder / _DECLARATION
-    try:
-        declared, packed = json.loads(path.read_text(encoding="utf-8")), (folder / _ARRAYS).read_bytes()
-        given = declared.pop("checksum", None) if isinstance(declared, dict) else None
-        checksum = _checksum(declared)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be read ({error.strerror}).") from None
-    except (ValueError, RecursionError):
-        raise InputError(f"{path}: the file is cut or altered (no JSON); fit again, or copy it again.") from None
-    if not isinstance(declared, dict) or type(declared.get("format")) is not int or declared["format"] < 1:
-        raise InputError(f"{path}: not a model of orthaug.")
-    if declared["format"] > FORMAT:
-        raise InputError(
-            f"{path}: written by orthaug {declared.get('orthaug')} in format {declared['format']}; this version "
-            f"({__version__}) reads up to {FORMAT}. Update orthaug."
-        )
-    if given != checksum:
-        raise InputError(f"{path}: the file was altered (its checksum differs); fit again, or copy it again.")
-    if hashlib.sha256(packed).hexdigest() != declared.get("arrays_sha256"):
-        raise InputError(f"{folder / _ARRAYS}: the file is cut or altered (its checksum differs); copy it again.")
-    try:
-        arrays = load_arrays(packed)
-    except SafetensorError as error:
-        raise InputError(f"{folder / _ARRAYS}: cannot be read ({error}).") from None
     try:
         kind = motion_storage if declared.get("kind") == "motion" else lagged_storage
         return kind.rebuild(declared, arrays, baseline, learner, path)
@@ -135,8 +102,3 @@ def load(
         raise
     except Exception as error:  # the checksum holds, so someone made it: there is no list of what that can hold
         raise InputError(f"{path}: not a model of this version (missing or misplaced: {error}).") from None
-
-
-def _checksum(declaration: dict[str, Any]) -> str:
-    canonical = json.dumps(declaration, sort_keys=True, ensure_ascii=False, separators=(",", ":"))
-    return hashlib.sha256(canonical.encode()).hexdigest()

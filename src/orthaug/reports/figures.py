@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from orthaug._base.checks import check_choice, check_type
 from orthaug._base.errors import InputError
 from orthaug.analysis.linear_view import Linearization
+from orthaug.fitting.recursive import Recursive
 from orthaug.models.response import Response
 from orthaug.reports.result import CheckResult, CompareResult, FitResult
 
@@ -20,7 +21,7 @@ _OF_VIEWS = ("bode", "poles")
 
 
 def plot(
-    what: Response | Linearization | FitResult | CheckResult | CompareResult,
+    what: Response | Linearization | Recursive | FitResult | CheckResult | CompareResult,
     kind: str | None = None,
     *,
     title: str | None = None,
@@ -29,20 +30,23 @@ def plot(
     """A matplotlib figure; also written as a PNG where there is a `path`.
 
     Args:
-        what: a response, of `model.simulate` or `model.predict`; what `linearize` returns; or the `result` of
-            `fit_spec` or `compare`.
+        what: a response, of `model.simulate` or `model.predict`; what `linearize` returns; a `Recursive`, for θ over
+            time; or the `result` of `fit_spec` or `compare`.
         kind: of a response "output" (measured and model; the default), "residual" or "components" (physics and
             learner); of linear views "bode" (the default) or "poles". A result has one figure: the biases by suspected
             terms of a fit, or the comparison.
-        title: of a response's figure; by default what kind of response it is.
+        title: of the figure of a response or of a `Recursive`; by default what kind it is.
         path: PNG file to write; a file of that name is replaced.
 
     Raises:
         InputError: nothing that has a figure, an unknown kind, outputs that were not measured, a path that cannot be
             written.
     """
-    wanted = "a Response, such as model.simulate(record), what linearize gives, or the `result` of fit_spec or compare"
-    check_type(what, Response | Linearization | FitResult | CheckResult | CompareResult, "what", wanted)
+    wanted = (
+        "a Response, such as model.simulate(record), what linearize gives, a Recursive, or the `result` of fit_spec or "
+        "compare"
+    )
+    check_type(what, Response | Linearization | Recursive | FitResult | CheckResult | CompareResult, "what", wanted)
     kinds = _OF_VIEWS if isinstance(what, Linearization) else _OF_RESPONSES
     kind = check_choice(kinds[0] if kind is None else kind, kinds, "`kind`")
     check_type(title, str | None, "title", "text")
@@ -67,6 +71,12 @@ def _drawn(what: Any, kind: str, title: str | None) -> Figure:
         if kind == "bode" and not what[0].inputs:
             raise InputError("the model has no inputs, so that it has no frequency response to draw.")
         return linear_plots.bode_figure(what) if kind == "bode" else linear_plots.poles_figure(what)
+    if isinstance(what, Recursive):
+        from orthaug.reports.tracking_plot import THETA, labels, tracking_figure
+
+        named = labels(what.fitted.form.baseline.parameters)
+        alarms = [alarm.time for alarm in what.alarms]
+        return tracking_figure(what.history, named, alarms, THETA if title is None else title)
     if isinstance(what, CompareResult):
         return plots.comparison_figure(what.comparison)
     if not isinstance(what, Response):

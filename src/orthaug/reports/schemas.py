@@ -9,6 +9,7 @@ from orthaug.reports.fields import Content
 from orthaug.reports.linear import LinearizeResult
 from orthaug.reports.result import CheckResult, CompareResult, DesignResult, FitResult, SplitResult
 from orthaug.reports.selection import SelectResult
+from orthaug.reports.tracking import TrackResult
 
 RESULTS: dict[str, type[Content]] = {
     "fit": FitResult,
@@ -19,6 +20,7 @@ RESULTS: dict[str, type[Content]] = {
     "select": SelectResult,
     "explain": ExplainResult,
     "linearize": LinearizeResult,
+    "track": TrackResult,
 }
 """By command."""
 

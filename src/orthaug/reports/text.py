@@ -44,7 +44,7 @@ def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
     findings = [result.residuals, result.missing_lags, result.validation]
     findings += [result.stability] if result.motion is not None else []
     told = [finding.text for finding in findings if finding]
-    blocks += [told, _warning_lines(w for w in dict.fromkeys(result.warnings) if w.text not in told)]
+    blocks += [told, warning_lines(w for w in dict.fromkeys(result.warnings) if w.text not in told)]
     return "\n\n".join("\n".join(lines) for lines in blocks if lines)
 
 
@@ -79,7 +79,7 @@ def check_text(result: CheckResult) -> str:
             "the learner, if it sees the term, from what it could not imitate.",
             *_suspect_lines(result.bias),
         ]
-    return "\n".join([*lines, *_warning_lines(result.warnings)])
+    return "\n".join([*lines, *warning_lines(result.warnings)])
 
 
 def _shared_lines(shared: SharedResult) -> list[str]:
@@ -107,7 +107,7 @@ def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
     lines += ["", *told, *beyond] if told else []
     lines.append("")
     lines += [f"left out: {kind}: {why}" for kind, why in result.left_out.items()]
-    lines += _warning_lines(result.warnings)
+    lines += warning_lines(result.warnings)
     for row in result.comparison:
         lines += [f"warning: {row.name}: {w.text}" for w in row.warnings if w not in result.warnings]
     return "\n".join(lines).rstrip()
@@ -115,14 +115,22 @@ def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
 
 def split_text(result: SplitResult) -> str:
     """θ under the measure, with intervals."""
-    detail, width = result.measure_detail, _width(result.parameters)
+    detail = result.measure_detail
     support = "–" if detail.support is None else f"{100 * detail.support:.0f} %"
     lines = [
         f"measure     {result.measure}, {detail.points} points, {support} of it within reach of the data",
-        f"{'parameter':<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  unit",
-        *(f"{_value_cells(row, row.ci95, width)}  {row.unit}".rstrip() for row in result.parameters),
+        *parameter_table("parameter", result.parameters),
     ]
-    return "\n".join([*lines, *_warning_lines(result.warnings)])
+    return "\n".join([*lines, *warning_lines(result.warnings)])
+
+
+def parameter_table(name: str, rows: Sequence[ParameterResult]) -> list[str]:
+    """Parameters with standard errors and intervals, under a head that begins with `name`."""
+    width = _width(rows)
+    return [
+        f"{name:<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  unit",
+        *(f"{_value_cells(row, row.ci95, width)}  {row.unit}".rstrip() for row in rows),
+    ]
 
 
 def design_text(result: DesignResult) -> str:
@@ -152,7 +160,8 @@ def _or_infinite(value: float | None, digits: int = 4) -> str:
     return "inf" if value is None else f"{value:.{digits}g}"
 
 
-def _warning_lines(warnings: Iterable[WarningResult]) -> list[str]:
+def warning_lines(warnings: Iterable[WarningResult]) -> list[str]:
+    """A line for each warning."""
     return [f"warning: {warning.text}" for warning in warnings]
 
 

@@ -1,0 +1,197 @@
+"""The parameters of a saved model followed over new data: what `orthaug track` does."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import ValidationError
+
+from orthaug._base.errors import InputError
+from orthaug._base.folders import whole_folder
+from orthaug._base.warning import Warning
+from orthaug.commands.folder import not_a_result
+from orthaug.commands.split import open_training
+from orthaug.data.readers import read_record
+from orthaug.data.record import Record
+from orthaug.data.tables import check_readable
+from orthaug.physics.parameters import PhysicsMap
+from orthaug.reports.result import FileResult, parameter_rows, physical_rows
+from orthaug.reports.tracking import TrackResult
+
+if TYPE_CHECKING:
+    from orthaug.fitting.recursive import Recursive
+    from orthaug.models.model import Model
+
+STATE = "state"
+"""The folder in a result from which a later run goes on."""
+
+
+@dataclass(frozen=True, eq=False)
+class Opened:
+    """A model with new data, what it was trained on, and the physical parameters that its result declares."""
+
+    model: Model
+    record: Record
+    training: Record | None
+    files: tuple[FileResult, ...]
+    physics: PhysicsMap | None
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """What was found."""
+
+    online: Recursive
+    result: TrackResult
+    physics: PhysicsMap | None
+
+
+def open_track(
+    model: Path, data: Sequence[Path], training: Sequence[Path], rows: tuple[int, int] | None, state: Path | None
+) -> Opened:
+    """Load a model, new data, and the files that it was trained on.
+
+    Raises:
+        InputError: no model, no data, a motion, training files missing where no state is given, or given beside one.
+    """
+    from orthaug.models.model import Model
+    from orthaug.models.storage import load
+
+    if not data:
+        raise InputError("--data: is missing; give at least one file of new data.")
+    if state is None and not training:
+        raise InputError("--training: is missing; give the files that the model was trained on, or --state of a run.")
+    if state is not None and training:
+        raise InputError("--training: found beside --state, which holds what training left; leave one of them out.")
+    for path in data:
+        check_readable(path)
+    loaded = load(model)
+    if not isinstance(loaded, Model):
+        from orthaug.fitting.recursive_start import MOTION
+
+        raise InputError(f"{model}: {MOTION}")
+    step = None if loaded.time_column else loaded.sampling_time
+    records, files = [], []
+    for path in data:
+        records.append(
+            read_record(
+                path,
+                inputs=loaded.inputs,
+                outputs=loaded.outputs,
+                sampling_time=step,
+                time=loaded.time_column,
+                missing="skip",
+            )
+        )
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        files.append(FileResult(file=str(path), sha256=digest, rows=len(records[-1])))
+    given = open_training(model, training, rows).record if training else None
+    return Opened(loaded, Record.join(records), given, tuple(files), _physics_of(model, loaded.sampling_time))
+
+
+def _physics_of(model: Path, sampling_time: float) -> PhysicsMap | None:
+    """What θ is made of, from the result beside a model; None where there is none."""
+    from orthaug.commands.spec import spec_model
+
+    for folder in (model, model.parent):
+        try:
+            content = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+            return spec_model().model_validate(content["spec"]).physics_map(sampling_time)
+        except (OSError, ValueError, KeyError, TypeError, RecursionError, ValidationError):
+            continue
+    return None
+
+
+def track(
+    opened: Opened,
+    *,
+    forgetting: float | None,
+    memory: float | None,
+    state: Path | None,
+    follows: bool,
+) -> Tracked:
+    """Follow the new rows.
+
+    Raises:
+        InputError: forgetting beside a state, a state of another model, other than the training data.
+    """
+    from orthaug.fitting.recursive import Recursive
+    from orthaug.models.storage import digest
+
+    if state is None:
+        online = Recursive(opened.model, training=opened.training, forgetting=forgetting, memory=memory)
+    else:
+        if forgetting is not None or memory is not None:
+            raise InputError("--forgetting, --memory: found beside --state, which holds them; leave them out.")
+        place = state / STATE if (state / STATE).is_dir() else state
+        online = Recursive.load(place)
+        if digest(online.fitted) != digest(opened.model):
+            raise InputError(f"{state}: is the state of another model; give the one that it was begun with.")
+    online.update(opened.record, gap=not follows)
+    return Tracked(online, _result(opened, online), opened.physics)
+
+
+def _result(opened: Opened, online: Recursive) -> TrackResult:
+    from orthaug.fitting.recursive import outside_text
+    from orthaug.models.storage import digest
+
+    step, factor = opened.model.sampling_time, online.forgetting
+    baseline = opened.model.form.baseline
+    warnings = []
+    if online.std is None:
+        text = "no standard errors: the fit has none, or the rows do not tell θ."
+        warnings.append(Warning("no_standard_errors", text))
+    if online.outside:
+        text = outside_text(online.outside, online.rows)
+        warnings.append(Warning("learner_extrapolates", f"{text[0].upper()}{text[1:]}."))
+    physical: Any = None
+    if opened.physics is not None:
+        estimate = online.physical(opened.physics)
+        physical = physical_rows(estimate)
+        warnings += estimate.warnings
+    return TrackResult.model_validate(
+        {
+            "files": opened.files,
+            "model": digest(opened.model),
+            "rows": online.rows,
+            "outside": online.outside,
+            "time": online.rows * step,
+            "forgetting": factor,
+            "memory": None if factor == 1 else -step / math.log(factor),
+            "effective_rows": online.effective_rows,
+            "parameters": parameter_rows(baseline.parameters, online.theta, online.std, online.interval),
+            "physical_parameters": physical,
+            "alarms": list(online.alarms),
+            "alarmed": online.alarmed,
+            "alarm_level": online.alarm_level,
+            "warnings": warnings,
+        }
+    )
+
+
+def write_tracked(tracked: Tracked, folder: Path, text: str, *, force: bool = False) -> None:
+    """result.json, report.txt, table.csv, figures/ and the state, whole or not at all."""
+    from orthaug.reports.drawing import save
+    from orthaug.reports.tracking_plot import THETA, labels, tracking_figure
+
+    online, result = tracked.online, tracked.result
+    history = online.history
+    physical = None if tracked.physics is None else online.physical_history(tracked.physics)
+    theta, others = labels(result.parameters), labels(result.physical_parameters or ())
+    alarms = [alarm.time for alarm in online.alarms]
+    with whole_folder(folder, not_a_result, force=force) as partial:
+        (partial / "result.json").write_text(result.to_json() + "\n", encoding="utf-8")
+        (partial / "report.txt").write_text(text + "\n", encoding="utf-8")
+        history.to_csv(partial / "table.csv")
+        if physical is not None:
+            physical.to_csv(partial / "physical.csv")
+        (partial / "figures").mkdir()
+        save(tracking_figure(history, theta, alarms, THETA, physical, others), partial / "figures" / "parameters.png")
+        (partial / STATE).mkdir()
+        online.fill(partial / STATE)

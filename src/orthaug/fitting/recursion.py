@@ -1,0 +1,192 @@
+"""Weighted least squares row by row: a triangular factor that each row updates by QR, with exponential forgetting.
+
+With weights `w_i = λ^(k−i)` and `e₀ = y − φθ₀` the factor has `[R z]ᵀ[R z] = Σ w [φ e₀]ᵀ[φ e₀]`, so `θ = θ₀ + R⁻¹z`:
+`ΦᵀΦ` is never formed, and rounding adds up against the change of θ only. The covariance needs the squared weights too:
+`Cov θ = s² I⁻¹ M I⁻¹`, `I = RᵀR`, `M = Σ w² φᵀφ`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.linalg.lapack import dtpqrt, dtrtrs  # pyright: ignore[reportAttributeAccessIssue]  (made at build)
+
+from orthaug._base.checks import Matrix, Vector
+
+_DETERMINED = 1e-12  # smallest singular value of R with unit columns that tells all of θ
+_KEPT = 0.1
+"""Share of the information of a whole memory of training rows that forgetting leaves in every direction of θ."""
+
+
+@dataclass(eq=False)
+class Recursion:
+    """The state of recursive least squares; `update` changes it.
+
+    `factor` (nθ+1, nθ+1) is `[R z]` above a row that is not used; `squared` is M. `level` is s², the mean square of
+    whitened errors, `_errors / _freedom`. `rows` and `rows_squared` are Σw and Σw². Where `floor` is given, directions
+    whose information has come down to `floorᵀ floor` are not forgotten further, so that rows without excitation do not
+    wind the covariance up.
+    """
+
+    factor: Matrix
+    squared: Matrix
+    shape: Matrix
+    """Covariance of whitened errors (ny, ny), with a mean of 1 on its diagonal."""
+    start: Vector
+    """θ₀ (nθ,), which stays where rows do not tell θ."""
+    forgetting: float
+    floor: Matrix | None
+    errors: float
+    freedom: float
+    rows: float
+    rows_squared: float
+    oldest: float = 0.0
+    """Weight of the training rows now."""
+    until: int = 0
+    """Rows until the floor has to be looked at again."""
+    determined: bool = False
+
+    def __post_init__(self) -> None:
+        self.theta = np.asarray(self.start, dtype=float)
+        self._root = math.sqrt(self.forgetting)
+        self.factor = np.array(self.factor, dtype=float, order="F")
+        self._own_noise = len(self.shape) > 1
+        self.theta = self._solve()
+
+    @property
+    def level(self) -> float:
+        """s²."""
+        return self.errors / self.freedom if self.freedom > 0 else 0.0
+
+    @property
+    def factor_now(self) -> Matrix:
+        """R (nθ, nθ)."""
+        return self.factor[:-1, :-1]
+
+    @property
+    def effective_rows(self) -> float:
+        """`(Σw)² / Σw²`: as many rows of equal weight say as much."""
+        return self.rows**2 / self.rows_squared if self.rows_squared > 0 else 0.0
+
+    def update(self, phi: Float[np.ndarray, "ny nt"], target: Vector) -> tuple[Vector, float]:
+        """Add a row of whitened outputs: the errors (ny,) of θ before it, and their variance in units of s²."""
+        error = target - phi @ self.theta
+        self._forget()
+        spread = self._spread(phi)
+        self.errors += float(error @ error) / spread
+        self.freedom += len(error)
+        self.rows += 1.0
+        self.rows_squared += 1.0
+        self.squared += phi.T @ (self.shape @ phi if self._own_noise else phi)
+        rows = np.empty((len(error), len(self.theta) + 1), order="F")
+        rows[:, :-1], rows[:, -1] = phi, target - phi @ self.start
+        self.factor = dtpqrt(0, 1, self.factor, rows, overwrite_a=1, overwrite_b=1)[0]
+        self.theta = self._solve()
+        return error, spread
+
+    def _spread(self, phi: Float[np.ndarray, "ny nt"]) -> float:
+        """1 + φ Cov(θ) φᵀ / s² of a row before it is added; 1 where θ is not told yet."""
+        if not self.determined or not phi.size:
+            return 1.0
+        inner = dtrtrs(self.factor[:-1, :-1], phi.T, trans=1)[0]
+        reach = dtrtrs(self.factor[:-1, :-1], inner)[0]
+        return 1.0 + float(np.sum(reach * (self.squared @ reach))) / len(phi)
+
+    def _solve(self) -> Vector:
+        if not len(self.start):
+            return self.start
+        r, z = self.factor[:-1, :-1], self.factor[:-1, -1]
+        if self.determined:
+            return self.start + dtrtrs(r, z)[0]
+        norms = np.linalg.norm(r, axis=0)
+        scaled = r / np.where(norms > 0, norms, 1.0)
+        size = np.linalg.svd(scaled, compute_uv=False)
+        self.determined = bool(size[-1] > _DETERMINED * size[0])
+        change = np.linalg.lstsq(scaled, z, rcond=_DETERMINED)[0]  # the least that explains the rows
+        return self.start + change / np.where(norms > 0, norms, 1.0)
+
+    def _forget(self) -> None:
+        if self.forgetting == 1.0:
+            return
+        self.errors *= self.forgetting
+        self.freedom *= self.forgetting
+        self.rows *= self.forgetting
+        self.rows_squared *= self.forgetting**2
+        self.oldest *= self.forgetting
+        if self.until <= 0 and self.floor is not None and len(self.start) and self._keep():
+            return
+        self.until -= 1
+        self.factor *= self._root
+        self.squared *= self.forgetting**2
+
+    def _keep(self) -> bool:
+        """Forget only what stands above the floor, where anything has come down to it."""
+        assert self.floor is not None
+        r = self.factor[:-1, :-1]
+        u, size, _ = np.linalg.svd(np.linalg.solve(self.floor.T, r.T).T)
+        least = float(size[-1]) ** 2
+        spare = math.floor(math.log(least) / -math.log(self.forgetting)) if least > 1 else 0
+        if spare >= 1:
+            self.until = spare
+            return False
+        left = np.where(size > 1, np.maximum(self.forgetting, 1 / np.maximum(size, 1.0) ** 2), 1.0)
+        top = (u * np.sqrt(left)) @ u.T @ self.factor[:-1]
+        self.factor[:-1] = np.linalg.qr(top, mode="r")
+        if self.determined:
+            turn = np.linalg.solve(r, (u * left) @ u.T @ r)
+            self.squared = turn.T @ self.squared @ turn
+        return True
+
+
+def upright(r: Float[np.ndarray, "*k n n"]) -> Float[np.ndarray, "*k n n"]:
+    """Triangular factors with positive diagonals, which makes them unique."""
+    sign = np.where(np.diagonal(r, axis1=-2, axis2=-1) < 0, -1.0, 1.0)
+    return r * sign[..., None]
+
+
+def started(
+    phi: Float[np.ndarray, "N ny nt"],
+    target: Matrix,
+    theta: Vector,
+    shape: Matrix,
+    level: float,
+    freedom: float,
+    forgetting: float,
+    *,
+    empty: bool,
+) -> Recursion:
+    """The state after the training rows in whitened outputs, which count as one memory at most.
+
+    Args:
+        level, freedom: s² and its degrees of freedom over these rows.
+        empty: begin without them; they still say what the floor is.
+    """
+    count, ny, nt = phi.shape
+    whole = np.linalg.qr(np.column_stack([phi.reshape(-1, nt), (target - phi @ theta).ravel()]), mode="r")
+    factor = np.zeros((nt + 1, nt + 1))
+    factor[: len(whole)] = whole
+    memory = 1 / (1 - forgetting) if forgetting < 1 else np.inf
+    share = 0.0 if empty else min(1.0, memory / count)
+    floor = np.sqrt(_KEPT * memory / count) * factor[:nt, :nt] if forgetting < 1 else None
+    squared = squares(phi, shape)
+    return Recursion(
+        np.sqrt(share) * factor,
+        share**2 * squared,
+        shape,
+        theta,
+        forgetting,
+        floor,
+        errors=share * level * freedom,
+        freedom=share * freedom,
+        rows=share * count,
+        rows_squared=share**2 * count,
+        oldest=share,
+    )
+
+
+def squares(phi: Float[np.ndarray, "N ny nt"], shape: Matrix) -> Matrix:
+    """M of rows of equal weight (nθ, nθ)."""
+    return phi[:, 0].T @ phi[:, 0] if len(shape) == 1 else np.einsum("kit,ij,kjs->ts", phi, shape, phi)

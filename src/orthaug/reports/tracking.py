@@ -1,0 +1,52 @@
+"""What `orthaug track` tells, and its text."""
+
+from __future__ import annotations
+
+from orthaug.reports.fields import Content, Flag, Number, WarningResult, Whole
+from orthaug.reports.result import FileResult, Headed, ParameterResult
+from orthaug.reports.text import parameter_table, warning_lines
+
+
+class AlarmResult(Content):
+    """The residual left its band."""
+
+    row: Whole
+    time: Number
+
+
+class TrackResult(Headed):
+    """What `orthaug track` tells."""
+
+    files: list[FileResult]
+    model: str
+    rows: Whole
+    outside: Whole
+    time: Number
+    forgetting: Number
+    memory: Number
+    effective_rows: Number
+    parameters: list[ParameterResult]
+    physical_parameters: list[ParameterResult] | None
+    alarms: list[AlarmResult]
+    alarmed: Flag
+    alarm_level: Number
+    warnings: list[WarningResult]
+
+
+def track_text(result: TrackResult) -> str:
+    """Rows, memory, alarms, and the parameters at the end."""
+    memory = "everything" if result.memory is None else f"{result.memory:.4g} s"
+    lines = [
+        f"rows        {result.rows}, {result.time:g} s",
+        f"memory      {memory} (forgetting {result.forgetting:.8g}), worth {result.effective_rows:.0f} rows",
+    ]
+    told = [f"the residual has left its band at {alarm.time:g} s (row {alarm.row})" for alarm in result.alarms]
+    lines += [f"alarm       {sentence}" for sentence in told] or ["alarm       none"]
+    if told:
+        stands = "is still out of it" if result.alarmed else "has come back"
+        lines.append(f"            it {stands}, at {result.alarm_level:.2g} of its limit")
+    blocks = [lines, parameter_table("parameter", result.parameters)]
+    if result.physical_parameters:
+        blocks.append(parameter_table("physical", result.physical_parameters))
+    blocks.append(warning_lines(result.warnings))
+    return "\n\n".join("\n".join(lines) for lines in blocks if lines)
