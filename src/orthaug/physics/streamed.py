@@ -141,20 +141,20 @@ class Refined(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Basis:
-    """Rows of Q: `Φ scale R₁⁻¹ turn`, with `turn = R₂⁻¹` of the second QR."""
+    """Rows of Q: `(Φ scale R₁⁻¹) turn`, with `turn = R₂⁻¹` of the second QR.
+
+    Two products, not one: what rounding does in the first is in the second QR.
+    """
 
     form: Form
     weight: OutputWeights
-    scale: Vector
-    r: Matrix
+    inverse: Matrix
+    """`scale R₁⁻¹`."""
     turn: Matrix
 
     def rows(self, phi: np.ndarray) -> Float[np.ndarray, "m ny nt"]:
-        flat = self.weight.rows(phi).reshape(-1, len(self.scale)) * self.scale
-        if not len(self.scale):
-            return phi
-        q = scipy.linalg.solve_triangular(self.r.T, flat.T, lower=True, check_finite=False).T @ self.turn
-        return q.reshape(phi.shape)
+        flat = self.weight.rows(phi).reshape(len(phi) * phi.shape[1], len(self.turn))
+        return (flat @ self.inverse @ self.turn).reshape(phi.shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,12 +337,13 @@ def _factored(seen: Problem, source: Source, passes: Passes, survey: Survey, for
     ready = excited.full_rank and len(r) == nt
     if not ready:  # `check` tells; nothing can be solved
         r, coordinates = np.eye(nt), np.zeros(nt)
-    basis = Basis(form, weight, scale, r, np.eye(nt))
+    inverse = scale[:, None] * scipy.linalg.solve_triangular(r, np.eye(nt)) if nt else r
+    basis = Basis(form, weight, inverse, np.eye(nt))
     second = _merged(passes(Refining(basis, coordinates), source.partitions), _both)
     turn, rest = (second.r[:nt, :nt], second.r[:nt, nt]) if ready else (np.eye(nt), np.zeros(nt))
-    inverse = np.linalg.inv(turn)
-    basis = replace(basis, turn=inverse)
-    theta = scale * scipy.linalg.solve_triangular(r, coordinates + inverse @ rest) if nt else coordinates
+    back = np.linalg.inv(turn)
+    basis = replace(basis, turn=back)
+    theta = inverse @ (coordinates + back @ rest)
     phi = _phi(seen)
     fields = {name: getattr(seen, name) for name in Problem.__dataclass_fields__}
     fields |= {"projection": Projection(turn @ r, scale, weight.rows(phi), basis.rows(phi)), "excitation": excited}
