@@ -17,6 +17,7 @@ import pytest
 import orthaug as oa
 from orthaug.commands.fit import fit_job
 from orthaug.commands.opening import open_job
+from orthaug.commands.spec import load_spec
 
 pytest.importorskip("pyarrow")
 ROWS, GROUP = 1200, 170
@@ -284,3 +285,41 @@ def test_gaps_end_a_stretch_in_files_too(folder, tmp_path):
         thetas.append((problem.count, problem.least_squares))
     assert thetas[0][0] == thetas[1][0]
     np.testing.assert_allclose(thetas[1][1], thetas[0][1], rtol=1e-12)
+
+
+def test_files_for_clusters_say_what_the_program_takes(folder, monkeypatch):
+    """They are not run here: what can be checked is that they parse, and that the spec that is made of them does."""
+    import yaml
+    from test_docs import ROOT
+
+    place = ROOT / "examples" / "cluster"
+    compose, operator = (yaml.safe_load((place / name).read_text()) for name in ("compose.yaml", "kubernetes.yaml"))
+    threads = {"OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "XLA_FLAGS"}
+    assert threads == set(compose["services"]["worker"]["environment"])
+    (container,) = operator["spec"]["worker"]["spec"]["containers"]
+    assert threads == {variable["name"] for variable in container["env"]}
+    monkeypatch.syspath_prepend(place)
+    import slurm
+
+    path = folder / "plain.toml"
+    path.write_text(SPEC.split("[engine]")[0].format(structure="orthogonal", regularization='"none"'), encoding="utf-8")
+    engine = load_spec(slurm.with_engine(path, "tcp://there:8786")).engine
+    assert (engine.kind, engine.scheduler, engine.partition_rows) == ("dask", "tcp://there:8786", 5_000_000)
+
+
+def test_no_cluster_in_reach_is_told(folder, monkeypatch):
+    monkeypatch.setattr("orthaug.models.cluster._PATIENCE", "1 s")
+    with pytest.raises(oa.InputError, match=r"no Dask scheduler answers at tcp://127.0.0.1:9 "):
+        fitted(folder, "dask", more='scheduler = "tcp://127.0.0.1:9"')
+
+
+def test_workers_of_another_version_are_refused():
+    from orthaug.models.cluster import check_versions, versions
+
+    class Client:
+        def run(self, function):
+            return {"tcp://there:1": function(), "tcp://there:2": function() | {"jax": "0.1"}}
+
+    with pytest.raises(oa.InputError, match=r"the worker tcp://there:2 has orthaug .*, jax 0.1; here is"):
+        check_versions(Client())
+    assert set(versions()) == {"orthaug", "jax"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -11,23 +12,28 @@ from typing import Any
 from orthaug._base.progress import SILENT, Progress
 from orthaug.commands.signals import WATCH
 
+_MANY = 1_000_000  # rows from which the rate is told
 _LONG = 5.0  # s of a search that are told beforehand
 _SEEN = 3  # models after which the time of the rest is told: the first ones compile
 
 
 @contextmanager
-def training_bar(runs: int, iterations: int, wanted: bool = True) -> Iterator[Progress]:
-    """A progress bar on standard error where that is a terminal; Ctrl-C says what it stopped."""
+def training_bar(runs: int, iterations: int, wanted: bool = True, rows: int = 0) -> Iterator[Progress]:
+    """A progress bar on standard error where that is a terminal; Ctrl-C says what it stopped.
+
+    Args:
+        rows: of the training data. Where there are many, it says how many are gone through in a second.
+    """
     if not wanted:
         yield SILENT
         return
     from rich.console import Console
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
 
     console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    reached = "the start of training"
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    reached, began = "the start of training", time.monotonic()
     with (
         _deferred_interrupt() as interrupted,
         Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar,
@@ -40,7 +46,10 @@ def training_bar(runs: int, iterations: int, wanted: bool = True) -> Iterator[Pr
             nonlocal reached
             done[run] = iteration
             reached = f"run {run + 1} of {runs}, iteration {iteration}, loss {loss:.3g}"
-            bar.update(task, completed=sum(done.values()), description=reached)
+            passes = sum(done.values())
+            rate = rows * passes / max(time.monotonic() - began, 1e-3)
+            told = f"{reached}, {rate / 1e6:.3g} million rows/s" if rows >= _MANY else reached
+            bar.update(task, completed=passes, description=told)
             if interrupted.is_set():
                 raise KeyboardInterrupt(reached)
 

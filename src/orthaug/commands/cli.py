@@ -90,7 +90,8 @@ def fit(
     check_inputs_kept(job, folder)
     prepare_jax()
     job = keeping(job, folder, resume=resume)
-    with training_bar(job.run_count, job.iterations, job.spec.declared_learner() is not None) as progress:
+    learns, rows = job.spec.declared_learner() is not None, getattr(job.problem, "count", 0)
+    with training_bar(job.run_count, job.iterations, learns, rows) as progress:
         fitted = fit_job(job, progress)
     write_result(fitted, folder, force=force)
     if as_json:
