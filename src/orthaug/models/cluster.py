@@ -142,7 +142,7 @@ def connected(scheduler: str | None, workers: int | None) -> Any:
     if scheduler is None:
         count = workers or os.cpu_count() or 1
         with config.set({"distributed.nanny.pre-spawn-environ": _SINGLE_THREADED}):
-            options: dict[str, Any] = {"n_workers": count, "threads_per_worker": 1, "dashboard_address": None}
+            options: dict[str, Any] = {"n_workers": count, "threads_per_worker": 1, "dashboard_address": ":0"}
             client = Client(LocalCluster(**options))
     else:
         try:
