@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -179,6 +180,20 @@ def test_a_frame_on_a_cluster_as_a_record(folder, cluster):
         oa.open_frame(emptied, client=cluster, **COLUMNS)
 
 
+def test_a_study_on_a_cluster(cluster):
+    """Its cases are tasks; the table is that of this process."""
+    from orthaug.studies.study import Study, run
+
+    study = Study("powers", pow_of, {"base": [1, 2, 3], "exp": [2, 3]})
+    found, expected = run(study, client=cluster), run(study)
+    pd.testing.assert_frame_equal(found.drop(columns="process"), expected.drop(columns="process"))
+    assert os.getpid() not in set(found["process"]) and set(expected["process"]) == {os.getpid()}
+
+
+def pow_of(base, exp):
+    return {"value": base**exp, "process": os.getpid()}
+
+
 def test_a_worker_that_is_killed_changes_nothing(folder, cluster):
     """Its partitions are laid out again elsewhere; sums keep their order, so θ keeps its bits."""
     before = on_cluster(folder, cluster)
@@ -290,9 +305,8 @@ def test_gaps_end_a_stretch_in_files_too(folder, tmp_path):
 def test_files_for_clusters_say_what_the_program_takes(folder, monkeypatch):
     """They are not run here: what can be checked is that they parse, and that the spec that is made of them does."""
     import yaml
-    from test_docs import ROOT
 
-    place = ROOT / "examples" / "cluster"
+    place = Path(__file__).parents[1] / "examples" / "cluster"
     compose, operator = (yaml.safe_load((place / name).read_text()) for name in ("compose.yaml", "kubernetes.yaml"))
     threads = {"OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "XLA_FLAGS"}
     assert threads == set(compose["services"]["worker"]["environment"])

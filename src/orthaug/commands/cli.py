@@ -200,6 +200,9 @@ def reproduce(
         str, typer.Option("--pipeline", metavar="ours|paper|scripts", help="Who trains; scripts: as published.")
     ] = "ours",
     small: Annotated[bool, typer.Option("--small", help="The reduced size that the tests run.")] = False,
+    scheduler: Annotated[
+        str | None, typer.Option("--scheduler", metavar="ADDRESS", help="A Dask cluster whose workers make the runs.")
+    ] = None,
     force: Force = False,
 ) -> None:
     """The paper's figures and tables, each number beside the published one; goes on where it was interrupted."""
@@ -210,8 +213,13 @@ def reproduce(
     entries = reproduction.chosen(name)
     check_choice(pipeline, reproduction.PIPELINES, "--pipeline")
     prepare_jax()
+    client = None
+    if scheduler is not None:
+        from orthaug.models.cluster import connected
+
+        client = connected(scheduler, None)
     with study_bars() as progress:
-        reproduced = reproduction.reproduce(entries, pipeline=pipeline, small=small, progress=progress)
+        reproduced = reproduction.reproduce(entries, pipeline=pipeline, small=small, progress=progress, client=client)
     reproduction.write(reproduced, folder, pipeline, force=force)
     streams.echo(f"{reproduction.text(reproduced)}\n\nwritten to {folder}/index.html")
 

@@ -75,6 +75,7 @@ def reproduce(
     small: bool = False,
     store: Path | None = None,
     progress: StudiesTell | None = None,
+    client: Any = None,
 ) -> list[Reproduced]:
     """Run the studies; what a store holds already is not run again.
 
@@ -83,13 +84,14 @@ def reproduce(
             for what the published scripts do, un-normalised and from θ⁰.
         small: at the reduced size of the tests.
         store: where results are kept as they are made; None for the user's cache folder.
+        client: a `distributed.Client` whose workers make the runs.
     """
     check_choice(pipeline, PIPELINES, "--pipeline")
     store = Path(platformdirs.user_cache_dir("orthaug")) / "studies" if store is None else store
     reproduced = []
     for entry in entries:
         tell = None if progress is None else lambda done, total, e=entry: progress(e.title, done, total)
-        done = runs(entry.study(pipeline, small), store=store, progress=tell)
+        done = runs(entry.study(pipeline, small), store=store, progress=tell, client=client)
         table = as_table(done)
         reproduced.append(Reproduced(entry, done, table, dict(entry.figures(table)), entry.findings(table), small))
     return reproduced

@@ -24,6 +24,7 @@ from orthaug._base.checks import finite_or_none
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_file
 from orthaug._base.parallel import spread
+from orthaug.models.cluster import told
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -105,17 +106,19 @@ def run(
     store: Path | None = None,
     workers: int | None = None,
     progress: CasesTell | None = None,
+    client: Any = None,
 ) -> pd.DataFrame:
     """Run what the store does not hold yet, several cases at a time; a row per case, axes first.
 
     Args:
         store: a folder that keeps each result as it is made; None to keep nothing.
         workers: cases at a time; by default the study's own number, or the machine's cores.
+        client: a `distributed.Client`; its workers make the cases of a study that does not measure time.
 
     Raises:
         InputError: a result that is not plain values; a store that cannot be written.
     """
-    return as_table(runs(study, store=store, workers=workers, progress=progress))
+    return as_table(runs(study, store=store, workers=workers, progress=progress, client=client))
 
 
 def as_table(done: Sequence[Run]) -> pd.DataFrame:
@@ -131,6 +134,7 @@ def runs(
     store: Path | None = None,
     workers: int | None = None,
     progress: CasesTell | None = None,
+    client: Any = None,
 ) -> list[Run]:
     """`run`, with the time of every result instead of a table."""
     cases = study.cases()
@@ -140,11 +144,15 @@ def runs(
     if progress is not None:
         progress(done, len(cases))
 
+    one, wanted = study.one, study.workers if workers is None else workers
+    if client is not None and study.workers != 1:
+        one, wanted = elsewhere(client, study.one)
+
     def run_case(i: int, check: Callable[[], None]) -> None:
         nonlocal done
         check()
         began = time.perf_counter()
-        result = _plain(study, study.one(**cases[i]))
+        result = _plain(study, one(**cases[i]))
         seconds = round(time.perf_counter() - began, 3)
         made = datetime.now(UTC).isoformat(timespec="seconds")
         run = Run(cases[i], result, made, seconds, stored=False)
@@ -154,8 +162,19 @@ def runs(
         if progress is not None:
             progress(done, len(cases))
 
-    spread(run_case, todo, study.workers if workers is None else workers)
+    spread(run_case, todo, wanted)
     return [run for run in found if run is not None]
+
+
+def elsewhere(client: Any, one: Callable[..., Any]) -> tuple[Callable[..., Any], int]:
+    """A function that has the workers of a cluster compute, and how many of its calls they take at a time."""
+    threads = sum(client.nthreads().values())
+
+    def ask(**case: Any) -> Any:
+        with told():
+            return client.submit(one, **case, pure=False).result()
+
+    return ask, max(threads, 1)
 
 
 def _path(store: Path, study: Study, case: Case) -> Path:

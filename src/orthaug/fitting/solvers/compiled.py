@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -41,6 +41,7 @@ class State(NamedTuple):
     code: Int[Array, ""]
 
 
+@runtime_checkable
 class Keeper(Protocol):
     """Where the states of a run are kept."""
 
