@@ -80,6 +80,8 @@ class AugmentedNARX(Augmented):
         ['0.800', '0.500']
     """
 
+    _ordered = True
+
     def __init__(
         self,
         physics: Physics = "linear",
@@ -125,12 +127,10 @@ class AugmentedNARX(Augmented):
         check_choice(self.score_on, SCORED_ON, "`score_on`")
         given = y
         X, y = checked(self, X, y)
-        columns = y[:, None] if y.ndim == 1 else y
         names = input_names(self)
-        self.output_names_ = output_names(given, columns.shape[1], names)
-        self._one_column = y.ndim == 1
+        self.output_names_ = output_names(given, y.shape[1], names)
         baseline = baseline_of(self.physics, self._layout(names), self.output_names_)
-        record = self._record(X, columns, [*_groups(groups, len(X))])
+        record = self._record(X, y, [*_groups(groups, len(X))])
         lags = _FIRST if self.lags is None and isinstance(self.physics, str) else self.lags
         self._estimate(record, baseline, lags, learner_of(self.learner), criterion=self.criterion)
         self.first_row_ = self.estimate_.model.form.first_row
@@ -215,9 +215,6 @@ class AugmentedNARX(Augmented):
         if y.shape != (rows, len(self.output_names_)):
             raise InputError(f"`y` has the shape {y.shape}; expected {(rows, len(self.output_names_))}, rows as in X.")
         return y
-
-    def _shaped(self, values: np.ndarray) -> np.ndarray:
-        return values[:, 0] if self._one_column else values
 
 
 def _groups(groups: Any, rows: int) -> Iterator[Group]:

@@ -64,6 +64,8 @@ class AugmentedRegressor(Augmented):
         '2.000'
     """
 
+    _ordered = False
+
     def __init__(
         self,
         physics: Physics = "linear",
@@ -94,14 +96,12 @@ class AugmentedRegressor(Augmented):
         """
         given = y
         X, y = checked(self, X, y)
-        columns = y[:, None] if y.ndim == 1 else y
         names = input_names(self)
-        outputs = output_names(given, columns.shape[1], names)
-        record = Record.from_arrays(X, columns, inputs=names, outputs=outputs)
+        outputs = output_names(given, y.shape[1], names)
+        record = Record.from_arrays(X, y, inputs=names, outputs=outputs)
         baseline = baseline_of(self.physics, _NOW.layout(outputs, names), outputs, names)
         self._estimate(record, baseline, _NOW, learner_of(self.learner, names))
         self.output_names_ = outputs
-        self._one_column = y.ndim == 1
         return self
 
     def predict(self, X: Any, return_std: bool = False) -> Any:
@@ -123,6 +123,3 @@ class AugmentedRegressor(Augmented):
         if not return_std:
             return self._shaped(response)
         return self._shaped(response), self._shaped(prediction_std(model, record)[0])
-
-    def _shaped(self, values: np.ndarray) -> np.ndarray:
-        return values[:, 0] if self._one_column else values

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -26,16 +26,16 @@ if TYPE_CHECKING:
     import pandas as pd
 
 try:
-    from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
+    from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin  # type: ignore[assignment]
 except ImportError:  # the names are there without the extra, and say so when they are used
 
-    class MultiOutputMixin:  # type: ignore[no-redef]
+    class MultiOutputMixin:
         """Stands for the one of scikit-learn."""
 
-    class RegressorMixin:  # type: ignore[no-redef]
+    class RegressorMixin:
         """Stands for the one of scikit-learn."""
 
-    class BaseEstimator:  # type: ignore[no-redef]
+    class BaseEstimator:
         """Stands for the one of scikit-learn."""
 
         def __new__(cls, *_: Any, **__: Any) -> Any:
@@ -63,6 +63,8 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
     restarts: int
     output_weights: Any
     random_state: Any
+    _one_column: bool
+    _ordered: ClassVar[bool]
 
     def _estimate(self, record: Record, baseline: Baseline, lags: Lags | None, learner: Any, **more: Any) -> None:
         """Fit, and set the attributes.
@@ -88,6 +90,8 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
             output_weights=self.output_weights,
             **more,
         )
+        if fit.model.form.first_row and not self._ordered:
+            raise InputError("the rows of X have no order, so there are no lags of them; use an AugmentedNARX.")
         if not fit.status.ok:
             raise TrainingError(fit.status.message)
         self.estimate_: Estimate = fit
@@ -105,6 +109,10 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
         noise = self._fitted().model.statistics.noise
         return None if noise is None else np.sqrt(np.diag(noise))
 
+    def _shaped(self, values: np.ndarray) -> np.ndarray:
+        """Values (n, n_outputs) with as many axes as y had."""
+        return values[:, 0] if self._one_column else values
+
     def _fitted(self) -> Estimate:
         """The estimate; NotFittedError where there is none."""
         from sklearn.utils.validation import check_is_fitted
@@ -114,7 +122,7 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
 
 def checked(estimator: Augmented, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
-    """X (n, n_features) and y (n,) or (n, n_outputs) for a fit, by scikit-learn's own checks.
+    """X (n, n_features) and y (n, n_outputs) for a fit, by scikit-learn's own checks.
 
     Raises:
         ValueError: anything but finite real numbers of two samples or more.
@@ -123,7 +131,9 @@ def checked(estimator: Augmented, x: Any, y: Any) -> tuple[np.ndarray, np.ndarra
 
     limits: dict[str, Any] = {"dtype": np.float64, "ensure_min_samples": 2}
     x, y = validate_data(estimator, x, y, multi_output=True, y_numeric=True, **limits)
-    return x, np.asarray(y, dtype=float)
+    y = np.asarray(y, dtype=float)
+    estimator._one_column = y.ndim == 1
+    return x, y.reshape(len(y), -1)
 
 
 def checked_again(estimator: Augmented, x: Any) -> np.ndarray:
@@ -134,7 +144,7 @@ def checked_again(estimator: Augmented, x: Any) -> np.ndarray:
     """
     from sklearn.utils.validation import validate_data
 
-    return validate_data(estimator, x, reset=False, dtype=np.float64)
+    return np.asarray(validate_data(estimator, x, reset=False, dtype=np.float64))
 
 
 def check_there(values: np.ndarray) -> None:
