@@ -184,8 +184,10 @@ def _free(name: str, taken: Sequence[str]) -> str:
 
 def at_now(text: str, names: Sequence[str]) -> str:
     """An expression of columns as one of channels: `speed**2` becomes `speed[k]**2`."""
+    if not names or not isinstance(text, str):  # what is no text is refused where it is read
+        return text
     columns = "|".join(map(re.escape, names))
-    return re.sub(rf"\b({columns})\b(?!\s*\[)", r"\1[k]", text) if names else text
+    return re.sub(rf"\b({columns})\b(?!\s*\[)", r"\1[k]", text)
 
 
 def learner_of(given: Any, names: Sequence[str] = ()) -> Any:
@@ -225,7 +227,8 @@ def baseline_of(physics: Any, layout: Layout, outputs: Sequence[str], names: Seq
             )
         return Baseline.from_function(physics, [f"theta{i + 1}" for i in range(shape[1])])
     if isinstance(physics, str) and physics == "linear":
-        physics = {"intercept": "1"} | {(f"{i.channel}_{i.lag}" if i.lag else i.channel): str(i) for i in layout}
+        line = {(f"{lag.channel}_{lag.lag}" if lag.lag else lag.channel): str(lag) for lag in layout}
+        physics = {_free("intercept", [*line]): "1"} | line
     elif not isinstance(physics, str) and isinstance(physics, Sequence) and all(isinstance(t, str) for t in physics):
         physics = {f"theta{i + 1}": text for i, text in enumerate(physics)}
     if isinstance(physics, Mapping) and all(isinstance(text, str) for text in physics.values()):
