@@ -29,6 +29,8 @@ from .export import export as export
 from .export import numpy_step as numpy_step
 from .fitting import AdamLBFGS as AdamLBFGS
 from .fitting import Additive as Additive
+from .fitting import AugmentedNARX as AugmentedNARX
+from .fitting import AugmentedRegressor as AugmentedRegressor
 from .fitting import BaselinePenalty as BaselinePenalty
 from .fitting import Estimate as Estimate
 from .fitting import LevenbergMarquardt as LevenbergMarquardt

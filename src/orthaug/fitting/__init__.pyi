@@ -4,7 +4,9 @@ from .estimates import Estimate as Estimate
 from .estimation import estimate as estimate
 from .estimation import orthogonalize as orthogonalize
 from .motion_estimates import MotionEstimate as MotionEstimate
+from .narx import AugmentedNARX as AugmentedNARX
 from .recursive import Recursive as Recursive
+from .regressor import AugmentedRegressor as AugmentedRegressor
 from .solvers import AdamLBFGS as AdamLBFGS
 from .solvers import LevenbergMarquardt as LevenbergMarquardt
 from .status import Status as Status

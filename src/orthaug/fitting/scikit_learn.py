@@ -1,0 +1,246 @@
+"""What the estimators for scikit-learn share: its base classes, columns as channels, physics written in columns."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, is_dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from orthaug._base.checks import check_count
+from orthaug._base.errors import InputError, TrainingError, shown
+from orthaug._base.jax import jax
+from orthaug.data.expressions import is_name
+from orthaug.data.record import Record
+from orthaug.data.regressors import Lags, Layout
+from orthaug.fitting.estimates import Estimate
+from orthaug.fitting.estimation import estimate
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.structures import Orthogonal
+from orthaug.models.learners import MLP
+from orthaug.physics.baseline import Baseline, Term
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+try:
+    from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin  # type: ignore[assignment]
+except ImportError:  # the names are there without the extra, and say so when they are used
+
+    class MultiOutputMixin:
+        """Stands for the one of scikit-learn."""
+
+    class RegressorMixin:
+        """Stands for the one of scikit-learn."""
+
+    class BaseEstimator:
+        """Stands for the one of scikit-learn."""
+
+        def __new__(cls, *_: Any, **__: Any) -> Any:
+            """Refuse.
+
+            Raises:
+                InputError: scikit-learn is not there.
+            """
+            raise InputError(f"{cls.__name__} needs scikit-learn; install orthaug[sklearn].")
+
+
+Physics = str | Sequence[str | Term] | Mapping[str, str] | Baseline | Callable[[Any], Any]
+_SEEN = ("inputs", "terms", "exclude")  # fields of a learner that hold expressions
+_TAKEN = ("time",)  # no name of an output
+
+
+class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
+    """Physics with a learned correction, in the manners of scikit-learn."""
+
+    physics: Any
+    learner: Any
+    structure: Any
+    regularization: Any
+    solver: Any
+    restarts: int
+    output_weights: Any
+    random_state: Any
+    _one_column: bool
+    _ordered: ClassVar[bool]
+
+    def _estimate(self, record: Record, baseline: Baseline, lags: Lags | None, learner: Any, **more: Any) -> None:
+        """Fit, and set the attributes.
+
+        Raises:
+            InputError: as `estimate`; TrainingError where there is no finite model.
+        """
+        from sklearn.utils import check_random_state
+
+        seed = self.random_state
+        if seed is None or isinstance(seed, np.random.RandomState):
+            seed = int(check_random_state(seed).randint(2**31 - 1))
+        fit = estimate(
+            record,
+            baseline,
+            lags=lags,
+            learner=learner,
+            structure=Orthogonal() if self.structure is None else self.structure,
+            solver=LevenbergMarquardt() if self.solver is None else self.solver,
+            regularization=self.regularization,
+            restarts=self.restarts,
+            seed=check_count(seed, "random_state", least=0),
+            output_weights=self.output_weights,
+            **more,
+        )
+        if fit.model.form.first_row and not self._ordered:
+            raise InputError("the rows of X have no order, so there are no lags of them; use an AugmentedNARX.")
+        if not fit.status.ok:
+            raise TrainingError(fit.status.message)
+        self.estimate_: Estimate = fit
+        self.theta_ = fit.theta
+        self.theta_interval_ = fit.interval
+
+    @property
+    def coef_table_(self) -> pd.DataFrame:
+        """Table with a row per parameter: unit, initial, value, std, and the 95 % interval."""
+        return self._fitted().parameters
+
+    @property
+    def noise_std_(self) -> np.ndarray | None:
+        """Standard deviation of the noise of each output (n_outputs,); None where no degrees of freedom are left."""
+        noise = self._fitted().model.statistics.noise
+        return None if noise is None else np.sqrt(np.diag(noise))
+
+    def _shaped(self, values: np.ndarray) -> np.ndarray:
+        """Values (n, n_outputs) with as many axes as y had."""
+        return values[:, 0] if self._one_column else values
+
+    def _fitted(self) -> Estimate:
+        """The estimate; NotFittedError where there is none."""
+        from sklearn.utils.validation import check_is_fitted
+
+        check_is_fitted(self, "estimate_")
+        return self.estimate_
+
+
+def checked(estimator: Augmented, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
+    """X (n, n_features) and y (n, n_outputs) for a fit, by scikit-learn's own checks.
+
+    Raises:
+        ValueError: anything but finite real numbers of two samples or more.
+    """
+    from sklearn.utils.validation import validate_data
+
+    limits: dict[str, Any] = {"dtype": np.float64, "ensure_min_samples": 2}
+    x, y = validate_data(estimator, x, y, multi_output=True, y_numeric=True, **limits)
+    y = np.asarray(y, dtype=float)
+    estimator._one_column = y.ndim == 1
+    return x, y.reshape(len(y), -1)
+
+
+def checked_again(estimator: Augmented, x: Any) -> np.ndarray:
+    """X (n, n_features) with the columns that the fit had.
+
+    Raises:
+        ValueError: other columns, anything but finite real numbers.
+    """
+    from sklearn.utils.validation import validate_data
+
+    return np.asarray(validate_data(estimator, x, reset=False, dtype=np.float64))
+
+
+def check_there(values: np.ndarray) -> None:
+    """Raise InputError for a row (n, n_outputs) on which the model has no value."""
+    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if bad.size:
+        raise InputError(f"the model has no finite value at row {bad[0]} of X; look at the physics there.")
+
+
+def input_names(estimator: Any) -> tuple[str, ...]:
+    """The columns of X as expressions name them: their own names, or x0, x1, … where they cannot be used."""
+    given = getattr(estimator, "feature_names_in_", [""] * estimator.n_features_in_)
+    good = [str(name) if is_name(str(name)) else "" for name in given]
+    return tuple(name or _free(f"x{j}", good) for j, name in enumerate(good))
+
+
+def output_names(y: Any, columns: int, inputs: Sequence[str]) -> tuple[str, ...]:
+    """The outputs as expressions name them: those of a Series or DataFrame, or y (y0, y1, … of several).
+
+    Args:
+        y: as the user gave it.
+        columns: how many there are.
+        inputs: names that are taken.
+    """
+    given = getattr(y, "columns", [getattr(y, "name", None)])
+    named = [str(name) for name in given]
+    if len(set(named)) == columns and all(is_name(n) and n not in (*inputs, *_TAKEN, "None") for n in named):
+        return tuple(named)
+    return tuple(_free("y" if columns == 1 else f"y{j}", inputs) for j in range(columns))
+
+
+def _free(name: str, taken: Sequence[str]) -> str:
+    while name in taken:
+        name += "_"
+    return name
+
+
+def at_now(text: str, names: Sequence[str]) -> str:
+    """An expression of columns as one of channels: `speed**2` becomes `speed[k]**2`."""
+    if not names or not isinstance(text, str):  # what is no text is refused where it is read
+        return text
+    columns = "|".join(map(re.escape, names))
+    return re.sub(rf"\b({columns})\b(?!\s*\[)", r"\1[k]", text)
+
+
+def learner_of(given: Any, names: Sequence[str] = ()) -> Any:
+    """The learner of a parameter, "auto" for `MLP()`; the columns `names` in its expressions become channels."""
+    if isinstance(given, str) and given == "auto":
+        return MLP()
+    if not is_dataclass(given) or isinstance(given, type):
+        return given
+    changed = {}
+    for name in (field.name for field in fields(given)):
+        value = getattr(given, name)
+        if name in _SEEN and isinstance(value, tuple):
+            changed[name] = tuple(at_now(text, names) for text in value)
+    return replace(given, **changed) if changed else given
+
+
+def baseline_of(physics: Any, layout: Layout, outputs: Sequence[str], names: Sequence[str] = ()) -> Baseline:
+    """The physics of a parameter.
+
+    Args:
+        physics: "linear", expressions, `Term`s, a mapping of parameters to expressions, a Baseline, or a JAX function.
+        layout: the regressor, for "linear" and for a function.
+        outputs: with several, every expression has a parameter of its own for each, `gain_y0`.
+        names: columns that may stand in expressions without an instant.
+
+    Raises:
+        InputError: none of these.
+    """
+    if isinstance(physics, Baseline):
+        return physics
+    if callable(physics) and not isinstance(physics, type):
+        shape = np.shape(jax.eval_shape(physics, jax.ShapeDtypeStruct((len(layout),), float)))
+        if len(shape) != 2 or shape[0] != len(outputs):
+            raise InputError(
+                f"the physics function returned shape {shape} for one row; "
+                f"expected (n_outputs, n_parameters), n_outputs = {len(outputs)}."
+            )
+        return Baseline.from_function(physics, [f"theta{i + 1}" for i in range(shape[1])])
+    if isinstance(physics, str) and physics == "linear":
+        line = {(f"{lag.channel}_{lag.lag}" if lag.lag else lag.channel): str(lag) for lag in layout}
+        physics = {_free("intercept", [*line]): "1"} | line
+    elif not isinstance(physics, str) and isinstance(physics, Sequence) and all(isinstance(t, str) for t in physics):
+        physics = {f"theta{i + 1}": text for i, text in enumerate(physics)}
+    if isinstance(physics, Mapping) and all(isinstance(text, str) for text in physics.values()):
+        several = len(outputs) > 1
+        physics = [
+            Term(f"{parameter}_{output}" if several else parameter, text, output=output)
+            for parameter, text in physics.items()
+            for output in outputs
+        ]
+    if isinstance(physics, str) or not isinstance(physics, Sequence) or not all(isinstance(t, Term) for t in physics):
+        raise InputError(
+            "`physics` must be 'linear', a list of expressions or Terms, a mapping of parameters to expressions, a "
+            f"Baseline, or a function of a row; got {shown(physics)}."
+        )
+    return Baseline.from_terms([replace(t, regressor=at_now(t.regressor, names)) for t in physics])
