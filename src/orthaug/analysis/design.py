@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -42,6 +42,7 @@ BATCH = 2_000_000  # samples that are simulated side by side
 Factors = Float[np.ndarray, "M 2 n n"]  # per candidate the R of rows [Φ Δ] and of σ[Φ Δ], n = nt + 1
 
 
+@runtime_checkable
 class DesignPlant(Protocol):
     """What is simulated for inputs side by side: `Plant`, or that of a motion. `theta` are the parameters."""
 

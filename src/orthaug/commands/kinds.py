@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from orthaug._base.errors import InputError
 from orthaug.commands import lagged_kind, motion_kind
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from orthaug.reports.drawing import Figure
 
 
+@runtime_checkable
 class Kind(Protocol):
     """What a module of a kind has."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from orthaug.export.program import Program
 from orthaug.export.vectors import Vectors
@@ -11,6 +11,7 @@ from orthaug.export.vectors import Vectors
 VECTORS = "vectors.csv"
 
 
+@runtime_checkable
 class Target(Protocol):
     """A language or tool that a model is exported to. `summary` says in one line what is made."""
 

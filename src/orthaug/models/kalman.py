@@ -8,7 +8,7 @@ its states (`models.motion_filter`). Outputs that are NaN are missing: they tell
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -55,6 +55,7 @@ class Told(NamedTuple):
     """`−(νᵀS⁻¹ν + log det S + count log 2π)/2` of what is measured."""
 
 
+@runtime_checkable
 class Filter(Protocol):
     """The dynamics of a filter without numbers; hashable, so that compiled programs are reused."""
 

@@ -39,6 +39,7 @@ IDENTITY = Damping(1e-5, 1e12, diagonal=False)  # docs/design.md has the compari
 MARQUARDT = Damping(1e-3, 1e16, diagonal=True)
 
 
+@runtime_checkable
 class Tried(Protocol):
     """A trial: an objective at p."""
 
@@ -51,6 +52,7 @@ class Tried(Protocol):
         ...
 
 
+@runtime_checkable
 class Linearised(Protocol):
     """An objective and its derivative about an accepted trial."""
 
