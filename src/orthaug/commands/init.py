@@ -15,6 +15,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_file
 from orthaug.data.readers import read_record
 from orthaug.data.record import Channel, Record
+from orthaug.data.steps import Resample
 from orthaug.data.survey import Column, Survey, survey
 from orthaug.selection.first_orders import FirstModel, first_model
 
@@ -142,8 +143,16 @@ def _extent(roles: Roles) -> tuple[int, int]:
 def _record(found: Survey, roles: Roles, cut: int, missing: int) -> Record:
     """The training rows."""
     inputs, outputs = ([Channel(c.name, c.unit, c.header) for c in group] for group in (roles.inputs, roles.outputs))
-    options: dict[str, Any] = {"rows": (0, cut), "missing": "skip" if missing else "error"}
+    options: dict[str, Any] = {"rows": (0, cut), "missing": "skip" if missing or not found.clock.even else "error"}
+    if not found.clock.even and _time(found, roles):
+        options |= {"time": _time(found, roles), "prepare": [Resample(found.clock.step)]}
     return read_record(found.path, inputs=inputs, outputs=outputs, **options)
+
+
+def _time(found: Survey, roles: Roles) -> str | None:
+    """The column of instants in seconds, where there is one that is to be used."""
+    clock = found.clock
+    return clock.column.header if clock.column is not None and clock.instants and not roles.sampling_time else None
 
 
 def _step(found: Survey, roles: Roles) -> float:
@@ -242,19 +251,20 @@ def _data(
 ) -> Any:
     file, clock = _relative(found.path, out), found.clock
     data = tomlkit.table()
-    by_column = clock.column is not None and clock.instants and clock.even and not roles.sampling_time
-    if by_column and clock.column is not None:
-        data.add("time", clock.column.header)
-        data["time"].comment(f"instants in s, every {clock.step:g}")
+    time = _time(found, roles)
+    if time is not None:
+        data.add("time", time)
+        data["time"].comment(f"instants in s, {'every' if clock.even else 'mostly every'} {clock.step:g}")
     else:
         data.add("sampling_time", _step(found, roles))
         unknown = clock.step is None and not roles.sampling_time
         data["sampling_time"].comment("s; no column tells it: change it" if unknown else "s")
     for key, names in zip(("inputs", "outputs"), named, strict=True):
         data.add(key, names)
-    if missing:
+    uneven = time is not None and not clock.even
+    if missing or uneven:
         data.add("missing", "skip")
-        data["missing"].comment(f"{missing} rows lack a value")
+        data["missing"].comment(f"{missing} rows lack a value" if missing else "nothing is interpolated across gaps")
     for name, part in (("train", [0, cut]), ("tests", [cut, rows])):
         if part[0] == part[1]:
             continue
@@ -273,6 +283,14 @@ def _data(
             channels.add(tomlkit.key(column.name), entry)
     if len(channels):
         data.add("channels", channels)
+    if uneven:
+        step = tomlkit.table()
+        step.add("step", "resample")
+        step.add("sampling_time", clock.step)
+        step["sampling_time"].comment("s; the instants are uneven")
+        steps = tomlkit.aot()
+        steps.append(step)
+        data.add("prepare", steps)
     return data
 
 
