@@ -206,7 +206,7 @@ def _clock(columns: Sequence[Column]) -> Clock:
             usual = float(np.median(steps))
             even = column.missing > 0 or bool((np.abs(steps - usual) <= JITTER * usual).all())
             step = float(steps.mean()) if even and not column.missing else usual
-            return Clock(scale * step, column, instants=scale == 1, even=even)
+            return Clock(float(f"{scale * step:.9g}"), column, instants=scale == 1, even=even)
         if _STEP.match(base) and column.constant and values[0] > 0:
             return Clock(scale * float(values[0]), column)
     return Clock()
