@@ -151,6 +151,9 @@ def test_what_is_seen_of_a_column(tmp_path):
     frame.to_csv(tmp_path / "a.csv", index=False)
     found = survey(tmp_path / "a.csv")
     assert not found.clock.even and found.clock.step == 1.0 and "uneven" in str(found.clock)
+    held = np.repeat(rng.normal(size=40), 10)
+    pd.DataFrame({"held": np.convolve(held, [0.5, 0.5], "same")}).to_csv(tmp_path / "b.csv", index=False)
+    assert survey(tmp_path / "b.csv").find("held").limits == ()  # an input between its steps is at no limit
     assert found.find("square").limits == () and found.find("square").quantum is None
     assert found.find("coarse").quantum == pytest.approx(0.1)
 
@@ -159,8 +162,10 @@ def test_uneven_instants_are_resampled(tmp_path):
     u, y = plant(300)
     t = 0.1 * np.arange(300.0)
     t[200:] += 0.06
+    y[77] += 50.0
     pd.DataFrame({"t": t, "u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
     done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
     assert done.code == 0 and "but the steps are uneven" in done.out, done.err
     data = tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
-    assert data["prepare"] == [{"step": "resample", "sampling_time": 0.1}] and data["time"] == "t"
+    assert [step["step"] for step in data["prepare"]] == ["outliers", "fill", "resample"] and data["time"] == "t"
+    assert data["prepare"][-1]["sampling_time"] == 0.1 and "1 samples far from all their neighbours" in done.out

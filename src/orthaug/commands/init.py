@@ -15,8 +15,8 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_file
 from orthaug.data.readers import read_record
 from orthaug.data.record import Channel, Record
-from orthaug.data.steps import Resample
-from orthaug.data.survey import Column, Survey, survey
+from orthaug.data.steps import STEPS
+from orthaug.data.survey import SPIKE, Column, Survey, survey
 from orthaug.selection.first_orders import FirstModel, first_model
 
 TRAINED = 0.75  # share of the rows; the rest is a test
@@ -144,8 +144,9 @@ def _record(found: Survey, roles: Roles, cut: int, missing: int) -> Record:
     """The training rows."""
     inputs, outputs = ([Channel(c.name, c.unit, c.header) for c in group] for group in (roles.inputs, roles.outputs))
     options: dict[str, Any] = {"rows": (0, cut), "missing": "skip" if missing or not found.clock.even else "error"}
-    if not found.clock.even and _time(found, roles):
-        options |= {"time": _time(found, roles), "prepare": [Resample(found.clock.step)]}
+    options["prepare"] = [STEPS.declare(kind, keys) for kind, keys in _steps(found, roles)]
+    if not found.clock.even:
+        options["time"] = _time(found, roles)
     return read_record(found.path, inputs=inputs, outputs=outputs, **options)
 
 
@@ -153,6 +154,16 @@ def _time(found: Survey, roles: Roles) -> str | None:
     """The column of instants in seconds, where there is one that is to be used."""
     clock = found.clock
     return clock.column.header if clock.column is not None and clock.instants and not roles.sampling_time else None
+
+
+def _steps(found: Survey, roles: Roles) -> list[tuple[str, dict[str, Any]]]:
+    """Preparation that the data need: spikes of outputs replaced, uneven instants put onto a grid."""
+    steps: list[tuple[str, dict[str, Any]]] = []
+    if any(column.spikes for column in roles.outputs):
+        steps += [("outliers", {"threshold": SPIKE}), ("fill", {"most": 3})]
+    if _time(found, roles) and not found.clock.even:
+        steps.append(("resample", {"sampling_time": found.clock.step}))
+    return steps
 
 
 def _step(found: Survey, roles: Roles) -> float:
@@ -166,7 +177,7 @@ def _account(found: Survey, roles: Roles, rows: int, missing: int, cut: int, mod
         step += "; 1 s is written: change it"
     lines = [f"{found.path.name}: {rows} rows, {len(found.columns)} columns", f"sampling time: {step}"]
     for kind, columns in (("input", roles.inputs), ("output", roles.outputs)):
-        lines += [f"{kind:<7}{_seen(column)}" for column in columns]
+        lines += [f"{kind:<7}{_seen(column, spikes=kind == 'output')}" for column in columns]
     used = {id(c) for c in (*roles.inputs, *roles.outputs, found.clock.column)}
     for column in (c for c in found.columns if id(c) not in used):
         why = "no numbers" if not column.numeric else "constant" if column.constant else "not named"
@@ -200,13 +211,15 @@ def _order(order: int) -> str:
     return f"up to order {order}" + (" or more" if order >= PERSISTENCE else ": few lags can be told apart")
 
 
-def _seen(column: Column) -> str:
+def _seen(column: Column, *, spikes: bool) -> str:
     """A channel in words: range, and what is odd about it."""
     low, high = float(column.finite.min()), float(column.finite.max())
     text = f"{column.name}" + (f" = column '{column.header}'" if column.header != column.name else "")
     text += f": {low:.4g} to {high:.4g} {column.unit}".rstrip()
     if column.missing:
         text += f"; {column.missing} cells missing"
+    if spikes and column.spikes:
+        text += f"; {column.spikes} samples far from all their neighbours, which the spec replaces"
     for value, count in column.limits:
         text += f"; {count} rows at {value:.4g}, perhaps a limit of sensor or actuator"
     if column.quantum is not None:
@@ -283,13 +296,12 @@ def _data(
             channels.add(tomlkit.key(column.name), entry)
     if len(channels):
         data.add("channels", channels)
-    if uneven:
+    steps = tomlkit.aot()
+    for kind, keys in _steps(found, roles):
         step = tomlkit.table()
-        step.add("step", "resample")
-        step.add("sampling_time", clock.step)
-        step["sampling_time"].comment("s; the instants are uneven")
-        steps = tomlkit.aot()
+        step.update({"step": kind, **keys})
         steps.append(step)
+    if len(steps):
         data.add("prepare", steps)
     return data
 

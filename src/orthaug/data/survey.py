@@ -15,6 +15,7 @@ from orthaug._base.checks import Vector
 from orthaug._base.errors import LONGEST, InputError
 from orthaug.data.expressions import SAMPLING_TIME, is_name
 from orthaug.data.readers import JITTER
+from orthaug.data.steps import Outliers, Run
 from orthaug.data.tables import column_names, read_table
 
 _UNITS = re.compile(
@@ -29,8 +30,13 @@ _OUTPUT = re.compile(r"^(y|y_?\d+|out|output|output_?\d+)$", re.IGNORECASE)
 _SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 _HELD = 6  # rows at the largest or smallest value from which on it is suspected to be a limit
 _OFTEN = 5.0  # times the rows that a value usually has
+_LONGER = 3.0  # times the rows for which other values are usually held
 _LEVELS = 20  # of a signal at least, for one with fewer stands at its extremes anyway
 _COARSE = 0.02  # steps of a signal over its standard deviation that are told
+SPIKE = 15.0
+"""Deviations from its neighbours that a sample is a spike from on."""
+_OUTSIDE = 2.5  # interquartile ranges from the middle
+_FEW = 0.01  # share of samples that spikes are at most
 _SAME = 1e-6  # relative
 
 
@@ -71,8 +77,22 @@ class Column:
         levels, counts = np.unique(self.finite, return_counts=True)
         if len(levels) < _LEVELS:
             return ()
-        least = max(_HELD, _OFTEN * float(np.median(counts)))
+        x = self.finite
+        edges = np.concatenate([[0], np.flatnonzero(np.diff(x)) + 1, [len(x)]])
+        held = np.diff(edges)
+        held = held[(held > 1) & ~np.isin(x[edges[:-1]], levels[[0, -1]])]  # as inputs are, between their steps
+        least = max(_HELD, _OFTEN * float(np.median(counts)), _LONGER * float(np.median(held)) if len(held) else 0.0)
         return tuple((float(levels[i]), int(counts[i])) for i in (0, -1) if counts[i] >= least)
+
+    @property
+    def spikes(self) -> int:
+        """Samples far from all their neighbours and from what the signal usually is, where they are few."""
+        x = self.values[: self.filled]
+        run = Run(x[:, None], np.arange(float(len(x))), (self.name,), 0, 1.0)
+        wild = np.isfinite(x) & ~np.isfinite(Outliers(threshold=SPIKE).apply(run).values[:, 0])
+        usual = np.quantile(self.finite, [0.25, 0.75])
+        count = int((wild & (np.abs(x - usual.mean()) > _OUTSIDE * np.ptp(usual))).sum())
+        return count if count <= max(1.0, _FEW * len(x)) else 0
 
     @property
     def quantum(self) -> float | None:
