@@ -79,8 +79,7 @@ def read_record(
     ranges = _ranges(rows, total, path)
     ranges = ranges if experiment is None else _labelled(table, experiment, ranges)
     if prepare:
-        reading = _Uncut(table, channels, column_of, time, sampling_time or 1.0, every, missing)
-        return reading.prepared(list(prepare), ranges)
+        return _Uncut(table, channels, column_of, time, sampling_time or 1.0, every, missing).prepared(prepare, ranges)
     for begin, end in ranges:
         recorded += len(range(begin, end, every))
         for start, stop in _stretches(table, wanted, needed, begin, end, every, missing):
@@ -122,7 +121,7 @@ class _Uncut:
     every: int
     missing: str
 
-    def prepared(self, steps: list[Any], ranges: Sequence[tuple[int, int]]) -> Record:
+    def prepared(self, steps: Sequence[Any], ranges: Sequence[tuple[int, int]]) -> Record:
         """The record after the steps."""
         check_steps(steps)
         mends = self.missing != "error" or any(isinstance(step, Outliers | Fill) for step in steps)

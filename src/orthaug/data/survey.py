@@ -178,10 +178,16 @@ def survey(path: Path) -> Survey:
         InputError: no such file, an unknown ending, a file that cannot be read or has no column of numbers.
     """
     columns: list[Column] = []
-    for header in dict.fromkeys(column_names(path)):
+    headers = list(dict.fromkeys(column_names(path)))
+    try:
+        table = read_table(path, headers).columns
+    except InputError:  # one of them cannot be read: each by itself
+        table = {}
+    for header in headers:
         base, unit = split_header(header)
         try:
-            values, numeric = read_table(path, [header]).columns[header], True
+            values = table[header] if table else read_table(path, [header]).columns[header]
+            numeric = True
         except InputError:  # text, complex numbers, a name that stands twice: no channel
             values, numeric = np.empty(0), False
         name = channel_name(base, [c.name for c in columns])
