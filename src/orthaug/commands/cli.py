@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -175,6 +177,41 @@ def select(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force
     else:
         streams.echo(selection_text(selected.result))
         streams.echo(f"\nwritten to {folder}; next: orthaug fit {folder / 'spec.toml'}")
+
+
+@app.command()
+def init(
+    data: Annotated[Path, typer.Argument(metavar="DATA", help="Data file.")],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The spec to write.")] = Path("spec.toml"),
+    inputs: Annotated[str | None, typer.Option("--inputs", metavar="A,B", help="Columns of the inputs.")] = None,
+    outputs: Annotated[str | None, typer.Option("--outputs", metavar="Y", help="Columns of the outputs.")] = None,
+    sampling_time: Annotated[float | None, typer.Option("--sampling-time", metavar="S", help="Between rows.")] = None,
+    force: Force = False,
+) -> None:
+    """Look at a data file, and write a first spec for it that runs; asks where it is on a terminal."""
+    from orthaug._base.errors import InputError
+    from orthaug.commands.folder import check_file
+    from orthaug.commands.init import assign, draft, look, question, write_spec
+    from orthaug.data.record import check_step
+
+    check_file(out, data, force=force)
+    if sampling_time is not None:
+        check_step(sampling_time)
+    found = look(data)
+    roles = assign(found, inputs, outputs, sampling_time)
+    if roles is None:
+        if not sys.stdin.isatty():
+            raise InputError(question(found))
+        streams.say("columns: " + ", ".join(column.header for column in found.signals))
+        if inputs is None:
+            inputs = typer.prompt("inputs, separated by commas (none: press enter)", default="", show_default=False)
+        roles = assign(found, inputs, outputs or typer.prompt("outputs"), sampling_time)
+    if roles is not None and sampling_time is None and found.clock.step is None and sys.stdin.isatty():
+        roles = replace(roles, sampling_time=check_step(typer.prompt("seconds between rows", type=float, default=1.0)))
+    assert roles is not None
+    spec = draft(found, roles, out)
+    write_spec(spec, out, force=force)
+    streams.echo(f"{spec.account}\n\nwritten to {out}; next: orthaug fit {out}")
 
 
 @app.command()

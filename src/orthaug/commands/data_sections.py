@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from orthaug._base.checks import check_label
-from orthaug.commands.sections import Count, Finite, Positive, Section
+from orthaug.commands.sections import Count, Finite, KindSection, Positive, Section, with_kinds
+from orthaug.data.steps import STEPS
 
 Range = Annotated[list[Count], Field(min_length=2, max_length=2)]
 
@@ -31,6 +32,17 @@ class ChannelSection(Section):
     offset: Finite = 0.0
 
 
+class PrepareSection(KindSection):
+    """A step that every part of the data goes through."""
+
+    step: str
+
+    @model_validator(mode="after")
+    def _check(self) -> PrepareSection:
+        self.declared(STEPS, self.step)
+        return self
+
+
 class Data(Section):
     """Channels, sampling time and parts."""
 
@@ -44,11 +56,19 @@ class Data(Section):
     validation: PartSection | None = None
     tests: dict[str, PartSection] = {}
     channels: dict[str, ChannelSection] = {}
+    prepare: list[with_kinds(PrepareSection, step=STEPS)] = []  # type: ignore[valid-type]
+
+    @property
+    def steps(self) -> tuple[Any, ...]:
+        """The steps of preparation, as declared."""
+        return tuple(section.declared(STEPS, section.step) for section in self.prepare)
 
     @property
     def step(self) -> float | None:
-        """Seconds between the rows that are kept of the training data; None where a time column tells."""
-        return None if self.time else (self.sampling_time or 1.0) * self.train.every
+        """Seconds between the rows that are kept of the training data; None where the data tell."""
+        if self.time or any(section.step in ("decimate", "resample") for section in self.prepare):
+            return None
+        return (self.sampling_time or 1.0) * self.train.every
 
     @model_validator(mode="after")
     def _one_time(self) -> Data:

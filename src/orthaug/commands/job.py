@@ -18,7 +18,7 @@ from orthaug.commands.parts import Part
 from orthaug.commands.spec import Spec
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout
-from orthaug.reports.result import DataResult
+from orthaug.reports.result import DataResult, PreparedResult
 
 if TYPE_CHECKING:
     from orthaug.fitting.checkpoints import Checkpoints
@@ -144,6 +144,7 @@ class Job(ABC):
             train=list(self.train.files),
             validation=list(self.validation.files) if self.validation else None,
             tests={part.name.removeprefix("tests."): list(part.files) for part in self.tests} or None,
+            prepare=[PreparedResult.model_validate(done) for done in self.train.record.prepared] or None,
         )
 
     def training_options(self, variant: Variant) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from orthaug._base.warning import Warning
 from orthaug.commands.data_sections import PartSection
 from orthaug.commands.spec import Spec
 from orthaug.data.parquet_source import open_parquet
+from orthaug.data.preparation import warnings_of
 from orthaug.data.readers import read_record
 from orthaug.data.record import Record, same_step
 from orthaug.data.sources import Source, witness
@@ -166,6 +167,7 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
             every=part.every,
             columns=part.columns,
             missing=spec.data.missing,
+            prepare=spec.data.steps,
         )
         results.append(FileResult(file=file, sha256=file_digest(path.parent / file), rows=len(record)))
         records.append(record)
@@ -174,11 +176,18 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
     told = tuple(replace(e, source=file) for e, file in zip(record.experiments, sources, strict=True))
     record = replace(record, experiments=told)
     warnings = (_thinned(name, part.every),) if part.every > 1 else ()
+    if name == "train":
+        warnings += warnings_of(record.prepared, [c.name for c in record.channels])
     return Part(name, record, part.skip, tuple(results), warnings)
 
 
 def _left(path: Path, spec: Spec, part: PartSection, name: str, files: Sequence[str]) -> Part:
     """A part whose rows stay in its Parquet files."""
+    if spec.data.prepare:
+        raise InputError(
+            f"{path}: 'data.prepare' needs the rows in memory, and these stay in their files; prepare the files, or "
+            'set engine.kind = "memory".'
+        )
     if part.rows is not None or part.every > 1:
         raise InputError(
             f"{path}: 'data.{name}': `rows` and `every` need the rows in memory; write the files that way, or set "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -108,13 +109,25 @@ def open_run(
         record = read_record(data, **channels, sampling_time=step, time=loaded.time_column, **options)
     except MissingSampleError as error:
         raise InputError(f"{error} --missing skip leaves such rows out.") from None
-    rows, told = len(record) + record.missing, ()
+    rows, told = len(record) + record.missing, _prepared(model)
     if record.missing:
         estimated = need_outputs and loaded.form.states and not loaded.form.memory  # a state to predict from
         first = loaded.form.first_row + ahead + bool(estimated)
         record, text = long_stretches(record, [0] * len(record.experiments), first)
-        told = (f"note: {data}: {text}",)
+        told += (f"note: {data}: {text}",)
     return ModelOnData(loaded, record, data, rows, told)
+
+
+def _prepared(model: Path) -> tuple[str, ...]:
+    """What the result that a model lies in tells of the preparation of its data."""
+    for folder in (model, model.parent):
+        try:
+            steps = json.loads((folder / "result.json").read_text(encoding="utf-8"))["data"]["prepare"]
+            names = ", ".join(f"{step['text']}" for step in steps)
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            continue
+        return (f"note: the model was fitted to prepared data: {names}. The rows of this file are taken as they are.",)
+    return ()
 
 
 def read_initial(initial: str | None, opened: ModelOnData) -> str | Any:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,9 @@ import numpy as np
 
 from orthaug._base.checks import Vector, check_choice, check_count, check_type
 from orthaug._base.errors import InputError, MissingSampleError, shown
+from orthaug.data.preparation import check_steps, prepared_experiments
 from orthaug.data.record import Channel, Experiment, Record, as_channels, check_step, same_step
+from orthaug.data.steps import Fill, Outliers, Resample, Run
 from orthaug.data.tables import Table, check_readable, has_column, read_table
 
 RowRange = tuple[int, int] | list[int]
@@ -38,6 +40,7 @@ def read_record(
     columns: Mapping[str, str] | None = None,
     missing: str = "error",
     experiment: str | None = None,
+    prepare: Sequence[Any] = (),
 ) -> Record:
     """Read one file; several row ranges are experiments of their own.
 
@@ -52,6 +55,8 @@ def read_record(
             experiment of its own, so that no lag reaches across a gap. "keep" does so where inputs are missing, and
             keeps missing outputs as NaN: an `Observer` takes them.
         experiment: the column, of numbers, that tells experiments apart; each is in one piece.
+        prepare: steps such as `Fill()` or `Lowpass(cutoff=10.0)`, in order, before missing samples are looked at;
+            with `Resample()` the instants of `time` may be uneven.
 
     Raises:
         InputError: no such file, wrong type, missing columns, cells that are empty or no finite numbers.
@@ -72,7 +77,10 @@ def read_record(
     total = len(next(iter(table.columns.values())))
     experiments, steps, recorded = [], [], 0
     ranges = _ranges(rows, total, path)
-    for begin, end in ranges if experiment is None else _labelled(table, experiment, ranges):
+    ranges = ranges if experiment is None else _labelled(table, experiment, ranges)
+    if prepare:
+        return _Uncut(table, channels, column_of, time, sampling_time or 1.0, every, missing).prepared(prepare, ranges)
+    for begin, end in ranges:
         recorded += len(range(begin, end, every))
         for start, stop in _stretches(table, wanted, needed, begin, end, every, missing):
             pick = slice(start, stop, every)
@@ -99,6 +107,53 @@ def read_record(
     left_out = recorded - sum(len(experiment) for experiment in experiments)
     step *= min(every, 10**15)  # what is longer is refused
     return Record(tuple(channels[0]), tuple(channels[1]), step, tuple(experiments), time, left_out)
+
+
+@dataclass(frozen=True, eq=False)
+class _Uncut:
+    """Ranges of a table as they are, missing samples too, for steps that may mend them."""
+
+    table: Table
+    channels: list[tuple[Channel, ...]]
+    column_of: Mapping[str, str]
+    time: str | None
+    step: float
+    every: int
+    missing: str
+
+    def prepared(self, steps: Sequence[Any], ranges: Sequence[tuple[int, int]]) -> Record:
+        """The record after the steps."""
+        check_steps(steps)
+        mends = self.missing != "error" or any(isinstance(step, Outliers | Fill) for step in steps)
+        uneven = any(isinstance(step, Resample) for step in steps)
+        runs = [self._run(begin, end, mends=mends, uneven=uneven) for begin, end in ranges]
+        experiments, step, done, lost = prepared_experiments(runs, steps, keep=self.missing == "keep")
+        if lost and self.missing == "error":
+            raise MissingSampleError(
+                f"{self.table.path}: {lost} rows lack a sample after preparation. Let `fill` reach over longer gaps, "
+                'or leave them out (missing = "skip").'
+            )
+        return Record(self.channels[0], self.channels[1], step, experiments, self.time, lost, done)
+
+    def _run(self, begin: int, end: int, *, mends: bool, uneven: bool) -> tuple[Run, Experiment]:
+        """The rows of a range, and where they stand."""
+        table, pick, both = self.table, slice(begin, end, self.every), [*self.channels[0], *self.channels[1]]
+        names = [self.column_of[c.name] for c in both]
+        _stretches(table, names, names, begin, end, self.every, "skip" if mends else "error")  # text is refused
+        values = np.column_stack([c.scale * table.columns[self.column_of[c.name]][pick] + c.offset for c in both])
+        step = self.step * self.every
+        instants = step * np.arange(len(values))
+        if self.time:
+            _check_cells(table, [self.time], begin, end)
+            instants = table.columns[self.time][pick]
+            if uneven and len(instants) > 1:
+                step = float(np.median(np.diff(instants)))
+            else:
+                step = _uniform_step(table, self.time, begin, end) * self.every
+        place = (str(table.path), begin, self.every, table.first_line, float(instants[0]))
+        count = len(self.channels[0])
+        run = Run(values, instants, tuple(c.name for c in both), count, step, even=not (self.time and uneven))
+        return run, Experiment(values[:, :count], values[:, count:], *place)
 
 
 def read_samples(

@@ -138,6 +138,27 @@ class Experiment:
         return replace(self, inputs=self.inputs[start:stop], outputs=self.outputs[start:stop], first_row=first)
 
 
+@dataclass(frozen=True)
+class Prepared:
+    """A step that data went through: its kind, its options, and how many samples it marked as missing or filled."""
+
+    step: str
+    options: dict[str, Any]
+    samples: int = 0
+
+    @property
+    def text(self) -> str:
+        """The same in words."""
+        values = {name: " ".join(v) if isinstance(v, list) else v for name, v in self.options.items()}
+        text = f"{self.step} ({', '.join(f'{name} {value}' for name, value in values.items())})"
+        done = {"outliers": "marked as missing", "fill": "reconstructed"}.get(self.step)
+        return f"{text}: {self.samples} samples {done}" if done else text
+
+    def with_samples(self, samples: int) -> Prepared:
+        """The same step of more samples."""
+        return replace(self, samples=samples)
+
+
 @dataclass(frozen=True, eq=False)
 class Record:
     """Experiments that share channels and sampling time; lags never reach across experiments.
@@ -161,6 +182,8 @@ class Record:
     time_column: str | None = None
     missing: int = 0
     """Rows that were left out because a sample was missing."""
+    prepared: tuple[Prepared, ...] = ()
+    """What was done to the samples, in order."""
 
     def __post_init__(self) -> None:
         for name in ("inputs", "outputs"):
@@ -239,7 +262,8 @@ class Record:
                     f"{first.experiments[0].source or 'another'} every {first.sampling_time:g} s; resample one of them."
                 )
         experiments = tuple(e for record in records for e in record.experiments)
-        return replace(first, experiments=experiments, missing=sum(record.missing for record in records))
+        missing = sum(record.missing for record in records)
+        return replace(first, experiments=experiments, missing=missing, prepared=_added([r.prepared for r in records]))
 
     def __len__(self) -> int:
         return sum(len(experiment) for experiment in self.experiments)
@@ -318,6 +342,18 @@ class Record:
         """Rows of an experiment, with the instant of their first."""
         first = range(len(experiment))[start:stop].start
         return replace(experiment.rows(start, stop), start_time=experiment.start_time + first * self.sampling_time)
+
+
+def _added(prepared: Sequence[tuple[Prepared, ...]]) -> tuple[Prepared, ...]:
+    """What was done to records that are joined, their samples added up; all went through the same steps.
+
+    Raises:
+        InputError: they did not.
+    """
+    kinds = {tuple((done.step, repr(done.options)) for done in one) for one in prepared}
+    if len(kinds) > 1:
+        raise InputError("records that went through different preparation cannot be joined; prepare all alike.")
+    return tuple(done[0].with_samples(sum(one.samples for one in done)) for done in zip(*prepared, strict=True))
 
 
 def _channels(given: Sequence[str | Channel] | None, default: str, count: int) -> tuple[Channel, ...]:

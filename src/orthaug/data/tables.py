@@ -17,7 +17,7 @@ from orthaug._base.checks import Matrix, Vector, nearest
 from orthaug._base.errors import InputError, MissingColumnError
 from orthaug._base.memory import check_memory
 from orthaug.data.spreadsheets import as_number, read_sheet, text_number
-from orthaug.data.variables import ENDINGS, foreign, read_variables, short
+from orthaug.data.variables import ENDINGS, foreign, read_variables, short, variable_names
 
 _SMALL = 4_000_000  # bytes of a text file that NumPy reads sooner than pandas is imported
 _NAMED = 30  # columns that a message lists
@@ -70,6 +70,30 @@ def has_column(path: Path, name: str) -> bool:
     return True
 
 
+def column_names(path: Path) -> list[str]:
+    """The columns (or variables) of a file that could be read, in order.
+
+    Raises:
+        InputError: no such file, an unknown ending, content that does not fit it.
+    """
+    check_readable(path)
+    ending = path.suffix.lower()
+    if ending not in _READERS:
+        raise InputError(f"{path}: unknown file type '{path.suffix}'; known are {', '.join(_READERS)}.")
+    with foreign(path):
+        if ending in ENDINGS:
+            return variable_names(path)
+        if ending == ".parquet":
+            with parquet_file(path) as file:
+                return list(file.schema_arrow.names)
+        found: list[str] = []
+        if ending == ".xlsx":
+            read_sheet(path, lambda header: found.extend(header) or [])
+        else:
+            found = _text_header(path)[0]
+    return [name for name in found if name]
+
+
 def check_readable(path: Path) -> None:
     """Raise InputError unless `path` is a file with something in it."""
     try:
@@ -91,13 +115,9 @@ def check_readable(path: Path) -> None:
 
 def _read_text(path: Path, columns: Sequence[str]) -> Table:
     """CSV and TSV as they occur: byte-order mark, trailing separators, units in headers, decimal commas."""
-    try:
-        _check_no_nul(path)
-        header, header_line, separator = _header(path)
-        check_present(path, columns, header)
-        commas = separator == ";" and _DECIMAL_COMMA.search(path.read_text(encoding="utf-8-sig")) is not None
-    except (UnicodeDecodeError, csv.Error):
-        raise InputError(f"{path}: not a text table; expected UTF-8 text with a header row.") from None
+    header, header_line, separator = _text_header(path)
+    check_present(path, columns, header)
+    commas = separator == ";" and _DECIMAL_COMMA.search(path.read_text(encoding="utf-8-sig")) is not None
     place = {name: str(header.index(name)) for name in columns}
     beyond = str(len(header))  # a column that must stay empty: cells behind the last header
     numbers, texts, held = _cells(path, header_line, len(header), separator, [*place.values(), beyond], commas)
@@ -187,6 +207,18 @@ def _check_no_nul(path: Path) -> None:
 def _comma_number(text: str) -> float:
     """A number where decimals are commas; a point would be one of thousands, and is refused."""
     return np.nan if "." in text else text_number(text.replace(",", "."))
+
+
+def _text_header(path: Path) -> tuple[list[str], int, str]:
+    """`_header` of what is UTF-8 text."""
+    try:
+        _check_no_nul(path)
+        found = _header(path)
+        if found[2] == ";":
+            path.read_text(encoding="utf-8-sig")
+        return found
+    except (UnicodeDecodeError, csv.Error):
+        raise InputError(f"{path}: not a text table; expected UTF-8 text with a header row.") from None
 
 
 def _header(path: Path) -> tuple[list[str], int, str]:

@@ -32,6 +32,7 @@ class Held:
 
     what: str
     read: Callable[[], np.ndarray] | None
+    shape: tuple[int, ...] = ()
 
 
 def read_variables(path: Path, names: Sequence[str]) -> dict[str, Vector]:
@@ -45,6 +46,16 @@ def read_variables(path: Path, names: Sequence[str]) -> dict[str, Vector]:
     """
     with foreign(path):
         return _FORMATS[path.suffix.lower()](path, names)
+
+
+def variable_names(path: Path) -> list[str]:
+    """The names under which a file's channels are read: vectors, and every line along a narrow matrix.
+
+    Raises:
+        InputError: a corrupt file.
+    """
+    with foreign(path):
+        return list(_FORMATS[path.suffix.lower()](path, None))
 
 
 @contextmanager
@@ -63,7 +74,7 @@ def foreign(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: cannot be read as {path.suffix.lower()} ({reason}); is it cut or corrupt?") from None
 
 
-def _from_npz(path: Path, names: Sequence[str]) -> dict[str, Vector]:
+def _from_npz(path: Path, names: Sequence[str] | None) -> dict[str, Vector]:
     with zipfile.ZipFile(path) as archive:
         held: dict[str, Held] = {}
         for info in archive.infolist():
@@ -71,7 +82,7 @@ def _from_npz(path: Path, names: Sequence[str]) -> dict[str, Vector]:
                 held[info.filename.removesuffix(".npy")] = _member(path, archive, info)
             except Exception as error:  # one that cannot be read matters only where it is asked for
                 held[info.filename.removesuffix(".npy")] = Held(f"unreadable: {short(error)}", None)
-        return {name: _pick(path, name, held) for name in names}
+        return _taken(path, names, held)
 
 
 def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Held:
@@ -96,16 +107,16 @@ def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Held
     return _lazy(path, shape, kind.itemsize, load)
 
 
-def _from_mat(path: Path, names: Sequence[str]) -> dict[str, Vector]:
+def _from_mat(path: Path, names: Sequence[str] | None) -> dict[str, Vector]:
     content = path.read_bytes()
     if _HDF5 in content[:_USERBLOCK] or content[124:126] in (b"\x00\x02", b"\x02\x00"):  # v7.3
         return _from_hdf5(path, names)
     variables = read_mat5(content, path)
-    roots = {_ROOT.split(name.lstrip("/"))[0] for name in names}
+    roots = {_ROOT.split(name.lstrip("/"))[0] for name in names or ()}
     held: dict[str, Held] = {}
     for name, variable in variables.items():
-        held |= _held(path, variable, deep=name in roots)
-    return {name: _pick(path, name, held) for name in names}
+        held |= _held(path, variable, deep=names is None or name in roots)
+    return _taken(path, names, held)
 
 
 def _held(path: Path, variable: Variable, *, deep: bool) -> dict[str, Held]:
@@ -118,7 +129,7 @@ def _held(path: Path, variable: Variable, *, deep: bool) -> dict[str, Held]:
     return held
 
 
-def _from_hdf5(path: Path, names: Sequence[str]) -> dict[str, Vector]:
+def _from_hdf5(path: Path, names: Sequence[str] | None) -> dict[str, Vector]:
     """Datasets by their path; MATLAB's v7.3 files hold every matrix transposed."""
     try:
         import h5py
@@ -150,12 +161,12 @@ def _from_hdf5(path: Path, names: Sequence[str]) -> dict[str, Vector]:
                 held[key] = _lazy(path, shape, item.dtype.itemsize, lambda: item[()].T if matlab else item[()])
 
     with h5py.File(path, "r") as file:
-        _ = [name in file for name in names]  # complains of broken tables on which a visit never ends
+        _ = [name in file for name in names or ()]  # complains of broken tables on which a visit never ends
         file.visititems(note)
-        return {name: _pick(path, name, held) for name in names}
+        return _taken(path, names, held)
 
 
-_FORMATS: dict[str, Callable[[Path, Sequence[str]], dict[str, Vector]]] = {
+_FORMATS: dict[str, Callable[[Path, Sequence[str] | None], dict[str, Vector]]] = {
     ".npz": _from_npz,
     ".mat": _from_mat,
     ".h5": _from_hdf5,
@@ -175,7 +186,22 @@ def _lazy(path: Path, shape: Sequence[int], itemsize: int, read: Callable[[], An
         check_memory(2 * math.prod(shape) * max(itemsize, 8), f"{path}: an array of {what} numbers")
         return read()
 
-    return Held(what, fitting)
+    return Held(what, fitting, tuple(shape))
+
+
+def _taken(path: Path, names: Sequence[str] | None, held: Mapping[str, Held]) -> dict[str, Vector]:
+    """The named channels; without names an empty one for each that could be named."""
+    if names is not None:
+        return {name: _pick(path, name, held) for name in names}
+    lines = {}
+    for name, variable in held.items():
+        sides = [n for n in variable.shape if n != 1]
+        if len(variable.shape) <= 2 and len(sides) == 1:
+            lines[name] = np.empty(0)
+        elif len(sides) == len(variable.shape) == 2 and min(sides) <= _NAMED:
+            tall = sides[0] >= sides[1]
+            lines |= {f"{name}[{i}]" if tall else f"{name}[{i},:]": np.empty(0) for i in range(min(sides))}
+    return lines
 
 
 def _pick(path: Path, name: str, held: Mapping[str, Held]) -> Vector:

@@ -46,14 +46,24 @@ class FileResult(Content):
     rows: int
 
 
-class DataResult(Content):
-    """The files of each part."""
+class PreparedResult(Content):
+    """A step of preparation: `samples` were marked as missing or reconstructed in all files of the training data."""
 
-    absent: ClassVar = frozenset({"validation", "tests"})
+    step: str
+    options: dict[str, Any]
+    samples: Whole
+    text: str
+
+
+class DataResult(Content):
+    """The files of each part, and what all parts went through."""
+
+    absent: ClassVar = frozenset({"validation", "tests", "prepare"})
 
     train: list[FileResult]
     validation: list[FileResult] | None = None
     tests: dict[str, list[FileResult]] | None = None
+    prepare: list[PreparedResult] | None = None
 
     @property
     def parts(self) -> dict[str, list[FileResult]]:

@@ -1,0 +1,151 @@
+"""Data prepared step by step within each experiment, with an account of what was done."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import check_type
+from orthaug._base.errors import InputError
+from orthaug._base.warning import Warning
+from orthaug.data.record import Experiment, Prepared, Record, same_step
+from orthaug.data.steps import STEPS, Run, Step, options_of, stretches
+
+_FILTERS = ("lowpass", "highpass", "decimate")
+
+
+def prepare(record: Record, *steps: Any) -> Record:
+    """A record after steps such as `Detrend()` and `Lowpass(cutoff=10.0)`, in this order; `.prepared` tells of them.
+
+    Every step acts within an experiment, never across. Samples that are missing afterwards split experiments. Gaps
+    that were left out when the record was read are not seen: to fill them give the steps to `read_record(prepare=…)`.
+
+    Raises:
+        InputError: no step, or one that cannot be done with these samples.
+
+    Examples:
+        >>> import numpy as np
+        >>> record = Record.from_arrays(u=np.ones(40), y=np.arange(40.0), sampling_time=0.1)
+        >>> from orthaug.data.steps import Decimate, Detrend
+        >>> prepare(record, Detrend(degree=1)).prepared[0].text
+        'detrend (degree 1)'
+    """
+    check_type(record, Record, "record", "a Record")
+    check_steps(steps)
+    runs = []
+    for e in record.experiments:
+        instants = e.start_time + record.sampling_time * np.arange(len(e))
+        names = tuple(c.name for c in (*record.inputs, *record.outputs))
+        values = np.hstack([e.inputs, e.outputs])
+        runs.append((Run(values, instants, names, len(record.inputs), record.sampling_time), e))
+    experiments, step, done, lost = prepared_experiments(runs, steps)
+    changed = replace(record, experiments=experiments, sampling_time=step, missing=record.missing + lost)
+    return replace(changed, prepared=(*record.prepared, *done))
+
+
+def check_steps(steps: Any) -> None:
+    """Raise InputError for what are no steps."""
+    if not isinstance(steps, list | tuple) or not all(type(step) in STEPS.values() for step in steps):
+        known = ", ".join(kind.__name__ for kind in STEPS.values())
+        raise InputError(f"preparation takes steps, which are {known}, each with its arguments; got {steps!r:.80}.")
+
+
+def prepared_experiments(
+    runs: Iterable[tuple[Run, Experiment]], steps: Sequence[Step], *, keep: bool = False
+) -> tuple[tuple[Experiment, ...], float, tuple[Prepared, ...], int]:
+    """Experiments after the steps, their sampling time, what was done, and how many rows are left out as missing.
+
+    Args:
+        runs: with the experiment that each was, for its place in the file.
+        keep: keep outputs that are missing.
+    """
+    found: list[Experiment] = []
+    done = [_Account(_kind(step), step) for step in steps]
+    sampling, lost, where = [], 0, ""
+    for run, place in runs:
+        for account in done:
+            try:
+                after = account.step.apply(run)
+            except InputError as error:
+                source = f"{place.source}: " if place.source else ""
+                raise InputError(f"{source}{error}") from None
+            account.count(run, after)
+            run = after
+        pieces = _pieces(run, place, keep)
+        lost += len(run.values) - sum(map(len, pieces))
+        found += pieces
+        sampling.append(run.step)
+        where = place.source
+    if not found:
+        raise InputError(f"{where + ': ' if where else ''}after preparation every row has a missing sample.")
+    if not all(same_step(step, sampling[0]) for step in sampling):
+        apart = f"{min(sampling):g} to {max(sampling):g} s"
+        raise InputError(f"after preparation samples are {apart} apart; say one `sampling_time` in `resample`.")
+    return tuple(found), sampling[0], tuple(account.told() for account in done), lost
+
+
+@dataclass(eq=False)
+class _Account:
+    """How many samples a step marked as missing or filled."""
+
+    kind: str
+    step: Any
+    marked: int = 0
+    filled: int = 0
+
+    def count(self, before: Run, after: Run) -> None:
+        if self.kind in ("outliers", "fill"):
+            old, new = np.isfinite(before.values), np.isfinite(after.values)
+            self.marked += int((old & ~new).sum())
+            self.filled += int((new & ~old).sum())
+
+    def told(self) -> Prepared:
+        return Prepared(self.kind, options_of(self.step), self.marked + self.filled)
+
+
+def _kind(step: Any) -> str:
+    return next(kind for kind in STEPS if STEPS[kind] is type(step))
+
+
+def _pieces(run: Run, place: Experiment, keep: bool) -> list[Experiment]:
+    """The stretches of rows that have all that is needed."""
+    stride = place.stride * run.stride
+    line = None if run.moved else place.first_line
+    pieces = []
+    for part in stretches(run.values[:, : run.inputs] if keep else run.values):
+        a, b = part.start, part.stop
+        first = a if run.moved else place.first_row + place.stride * run.first + stride * a
+        values = run.values[a:b]
+        where = (place.source, first, 1 if run.moved else stride, line, float(run.instants[a]), place.offset + a)
+        pieces.append(Experiment(values[:, : run.inputs], values[:, run.inputs :], *where))
+    return pieces
+
+
+def warnings_of(prepared: Sequence[Prepared], names: Sequence[str]) -> tuple[Warning, ...]:
+    """What must be known of a fit to data that were prepared so."""
+    found = []
+    for done in prepared:
+        channels = done.options.get("channels")
+        if done.step in _FILTERS and channels is not None and set(channels) != set(names):
+            found.append(
+                Warning(
+                    "filtered_alone",
+                    f"{done.step} acts on {', '.join(channels)} only: the model then explains the filter too, and θ "
+                    "is biased. Leave `channels` out, so that inputs and outputs are filtered alike.",
+                )
+            )
+        if done.step not in _FILTERS:
+            continue
+        late = ", and delays all that it acts on" if done.options.get("phase") == "causal" else ""
+        found.append(
+            Warning(
+                "filtered_noise",
+                f"{done.step} colours the noise{late}: residuals follow from one another, and one step ahead θ is "
+                "biased by that. What is nonlinear in physics or learner is not the same of filtered signals. Compare "
+                'with a fit to the data as they are, and with training.focus = "simulation".',
+            )
+        )
+    return tuple(found)

@@ -1,0 +1,146 @@
+"""Orders of a first linear model, quickly: least squares one step ahead, judged by the free run on rows held out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from orthaug._base.checks import Matrix
+from orthaug.data.record import Experiment, Record
+from orthaug.selection.orders import Orders, correlated_delay
+
+_MOST = 4  # lags of a channel
+_LOOKED_AT = 40_000  # rows
+_FITTED = 0.7  # share of the rows that a candidate is fitted to
+_AS_GOOD = 1.05  # free-run error over the best, up to which fewer lags are taken
+_RANK = 1e-9  # singular value over the largest
+PERSISTENCE = 20  # the highest order of excitation that is looked for
+_EXCITED = 1e-6  # singular value over the largest
+_DELAY = 20  # the largest delay that is looked for
+_LEVEL = 0.1  # mean over standard deviation, from which on a constant is part of the physics
+
+
+@dataclass(frozen=True, eq=False)
+class FirstModel:
+    """A linear model with an own past of na lags for each output, and what its inputs are like."""
+
+    orders: Orders
+    offset: bool
+    """Whether the signals have a level, so that the physics needs a constant."""
+    delays: tuple[int | None, ...]
+    """Of each input by its cross-correlation; None where it is not seen."""
+    persistence: tuple[int, ...]
+    """Up to which order each input excites; `PERSISTENCE` stands for that or more."""
+    free_run: tuple[float, ...]
+    """Error of the free run on rows held out over the output's standard deviation, for each output."""
+
+
+def first_model(record: Record) -> FirstModel | None:
+    """Delays, excitation and orders for a record; None where it has too few rows for any model.
+
+    The orders are the smallest whose free run is within 5 % of the best of up to 4 lags a channel.
+    """
+    record = replace(record, experiments=_first_rows(record.experiments, _LOOKED_AT))
+    signals = np.concatenate([np.hstack([e.outputs, e.inputs]) for e in record.experiments])
+    offset = bool((np.abs(signals.mean(axis=0)) > _LEVEL * signals.std(axis=0)).any())
+    delays = tuple(_delay(record, i) for i in range(len(record.inputs)))
+    excited = tuple(_persistence(record, i) for i in range(len(record.inputs)))
+    usual = [tuple(late if delay is None else delay for delay in delays) for late in (1, 0)]
+    best: list[tuple[float, int, Orders, tuple[float, ...]]] = []
+    for nk in dict.fromkeys(
+        [*usual, *((late,) * len(delays) for late in (1, 0))]
+    ):  # a correlation may miss the first lags
+        for na, n in product(range(_MOST + 1), range(1, _MOST + 1) if record.inputs else [0]):
+            orders = Orders(na, tuple(max(1, min(n, order)) for order in excited), nk)
+            errors = _errors(record, orders, offset)
+            if errors is not None and orders.size:
+                best.append((float(np.mean(errors)), orders.size, orders, errors))
+    if not best:
+        return None
+    least = min(error for error, *_ in best)
+    near = [one for one in best if one[0] <= _AS_GOOD * least]
+    _, _, orders, errors = min(near, key=lambda one: (one[1], one[0]))
+    return FirstModel(orders, offset, delays, excited, errors)
+
+
+def _first_rows(experiments: tuple[Experiment, ...], most: int) -> tuple[Experiment, ...]:
+    found, left = [], most
+    for experiment in experiments:
+        if left > 0:
+            found.append(experiment.rows(0, left))
+        left -= len(experiment)
+    return tuple(found)
+
+
+def _delay(record: Record, number: int) -> int | None:
+    """The shortest delay with which an input acts on any output."""
+    long = tuple(e for e in record.experiments if len(e) > 2 * _DELAY)
+    found = []
+    for j, output in enumerate(record.outputs):
+        own = tuple(replace(e, outputs=e.outputs[:, [j]]) for e in long)
+        if own:
+            found.append(correlated_delay(replace(record, outputs=(output,), experiments=own), number, _DELAY))
+    seen = [lag for lag in found if lag is not None]
+    return min(seen) if seen else None
+
+
+def _persistence(record: Record, number: int) -> int:
+    """Rank of the matrix of an input's lags, its mean removed."""
+    longest = max(record.experiments, key=len).inputs[:, number]
+    n = min(PERSISTENCE, len(longest) // 3)
+    if n < 1:
+        return 1
+    lagged = np.lib.stride_tricks.sliding_window_view(longest - longest.mean(), n)
+    values = np.linalg.svd(np.linalg.qr(lagged, mode="r"), compute_uv=False)
+    return int((values > _EXCITED * values[0]).sum()) if values[0] > 0 else 0
+
+
+def _errors(record: Record, orders: Orders, offset: bool) -> tuple[float, ...] | None:
+    """Error of the free run on the last rows for each output; None where it cannot be fitted, or runs away."""
+    first = max([orders.na, *(nb + nk - 1 for nb, nk in zip(orders.nb, orders.nk, strict=True))])
+    usable = [e for e in record.experiments if len(e) > first + 1]
+    rows = sum(len(e) - first for e in usable)
+    cut, found = int(_FITTED * rows), []
+    for j in range(len(record.outputs)):
+        columns = orders.size + offset
+        if cut < 2 * columns or rows - cut < 2:
+            return None
+        phi = np.concatenate([_rows(e, j, orders, first, offset) for e in usable])
+        y = np.concatenate([e.outputs[first:, j] for e in usable])
+        scale = np.maximum(np.linalg.norm(phi[:cut], axis=0), 1e-300)
+        theta, _, rank, _ = np.linalg.lstsq(phi[:cut] / scale, y[:cut], rcond=_RANK)
+        if rank < columns:
+            return None
+        theta = theta / scale
+        if record.inputs:
+            flown = np.concatenate([_free_run(e, j, theta, orders, first, offset) for e in usable])
+        else:
+            flown = phi @ theta
+        with np.errstate(all="ignore"):  # one that is not stable overflows
+            wrong = float(np.sqrt(np.mean((flown[cut:] - y[cut:]) ** 2)))
+        if not np.isfinite(wrong):
+            return None
+        found.append(wrong / max(float(y.std()), 1e-300))
+    return tuple(found)
+
+
+def _rows(e: Experiment, j: int, orders: Orders, first: int, offset: bool) -> Matrix:
+    """Own past, inputs from their delays on, and 1."""
+    count = len(e) - first
+    columns = [e.outputs[first - i : first - i + count, j] for i in range(1, orders.na + 1)]
+    for i, (nb, nk) in enumerate(zip(orders.nb, orders.nk, strict=True)):
+        columns += [e.inputs[first - lag : first - lag + count, i] for lag in range(nk, nk + nb)]
+    return np.stack([*columns, *([np.ones(count)] if offset else [])], axis=1)
+
+
+def _free_run(e: Experiment, j: int, theta: np.ndarray, orders: Orders, first: int, offset: bool) -> np.ndarray:
+    """The output from its first measured rows on."""
+    from scipy.signal import lfilter, lfiltic
+
+    driven = _rows(e, j, orders, first, offset)[:, orders.na :] @ theta[orders.na :]
+    taps = np.concatenate([[1.0], -theta[: orders.na]])
+    with np.errstate(all="ignore"):
+        start = lfiltic([1.0], taps, e.outputs[first - 1 :: -1, j][: orders.na] if first else np.empty(0))
+        return lfilter([1.0], taps, driven, zi=start)[0]

@@ -1,0 +1,171 @@
+"""`orthaug init`: what stands in a file is seen, and the spec that is written runs."""
+
+from __future__ import annotations
+
+import io
+import sys
+import tomllib
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.io
+import scipy.signal
+from test_cli import run
+
+from orthaug.data.survey import channel_name, split_header, survey
+from orthaug.data.tables import column_names
+
+
+def plant(rows: int = 600) -> tuple[np.ndarray, np.ndarray]:
+    """y_k = 1.5 y_{k-1} − 0.7 y_{k-2} + 0.4 u_{k-3}, with noise on the sensor."""
+    rng = np.random.default_rng(4)
+    u = rng.normal(size=rows)
+    return u, scipy.signal.lfilter([0, 0, 0, 0.4], [1, -1.5, 0.7], u) + 1e-3 * rng.normal(size=rows)
+
+
+@pytest.fixture
+def csv(tmp_path):
+    u, y = plant()
+    frame = pd.DataFrame({"time [ms]": 10.0 * np.arange(len(u)), "force [N]": np.clip(u, -1.5, 1.5)})
+    frame["force [N]"] = u.clip(-1.5, None)
+    frame["position_mm"], frame["gain"], frame["note"] = y, 2.0, "ok"
+    frame.loc[40:43, "position_mm"] = np.nan
+    path = tmp_path / "run 1.csv"
+    frame.to_csv(path, index=False)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("header", "parts"),
+    [
+        ("force [N]", ("force", "N")),
+        ("force (N)", ("force", "N")),
+        ("force_N", ("force", "N")),
+        ("speed_rad_s", ("speed", "rad/s")),
+        ("U[2]", ("U[2]", "")),
+        ("U[2,:]", ("U[2,:]", "")),
+        ("motor_left", ("motor_left", "")),
+        ("[N]", ("[N]", "")),
+    ],
+)
+def test_units_of_headers(header, parts):
+    assert split_header(header) == parts
+
+
+def test_names_of_channels_are_identifiers():
+    texts = ["Kraft 1", "2nd", "sin", "lambda", "time", "Ts", "U[2]", "…", "Kraft-1"]
+    names: list[str] = []
+    for text in texts:
+        names.append(channel_name(text, names))
+    assert names == ["Kraft_1", "x2nd", "sin_", "lambda_", "time_", "Ts_", "U_2", "channel", "Kraft_1_2"]
+
+
+def test_columns_of_every_kind_of_file(tmp_path):
+    frame = pd.DataFrame({"u": np.arange(4.0), "y": np.ones(4)})
+    frame.to_parquet(tmp_path / "a.parquet")
+    frame.to_excel(tmp_path / "a.xlsx", index=False)
+    (tmp_path / "a.csv").write_text("u;y;\n1,5;2;\n")
+    assert [column_names(tmp_path / f"a.{end}") for end in ("parquet", "xlsx", "csv")] == [["u", "y"]] * 3
+    wide = {"U": np.ones((9, 2)), "W": np.ones((2, 9)), "v": np.ones(9), "one": 3.0, "cube": np.ones((2, 2, 2))}
+    np.savez(tmp_path / "a.npz", **wide)
+    assert column_names(tmp_path / "a.npz") == ["U[0]", "U[1]", "W[0,:]", "W[1,:]", "v"]
+    scipy.io.savemat(tmp_path / "a.mat", {"data": {"u": np.ones(5)}, "v": np.ones(9), "name": "x"})
+    assert column_names(tmp_path / "a.mat") == ["data.u", "v"]
+
+
+def test_a_file_is_seen_and_its_spec_runs(csv, tmp_path):
+    out = tmp_path / "spec.toml"
+    done = run("init", csv, "--inputs", "force", "--outputs", "position_mm", "--out", out)
+    assert done.code == 0, done.err
+    for told in (
+        "sampling time: 0.01 s, from column 'time [ms]'",
+        "rows at -1.5, perhaps a limit",
+        "position = column 'position_mm'",
+        "4 cells missing",
+        "left out: gain (constant)",
+        "left out: note (no numbers)",
+        "significant at lag 3",
+        "na 2, nb 1, nk 3",
+        "test: rows 450 to 600",
+    ):
+        assert told in done.out, told
+    assert "rows at 1.5" not in done.out
+    spec = tomllib.loads(out.read_text())
+    assert spec["data"]["missing"] == "skip" and spec["data"]["sampling_time"] == 0.01
+    assert spec["data"]["channels"]["position"] == {"column": "position_mm", "unit": "mm"}
+    assert [t["regressor"] for t in spec["baseline"]["terms"]] == ["position[k-1]", "position[k-2]", "force[k-3]"]
+    assert run("check", out).code == 0
+    assert run("init", csv, "--inputs", "force", "--outputs", "position", "--out", out).code == 2
+    assert run("init", csv, "--inputs", "force", "--outputs", "position", "--out", out, "--force").code == 0
+
+
+REFUSED = [
+    ((), "the names of the columns do not tell inputs from outputs: force [N], position_mm. Say both"),
+    (("--inputs", "force"), "Say both"),
+    (("--inputs", "force", "--outputs", "speed"), "no column 'speed'; the file has time [ms], force [N]"),
+    (("--inputs", "gain", "--outputs", "position"), "column 'gain' is 2 in every row; leave it out"),
+    (("--inputs", "note", "--outputs", "position"), "column 'note' holds no numbers"),
+    (("--inputs", "force", "--outputs", "force_,force"), "no column 'force_'"),
+    (("--inputs", "force", "--outputs", "force [N]"), "'force [N]' is named twice"),
+    (("--inputs", "time [ms]", "--outputs", "position"), "is the time; it is no channel"),
+    (("--inputs", "force", "--outputs", ","), "no output is named"),
+    (("--inputs", "force", "--outputs", "position", "--sampling-time", "0"), "the sampling time must be a positive"),
+]
+
+
+@pytest.mark.parametrize(("options", "message"), REFUSED, ids=range(len(REFUSED)))
+def test_what_cannot_be_written_is_said(csv, tmp_path, monkeypatch, options, message):
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    done = run("init", csv, *options, "--out", tmp_path / "spec.toml")
+    assert done.code == 2 and message in done.err
+    assert not (tmp_path / "spec.toml").exists()
+
+
+def test_on_a_terminal_it_asks(tmp_path, monkeypatch):
+    u, y = plant(300)
+    pd.DataFrame({"force": u, "position": y}).to_csv(tmp_path / "a.csv", index=False)
+    terminal = io.StringIO("force\nposition\n0.02\n")
+    terminal.isatty = lambda: True  # type: ignore[method-assign]
+    monkeypatch.setattr(sys, "stdin", terminal)
+    done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
+    assert done.code == 0, done.err
+    assert "columns: force, position" in done.err and "0.02 s, as given" in done.out
+
+
+def test_names_that_say_it_are_enough_and_few_rows_are_refused(tmp_path):
+    u, y = plant(300)
+    pd.DataFrame({"t": 0.5 * np.arange(300), "u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
+    assert run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml").code == 0
+    data = tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
+    assert (data["time"], data["inputs"], data["outputs"]) == ("t", ["u"], ["y"])
+    pd.DataFrame({"u": u[:3], "y": y[:3]}).to_csv(tmp_path / "b.csv", index=False)
+    done = run("init", tmp_path / "b.csv", "--out", tmp_path / "b.toml")
+    assert done.code == 2 and "3 usable rows are too few" in done.err and not (tmp_path / "b.toml").exists()
+
+
+def test_what_is_seen_of_a_column(tmp_path):
+    rng = np.random.default_rng(0)
+    square, coarse = np.sign(rng.normal(size=400)), np.round(rng.normal(size=400), 1)
+    frame = pd.DataFrame({"t": np.arange(400.0) + (np.arange(400) > 200), "square": square, "coarse": coarse})
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    found = survey(tmp_path / "a.csv")
+    assert not found.clock.even and found.clock.step == 1.0 and "uneven" in str(found.clock)
+    held = np.repeat(rng.normal(size=40), 10)
+    pd.DataFrame({"held": np.convolve(held, [0.5, 0.5], "same")}).to_csv(tmp_path / "b.csv", index=False)
+    assert survey(tmp_path / "b.csv").find("held").limits == ()  # an input between its steps is at no limit
+    assert found.find("square").limits == () and found.find("square").quantum is None
+    assert found.find("coarse").quantum == pytest.approx(0.1)
+
+
+def test_uneven_instants_are_resampled(tmp_path):
+    u, y = plant(300)
+    t = 0.1 * np.arange(300.0)
+    t[200:] += 0.06
+    y[77] += 50.0
+    pd.DataFrame({"t": t, "u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
+    done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
+    assert done.code == 0 and "but the steps are uneven" in done.out, done.err
+    data = tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
+    assert [step["step"] for step in data["prepare"]] == ["outliers", "fill", "resample"] and data["time"] == "t"
+    assert data["prepare"][-1]["sampling_time"] == 0.1 and "1 samples far from all their neighbours" in done.out
