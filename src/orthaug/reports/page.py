@@ -3,23 +3,109 @@
 from __future__ import annotations
 
 import base64
+import gzip
+import importlib.util
 import json
+import math
+from collections.abc import Sequence
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import jinja2
 
-from orthaug.reports.result import FitResult
+from orthaug.reports.fields import WarningResult
+from orthaug.reports.page_blocks import Plot, Section, plots_of
+from orthaug.reports.page_compare import ComparePage, compare_sections
+from orthaug.reports.page_fit import FitPage, Origin, fit_sections
+from orthaug.reports.page_verdict import PageVerdict, compare_verdict, fit_verdict
+
+_TOLD_ELSEWHERE = ("witness", "free_run_diverged", "residual_not_analysed")
 
 
-def page(name: str, result: FitResult, figures: Path) -> str:
-    """One HTML file of a result, with the figures of a folder inside."""
-    source = files("orthaug.reports").joinpath("templates/report.html").read_text(encoding="utf-8")
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    return environment.from_string(source).render(
-        name=name,
-        result=result,
-        figures={p.stem: base64.b64encode(p.read_bytes()).decode() for p in sorted(figures.glob("*.png"))},
-        spec=json.dumps(result.spec, indent=1, ensure_ascii=False),
-        number=lambda value, digits=6: "–" if value is None else f"{value:.{digits}g}",
+def fit_page(page: FitPage) -> str:
+    """The page of a fit."""
+    title = f"{page.origin.name}: model of {', '.join(page.outputs)}"
+    result = page.result
+    kind = f"{result.structure} structure" + (f", {result.measure} measure" if result.measure else "")
+    warnings = [w for w in result.warnings if w.code not in _TOLD_ELSEWHERE]
+    return _page(
+        title,
+        kind,
+        fit_verdict(result),
+        warnings,
+        fit_sections(page),
+        page.origin,
+        result.validation.text if result.validation else "",
     )
+
+
+def compare_page(page: ComparePage) -> str:
+    """The page of a comparison."""
+    title = f"{page.origin.name}: {len(page.result.comparison)} models of {', '.join(page.outputs)} compared"
+    verdict = compare_verdict(page.result)
+    return _page(title, "comparison", verdict, page.result.warnings, compare_sections(page), page.origin, "")
+
+
+def _page(
+    title: str,
+    kind: str,
+    verdict: PageVerdict,
+    warnings: Sequence[WarningResult],
+    sections: Sequence[Section],
+    origin: Origin,
+    judged: str,
+) -> str:
+    plots = plots_of(sections)
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.from_string(_template("page.html")).render(
+        title=title,
+        kind=kind,
+        verdict=verdict,
+        judged=judged,
+        warnings=list(dict.fromkeys(w.text for w in warnings)),
+        sections=sections,
+        origin=origin,
+        number_of={id(plot): i for i, plot in enumerate(plots)},
+        key=id,
+        kind_of=lambda block: type(block).__name__,
+        style=_template("page.css"),
+        script=_template("page.js"),
+        figures=_embedded([_figure(plot) for plot in plots]),
+        plotly=_plotly(),
+    )
+
+
+def _figure(plot: Plot) -> dict[str, Any]:
+    return {"data": plot.traces, "layout": plot.layout, "height": plot.height, "small": plot.small}
+
+
+def _embedded(content: Any) -> str:
+    """JSON that stands in a script element: finite, and without anything that would end it."""
+    text = json.dumps(_finite(content), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+
+
+def _finite(content: Any) -> Any:
+    """None for numbers that JSON does not have."""
+    if isinstance(content, float):
+        return content if math.isfinite(content) else None
+    if isinstance(content, dict):
+        return {key: _finite(value) for key, value in content.items()}
+    return [_finite(value) for value in content] if isinstance(content, list | tuple) else content
+
+
+def _template(name: str) -> str:
+    return files("orthaug.reports").joinpath("templates", name).read_text(encoding="utf-8")
+
+
+@cache
+def _plotly() -> str:
+    """Plotly's script of its package, compressed, for the page to unpack; the package itself is not imported."""
+    found = importlib.util.find_spec("plotly")
+    assert found is not None and found.submodule_search_locations
+    script = Path(found.submodule_search_locations[0]) / "package_data" / "plotly.min.js"
+    return base64.b64encode(gzip.compress(script.read_bytes(), 6, mtime=0)).decode()
