@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+from markupsafe import Markup, escape
 
 from orthaug.reports.fields import WarningResult
 from orthaug.reports.page_blocks import Plot, Section, plots_of
@@ -71,12 +72,21 @@ def _page(
         origin=origin,
         number_of={id(plot): i for i, plot in enumerate(plots)},
         key=id,
+        ticked=_ticked,
         kind_of=lambda block: type(block).__name__,
         style=_template("page.css"),
         script=_template("page.js"),
         figures=_embedded([_figure(plot) for plot in plots]),
         plotly=_plotly(),
     )
+
+
+def _ticked(text: str) -> Markup:
+    """Text in which what stands between backticks is code."""
+    parts = [
+        Markup("<code>{}</code>").format(part) if i % 2 else escape(part) for i, part in enumerate(text.split("`"))
+    ]
+    return Markup("").join(parts) if len(parts) % 2 else escape(text)
 
 
 def _figure(plot: Plot) -> dict[str, Any]:

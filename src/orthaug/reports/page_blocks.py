@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+_LARGE = 7  # digits before the point from which a power of ten is written
+_RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _ROUNDING = 1e-12  # of its scale: a number below is rounding of zero
 
 
@@ -13,9 +15,15 @@ def number(value: float | None, digits: int = 5, scale: float | None = None) -> 
     """A cell; 0 for what is rounding beside a `scale`, a dash where there is no number."""
     if value is None:
         return "–"
-    if scale is not None and abs(value) <= _ROUNDING * abs(scale):
+    if value == 0 or (scale is not None and abs(value) <= _ROUNDING * abs(scale)):
         return "0"
-    return f"{value:.{digits}g}".replace("-", "−")
+    text = f"{value:.{digits}g}"
+    mantissa, _, power = text.partition("e")
+    if power and 0 < int(power) < _LARGE:
+        text = f"{float(text):.0f}"
+    elif power:
+        text = f"{mantissa}·10{str(int(power)).translate(_RAISED)}"
+    return text.replace("-", "−")
 
 
 def interval(ends: Sequence[float | None] | None, digits: int = 5) -> str:

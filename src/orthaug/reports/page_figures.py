@@ -75,12 +75,13 @@ def interval_plot(rows: Sequence[ParameterResult]) -> Plot | None:
             "anchor": own["xaxis"],
             "range": [-1, 1],
             "tickvals": [0],
-            "ticktext": [f"<b>{with_unit(row.name, row.unit)}</b>"],
+            "ticktext": [_tick(row)],
             "fixedrange": True,
             "showgrid": False,
             "zeroline": False,
         }
-        layout[f"xaxis{i + 1}" if i else "xaxis"] = {"anchor": own["yaxis"], "nticks": 6, "zeroline": False}
+        axis = {"anchor": own["yaxis"], "nticks": 6, "zeroline": False, "range": _reach(row)}
+        layout[f"xaxis{i + 1}" if i else "xaxis"] = axis
     caption = (
         "Every parameter on an axis of its own: the circle is the estimate, the thick bar its 95 % interval"
         + ("; the thin bar covers its bias too." if told else ".")
@@ -92,6 +93,21 @@ def interval_plot(rows: Sequence[ParameterResult]) -> Plot | None:
 
 def _first(rows: Sequence[ParameterResult]) -> int:
     return next((i for i, row in enumerate(rows) if row.ci95_with_bias), 0)
+
+
+def _tick(row: ParameterResult) -> str:
+    """The name of a parameter, and half its interval in per cent of it."""
+    low, high = row.ci95 or (None, None)
+    half = None if low is None or high is None or not row.value else abs((high - low) / (2 * row.value))
+    return f"<b>{with_unit(row.name, row.unit)}</b>" + ("" if half is None else f"<br>± {percent(half)}")
+
+
+def _reach(row: ParameterResult) -> list[float]:
+    """What the axis of a parameter shows: its intervals with a margin, and the initial value where it is near."""
+    ends = [row.value, *(row.ci95 or ()), *(row.ci95_with_bias or ()), row.initial if _near(row) else None]
+    known = [end for end in ends if end is not None]
+    margin = 0.35 * max(max(known) - min(known), 1e-300)
+    return [min(known) - margin, max(known) + margin]
 
 
 def _near(row: ParameterResult) -> bool:
@@ -196,7 +212,7 @@ def residual_plots(test: ResidualTestResult, what: str) -> list[Plot]:
                 }
             )
         band = max(cross.band or 0.0 for cross in shown.values())
-        told = f"Correlation of the {what} of {test.name} with the inputs before it; beyond the band it is more than noise."
+        told = f"Correlation of the {what} of {test.name} with the inputs; beyond the band it is more than noise."
         layout = _titled("lag behind the input [samples]", "correlation") | {"shapes": [_band(band)]}
         layout["showlegend"] = True
         label = f"Correlation of the {what} of {test.name} with the inputs."
@@ -274,8 +290,9 @@ def restart_plot(restarts: Sequence[RestartResult]) -> Plot | None:
     losses = [run.loss for run in restarts if run.loss]
     wide = bool(losses) and max(losses) > _DECADES * min(losses) > 0
     layout = _titled("run", "loss") | {"showlegend": False}
-    layout["yaxis"]["type"] = "log" if wide else "linear"
-    caption = "The loss that every start came to; the large dot is the one that was chosen. Where several starts end at the same loss, it is hardly a poor minimum."
+    layout["yaxis"] = {"title": {"text": "loss"}, "type": "log" if wide else "linear"}
+    caption = "The loss that every start came to; the large dot is the chosen one. "
+    caption += "Where several starts end at the same loss, it is hardly a poor minimum."
     return Plot("Loss of every start.", caption, [dots], layout, 260)
 
 

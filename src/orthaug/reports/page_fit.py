@@ -163,12 +163,16 @@ def _runs(page: FitPage) -> list[Any]:
     runs = [Run(part, free, page.alone.get(part)) for part, (_, free) in page.responses.items()]
     train = next(iter(page.responses.values()))[1]
     notes = [Text(w.text, "warning") for w in page.result.warnings if w.code in ("witness", "free_run_diverged")]
+    band, alone = error_band(train), bool(page.alone)
+    told = "A model in free run sees the inputs alone and lives on its own past; the residual is measured less model."
+    told += " Physics alone is the same model with the learner switched off." if alone else ""
+    told += " Between the limits of the band lie 95 % of the errors on the training data." if band else ""
     how = Text(
         "Drag over a stretch to zoom, double-click for the whole record; with the keyboard the arrows move, "
         "+ and − zoom, 0 shows all.",
         "note",
     )
-    return [*notes, how, *run_plots(runs, error_band(train))]
+    return [*notes, Text(told), how, *run_plots(runs, band)]
 
 
 def _shares(page: FitPage) -> list[Any]:
@@ -206,7 +210,9 @@ def _shares(page: FitPage) -> list[Any]:
         "xaxis": {"title": {"text": "share of the two RMS [%]"}, "range": [0, 100]},
         "yaxis": {"autorange": "reversed", "automargin": True, "type": "category"},
     }
-    caption = "How the RMS of physics and learner divide. The learner of an orthogonal structure holds only what the physics cannot."
+    caption = "How the RMS of physics and learner divide."
+    if result.structure == "orthogonal":
+        caption += " The learner holds only what the physics cannot: its overlap with the physics is split off."
     plot = Plot(
         "Shares of physics and learner; the table has the numbers.", caption, bars, layout, 110 + 34 * len(rows)
     )
@@ -301,7 +307,8 @@ def _stability(result: FitResult) -> list[Any]:
 
 def _excitation(result: FitResult) -> list[Any]:
     seen = result.excitation
-    told = f"The data tell {seen.rank} of {seen.columns} parameters apart; the condition number is {number(seen.condition, 3)}."
+    told = f"The data tell {seen.rank} of {seen.columns} parameters apart; "
+    told += f"the condition number is {number(seen.condition, 3)}."
     if result.orthogonality_defect is not None:
         small = result.orthogonality_defect < 1e-10
         shown = "0 up to rounding" if small else number(result.orthogonality_defect, 2)
@@ -327,11 +334,15 @@ def _excitation(result: FitResult) -> list[Any]:
     return blocks
 
 
+def _sentence(text: str) -> str:
+    return f"{text[0].upper()}{text[1:].rstrip('.')}." if text else ""
+
+
 def _restarts(result: FitResult) -> list[Any]:
     status = result.status
     told = (
         f"Training ended with “{status.code.replace('_', ' ')}” after {status.iterations} iterations and "
-        f"{number(status.seconds, 3)} s. {status.message + '.' if status.message else ''}"
+        f"{number(status.seconds, 3)} s. {_sentence(status.message)}"
     )
     fall = f" The loss is {number(status.loss, 4)}; that of physics alone was {number(status.start_loss, 4)}."
     head = ["seed", "regularization", "loss", "validation", "iterations", "ended", "chosen"]

@@ -184,7 +184,7 @@ def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
     _mark(layout, run, start, step)
     return Plot(
         _label(run),
-        _caption(run, limits=bool(band), most=most),
+        _caption(run, most),
         traces,
         layout,
         height=60 + _PANEL * len(response.outputs),
@@ -300,19 +300,12 @@ def _label(run: Run) -> str:
     return f"Free run on {run.part}: {outputs} over time, {shown}, with the residual below."
 
 
-def _caption(run: Run, *, limits: bool, most: int) -> str:
+def _caption(run: Run, most: int) -> str:
     """What is drawn, in sentences."""
     response = run.response
     rows, count = sum(len(t.model) for t in response.trajectories), len(response.trajectories)
     files = f" of {count} experiments" if count > 1 else ""
-    told = [
-        f"The free run on {run.part}, all {rows} samples{files}: the model sees the inputs alone and lives on its "
-        "own past; the residual, measured less model, stands under it on the same time axis."
-    ]
-    if run.alone is not None:
-        told.append("Physics alone is the same model with the learner switched off.")
-    if limits:
-        told.append("Between the limits of the band lie 95 % of the errors on the training data.")
+    told = [f"The free run on {run.part}, all {rows} samples{files}, and the residual under it on the same time axis."]
     if rows > most:
         told.append(
             f"Of each curve {number(most, 3)} points are kept, the least and the largest value of every stretch."

@@ -1,4 +1,4 @@
-"""The verdict that a page begins with, in three sentences: is the model to be trusted, for what, and what comes next."""
+"""The verdict that a page begins with, in three sentences: is the model to be trusted, for what, what comes next."""
 
 from __future__ import annotations
 
@@ -75,10 +75,10 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
 
 def _after_comparison(result: CompareResult, row: RowResult) -> str:
     if row.residuals is not None and row.residuals.changes:
-        return f"Next: {_change(row.residuals.changes[0])}."
+        return f"{_change(row.residuals.changes[0])}."
     if not result.data.tests and not result.data.validation:
-        return "Next: hold out a test part, on which the models can be judged."
-    return f"Next: fit it alone with `orthaug fit` and structure “{row.name}”, whose report has its residuals and bias."
+        return "Hold out a test part, on which the models can be judged."
+    return f"Fit it alone with `orthaug fit` and structure “{row.name}”, whose report has its residuals and bias."
 
 
 def _word(row: RowResult) -> str:
@@ -92,7 +92,7 @@ def _told_error(error: float, part: str) -> str:
 
 
 def _worst(scores: dict[str, PartScores]) -> tuple[float | None, str]:
-    """NRMSE of the free run on the held-out part where it is largest, RMS over outputs; of training if there is none."""
+    """NRMSE of the free run on the held-out part where it is largest, RMS over outputs; of training if none is."""
     held_out = {part: score for part, score in scores.items() if part != "train"} or scores
     found = {}
     for part, score in held_out.items():
@@ -144,24 +144,28 @@ def _biased(row: ParameterResult) -> bool:
 
 
 def _use(result: FitResult, level: str) -> str:
-    known = [
-        row.name
-        for row in _rows(result)
-        if row.value and row.std is not None and row.std <= _SURE * abs(row.value) and not _biased(row)
-    ]
-    others = [row.name for row in _rows(result) if row.name not in known]
-    read = ""
-    if known:
-        read = f" and to read {_joined(known)} as physics"
-    unread = f", not {_joined(others)}" if known and others else ""
-    flown = (
-        "predict the next sample" if level == "bad" else "simulate and predict within the range of its training data"
-    )
-    return (
-        f"Use it to {flown}{read}{unread}."
-        if level != "bad" or known
-        else "Use it for nothing but to look for what is missing."
-    )
+    rows = _rows(result)
+    known = [row.name for row in rows if _known(row)]
+    shared = [row.name for row in rows if row.shared]
+    others = [row.name for row in rows if row.name not in (*known, *shared)]
+    if level == "bad" and not known:
+        return "Use it for nothing but to look for what is missing."
+    told = "predict the next sample" if level == "bad" else "simulate and predict within the range of its training data"
+    told += f" and to read {_joined(known)} as physics" if known else ""
+    told += f"; {_joined(others)} {_is(others)} too uncertain or biased for that" if others else ""
+    if shared:
+        told += f"; {_joined(shared)} {_is(shared)} the nearest physics only, for the learner could imitate the rest"
+    return f"Use it to {told}."
+
+
+def _known(row: ParameterResult) -> bool:
+    """Whether a parameter may be read as physics."""
+    sure = row.std is not None and row.value is not None and 0 < row.std <= _SURE * abs(row.value)
+    return sure and not row.shared and not _biased(row)
+
+
+def _is(names: list[str]) -> str:
+    return "is" if len(names) == 1 else "are"
 
 
 def _then(result: FitResult) -> str:
@@ -170,29 +174,31 @@ def _then(result: FitResult) -> str:
     missing = result.residuals.missing.terms if result.residuals and result.residuals.missing else []
     significant = result.residuals is not None and result.residuals.verdict == "unmodelled"
     if _code(result) == "hurts":
-        return 'Next: take physics alone (`learner.kind = "none"`), or give the learner other inputs or fewer neurons.'
+        return 'Take physics alone (`learner.kind = "none"`), or give the learner other inputs or fewer neurons.'
     if missing and significant:
-        return f"Next: add {missing[0].expression} to the equation of {missing[0].equation}."
+        return f"Add {missing[0].expression} to the equation of {missing[0].equation}."
     if result.residuals is not None and result.residuals.changes:
-        return f"Next: {_change(result.residuals.changes[0])}."
+        return f"{_change(result.residuals.changes[0])}."
     if cause is not None:
-        return f"Next: add “{cause.cause}” to the physics, for it explains {percent(cause.share)} of what was learned."
+        return f"Add “{cause.cause}” to the physics, for it explains {percent(cause.share)} of what was learned."
     if _ran_away(result):
-        return 'Next: train on the free run (`focus = "simulation"`), or record data over the range that it leaves.'
+        return 'Train on the free run (`focus = "simulation"`), or record data over the range that it leaves.'
     if not result.data.tests and not result.data.validation:
-        return "Next: hold out a test part (`[data.tests.NAME]`), on which the model can be judged."
+        return "Hold out a test part (`[data.tests.NAME]`), on which the model can be judged."
     if result.status.code == "iteration_limit":
-        return "Next: give training more iterations (`training.iterations`)."
+        return "Give training more iterations (`training.iterations`)."
     if result.validation is not None and result.validation.extrapolation:
         entry = result.validation.extrapolation[0]
         low, high = entry.found
-        return f"Next: record training data that reach {entry.regressor} from {number(low, 3)} to {number(high, 3)}."
-    return "Next: nothing further is predicted to help; export it (`orthaug export`) or design the next experiment."
+        return f"Record training data that reach {entry.regressor} from {number(low, 3)} to {number(high, 3)}."
+    return "Nothing further is predicted to help; export it (`orthaug export`) or design the next experiment."
 
 
 def _change(change: object) -> str:
+    """A change that is predicted to help, as the beginning of a sentence."""
     told = {key: getattr(change, key) for key in ("kind", "what", "fall", "of", "output")}
-    return str(Change(**{**told, "fall": told["fall"] or 0.0}))
+    text = str(Change(**{**told, "fall": told["fall"] or 0.0}))
+    return text[0].upper() + text[1:]
 
 
 def _joined(words: list[str]) -> str:
