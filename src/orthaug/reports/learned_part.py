@@ -130,15 +130,17 @@ class LearnedPart:
         half = None if self.reach is None else self.reach(rows)
         return Curve(along, (along >= low) & (along <= high), self.at(rows), half)
 
-    def tied(self, feature: str) -> bool:
-        """Whether the data move another feature along with it, so that they hold nothing with the others at rest."""
-        place = self.features.index(feature)
-        moving = self.seen.std(axis=0) > 0
-        if not moving[place] or moving.sum() < 2:
-            return False
-        others = np.delete(np.flatnonzero(moving), np.flatnonzero(np.flatnonzero(moving) == place))
-        own = self.seen[:, place]
-        return any(abs(np.corrcoef(own, self.seen[:, j])[0, 1]) > _TIED for j in others)
+    def tied(self, feature: str, but: str = "") -> bool:
+        """Whether the data move another feature along with it, `but` one: then they hold nothing with that at rest."""
+        moving = [name for name, spread in zip(self.features, self.seen.std(axis=0), strict=True) if spread > 0]
+        own = self.seen[:, self.features.index(feature)]
+        others = [self.seen[:, self.features.index(n)] for n in moving if n not in (feature, but)]
+        return feature in moving and any(abs(np.corrcoef(own, other)[0, 1]) > _TIED for other in others)
+
+    def alone(self, across: str, along: str) -> bool:
+        """Whether two features are variables that can be moved with all else at rest."""
+        known = across in self.variables and along in self.variables
+        return known and not self.tied(across, along) and not self.tied(along, across)
 
     def means(self, feature: str) -> tuple[Vector, Matrix]:
         """Means of feature and learned part over bins of the feature of equally many points, (k,) and (k, nl)."""
@@ -158,13 +160,13 @@ class LearnedPart:
         return [self.features[j] for j in order]
 
     def surface(self, across: str, along: str) -> Surface:
-        """Over two features where data are near; of expressions the mean of the data in each cell."""
+        """Over two features where data are near; of such that do not move alone the mean of the data in each cell."""
         pair = self.seen[:, [self.features.index(across), self.features.index(along)]]
         low, high = pair.min(axis=0), pair.max(axis=0)
         width = np.maximum(high - low, 1e-300)
         cells = np.minimum((_CELLS * (pair - low) / width).astype(int), _CELLS - 1)
         first, second = (low[k] + width[k] * (np.arange(_CELLS) + 0.5) / _CELLS for k in (0, 1))
-        if across in self.variables and along in self.variables:
+        if self.alone(across, along):
             rows = np.tile(np.median(self.points, axis=0), (_CELLS * _CELLS, 1))
             rows[:, self.variables.index(across)] = np.repeat(first, _CELLS)
             rows[:, self.variables.index(along)] = np.tile(second, _CELLS)

@@ -90,7 +90,13 @@ def _ticked(text: str) -> Markup:
 
 
 def _figure(plot: Plot) -> dict[str, Any]:
-    return {"data": plot.traces, "layout": plot.layout, "height": plot.height, "small": plot.small}
+    return {
+        "data": plot.traces,
+        "layout": plot.layout,
+        "height": plot.height,
+        "small": plot.small,
+        "series": plot.series,
+    }
 
 
 def _embedded(content: Any) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -85,6 +85,8 @@ class Plot:
     layout: dict[str, Any] = field(default_factory=dict)
     height: int = 320
     small: bool = False
+    series: Mapping[str, Any] = field(default_factory=dict)
+    """Long curves by a name that traces give."""
 
 
 @dataclass(frozen=True)

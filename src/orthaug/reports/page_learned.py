@@ -35,16 +35,13 @@ def learned_blocks(part: LearnedPart, measure: str) -> list[Text | Grid | Plot]:
 
 def _told(part: LearnedPart, ranked: list[str], shares: Any, measure: str) -> str:
     explained = shares.max(axis=1)
-    first = ranked[0]
-    told = f"The learner sees {', '.join(part.features)}. "
-    told += f"Means over {first} alone explain {percent(explained[part.features.index(first)])} of what it adds"
-    told += f" to {', '.join(part.names)}" + (
-        f", less the share that the {measure} measure gives to the physics. " if measure else ". "
-    )
+    told = f"The learner sees {', '.join(part.features)}, and adds to {', '.join(part.names)}"
+    told += f" what the {measure} measure does not give to the physics" if measure else ""
+    told += ". The curves show what it adds over each input, the one that explains most of its variance first."
     idle = [name for name in ranked[1:] if explained[part.features.index(name)] < _LEVEL]
     if idle:
-        told += f"By themselves {', '.join(idle)} explain next to nothing of it. "
-    return told.strip()
+        told += f" By themselves {', '.join(idle)} explain next to nothing of it."
+    return told
 
 
 def _curve_plot(part: LearnedPart, k: int, feature: str, share: float) -> Plot:
@@ -63,7 +60,7 @@ def _curve_plot(part: LearnedPart, k: int, feature: str, share: float) -> Plot:
     ]
     layout: dict[str, Any] = {"xaxis": {"title": {"text": axis}}, "yaxis": {"title": {"text": name}}, "shapes": []}
     curve = None if part.tied(feature) else part.curve(feature)
-    told = f"What the learner adds to {name} over {feature}"
+    told = f"Over {feature}, which explains {percent(share)}"
     if curve is not None:
         traces += _curve_traces(curve, k)
         layout["yaxis"]["range"] = list(curve_limits(curve.learned[:, k], cloud[1]))
@@ -83,8 +80,7 @@ def _curve_plot(part: LearnedPart, k: int, feature: str, share: float) -> Plot:
                 "marker": {"color": "@learner", "size": 5},
             }
         )
-        told += ": the line is its mean over the training data, on which other inputs move along with this one."
-    told += f" Means over {feature} explain {percent(share)} of it."
+        told += ": the mean along the training data, on which other inputs move with it."
     return Plot(f"Learned part of {name} over {feature}.", told, traces, layout, height=300, small=True)
 
 
@@ -166,8 +162,7 @@ def _surface_plot(part: LearnedPart, k: int, across: str, along: str) -> Plot:
         "hoverinfo": "skip",
         "marker": {"color": "@ink", "size": 2, "opacity": 0.45},
     }
-    plain = across in part.variables and along in part.variables
-    how = "all else at its median" if plain else "the mean of the training data in each cell"
+    how = "all else at its median" if part.alone(across, along) else "the mean of the training data in each cell"
     caption = (
         f"What the learner adds to {part.names[k]} over {across} and {along}, the two inputs that tell most of it, "
         f"{how}. It is drawn where training data are near; the dots are these data."

@@ -63,21 +63,26 @@ def _compared(part: str, runs: Mapping[str, Response], most: int) -> Plot:
     traces: list[dict[str, Any]] = []
     panels, measured = 2 * len(first.outputs), [t.measured for t in first.trajectories]
     known = None if any(m is None for m in measured) else joined(first, measured)
+    series: dict[str, Any] = {}
     models = {name: joined(run, [t.model for t in run.trajectories]) for name, run in runs.items()}
     for i, channel in enumerate(first.outputs):
         own = {"yaxis": f"y{2 * i + 1}", "showlegend": i == 0}
         if known is not None:
-            series = packed(known[:, i], start, step, most)
-            traces.append({**own, "series": series, "name": "measured", "line": {"color": "@measured", "width": 3}})
+            series[f"measured {i}"] = packed(known[:, i], start, step, most)
+            traces.append(
+                {**own, "series": f"measured {i}", "name": "measured", "line": {"color": "@measured", "width": 3}}
+            )
         for name, color, dash in zip(
             models, ("@physics", "@model", "@learner", "@bias") * 9, _DASHES * 9, strict=False
         ):
             line = {"color": color, "width": 1.3, "dash": dash}
             given = {"name": name, "legendgroup": name, "line": line}
-            traces.append({**own, **given, "series": packed(models[name][:, i], start, step, most)})
+            key = f"{name} {i}"
+            series[key] = packed(models[name][:, i], start, step, most)
+            traces.append({**own, **given, "series": key})
             if known is not None:
-                residual = packed(known[:, i] - models[name][:, i], start, step, most)
-                traces.append({**given, "yaxis": f"y{2 * i + 2}", "showlegend": False, "series": residual})
+                residual = _residual(series, f"measured {i}", key, known[:, i] - models[name][:, i], most)
+                traces.append({**given, **residual, "yaxis": f"y{2 * i + 2}", "showlegend": False})
         ranges = [_range(known, model, i) for model in models.values()]
         layout |= _axes(i, panels, with_unit(channel.name, channel.unit), next((r for r in ranges if r), None))
     rows = len(next(iter(models.values())))
@@ -93,7 +98,7 @@ def _compared(part: str, runs: Mapping[str, Response], most: int) -> Plot:
     )
     caption += f" The run of {', '.join(lost)} diverges." if lost else ""
     label = f"Free runs of every model on {part}, with their residuals below."
-    return Plot(label, caption, traces, layout, height=60 + _PANEL * len(first.outputs))
+    return Plot(label, caption, traces, layout, 60 + _PANEL * len(first.outputs), series=series)
 
 
 def error_band(response: Response) -> dict[str, tuple[float, float]]:
@@ -126,6 +131,7 @@ def _fair(lengths: Sequence[int], budget: int) -> int:
 
 def packed(values: Vector, x0: float, dx: float, most: int = MOST_POINTS) -> dict[str, Any]:
     """A curve at even steps as the page reads it; of a longer one the least and the largest value of each stretch."""
+    step = dx
     if len(values) > most:
         stride = -(-len(values) // (most // 2))
         filled = np.full(-(-len(values) // stride) * stride, np.nan)
@@ -137,7 +143,7 @@ def packed(values: Vector, x0: float, dx: float, most: int = MOST_POINTS) -> dic
     shift = float(finite.mean()) if len(finite) else 0.0
     with np.errstate(over="ignore"):
         bare = (values - shift).astype("<f4")
-    return {"x0": x0, "dx": dx, "shift": shift, "f4": base64.b64encode(bare.tobytes()).decode()}
+    return {"x0": x0, "dx": dx, "step": step, "shift": shift, "f4": base64.b64encode(bare.tobytes()).decode()}
 
 
 def joined(response: Response, values: Sequence[Matrix | None]) -> Matrix:
@@ -158,16 +164,14 @@ def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
     traces: list[dict[str, Any]] = []
     layout: dict[str, Any] = {"shapes": [], "annotations": []}
     panels = 2 * len(response.outputs)
+    series: dict[str, Any] = {}
     for i, channel in enumerate(response.outputs):
         curves = {"measured": known, "physics": alone, "model": model}
-        series = {k: packed(v[:, i], start, step, most) for k, v in curves.items() if v is not None}
+        series |= {f"{k} {i}": packed(v[:, i], start, step, most) for k, v in curves.items() if v is not None}
         limits = band.get(channel.name)
-        traces += _upper(series, 2 * i + 1, limits, first=i == 0)
+        traces += _upper([k for k, v in curves.items() if v is not None], i, limits)
         if known is not None:
-            residual = known[:, i] - model[:, i]
-            given: Any = {"minus": [series["measured"], series["model"]]}
-            if len(residual) > most:
-                given = {"series": packed(residual, start, step, most)}
+            given = _residual(series, f"measured {i}", f"model {i}", known[:, i] - model[:, i], most)
             line = {"color": "@residual", "width": 1}
             traces.append(
                 {**given, "name": "measured − model", "yaxis": f"y{2 * i + 2}", "line": line, "showlegend": False}
@@ -187,28 +191,36 @@ def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
         _caption(run, most),
         traces,
         layout,
-        height=60 + _PANEL * len(response.outputs),
+        60 + _PANEL * len(response.outputs),
+        series=series,
     )
 
 
-def _upper(series: Mapping[str, Any], axis: int, limits: tuple[float, float] | None, *, first: bool) -> list[dict]:
-    """Measured, band, physics alone and model; the legend tells of the first output's."""
+def _residual(series: dict[str, Any], measured: str, model: str, residual: Vector, most: int) -> dict[str, Any]:
+    """A residual as the page reads it: the difference of two curves, or of thinned ones a curve of its own."""
+    if len(residual) <= most:
+        return {"minus": [measured, model]}
+    series[f"{measured} − {model}"] = packed(residual, series[model]["x0"], series[model]["step"], most)
+    return {"series": f"{measured} − {model}"}
+
+
+def _upper(curves: Sequence[str], i: int, limits: tuple[float, float] | None) -> list[dict]:
+    """Measured, band, physics alone and model of output number i; the legend tells of the first output's."""
     found = []
-    own: dict[str, Any] = {"yaxis": f"y{axis}"}
-    if "measured" in series:
+    if "measured" in curves:
         line = {"color": "@measured", "width": 3}
-        found.append({"series": series["measured"], "name": "measured", "line": line})
+        found.append({"series": f"measured {i}", "name": "measured", "line": line})
     if limits is not None:
-        edge: dict[str, Any] = {"series": series["model"], "line": {"width": 0, "color": "@band"}, "hoverinfo": "skip"}
+        edge: dict[str, Any] = {"series": f"model {i}", "line": {"width": 0, "color": "@band"}, "hoverinfo": "skip"}
+        fill = {"fill": "tonexty", "fillcolor": "@band"}
         found.append({**edge, "edge": "min", "plus": limits[0], "name": "lower limit", "showlegend": False})
-        found.append(
-            {**edge, "edge": "max", "plus": limits[1], "name": "95 % band", "fill": "tonexty", "fillcolor": "@band"}
-        )
-    if "physics" in series:
+        found.append({**edge, **fill, "edge": "max", "plus": limits[1], "name": "95 % band"})
+    if "physics" in curves:
         line = {"color": "@physics", "width": 1.3, "dash": "dash"}
-        found.append({"series": series["physics"], "name": "physics alone", "line": line})
-    found.append({"series": series["model"], "name": "model", "line": {"color": "@model", "width": 1.3}})
-    return [{**own, "showlegend": first, "legendgroup": trace["name"], **trace} for trace in found]
+        found.append({"series": f"physics {i}", "name": "physics alone", "line": line})
+    found.append({"series": f"model {i}", "name": "model", "line": {"color": "@model", "width": 1.3}})
+    own = {"yaxis": f"y{2 * i + 1}", "showlegend": i == 0}
+    return [{**own, "legendgroup": trace["name"], **trace} for trace in found]
 
 
 def _axes(i: int, panels: int, title: str, limits: list[float] | None) -> dict[str, Any]:

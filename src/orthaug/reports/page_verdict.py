@@ -154,7 +154,8 @@ def _use(result: FitResult, level: str) -> str:
     told += f" and to read {_joined(known)} as physics" if known else ""
     told += f"; {_joined(others)} {_is(others)} too uncertain or biased for that" if others else ""
     if shared:
-        told += f"; {_joined(shared)} {_is(shared)} the nearest physics only, for the learner could imitate the rest"
+        told += f"; {_joined(shared)} {_is(shared)} what the physics nearest to the data has, for the learner could"
+        told += f" imitate {'it' if len(shared) == 1 else 'them'}"
     return f"Use it to {told}."
 
 

@@ -29,13 +29,14 @@
     return series;
   }
 
-  function resolve(trace) {
+  /* The long curve of a trace: its own, or the difference of two. */
+  function curve(figure, trace) {
     if (trace.minus) {
-      const [a, b] = trace.minus.map(decode);
-      trace.series = { x0: a.x0, dx: a.dx, shift: 0, y: a.y.map((value, i) => value - b.y[i]) };
-      delete trace.minus;
+      const key = trace.minus.join(" less "), [a, b] = trace.minus.map((name) => decode(figure.series[name]));
+      figure.series[key] ??= { x0: a.x0, dx: a.dx, y: a.y.map((value, i) => value - b.y[i]) };
+      return figure.series[key];
     }
-    return trace.series && decode(trace.series);
+    return trace.series && decode(figure.series[trace.series]);
   }
 
   /* Points of a curve between two times: all, or the least and the largest in every column. */
@@ -79,7 +80,7 @@
 
   function traces(figure, range) {
     return figure.data.map((trace) => {
-      const series = resolve(trace);
+      const series = curve(figure, trace);
       const { series: _, minus, edge, plus, ...own } = trace;
       return series ? { type: "scatter", mode: "lines", ...own, ...outline(series, range[0], range[1], edge, plus) } : own;
     });
@@ -125,7 +126,7 @@
     const figure = figures[place.dataset.figure];
     if (!flown(figure)) return;
     const range = place.layout.xaxis.range.map(Number);
-    const fresh = traces(figure, range), which = figure.data.map((t, i) => (t.series ? i : -1)).filter((i) => i >= 0);
+    const fresh = traces(figure, range), which = figure.data.map((t, i) => (t.series || t.minus ? i : -1)).filter((i) => i >= 0);
     Plotly.restyle(place, { x: which.map((i) => fresh[i].x), y: which.map((i) => fresh[i].y) }, which);
   }
 
