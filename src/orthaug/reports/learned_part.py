@@ -106,6 +106,12 @@ class LearnedPart:
         of_channel = {channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
         units = {str(lag): of_channel.get(lag.channel, "") for lag in form.layout}
         features = tuple(str(entry) for entry in form.features.entries)
+
+        def at(x: Matrix) -> Matrix:
+            """Of as many rows as the points at least, for which there is a program."""
+            rows = np.minimum(np.arange(max(len(x), len(points))), len(x) - 1)
+            return np.asarray(model.parts_at(x[rows]).learner)[: len(x)]
+
         return cls(
             names=tuple(f"{c.name} [{c.unit}]" if c.unit else c.name for c in model.outputs),
             features=features,
@@ -113,8 +119,8 @@ class LearnedPart:
             variables=tuple(str(lag) for lag in form.layout),
             points=points,
             seen=np.asarray(form.features.evaluate(points, form.layout, np)),
-            values=np.asarray(model.parts_at(points).learner),
-            at=lambda x: np.asarray(model.parts_at(x).learner),
+            values=at(points),
+            at=at,
         )
 
     def curve(self, feature: str) -> Curve | None:
@@ -129,6 +135,16 @@ class LearnedPart:
         rows[:, place] = along
         half = None if self.reach is None else self.reach(rows)
         return Curve(along, (along >= low) & (along <= high), self.at(rows), half)
+
+    def telling_pair(self) -> tuple[str, str]:
+        """The most telling feature, and of those that do not move along with it the next; of at least two features."""
+        first, *others = self.ranked()
+        own = self.seen[:, self.features.index(first)]
+        for name in others:
+            other = self.seen[:, self.features.index(name)]
+            if own.std() > 0 and other.std() > 0 and abs(np.corrcoef(own, other)[0, 1]) <= _TIED:
+                return first, name
+        return first, others[0]
 
     def tied(self, feature: str, but: str = "") -> bool:
         """Whether the data move another feature along with it, `but` one: then they hold nothing with that at rest."""
@@ -164,16 +180,18 @@ class LearnedPart:
         pair = self.seen[:, [self.features.index(across), self.features.index(along)]]
         low, high = pair.min(axis=0), pair.max(axis=0)
         width = np.maximum(high - low, 1e-300)
-        cells = np.minimum((_CELLS * (pair - low) / width).astype(int), _CELLS - 1)
-        first, second = (low[k] + width[k] * (np.arange(_CELLS) + 0.5) / _CELLS for k in (0, 1))
-        if self.alone(across, along):
+        alone = self.alone(across, along)
+        count = _CELLS if alone else _CELLS // 2
+        cells = np.minimum((count * (pair - low) / width).astype(int), count - 1)
+        first, second = (low[k] + width[k] * (np.arange(count) + 0.5) / count for k in (0, 1))
+        if alone:
             rows = np.tile(np.median(self.points, axis=0), (_CELLS * _CELLS, 1))
             rows[:, self.variables.index(across)] = np.repeat(first, _CELLS)
             rows[:, self.variables.index(along)] = np.tile(second, _CELLS)
             learned = self.at(rows).reshape(_CELLS, _CELLS, -1)
             learned = np.where(_near(cells)[..., None], learned, np.nan)
         else:
-            learned = _mean_in_cells(cells, self.values)
+            learned = _mean_in_cells(cells, self.values, count)
         return Surface(first, second, learned)
 
 
@@ -186,8 +204,8 @@ def _near(cells: np.ndarray) -> Bool[np.ndarray, "a b"]:
     return there[1:-1, 1:-1]
 
 
-def _mean_in_cells(cells: np.ndarray, values: Matrix) -> Float[np.ndarray, "a b nl"]:
-    count, total = np.zeros((_CELLS, _CELLS)), np.zeros((_CELLS, _CELLS, values.shape[1]))
+def _mean_in_cells(cells: np.ndarray, values: Matrix, size: int) -> Float[np.ndarray, "a b nl"]:
+    count, total = np.zeros((size, size)), np.zeros((size, size, values.shape[1]))
     np.add.at(count, tuple(cells.T), 1)
     np.add.at(total, tuple(cells.T), values)
     return np.where(count[..., None] > 0, total / np.maximum(count, 1)[..., None], np.nan)

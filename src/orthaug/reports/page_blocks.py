@@ -51,7 +51,7 @@ def with_unit(name: str, unit: str | None) -> str:
 
 @dataclass(frozen=True)
 class Text:
-    """A paragraph; `kind` is plain, note, warning or lead."""
+    """A paragraph; `kind` is plain, note, warning, or hint for what is of use on a screen only."""
 
     text: str
     kind: str = "plain"

@@ -170,7 +170,7 @@ def _runs(page: FitPage) -> list[Any]:
     how = Text(
         "Drag over a stretch to zoom, double-click for the whole record; with the keyboard the arrows move, "
         "+ and − zoom, 0 shows all.",
-        "note",
+        "hint",
     )
     return [*notes, Text(told), how, *run_plots(runs, band)]
 

@@ -12,6 +12,7 @@ from orthaug.reports.page_blocks import Grid, Plot, Text, percent, with_unit
 
 _MOST_CURVES = 12
 _CLOUD = 600  # points of a cloud
+_COLOURED = 0.98  # of the cells of a surface have a colour of their own
 _LEVEL = 0.02  # share of the learned part below which an input is told to do next to nothing
 
 
@@ -29,7 +30,7 @@ def learned_blocks(part: LearnedPart, measure: str) -> list[Text | Grid | Plot]:
     if len(ranked) > _MOST_CURVES:
         blocks.append(Text(f"The {_MOST_CURVES} most telling of {len(ranked)} inputs are drawn.", "note"))
     if len(ranked) > 1:
-        blocks += [_surface_plot(part, k, ranked[0], ranked[1]) for k in range(len(part.names))]
+        blocks += [_surface_plot(part, k, *part.telling_pair()) for k in range(len(part.names))]
     return blocks
 
 
@@ -140,7 +141,8 @@ def _stripe(low: float, high: float) -> dict[str, Any]:
 def _surface_plot(part: LearnedPart, k: int, across: str, along: str) -> Plot:
     surface = part.surface(across, along)
     values = surface.learned[..., k].T
-    reach = float(np.nanmax(np.abs(values), initial=0.0)) or 1.0
+    seen = np.abs(values[np.isfinite(values)])
+    reach = float(np.quantile(seen, _COLOURED)) or 1.0 if seen.size else 1.0
     units = dict(zip(part.features, part.units, strict=True))
     heat = {
         "type": "heatmap",
@@ -164,7 +166,7 @@ def _surface_plot(part: LearnedPart, k: int, across: str, along: str) -> Plot:
     }
     how = "all else at its median" if part.alone(across, along) else "the mean of the training data in each cell"
     caption = (
-        f"What the learner adds to {part.names[k]} over {across} and {along}, the two inputs that tell most of it, "
+        f"What the learner adds to {part.names[k]} over {across} and {along}, two inputs that tell much of it, "
         f"{how}. It is drawn where training data are near; the dots are these data."
     )
     layout = {

@@ -124,7 +124,9 @@ def _doubts(result: FitResult) -> Iterator[str]:
         yield "training stopped before it converged"
     biased = [row.name for row in _rows(result) if _biased(row)]
     if biased:
-        yield f"the value of {_joined(biased)} carries a bias larger than its standard error"
+        one = len(biased) == 1
+        carry = "carries a bias larger than its standard error" if one else "carry biases larger than their errors"
+        yield f"the estimate{'' if one else 's'} of {_joined(biased)} {carry}"
     if result.residuals is not None and result.residuals.verdict in ("unmodelled", "sensor_noise"):
         yield {
             "unmodelled": "its residual is not noise alone",
@@ -132,7 +134,7 @@ def _doubts(result: FitResult) -> Iterator[str]:
         }[result.residuals.verdict]
     if result.validation is not None and result.validation.extrapolation:
         left = dict.fromkeys(entry.part for entry in result.validation.extrapolation)
-        yield f"{_joined(list(left))} leaves the range of the training data"
+        yield f"{_joined(list(left))} {'leaves' if len(left) == 1 else 'leave'} the range of the training data"
 
 
 def _rows(result: FitResult) -> list[ParameterResult]:

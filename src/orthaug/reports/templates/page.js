@@ -3,8 +3,8 @@
   const COLUMNS = 1400; // of pixels for which the least and the largest value of a curve are drawn
   const FONT = { family: "system-ui, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif", size: 12 };
   const CONFIG = {
-    responsive: true, displaylogo: false, doubleClick: "reset", locale: "en",
-    modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d", "toImage"],
+    responsive: false, displaylogo: false, doubleClick: "reset", showTips: false,
+    modeBarButtons: [["zoom2d", "pan2d"], ["zoomIn2d", "zoomOut2d", "resetScale2d"]],
   };
   const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
   const figures = JSON.parse(document.getElementById("figures").textContent);
@@ -118,7 +118,7 @@
     const now = place.layout && flown(figure) ? place.layout.xaxis.range : home(figure);
     const shown = layout(figure, from, widthOf(place));
     if (flown(figure)) shown.xaxis.range = [...now];
-    return Plotly.react(place, coloured(traces(figure, now), from), shown, { ...CONFIG, responsive: false });
+    return Plotly.react(place, coloured(traces(figure, now), from), shown, CONFIG);
   }
 
   /* After a zoom the curves are drawn anew, as finely as they are now seen. */
@@ -163,7 +163,10 @@
       waiting = setTimeout(redraw, 120);
     });
     const paper = (now) => { onPaper = now; document.documentElement.toggleAttribute("data-paper", now); redraw(); };
-    addEventListener("beforeprint", () => paper(true));
+    addEventListener("beforeprint", () => {
+      document.querySelectorAll("details").forEach((folded) => { folded.open = true; });
+      paper(true);
+    });
     addEventListener("afterprint", () => paper(false));
     document.documentElement.dataset.drawn = String(places.length);
   } catch (error) {
