@@ -7,7 +7,7 @@ import gzip
 import importlib.util
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -22,13 +22,14 @@ from orthaug.reports.page_compare import ComparePage, compare_sections
 from orthaug.reports.page_fit import FitPage, Origin, fit_sections
 from orthaug.reports.page_verdict import PageVerdict, compare_verdict, fit_verdict
 
+_MOST_NAMES = 4  # of channels in a title
 _TOLD_ELSEWHERE = ("witness", "free_run_diverged", "residual_not_analysed")
 
 
 def fit_page(page: FitPage) -> str:
     """The page of a fit."""
-    title = f"{page.origin.name}: model of {', '.join(page.outputs)}"
     result = page.result
+    title = _title("Model", page.outputs, result.spec, page.origin)
     kind = f"{result.structure} structure" + (f", {result.measure} measure" if result.measure else "")
     warnings = [w for w in result.warnings if w.code not in _TOLD_ELSEWHERE]
     return _page(
@@ -44,9 +45,20 @@ def fit_page(page: FitPage) -> str:
 
 def compare_page(page: ComparePage) -> str:
     """The page of a comparison."""
-    title = f"{page.origin.name}: {len(page.result.comparison)} models of {', '.join(page.outputs)} compared"
+    title = _title(f"{len(page.result.comparison)} models", page.outputs, page.result.spec, page.origin)
     verdict = compare_verdict(page.result)
     return _page(title, "comparison", verdict, page.result.warnings, compare_sections(page), page.origin, "")
+
+
+def _title(what: str, outputs: Sequence[str], spec: Mapping[str, Any], origin: Origin) -> str:
+    """What a page is about; a spec that is called just that adds nothing."""
+    inputs = spec.get("data", {}).get("inputs") or []
+    told = f"{what} of {_listed(outputs)}" + (f" from {_listed(inputs)}" if inputs else "")
+    return told if origin.name == "spec" else f"{told}: {origin.name}"
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join([*names[:_MOST_NAMES], *(["…"] if len(names) > _MOST_NAMES else [])])
 
 
 def _page(

@@ -12,6 +12,7 @@ from orthaug.reports.page_blocks import number, percent
 from orthaug.reports.result import CompareResult, FitResult, ParameterResult, PartScores, RowResult
 
 _GOOD, _POOR = 0.2, 0.5  # NRMSE of a free run up to which it is close, and from which it is far
+_ALIKE = 1.1  # ratio of errors up to which models are told to be as good as each other
 _SURE = 0.1  # standard error over value up to which a parameter is told to be known
 _STOPPED = ("iteration_limit", "no_descent")
 _RAN_AWAY = ("free_run_diverged",)
@@ -62,14 +63,16 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
     row = next(row for row in result.comparison if row.name == best)
     error, part = _worst(row.scores)
     level = "good" if error is not None and error <= _GOOD else "care" if error is None or error <= _POOR else "bad"
-    how = "has the lowest error on the validation part" if result.chosen else f"is the closest on {part}"
-    trust = f"Take “{best}”: it {how}, and {_told_error(error or 0.0, part)}."
+    near = [name for name in errors if name != best and errors[name] <= _ALIKE * (error or 0.0)]
+    how = f"it has the lowest error on the validation part, and {_told_error(error or 0.0, part)}"
+    trust = f"Take “{best}”: {how if result.chosen else _told_error(error or 0.0, part) + ', less than of any other'}"
+    trust += f"; {_joined([f'“{name}”' for name in near])} {_is(near)} as good within 10 %." if near else "."
     alone = errors.get("physics alone")
     use = "It is the physics alone: no learner earns its place beside it."
     if best != "physics alone" and alone is not None and error is not None:
         learns = error / alone if alone else 1.0
         use = f"Its error on {part} is {number(learns, 2)} of that of physics alone ({percent(alone)})"
-        use += f", and the verdict on its learner is “{_word(row)}”." if row.validation else "."
+        use += f", and its learner {_word(row)}." if row.validation else "."
     return PageVerdict(level, trust, use, _after_comparison(result, row))
 
 
@@ -78,12 +81,14 @@ def _after_comparison(result: CompareResult, row: RowResult) -> str:
         return f"{_change(row.residuals.changes[0])}."
     if not result.data.tests and not result.data.validation:
         return "Hold out a test part, on which the models can be judged."
+    if not result.data.validation:
+        return "Hold out a validation part (`[data.validation]`), so that the choice is not made on what judges it."
     return f"Fit it alone with `orthaug fit` and structure “{row.name}”, whose report has its residuals and bias."
 
 
 def _word(row: RowResult) -> str:
     assert row.validation is not None
-    return {"helps": "it helps", "no_help": "it does not help", "hurts": "it hurts"}.get(row.validation.verdict, "–")
+    return {"helps": "helps", "no_help": "does not help", "hurts": "hurts"}.get(row.validation.verdict, "–")
 
 
 def _told_error(error: float, part: str) -> str:
