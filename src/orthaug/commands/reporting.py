@@ -50,7 +50,7 @@ def origin_of(job: Job, command: str) -> Origin:
     versions |= {name: importlib.metadata.version(name) for name in _TOLD}
     return Origin(
         name=job.path.stem,
-        toml=job.path.read_text(encoding="utf-8"),
+        toml=job.path.read_text(encoding="utf-8-sig"),
         command=f"orthaug {command} {job.path.name}",
         date=now.strftime("%Y-%m-%d %H:%M UTC"),
         machine=f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",

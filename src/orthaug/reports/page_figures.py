@@ -293,7 +293,7 @@ def restart_plot(restarts: Sequence[RestartResult]) -> Plot | None:
     layout["yaxis"] = {"title": {"text": "loss"}, "type": "log" if wide else "linear"}
     caption = "The loss that every start came to; the large dot is the chosen one. "
     caption += "Where several starts end at the same loss, it is hardly a poor minimum."
-    return Plot("Loss of every start.", caption, [dots], layout, 260)
+    return Plot("Loss that every start came to.", caption, [dots], layout, 260)
 
 
 def parameter_comparison(rows: Sequence[RowResult]) -> list[Plot]:
