@@ -7,6 +7,7 @@ import json
 import re
 import subprocess
 import sys
+import tomllib
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -169,6 +170,17 @@ def test_a_page_tells_how_its_result_was_made(lagged, pages, monkeypatch):
     assert origin_of(lagged.job, "fit").date == "1970-01-02 00:00 UTC"
 
 
+def test_a_spec_that_was_changed_meanwhile_is_told_as_it_was_read(lagged):
+    path = lagged.job.path
+    written = path.read_text()
+    for changed in (written.replace("restarts = 3", "restarts = 4"), "not TOML"):
+        path.write_text(changed)
+        told = tomllib.loads(origin_of(lagged.job, "fit").toml)
+        assert told["training"]["restarts"] == 3 and told["baseline"]["terms"][0]["parameter"] == "a"
+    path.write_text(written)
+    assert origin_of(lagged.job, "fit").toml == written
+
+
 def test_what_a_motion_learned_is_a_curve_with_its_band_and_the_reach_of_the_data(motion, pages):
     (curve,) = [f for f in figures(pages["motion"]) if f["layout"].get("xaxis", {}).get("title") == {"text": "v [m/s]"}]
     traces = {trace["name"]: trace for trace in curve["data"]}
@@ -238,7 +250,9 @@ def test_long_records_are_thinned_by_their_envelope_and_said_to_be():
     long = wave(400_000)
     peak = np.asarray(long.trajectories[0].measured)
     peak[123_456] = 9.0
-    plots = run_plots([Run(name, long, long) for name in ("train", "validation", "tests.a", "tests.b")], error_band(long))
+    plots = run_plots(
+        [Run(name, long, long) for name in ("train", "validation", "tests.a", "tests.b")], error_band(long)
+    )
     kept = values(plots[0].series["measured 0"])
     assert kept.max() == pytest.approx(9.0, rel=1e-6) and kept.min() == pytest.approx(peak.min(), rel=1e-6)
     assert "points are kept, the least and the largest value of every stretch" in plots[0].caption

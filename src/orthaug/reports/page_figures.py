@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,51 +28,16 @@ def interval_plot(rows: Sequence[ParameterResult]) -> Plot | None:
     layout: dict[str, Any] = {"shapes": []}
     told = any(row.ci95_with_bias for row in drawn)
     for i, row in enumerate(drawn):
-        own = {"xaxis": f"x{i + 1}" if i else "x", "yaxis": f"y{i + 1}" if i else "y", "showlegend": False}
-        legend = {"showlegend": i == 0}
-        ends = {"95 % interval": (row.ci95, "@model", 7)}
-        if row.ci95_with_bias and None not in row.ci95_with_bias:
-            ends = {"95 % interval with the bias": (row.ci95_with_bias, "@bias", 3), **ends}
-        for name, (limits, color, width) in ends.items():
-            shown = {
-                **own,
-                "name": name,
-                "legendgroup": name,
-                "x": limits,
-                "y": [0, 0],
-                "mode": "lines",
-                "line": {"color": color, "width": width},
-            }
-            traces.append(
-                shown | (legend if name in ("95 % interval",) else {"showlegend": told and i == _first(drawn)})
-            )
-        traces.append(
-            {
-                **own,
-                **legend,
-                "name": "estimate",
-                "legendgroup": "estimate",
-                "x": [row.value],
-                "y": [0],
-                "mode": "markers",
-                "marker": {"color": "@paper", "size": 9, "line": {"color": "@ink", "width": 2}},
-            }
-        )
-        if _near(row):
-            traces.append(
-                {
-                    **own,
-                    "name": "initial value",
-                    "x": [row.initial],
-                    "y": [0],
-                    "mode": "markers",
-                    "marker": {"color": "@measured", "size": 9, "symbol": "diamond"},
-                }
-            )
+        number = str(i + 1) if i else ""
+        first = {"95 % interval": i == 0, "estimate": i == 0, "initial value": i == _first(drawn, _near)}
+        first["95 % interval with the bias"] = i == _first(drawn, lambda r: bool(r.ci95_with_bias))
+        for trace in _interval_traces(row):
+            own = {"xaxis": f"x{number}", "yaxis": f"y{number}", "legendgroup": trace["name"]}
+            traces.append({**own, **trace, "showlegend": first[trace["name"]]})
         top = 1 - i / len(drawn)
-        layout[f"yaxis{i + 1}" if i else "yaxis"] = {
+        layout[f"yaxis{number}"] = {
             "domain": [top - 0.42 / len(drawn), top - 0.08 / len(drawn)],
-            "anchor": own["xaxis"],
+            "anchor": f"x{number}",
             "range": [-1, 1],
             "tickvals": [0],
             "ticktext": [_tick(row)],
@@ -80,8 +45,7 @@ def interval_plot(rows: Sequence[ParameterResult]) -> Plot | None:
             "showgrid": False,
             "zeroline": False,
         }
-        axis = {"anchor": own["yaxis"], "nticks": 6, "zeroline": False, "range": _reach(row)}
-        layout[f"xaxis{i + 1}" if i else "xaxis"] = axis
+        layout[f"xaxis{number}"] = {"anchor": f"y{number}", "nticks": 6, "zeroline": False, "range": _reach(row)}
     caption = (
         "Every parameter on an axis of its own: the circle is the estimate, the thick bar its 95 % interval"
         + ("; the thin bar covers its bias too." if told else ".")
@@ -91,8 +55,26 @@ def interval_plot(rows: Sequence[ParameterResult]) -> Plot | None:
     return Plot(label, caption, traces, layout, height=70 + _ROW * len(drawn))
 
 
-def _first(rows: Sequence[ParameterResult]) -> int:
-    return next((i for i, row in enumerate(rows) if row.ci95_with_bias), 0)
+def _interval_traces(row: ParameterResult) -> list[dict[str, Any]]:
+    """Bars of the intervals, the circle of the estimate, and the diamond of the initial value where it is near."""
+    bars = {"95 % interval": (row.ci95, "@model", 7)}
+    if row.ci95_with_bias and None not in row.ci95_with_bias:
+        bars = {"95 % interval with the bias": (row.ci95_with_bias, "@bias", 3), **bars}
+    found: list[dict[str, Any]] = [
+        {"name": name, "x": ends, "y": [0, 0], "mode": "lines", "line": {"color": color, "width": width}}
+        for name, (ends, color, width) in bars.items()
+    ]
+    circle = {"color": "@paper", "size": 9, "line": {"color": "@ink", "width": 2}}
+    found.append({"name": "estimate", "x": [row.value], "y": [0], "mode": "markers", "marker": circle})
+    if _near(row):
+        diamond = {"color": "@measured", "size": 9, "symbol": "diamond"}
+        found.append({"name": "initial value", "x": [row.initial], "y": [0], "mode": "markers", "marker": diamond})
+    return found
+
+
+def _first(rows: Sequence[ParameterResult], holds: Callable[[ParameterResult], bool]) -> int:
+    """The number of the first row of which something holds."""
+    return next((i for i, row in enumerate(rows) if holds(row)), 0)
 
 
 def _tick(row: ParameterResult) -> str:
