@@ -86,10 +86,18 @@
     });
   }
 
+  /* Every name of a category axis; on a narrow screen on several lines. */
+  function named(figure, narrow) {
+    const names = [...new Set(figure.data.flatMap((trace) => trace.y))];
+    const lines = (name) => name.replace(/(.{12,}?)[ ,](?=.{4})/g, "$1<br>");
+    return { tickvals: names, ticktext: narrow ? names.map(lines) : names, tickfont: { color: "@soft", size: narrow ? 9 : 12 } };
+  }
+
   function layout(figure, from, width) {
     const narrow = width < 520;
     const axis = {
       gridcolor: "@grid", linecolor: "@grid", zerolinecolor: "@grid", automargin: true, tickfont: { color: "@soft" },
+      exponentformat: "power",
     };
     const own = structuredClone(figure.layout);
     for (const key of new Set([...Object.keys(own), "xaxis", "yaxis"])) {
@@ -97,6 +105,7 @@
         own[key] = { ...axis, ...own[key] };
         if (own[key].title) own[key].title = { standoff: 6, ...own[key].title };
         if (narrow) own[key].nticks = own[key].nticks ?? 5;
+        if (key === "yaxis" && own[key].type === "category") Object.assign(own[key], named(figure, narrow));
       }
     }
     return coloured({
