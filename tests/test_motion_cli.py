@@ -174,13 +174,12 @@ def test_the_folder_has_figures_and_a_page(folder, printed, result):
     figures = {path.stem for path in (folder / "out" / "figures").iterdir()}
     assert figures == {"simulation", "prediction", "residual", "states", "components", "learner"}
     page = (folder / "out" / "report.html").read_text()
-    assert "<code>(force - c*v - k*x)/m</code>" in page and "<td>dv/dt</td>" in page
+    assert ">(force - c*v - k*x)/m</td>" in page and ">dv/dt</th>" in page
     (part,) = result["motion"]["parts"]
     assert (part["equation"], part["unit"]) == ("dv/dt", "m/s²") and 0.01 < part["share"] < 0.2
     assert part["share"] == pytest.approx(part["learner"] / part["physics"], rel=0.2)
     assert set(result["motion"]["substep_bias"]) == set("mck")
     assert result["shared"]["text"] in printed
-    assert all(name in page for name in figures)
 
 
 def test_a_saved_motion_is_the_fitted_one(folder, model, result):

@@ -89,7 +89,9 @@ def _verdicts(job: Job, fitted: dict[str, Fitted]) -> dict[str, Verdict]:
 
 
 def write(comparison: Comparison, folder: Path, *, force: bool = False) -> None:
-    """result.json, models/ and figures/, whole or not at all."""
+    """result.json, models/, figures/ and report.html, whole or not at all."""
+    from orthaug.commands.reporting import compare_report
+
     with whole_folder(folder, not_a_result, force=force) as partial:
         (partial / "result.json").write_text(comparison.result.to_json() + "\n", encoding="utf-8")
         for kind, fitted in comparison.fitted.items():
@@ -100,6 +102,7 @@ def write(comparison: Comparison, folder: Path, *, force: bool = False) -> None:
         (partial / "figures").mkdir()
         figure = plots.comparison_figure(comparison.result.comparison)
         plots.save(figure, partial / "figures" / "comparison.png")
+        (partial / "report.html").write_text(compare_report(comparison), encoding="utf-8")
 
 
 def _matching(path: Path, job: Job) -> Model | MotionModel:

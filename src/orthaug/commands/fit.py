@@ -217,8 +217,8 @@ def write_result(fitted: Fitted, folder: Path, *, force: bool = False) -> None:
 
 def fill_result(fitted: Fitted, folder: Path) -> None:
     """Write the files of a result into an existing folder."""
+    from orthaug.commands.reporting import fit_report
     from orthaug.models import storage
-    from orthaug.reports import page
 
     (folder / "result.json").write_text(fitted.result.to_json() + "\n", encoding="utf-8")
     if not fitted.fit.status.ok:
@@ -227,8 +227,7 @@ def fill_result(fitted: Fitted, folder: Path) -> None:
     storage.write(fitted.fit.model, folder / "model")
     (folder / "figures").mkdir()
     _draw(fitted, folder / "figures")
-    text = page.page(fitted.job.path.stem, fitted.result, folder / "figures")
-    (folder / "report.html").write_text(text, encoding="utf-8")
+    (folder / "report.html").write_text(fit_report(fitted), encoding="utf-8")
 
 
 def _draw(fitted: Fitted, folder: Path) -> None:

@@ -15,6 +15,7 @@ from orthaug.reports.result import CheckResult, FitResult
 if TYPE_CHECKING:
     from orthaug.models.response import Response
     from orthaug.reports.drawing import Figure
+    from orthaug.reports.learned_part import LearnedPart
 
 
 @runtime_checkable
@@ -39,6 +40,16 @@ class Kind(Protocol):
         self, job: Any, fit: Any, result: FitResult, responses: Mapping[str, tuple[Response, Response]]
     ) -> dict[str, Figure]:
         """The figures of a result by their names."""
+        ...
+
+    def physics_alone(
+        self, job: Any, fit: Any, responses: Mapping[str, tuple[Response, Response]]
+    ) -> Mapping[str, Response]:
+        """The free run of every part by the physics without the learner; empty where nothing was learned."""
+        ...
+
+    def learned(self, job: Any, fit: Any) -> LearnedPart | None:
+        """What was learned, as a function; None where nothing was."""
         ...
 
 

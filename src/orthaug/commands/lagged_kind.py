@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from orthaug.inference.physical import PhysicalEstimate
     from orthaug.models.response import Response
     from orthaug.reports.drawing import Figure
+    from orthaug.reports.learned_part import LearnedPart
 
 _UNKNOWN = ("physical_parameters", "physical_consistency", "sensitivities", "bias")
 
@@ -108,6 +109,23 @@ def figures(
     if fit.model.form.bound is not None:
         drawn["components"] = plots.components_figure(one_step, f"parts of the one-step prediction, {where}")
     return drawn
+
+
+def physics_alone(
+    job: LaggedJob, fit: Estimate, responses: Mapping[str, tuple[Response, Response]]
+) -> Mapping[str, Response]:
+    """The free run of every part by the physics without the learner; empty where nothing was learned."""
+    if fit.model.form.bound is None:
+        return {}
+    alone = fit.model.alone
+    return {part.name: alone.simulate(part.record) for part in job.parts}
+
+
+def learned(job: LaggedJob, fit: Estimate) -> LearnedPart | None:
+    """What was learned, as a function; None where nothing was."""
+    from orthaug.reports.learned_part import LearnedPart
+
+    return None if fit.model.form.bound is None else LearnedPart.of_lagged(fit.model, job.train.record)
 
 
 def _physical_content(job: LaggedJob, fit: Estimate, warnings: list[Any]) -> dict[str, Any]:

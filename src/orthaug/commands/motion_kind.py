@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError, RankError
 from orthaug._base.warning import Warning
 from orthaug.commands.motion_job import MotionJob
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from orthaug.fitting.motion_estimates import MotionEstimate
     from orthaug.models.response import Response
     from orthaug.reports.drawing import Figure
+    from orthaug.reports.learned_part import LearnedPart
 
 _UNKNOWN = ("physical_parameters", "physical_consistency", "sensitivities", "bias", "missing_lags")
 _STIFF = 20  # substeps from which a motion is told to be stiff for its sampling
@@ -170,7 +171,6 @@ def figures(
     job: MotionJob, fit: MotionEstimate, result: FitResult, responses: Mapping[str, tuple[Response, Response]]
 ) -> dict[str, Figure]:
     """The figures of a result by their names."""
-    from orthaug.analysis.learned_part import learned_reach
     from orthaug.reports import motion_plots, plots
 
     part = job.parts[-1]
@@ -186,10 +186,35 @@ def figures(
     drawn["prediction"] = plots.output_figure(one_step, f"one-step prediction, {part.name}")
     if learns:
         drawn["components"] = motion_plots.parts_figure(fit.model, part.record, f"physics and learner, {part.name}")
-        drawn["learner"] = motion_plots.learner_figure(
-            fit.model, job.train.record, "learned beside the physics", partial(learned_reach, fit)
-        )
+        part = learned(job, fit)
+        assert part is not None
+        title = f"learned beside the physics, by the {fit.model.measure} measure"
+        drawn["learner"] = motion_plots.learner_figure(part, title)
     return drawn
+
+
+def physics_alone(
+    job: MotionJob, fit: MotionEstimate, responses: Mapping[str, tuple[Response, Response]]
+) -> Mapping[str, Response]:
+    """The free run of every part by the physics without the learner; empty where nothing was learned."""
+    if fit.model.form.bound is None:
+        return {}
+    return {part: free.physics_alone for part, (_, free) in responses.items()}
+
+
+def learned(job: MotionJob, fit: MotionEstimate) -> LearnedPart | None:
+    """What was learned, as a function; None where nothing was."""
+    from orthaug.analysis.learned_part import learned_reach
+    from orthaug.reports.learned_part import LearnedPart
+
+    if fit.model.form.bound is None:
+        return None
+    size = fit.model.form.states
+
+    def reach(points: Matrix) -> Matrix | None:
+        return learned_reach(fit, *np.split(points, [size], axis=1))
+
+    return LearnedPart.of_motion(fit.model, job.train.record, reach)
 
 
 def _parameters(fit: MotionEstimate, budget: MotionBudget | None) -> list[ParameterResult]:

@@ -92,6 +92,12 @@ class Model(OnRecords):
         """The parameters and their values, as results list them."""
         return self.form.baseline.parameters, self.theta
 
+    @property
+    def alone(self) -> Model:
+        """Its physics without the learner."""
+        numbers = self.numbers._replace(theta_aux=np.zeros_like(self.theta), weights=np.zeros(0), tilt=None)
+        return replace(self, form=replace(self.form, bound=None), numbers=numbers)
+
     def learner_at(self, x: Float[np.ndarray, "M nx"]) -> Float[np.ndarray, "M ny"]:
         """f, before any split, at regressors of the form's layout; in the outputs' units."""
         return self.parts_at(x).raw

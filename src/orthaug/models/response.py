@@ -5,7 +5,7 @@ Every response carries its horizon.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -130,6 +130,18 @@ class Response:
         if not sum(len(m) for m in measured):
             raise InputError(f"no samples are left to score after the first {max(skips)}.")
         return scores(np.concatenate(measured), np.concatenate(model))
+
+    @property
+    def physics_alone(self) -> Response:
+        """Of the free run of a motion that of its physics alone; of other responses the physics' part."""
+        found = []
+        for t in self.trajectories:
+            lost = np.isnan(t.baseline) & ~np.isnan(t.model)
+            row = int(np.argmax(lost.any(axis=1)))
+            diverged = (row, self.outputs[int(np.argmax(lost[row]))].name) if lost.any() else None
+            nothing = np.zeros_like(t.baseline)
+            found.append(replace(t, learner=nothing, learner_before=nothing, diverged=diverged, whole=None))
+        return replace(self, trajectories=tuple(found))
 
     def to_frame(self, experiment: int = 0) -> pd.DataFrame:
         """A table with `time` and, per output, measured, model, baseline and learner; of a free run `extrapolates`.

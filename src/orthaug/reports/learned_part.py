@@ -1,0 +1,246 @@
+"""What was learned beside the physics, as a function: along the training data, over one input, and over two."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug.data.record import Record
+from orthaug.models.motion_parts import labels_of, parts_at
+
+if TYPE_CHECKING:
+    from orthaug.models.model import Model
+    from orthaug.models.motion_model import MotionModel
+
+_MOST_POINTS = 2000  # of a cloud
+_BATCH = 512  # points of a compiled call
+_CURVE = 200  # points of a curve
+_BEYOND = 0.2  # of the data's reach, drawn at each side of it
+_BINS = 24  # of means over a feature
+_CELLS = 36  # of a surface, in each direction
+_TIED = 0.95  # correlation with another feature from which others at their medians are no state of the system
+Reach = Callable[[Matrix], Matrix | None]
+"""Half the length of 95 % intervals of the learned part (M, nl) at points (M, n); None where there are none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """The learned part over one variable, all others at their medians."""
+
+    along: Vector
+    inside: Bool[np.ndarray, "n"]
+    """Where the data reach."""
+    learned: Matrix
+    half: Matrix | None
+    """Half the length of 95 % intervals."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """The learned part over two variables, all others at their medians; NaN where no data are near."""
+
+    across: Vector
+    along: Vector
+    learned: Float[np.ndarray, "a b nl"]
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedPart:
+    """The learned part of a model on training data: points (M, n) of the `variables`, and `at` any other of them.
+
+    `seen` (M, nz) are the learner's `features` at the points, `values` (M, nl) the learned part, named `names` with
+    their units.
+    """
+
+    names: tuple[str, ...]
+    features: tuple[str, ...]
+    units: tuple[str, ...]
+    """Of the features; empty for expressions."""
+    variables: tuple[str, ...]
+    points: Matrix
+    seen: Matrix
+    values: Matrix
+    at: Callable[[Matrix], Matrix]
+    reach: Reach | None = None
+
+    @classmethod
+    def of_motion(cls, model: MotionModel, record: Record, reach: Reach | None = None) -> LearnedPart:
+        """Of a motion, along the free run of the first experiment."""
+        states, inputs = trajectory_of(model, record)
+        chosen = _spread(len(states))
+        points, size = np.concatenate([states, inputs], axis=1)[chosen], states.shape[1]
+
+        def at(x: Matrix) -> Matrix:
+            padded = x[np.minimum(np.arange(-(-len(x) // _BATCH) * _BATCH), len(x) - 1)]
+            batches = np.split(padded, len(padded) // _BATCH)
+            found = [parts_at(model.form, model.numbers, *np.split(b, [size], axis=1))[1] for b in batches]
+            return np.concatenate(found)[: len(x)]
+
+        with np.errstate(all="ignore"):
+            seen = np.asarray(model.form.seen(points[:, :size].T, points[:, size:].T, np)).T
+        motion, units = model.form.motion, units_of(model)
+        features = tuple(str(entry) for entry in model.form.features)
+        return cls(
+            names=tuple(labels_with_units(model)),
+            features=features,
+            units=tuple(units.get(name, "") for name in features),
+            variables=(*motion.names_of_states, *motion.inputs),
+            points=points,
+            seen=seen,
+            values=at(points),
+            at=at,
+            reach=reach,
+        )
+
+    @classmethod
+    def of_lagged(cls, model: Model, record: Record) -> LearnedPart:
+        """Of a lagged model, at the measured regressors of all experiments: `f − φ θ_aux`."""
+        form, record = model.form, model.fitting(record, need_outputs=True)
+        rows = np.concatenate([form.regressors(experiment, record) for experiment in record.experiments])
+        points = rows[_spread(len(rows))]
+        of_channel = {channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
+        units = {str(lag): of_channel.get(lag.channel, "") for lag in form.layout}
+        features = tuple(str(entry) for entry in form.features.entries)
+
+        def at(x: Matrix) -> Matrix:
+            """Of as many rows as the points at least, for which there is a program."""
+            rows = np.minimum(np.arange(max(len(x), len(points))), len(x) - 1)
+            return np.asarray(model.parts_at(x[rows]).learner)[: len(x)]
+
+        return cls(
+            names=tuple(f"{c.name} [{c.unit}]" if c.unit else c.name for c in model.outputs),
+            features=features,
+            units=tuple(units.get(name, "") for name in features),
+            variables=tuple(str(lag) for lag in form.layout),
+            points=points,
+            seen=np.asarray(form.features.evaluate(points, form.layout, np)),
+            values=at(points),
+            at=at,
+        )
+
+    def curve(self, feature: str) -> Curve | None:
+        """Over a variable, a fifth of the data's reach beyond them; None of an expression."""
+        if feature not in self.variables:
+            return None
+        place = self.variables.index(feature)
+        low, high = self.points[:, place].min(), self.points[:, place].max()
+        beyond = _BEYOND * (high - low)
+        along = np.linspace(low - beyond, high + beyond, _CURVE)
+        rows = np.tile(np.median(self.points, axis=0), (_CURVE, 1))
+        rows[:, place] = along
+        half = None if self.reach is None else self.reach(rows)
+        return Curve(along, (along >= low) & (along <= high), self.at(rows), half)
+
+    def telling_pair(self) -> tuple[str, str]:
+        """The most telling feature, and of those that do not move along with it the next; of at least two features."""
+        first, *others = self.ranked()
+        own = self.seen[:, self.features.index(first)]
+        for name in others:
+            other = self.seen[:, self.features.index(name)]
+            if own.std() > 0 and other.std() > 0 and abs(np.corrcoef(own, other)[0, 1]) <= _TIED:
+                return first, name
+        return first, others[0]
+
+    def tied(self, feature: str, but: str = "") -> bool:
+        """Whether the data move another feature along with it, `but` one: then they hold nothing with that at rest."""
+        moving = [name for name, spread in zip(self.features, self.seen.std(axis=0), strict=True) if spread > 0]
+        own = self.seen[:, self.features.index(feature)]
+        others = [self.seen[:, self.features.index(n)] for n in moving if n not in (feature, but)]
+        return feature in moving and any(abs(np.corrcoef(own, other)[0, 1]) > _TIED for other in others)
+
+    def alone(self, across: str, along: str) -> bool:
+        """Whether two features are variables that can be moved with all else at rest."""
+        known = across in self.variables and along in self.variables
+        return known and not self.tied(across, along) and not self.tied(along, across)
+
+    def means(self, feature: str) -> tuple[Vector, Matrix]:
+        """Means of feature and learned part over bins of the feature of equally many points, (k,) and (k, nl)."""
+        order = np.argsort(self.seen[:, self.features.index(feature)], kind="stable")
+        bins = np.array_split(order, min(_BINS, max(len(order) // 8, 1)))
+        centres = np.array([self.seen[b, self.features.index(feature)].mean() for b in bins])
+        return centres, np.array([self.values[b].mean(axis=0) for b in bins])
+
+    def shares(self) -> Matrix:
+        """Share of the learned part's variance that the means over each feature explain, (nz, nl)."""
+        total = np.maximum(self.values.var(axis=0), 1e-300)
+        return np.array([self.means(feature)[1].var(axis=0) / total for feature in self.features])
+
+    def ranked(self) -> Sequence[str]:
+        """Features, the one that explains most of the learned part first."""
+        order = np.argsort(-self.shares().max(axis=1), kind="stable")
+        return [self.features[j] for j in order]
+
+    def surface(self, across: str, along: str) -> Surface:
+        """Over two features where data are near; of such that do not move alone the mean of the data in each cell."""
+        pair = self.seen[:, [self.features.index(across), self.features.index(along)]]
+        low, high = pair.min(axis=0), pair.max(axis=0)
+        width = np.maximum(high - low, 1e-300)
+        alone = self.alone(across, along)
+        count = _CELLS if alone else _CELLS // 2
+        cells = np.minimum((count * (pair - low) / width).astype(int), count - 1)
+        first, second = (low[k] + width[k] * (np.arange(count) + 0.5) / count for k in (0, 1))
+        if alone:
+            rows = np.tile(np.median(self.points, axis=0), (_CELLS * _CELLS, 1))
+            rows[:, self.variables.index(across)] = np.repeat(first, _CELLS)
+            rows[:, self.variables.index(along)] = np.tile(second, _CELLS)
+            learned = self.at(rows).reshape(_CELLS, _CELLS, -1)
+            learned = np.where(_near(cells)[..., None], learned, np.nan)
+        else:
+            learned = _mean_in_cells(cells, self.values, count)
+        return Surface(first, second, learned)
+
+
+def _near(cells: np.ndarray) -> Bool[np.ndarray, "a b"]:
+    """Cells with data, and those beside them."""
+    there = np.zeros((_CELLS + 2, _CELLS + 2), dtype=bool)
+    for i in (0, 1, 2):
+        for j in (0, 1, 2):
+            there[cells[:, 0] + i, cells[:, 1] + j] = True
+    return there[1:-1, 1:-1]
+
+
+def _mean_in_cells(cells: np.ndarray, values: Matrix, size: int) -> Float[np.ndarray, "a b nl"]:
+    count, total = np.zeros((size, size)), np.zeros((size, size, values.shape[1]))
+    np.add.at(count, tuple(cells.T), 1)
+    np.add.at(total, tuple(cells.T), values)
+    return np.where(count[..., None] > 0, total / np.maximum(count, 1)[..., None], np.nan)
+
+
+def _spread(count: int) -> np.ndarray:
+    return np.linspace(0, count - 1, min(count, _MOST_POINTS)).astype(int)
+
+
+def trajectory_of(model: MotionModel, record: Record) -> tuple[Matrix, Matrix]:
+    """States and inputs of the free run of the first experiment, as far as it is finite."""
+    record = model.fitting(record, need_outputs=False)
+    frame = model.states(record)
+    first = record.experiments[0]
+    states = frame[list(model.form.motion.names_of_states)].to_numpy()[: len(first)]
+    finite = np.isfinite(states).all(axis=1)
+    end = len(states) if finite.all() else max(int(np.argmin(finite)), 1)
+    return states[:end], np.asarray(first.inputs)[:end]
+
+
+def labels_with_units(model: MotionModel) -> list[str]:
+    """Of learned equations and outputs."""
+    units = {channel.name: channel.unit for channel in model.outputs}
+    labels = [(name, unit or units.get(name, "")) for name, unit in labels_of(model.form)]
+    return [f"{name} [{unit}]" if unit else name for name, unit in labels]
+
+
+def units_of(model: MotionModel) -> dict[str, str]:
+    """Of states and inputs by name."""
+    return {s.name: s.unit for s in model.form.motion.states} | {c.name: c.unit for c in model.inputs}
+
+
+def curve_limits(curve: Vector, cloud: Vector) -> tuple[float, float]:
+    """What a panel of a curve shows: the curve and the cloud, not all of a band that widens where there are no data."""
+    both = np.concatenate([curve, cloud])
+    low, high = float(np.nanmin(both)), float(np.nanmax(both))
+    margin = 0.15 * max(high - low, 1e-12)
+    return low - margin, high + margin

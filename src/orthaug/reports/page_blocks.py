@@ -1,0 +1,116 @@
+"""What a page is made of: sections of paragraphs, tables and plots; and how numbers are written in cells."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+_LARGE = 7  # digits before the point from which a power of ten is written
+_RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+_ROUNDING = 1e-12  # of its scale: a number below is rounding of zero
+
+
+def number(value: float | None, digits: int = 5, scale: float | None = None) -> str:
+    """A cell; 0 for what is rounding beside a `scale`, a dash where there is no number."""
+    if value is None:
+        return "–"
+    if value == 0 or (scale is not None and abs(value) <= _ROUNDING * abs(scale)):
+        return "0"
+    text = f"{value:.{digits}g}"
+    mantissa, _, power = text.partition("e")
+    if power and 0 < int(power) < _LARGE:
+        text = f"{float(text):.0f}"
+    elif power:
+        text = f"{mantissa}·10{str(int(power)).translate(_RAISED)}"
+    return text.replace("-", "−")
+
+
+def interval(ends: Sequence[float | None] | None, digits: int = 5) -> str:
+    """The two ends of an interval; a dash where there is none."""
+    if ends is None:
+        return "–"
+    scale = max((abs(end) for end in ends if end is not None), default=None)
+    return " … ".join(number(end, digits, scale) for end in ends)
+
+
+def percent(share: float | None, digits: int = 2, *, signed: bool = False) -> str:
+    """A share in per cent."""
+    if share is None:
+        return "–"
+    shown = 0.0 if abs(share) < _ROUNDING else 100 * share
+    if shown and abs(shown) < 10**-3:
+        return "< 0.001 %"
+    return f"{f'{shown:+.{digits}g}' if signed and shown else f'{shown:.{max(digits, 3)}g}'} %".replace("-", "−")
+
+
+def with_unit(name: str, unit: str | None) -> str:
+    """A name with its unit in brackets."""
+    return f"{name} [{unit}]" if unit else name
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph; `kind` is plain, note, warning, or hint for what is of use on a screen only."""
+
+    text: str
+    kind: str = "plain"
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells as text, under a caption that is a sentence."""
+
+    caption: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True)
+class Code:
+    """Text as it is, such as a spec; folded where it is `long`."""
+
+    text: str
+    label: str
+    long: bool = False
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A Plotly figure that the page draws; `label` is read aloud in its place, `caption` stands below."""
+
+    label: str
+    caption: str
+    traces: list[dict[str, Any]]
+    layout: dict[str, Any] = field(default_factory=dict)
+    height: int = 320
+    small: bool = False
+    series: Mapping[str, Any] = field(default_factory=dict)
+    """Long curves by a name that traces give."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Small plots beside each other, as many as the width holds."""
+
+    plots: Sequence[Plot]
+
+
+@dataclass(frozen=True)
+class Section:
+    """A chapter of a page."""
+
+    key: str
+    title: str
+    blocks: Sequence[Text | Table | Code | Plot | Grid]
+
+
+def plots_of(sections: Sequence[Section]) -> list[Plot]:
+    """All plots in their order."""
+    blocks = [block for section in sections for block in section.blocks]
+    return [
+        plot
+        for block in blocks
+        for plot in (block.plots if isinstance(block, Grid) else (block,))
+        if isinstance(plot, Plot)
+    ]

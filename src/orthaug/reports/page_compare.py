@@ -1,0 +1,100 @@
+"""The sections of a comparison's page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from orthaug.models.response import Response
+from orthaug.reports.page_blocks import Grid, Section, Table, Text, interval, number
+from orthaug.reports.page_figures import parameter_comparison
+from orthaug.reports.page_fit import Origin, origin_blocks, score_blocks
+from orthaug.reports.page_runs import compared_plots
+from orthaug.reports.result import CompareResult
+
+_WORDS = {"helps": "the learner helps", "no_help": "the learner does not help", "hurts": "the learner hurts"}
+
+
+@dataclass(frozen=True, eq=False)
+class ComparePage:
+    """What a page tells of a comparison beside its result."""
+
+    origin: Origin
+    result: CompareResult
+    responses: Mapping[str, Mapping[str, Response]]
+    """Free run of every part, by the name of the row."""
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Their names."""
+        runs = next(iter(self.responses.values()), {})
+        return tuple(c.name for c in next(iter(runs.values())).outputs) if runs else ()
+
+
+def compare_sections(page: ComparePage) -> list[Section]:
+    """All of them; what a result does not have is left out."""
+    result = page.result
+    scores = {row.name: row.scores for row in result.comparison}
+    found = [
+        Section("models", "Models", _models(result)),
+        Section("scores", "Scores", score_blocks(scores, page.outputs)),
+        Section("parameters", "Parameters", _parameters(result)),
+        Section("free-run", "Free run", list(compared_plots(page.responses))),
+        Section(
+            "residuals",
+            "Residual tests",
+            [Text(f"{row.name}: {row.residuals.text}") for row in result.comparison if row.residuals is not None],
+        ),
+        Section(
+            "warnings",
+            "Warnings",
+            [
+                Text(f"{row.name}: {w.text}", "warning")
+                for row in result.comparison
+                for w in row.warnings
+                if w not in result.warnings
+            ],
+        ),
+        Section("reproduce", "How to reproduce it", origin_blocks(page.origin, result)),
+    ]
+    return [section for section in found if section.blocks]
+
+
+def _models(result: CompareResult) -> list[Any]:
+    rows = []
+    for row in result.comparison:
+        defect = row.orthogonality_defect
+        shown = "–" if defect is None else "0 up to rounding" if defect < 1e-10 else number(defect, 2)
+        verdict = "–" if row.validation is None else _WORDS.get(row.validation.verdict, row.validation.verdict)
+        chosen = " (chosen)" if row.name == result.chosen else ""
+        rows.append(
+            [
+                row.name + chosen,
+                row.status.replace("_", " "),
+                str(row.weights),
+                number(row.learner_to_physics, 2),
+                shown,
+                number(row.seconds, 3),
+                verdict,
+            ]
+        )
+    head = ["model", "ended", "weights", "learner over physics", "overlap ‖QᵀF̃‖/‖F‖", "time [s]", "verdict"]
+    caption = "Physics alone and every structure on the same data and seeds."
+    if result.chosen:
+        caption += " The chosen one has the lowest error on the validation part, unless its learner does not help."
+    blocks: list[Any] = [Table(caption, head, rows)]
+    blocks += [Text(f"{row.name}: {row.validation.text}") for row in result.comparison if row.validation]
+    return blocks + [Text(f"Left out: {kind}: {why}", "note") for kind, why in result.left_out.items()]
+
+
+def _parameters(result: CompareResult) -> list[Any]:
+    if not result.comparison or not result.comparison[0].parameters:
+        return []
+    rows = [
+        [row.name, p.name, number(p.value, 6), p.unit or "–", number(p.std, 2, p.value), interval(p.ci95)]
+        for row in result.comparison
+        for p in row.parameters
+    ]
+    head = ["model", "parameter", "value", "unit", "standard error", "95 % interval"]
+    return [Grid(parameter_comparison(result.comparison)), Table("What each model estimates.", head, rows)]

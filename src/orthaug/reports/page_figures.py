@@ -1,0 +1,342 @@
+"""Plotly figures of a page from the numbers of a result, written as the JSON that Plotly reads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from orthaug.reports.findings import ResidualTestResult, SuspectResult
+from orthaug.reports.page_blocks import Plot, percent, with_unit
+from orthaug.reports.result import ParameterResult, PartScores, RestartResult, RowResult
+
+_ROW = 62  # pixels of a parameter
+_FAR = 6.0  # widths of an interval from which the initial value is not drawn: the interval would be a point
+_DECADES = 20.0  # ratio of scores from which their axis is logarithmic
+_BAD = 1.0  # NRMSE of the mean, from which it is too
+_KINDS = {"prediction": ("one step", "@physics"), "simulation": ("free run", "@model")}
+
+
+def interval_plot(rows: Sequence[ParameterResult]) -> Plot | None:
+    """Every parameter on an axis of its own unit: value, intervals, and the initial value where it is near."""
+    drawn = [row for row in rows if row.value is not None and row.ci95 and None not in row.ci95]
+    if not drawn:
+        return None
+    traces: list[dict[str, Any]] = []
+    layout: dict[str, Any] = {"shapes": []}
+    told = any(row.ci95_with_bias for row in drawn)
+    for i, row in enumerate(drawn):
+        number = str(i + 1) if i else ""
+        first = {"95 % interval": i == 0, "estimate": i == 0, "initial value": i == _first(drawn, _near)}
+        first["95 % interval with the bias"] = i == _first(drawn, lambda r: bool(r.ci95_with_bias))
+        for trace in _interval_traces(row):
+            own = {"xaxis": f"x{number}", "yaxis": f"y{number}", "legendgroup": trace["name"]}
+            traces.append({**own, **trace, "showlegend": first[trace["name"]]})
+        top = 1 - i / len(drawn)
+        layout[f"yaxis{number}"] = {
+            "domain": [top - 0.42 / len(drawn), top - 0.08 / len(drawn)],
+            "anchor": f"x{number}",
+            "range": [-1, 1],
+            "tickvals": [0],
+            "ticktext": [_tick(row)],
+            "fixedrange": True,
+            "showgrid": False,
+            "zeroline": False,
+        }
+        layout[f"xaxis{number}"] = {"anchor": f"y{number}", "nticks": 6, "zeroline": False, "range": _reach(row)}
+    caption = (
+        "Every parameter on an axis of its own: the circle is the estimate, the thick bar its 95 % interval"
+        + ("; the thin bar covers its bias too." if told else ".")
+        + " A diamond is the initial value, where it is near enough to be shown."
+    )
+    label = "Intervals of " + ", ".join(row.name for row in drawn) + "; the table above has their numbers."
+    return Plot(label, caption, traces, layout, height=70 + _ROW * len(drawn))
+
+
+def _interval_traces(row: ParameterResult) -> list[dict[str, Any]]:
+    """Bars of the intervals, the circle of the estimate, and the diamond of the initial value where it is near."""
+    bars = {"95 % interval": (row.ci95, "@model", 7)}
+    if row.ci95_with_bias and None not in row.ci95_with_bias:
+        bars = {"95 % interval with the bias": (row.ci95_with_bias, "@bias", 3), **bars}
+    found: list[dict[str, Any]] = [
+        {"name": name, "x": ends, "y": [0, 0], "mode": "lines", "line": {"color": color, "width": width}}
+        for name, (ends, color, width) in bars.items()
+    ]
+    circle = {"color": "@paper", "size": 9, "line": {"color": "@ink", "width": 2}}
+    found.append({"name": "estimate", "x": [row.value], "y": [0], "mode": "markers", "marker": circle})
+    if _near(row):
+        diamond = {"color": "@measured", "size": 9, "symbol": "diamond"}
+        found.append({"name": "initial value", "x": [row.initial], "y": [0], "mode": "markers", "marker": diamond})
+    return found
+
+
+def _first(rows: Sequence[ParameterResult], holds: Callable[[ParameterResult], bool]) -> int:
+    """The number of the first row of which something holds."""
+    return next((i for i, row in enumerate(rows) if holds(row)), 0)
+
+
+def _tick(row: ParameterResult) -> str:
+    """The name of a parameter, and half its interval in per cent of it."""
+    low, high = row.ci95 or (None, None)
+    half = None if low is None or high is None or not row.value else abs((high - low) / (2 * row.value))
+    return f"<b>{with_unit(row.name, row.unit)}</b>" + ("" if half is None else f"<br>± {percent(half)}")
+
+
+def _reach(row: ParameterResult) -> list[float]:
+    """What the axis of a parameter shows: its intervals with a margin, and the initial value where it is near."""
+    ends = [row.value, *(row.ci95 or ()), *(row.ci95_with_bias or ()), row.initial if _near(row) else None]
+    known = [end for end in ends if end is not None]
+    margin = 0.35 * max(max(known) - min(known), 1e-300)
+    return [min(known) - margin, max(known) + margin]
+
+
+def _near(row: ParameterResult) -> bool:
+    low, high = row.ci95 or (None, None)
+    if row.initial is None or low is None or high is None or row.value is None:
+        return False
+    return abs(row.initial - row.value) <= _FAR * max(high - low, 1e-300)
+
+
+def score_plot(scores: Mapping[str, Mapping[str, PartScores]], outputs: Sequence[str]) -> Plot | None:
+    """NRMSE of every part, or of every way of modelling; logarithmic where some are bad or far apart.
+
+    Args:
+        scores: by the name of a row, by the name of a part.
+    """
+    traces, values, lost = [], [], []
+    for kind, (name, color) in _KINDS.items():
+        x, y = [], []
+        for row, parts in scores.items():
+            for part, score in parts.items():
+                place = f"{row}, {part}" if row else part
+                numbers = score.kinds[kind].nrmse
+                for j, value in enumerate(numbers or [None]):
+                    where = f"{place}, {outputs[j]}" if numbers and len(numbers) > 1 else place
+                    if value is None:
+                        lost.append(f"{where} ({name})")
+                        continue
+                    x.append(max(value, 1e-16))
+                    y.append(where)
+        values += x
+        symbol = "circle" if kind == "simulation" else "diamond"
+        traces.append(
+            {"x": x, "y": y, "mode": "markers", "name": name, "marker": {"color": color, "size": 11, "symbol": symbol}}
+        )
+    if not values:
+        return None
+    logarithmic = max(values) > _BAD or max(values) > _DECADES * min(values)
+    caption = "NRMSE of every part, the error over the output's deviation: 0 is perfect, 1 as bad as the mean"
+    caption += "; the axis is logarithmic." if logarithmic else "."
+    if lost:
+        caption += f" There is none of {', '.join(dict.fromkeys(lost))}: the run diverged, or the output does not move."
+    count = len({place for trace in traces for place in trace["y"]})
+    axis: dict[str, Any] = (
+        {"title": {"text": "NRMSE"}, "type": "log"}
+        if logarithmic
+        else {"title": {"text": "NRMSE"}, "range": [0, 1.1 * max(values)]}
+    )
+    if logarithmic:
+        axis |= {
+            "range": [math.log10(min(values)) - 0.2, math.log10(max(*values, 1.0)) + 0.2],
+            "dtick": 1,
+            "exponentformat": "power",
+        }
+    shapes = (
+        [
+            {
+                "type": "line",
+                "x0": 1,
+                "x1": 1,
+                "yref": "paper",
+                "y0": 0,
+                "y1": 1,
+                "line": {"color": "@bad", "width": 1, "dash": "dot"},
+            }
+        ]
+        if logarithmic
+        else []
+    )
+    layout = {
+        "xaxis": axis,
+        "yaxis": {"autorange": "reversed", "automargin": True, "type": "category"},
+        "shapes": shapes,
+    }
+    return Plot("NRMSE of every part; the table has the numbers.", caption, traces, layout, height=110 + 30 * count)
+
+
+def residual_plots(test: ResidualTestResult, what: str) -> list[Plot]:
+    """Autocorrelation, correlation with the inputs, and means over the most telling regressor."""
+    plots = []
+    if test.acf is not None and test.acf_band is not None:
+        lags = list(range(1, len(test.acf)))
+        bars = {"type": "bar", "x": lags, "y": test.acf[1:], "name": "autocorrelation", "marker": {"color": "@model"}}
+        told = (
+            f"Autocorrelation of the {what} of {test.name}; the band holds 99 % of the values that noise gives."
+            f" The largest is {_digits(test.largest_acf)}."
+        )
+        layout = _titled("lag [samples]", "autocorrelation") | {"shapes": [_band(test.acf_band)]}
+        plots.append(Plot(f"Autocorrelation of the {what} of {test.name}.", told, [bars], layout, 280, small=True))
+    shown = {name: cross for name, cross in test.cross.items() if cross is not None}
+    if shown:
+        traces = []
+        for (name, cross), color in zip(shown.items(), ("@model", "@physics", "@learner", "@bias") * 9, strict=False):
+            reach = len(cross.values) // 2
+            traces.append(
+                {
+                    "x": list(range(-reach, reach + 1)),
+                    "y": cross.values,
+                    "mode": "lines+markers",
+                    "name": name,
+                    "line": {"color": color, "width": 1},
+                    "marker": {"color": color, "size": 4},
+                }
+            )
+        band = max(cross.band or 0.0 for cross in shown.values())
+        told = f"Correlation of the {what} of {test.name} with the inputs; beyond the band it is more than noise."
+        layout = _titled("lag behind the input [samples]", "correlation") | {"shapes": [_band(band)]}
+        layout["showlegend"] = True
+        label = f"Correlation of the {what} of {test.name} with the inputs."
+        plots.append(Plot(label, told, traces, layout, 280, small=True))
+    curves = {name: curve for name, curve in test.regressors.items() if curve is not None}
+    if curves:
+        name = max(curves, key=lambda key: curves[key].share or 0.0)
+        curve = curves[name]
+        errors = [None if e is None else 2.576 * e for e in curve.errors]
+        dots = {
+            "x": curve.centres,
+            "y": curve.means,
+            "mode": "markers",
+            "name": "mean",
+            "error_y": {"array": errors, "color": "@learner", "thickness": 1},
+            "marker": {"color": "@learner"},
+        }
+        told = (
+            f"Mean of the {what} of {test.name} over {name} with 99 % intervals: it explains "
+            f"{percent(curve.share)} of its variance."
+        )
+        label = f"Mean of the {what} of {test.name} over {name}."
+        plots.append(Plot(label, told, [dots], _titled(name, f"residual of {test.name}"), 280, small=True))
+    return plots
+
+
+def bias_plot(suspects: Sequence[SuspectResult]) -> Plot:
+    """Heat map of the bias of each parameter by each suspect, in per cent."""
+    names, labels = list(suspects[0].percent), [suspect.name for suspect in suspects]
+    shares = np.array([[suspect.percent[name] for name in names] for suspect in suspects], dtype=float)
+    shares = np.where(np.abs(shares) < 1e-7, 0.0 * shares, shares)
+    signed = np.sign(shares) * np.log10(1 + np.abs(shares))  # biases of 0.1 % and of 100 % both show
+    reach = max(float(np.nanmax(np.abs(signed), initial=0.0)), 1e-12)
+    told = [[percent(v / 100, signed=True) if np.isfinite(v) else "–" for v in row] for row in shares]
+    heat = {
+        "type": "heatmap",
+        "x": names,
+        "y": labels,
+        "z": _cells(signed),
+        "zmin": -reach,
+        "zmax": reach,
+        "text": told,
+        "texttemplate": "%{text}" if shares.size <= 200 else "",
+        "showscale": False,
+        "colorscale": "@diverging",
+        "hovertemplate": "%{y} on %{x}: %{text}<extra></extra>",
+    }
+    layout = {
+        "yaxis": {"autorange": "reversed", "automargin": True, "type": "category"},
+        "xaxis": {"side": "top", "type": "category"},
+        "showlegend": False,
+    }
+    caption = (
+        "Bias of each parameter (columns) by each term that may be missing from the physics (rows), in per cent of "
+        "its value; a term without a guessed size counts as 1 % of the output."
+    )
+    return Plot("Bias of each parameter by each suspected term.", caption, [heat], layout, 90 + 28 * len(labels))
+
+
+def restart_plot(restarts: Sequence[RestartResult]) -> Plot | None:
+    """The loss that every start came to."""
+    if len([run for run in restarts if run.loss is not None]) < 3:
+        return None
+    place = [f"{run.seed}, {run.regularization}" for run in restarts]
+    sizes = [13 if run.chosen else 8 for run in restarts]
+    colors = ["@model" if run.chosen else "@measured" for run in restarts]
+    dots = {
+        "x": list(range(1, len(restarts) + 1)),
+        "y": [run.loss for run in restarts],
+        "mode": "markers",
+        "text": place,
+        "name": "loss",
+        "marker": {"color": colors, "size": sizes},
+    }
+    losses = [run.loss for run in restarts if run.loss]
+    wide = bool(losses) and max(losses) > _DECADES * min(losses) > 0
+    layout = _titled("run", "loss") | {"showlegend": False}
+    layout["xaxis"] |= {"tickformat": "d", "dtick": 1 + len(restarts) // 12}
+    layout["yaxis"] = {"title": {"text": "loss"}, "type": "log" if wide else "linear"}
+    caption = "The loss that every start came to; the large dot is the chosen one. "
+    caption += "Where several starts end at the same loss, it is hardly a poor minimum."
+    return Plot("Loss that every start came to.", caption, [dots], layout, 260)
+
+
+def parameter_comparison(rows: Sequence[RowResult]) -> list[Plot]:
+    """Of every parameter its value and 95 % interval in each way of modelling."""
+    plots = []
+    for parameter in rows[0].parameters:
+        x, y, arms = [], [], []
+        for row in rows:
+            entry = next((p for p in row.parameters if p.name == parameter.name), None)
+            if entry is not None and entry.value is not None:
+                x.append(entry.value)
+                y.append(row.name)
+                ends = entry.ci95 if entry.ci95 and None not in entry.ci95 else (entry.value, entry.value)
+                arms.append((max((ends[1] or 0.0) - entry.value, 0.0), max(entry.value - (ends[0] or 0.0), 0.0)))
+        dots = {
+            "x": x,
+            "y": y,
+            "mode": "markers",
+            "name": parameter.name,
+            "marker": {"color": "@model", "size": 9},
+            "error_x": {
+                "type": "data",
+                "symmetric": False,
+                "array": [up for up, _ in arms],
+                "arrayminus": [down for _, down in arms],
+                "color": "@model",
+                "thickness": 2,
+            },
+        }
+        layout = {
+            "xaxis": {"title": {"text": with_unit(parameter.name, parameter.unit)}, "nticks": 6},
+            "yaxis": {"autorange": "reversed", "automargin": True, "type": "category"},
+            "showlegend": False,
+        }
+        told = f"{parameter.name} by every way of modelling, with its 95 % interval where it has one."
+        plots.append(Plot(told, told, [dots], layout, 120 + 30 * len(rows), small=True))
+    return plots
+
+
+def _cells(values: np.ndarray) -> list[list[float | None]]:
+    return [[float(f"{v:.5g}") if np.isfinite(v) else None for v in row] for row in values]
+
+
+def _titled(x: str, y: str) -> dict[str, Any]:
+    return {"xaxis": {"title": {"text": x}}, "yaxis": {"title": {"text": y}}, "showlegend": False}
+
+
+def _band(half: float) -> dict[str, Any]:
+    return {
+        "type": "rect",
+        "xref": "paper",
+        "x0": 0,
+        "x1": 1,
+        "y0": -half,
+        "y1": half,
+        "fillcolor": "@reach",
+        "line": {"width": 0},
+        "layer": "below",
+    }
+
+
+def _digits(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.2g}"

@@ -1,0 +1,139 @@
+"""The findings of a fit on its page: residual tests, stability, excitation and suspects, restarts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from orthaug.reports.findings import ResidualTestResult
+from orthaug.reports.page_blocks import Grid, Table, Text, number, percent
+from orthaug.reports.page_figures import bias_plot, residual_plots, restart_plot
+from orthaug.reports.result import FitResult
+
+
+def residuals_blocks(result: FitResult) -> list[Any]:
+    """What the residuals tell, output by output."""
+    blocks: list[Any] = []
+    found = result.residuals
+    if found is None:
+        told = next((w.text for w in result.warnings if w.code == "residual_not_analysed"), "")
+        blocks += [Text(told)] if told else []
+    else:
+        blocks.append(Text(found.text))
+        tests = [("one-step residual", found.one_step), ("error of the free run", found.free_run or [])]
+        rows = [_test_cells(what, test) for what, group in tests for test in group]
+        head = ["residual", "RMS", "mean", "white", "Ljung-Box p", "largest autocorrelation", "follows", "curved over"]
+        blocks.append(
+            Table("Tests of the residuals on the training data, at the levels that the result tells.", head, rows)
+        )
+        blocks += [Grid(plots) for what, group in tests for test in group if (plots := residual_plots(test, what))]
+    blocks += [Text(result.missing_lags.text)] if result.missing_lags else []
+    return blocks
+
+
+def _test_cells(what: str, test: ResidualTestResult) -> list[str]:
+    white = {True: "yes", False: "no", None: "–"}[test.white]
+    return [
+        f"{what} of {test.name}",
+        number(test.rms, 3),
+        number(test.mean, 2, test.rms),
+        white,
+        _chance(test.ljung_box.p) if test.ljung_box else "–",
+        number(test.largest_acf, 2, 1.0),
+        ", ".join(test.correlated_inputs) or "no input",
+        ", ".join(test.curved_regressors) or "nothing",
+    ]
+
+
+def _chance(p: float | None) -> str:
+    """A p-value; a small one is as good as a smaller one."""
+    return "< 10⁻⁶" if p is not None and p < 1e-6 else number(p, 2)
+
+
+def stability_blocks(result: FitResult) -> list[Any]:
+    """What is known of the free run's stability."""
+    found = result.stability
+    if found is None:
+        return []
+    blocks: list[Any] = [Text(line) for line in found.text.splitlines() if line.strip()]
+    told: list[list[str]] = []
+    if found.feedback:
+        f = found.feedback
+        told += [
+            ["local spectral radius, largest", number(f.largest, 4)],
+            ["its median", number(f.median, 4)],
+            ["steps on which it is above 1", percent(f.share_above_one)],
+        ]
+    if found.contraction:
+        told.append(["rate of the best norm", number(found.contraction.rate, 4)])
+    if found.modes:
+        m = found.modes
+        told += [
+            ["rightmost eigenvalue, real part [1/s]", number(m.rightmost, 4, m.fastest)],
+            ["slowest and fastest mode [1/s]", f"{number(m.slowest, 3)} and {number(m.fastest, 3)}"],
+            ["points with a growing mode", percent(m.growing)],
+        ]
+    if found.diverges_at is not None or found.searched is not None:
+        at = "none found" if found.diverges_at is None else number(found.diverges_at, 4)
+        told.append([f"factor on the inputs at which the run diverges (searched to {number(found.searched, 4)})", at])
+    return [*blocks, Table("Evidence on the free run's stability.", ["measure", "value"], told)] if told else blocks
+
+
+def excitation_blocks(result: FitResult) -> list[Any]:
+    """How well the data tell the parameters apart, and what each suspected term does to them."""
+    seen = result.excitation
+    told = f"The data tell {seen.rank} of {seen.columns} parameters apart; "
+    told += f"the condition number is {number(seen.condition, 3)}."
+    if result.orthogonality_defect is not None:
+        small = result.orthogonality_defect < 1e-10
+        shown = "0 up to rounding" if small else number(result.orthogonality_defect, 2)
+        told += f" The overlap of physics and learner, ‖QᵀF̃‖/‖F‖, is {shown}."
+    blocks: list[Any] = [Text(told)]
+    if result.measure_detail:
+        detail = result.measure_detail
+        blocks.append(
+            Text(
+                f"θ was split under the {detail.kind} measure, {detail.points} points"
+                + ("." if detail.support is None else f", {percent(detail.support)} within reach of the data.")
+            )
+        )
+    if result.bias:
+        head = ["suspect", "expression", "explains of the learner", "cosine with the physics", "removed by"]
+        rows = [
+            [s.name, s.expression, percent(s.explained), number(s.cosine, 3, 1.0), s.removed_by or "–"]
+            for s in result.bias
+        ]
+        blocks.append(Table("Terms that may be missing from the physics, and what becomes of them.", head, rows))
+        if result.bias[0].percent:
+            blocks.append(bias_plot(result.bias))
+    return blocks
+
+
+def _sentence(text: str) -> str:
+    return f"{text[0].upper()}{text[1:].rstrip('.')}." if text else ""
+
+
+def restarts_blocks(result: FitResult) -> list[Any]:
+    """How training ended, from every start."""
+    status = result.status
+    told = (
+        f"Training ended with “{status.code.replace('_', ' ')}” after {status.iterations} iterations and "
+        f"{number(status.seconds, 3)} s. {_sentence(status.message)}"
+    )
+    fall = f" The loss is {number(status.loss, 4)}; that of physics alone was {number(status.start_loss, 4)}."
+    head = ["seed", "regularization", "loss", "validation", "iterations", "ended", "chosen"]
+    rows = [
+        [
+            str(r.seed),
+            str(r.regularization),
+            number(r.loss),
+            number(r.validation),
+            str(r.iterations),
+            r.code.replace("_", " "),
+            "yes" if r.chosen else "no",
+        ]
+        for r in result.restarts
+    ]
+    blocks: list[Any] = [Text(told + fall)]
+    plot = restart_plot(result.restarts)
+    blocks += [plot] if plot else []
+    return blocks + ([Table("Every run from its own initial weights.", head, rows)] if rows else [])

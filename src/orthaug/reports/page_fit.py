@@ -1,0 +1,289 @@
+"""The sections of a fit's page, in the order in which they are read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from orthaug.models.response import Response
+from orthaug.reports.learned_part import LearnedPart
+from orthaug.reports.page_blocks import Code, Plot, Section, Table, Text, interval, number, percent
+from orthaug.reports.page_figures import interval_plot, score_plot
+from orthaug.reports.page_findings import excitation_blocks, residuals_blocks, restarts_blocks, stability_blocks
+from orthaug.reports.page_learned import learned_blocks
+from orthaug.reports.page_runs import Run, error_band, run_plots
+from orthaug.reports.result import CompareResult, DataResult, FitResult, ParameterResult, PartScores
+
+
+@dataclass(frozen=True, eq=False)
+class Origin:
+    """Where a result comes from: name and text of its spec, the command, when and on what it was made."""
+
+    name: str
+    toml: str
+    command: str
+    date: str
+    machine: str
+    versions: Mapping[str, str]
+    seed: int
+
+
+@dataclass(frozen=True, eq=False)
+class FitPage:
+    """What a page tells of a fit beside its result."""
+
+    origin: Origin
+    result: FitResult
+    responses: Mapping[str, tuple[Response, Response]]
+    """One-step prediction and free run of every part."""
+    alone: Mapping[str, Response] = field(default_factory=dict)
+    """Free run of the physics without the learner, of every part; empty where nothing was learned."""
+    learned: LearnedPart | None = None
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Their names."""
+        return tuple(channel.name for _, free in self.responses.values() for channel in free.outputs)[: self._count]
+
+    @property
+    def _count(self) -> int:
+        return len(next(iter(self.responses.values()))[1].outputs)
+
+
+def fit_sections(page: FitPage) -> list[Section]:
+    """All of them; what a result does not have is left out."""
+    result = page.result
+    found = [
+        Section("parameters", "Parameters", _parameters(result)),
+        Section("free-run", "Free run", _runs(page)),
+        Section("share", "Physics and learner", _shares(page)),
+        Section("learned", "What was learned", _learned(page)),
+        Section("residuals", "Residual tests", residuals_blocks(result)),
+        Section("stability", "Stability", stability_blocks(result)),
+        Section("excitation", "Excitation and suspects", excitation_blocks(result)),
+        Section("restarts", "Training and restarts", restarts_blocks(result)),
+        Section("scores", "Scores", score_blocks({"": result.scores}, page.outputs)),
+        Section("reproduce", "How to reproduce it", origin_blocks(page.origin, result)),
+    ]
+    return [section for section in found if section.blocks]
+
+
+def _parameters(result: FitResult) -> list[Any]:
+    rows = [*result.parameters, *(result.physical_parameters or [])]
+    if not rows:
+        return [Text("The physics has no parameters: all of the model was learned.")]
+    told = {
+        "robust": "Standard errors are robust against a coloured residual.",
+        "plain": "Standard errors are those of a white residual.",
+        None: "There are no standard errors.",
+    }
+    columns = ["parameter", "value", "unit", "standard error", "95 % interval", "initial"]
+    biased = any(row.bias for row in rows)
+    columns += ["bias", "95 % interval with it"] if biased else []
+    shared = any(row.shared is not None for row in rows)
+    columns += ["learner could imitate it"] if shared else []
+    caption = f"What was estimated. {told[result.standard_errors]}"
+    if biased:
+        caption += " The bias is estimate less truth, as far as one suspected term explains what the learner found."
+    blocks: list[Any] = [Table(caption, columns, [_parameter_cells(row, biased, shared) for row in rows])]
+    plot = interval_plot(rows)
+    blocks += [plot] if plot else []
+    cause = next((row.bias for row in rows if row.bias), None)
+    if cause is not None:
+        blocks.append(Text(f"The bias budget: {percent(cause.share)} of what the learner found is {cause.cause}."))
+    if result.physical_consistency:
+        blocks.append(Text(result.physical_consistency.text))
+    if result.shared is not None:
+        blocks.append(Text(result.shared.text, "note"))
+    return blocks + _equations(result)
+
+
+def _parameter_cells(row: ParameterResult, biased: bool, shared: bool) -> list[str]:
+    scale = row.value
+    cells = [
+        row.name,
+        number(row.value, 6),
+        row.unit or "–",
+        number(row.std, 2, scale),
+        interval(row.ci95),
+        number(row.initial),
+    ]
+    if biased:
+        cells += [number(row.bias.value, 2, scale) if row.bias else "–", interval(row.ci95_with_bias)]
+    return cells + ([{True: "yes", False: "no", None: "–"}[row.shared]] if shared else [])
+
+
+def _equations(result: FitResult) -> list[Any]:
+    """The equations of a motion, and the terms that were learned."""
+    blocks: list[Any] = []
+    declared = result.spec.get("motion")
+    if result.motion is not None and declared:
+        next_value = result.motion.integrator == "discrete"
+        rows = [
+            [
+                state,
+                given.get("unit") or "–",
+                given.get("next") or given.get("derivative") or "–",
+                "yes" if given.get("learned") else "no",
+            ]
+            for state, given in declared["states"].items()
+        ]
+        told = result.motion
+        caption = (
+            f"The equations of motion, {told.integrator} with {told.substeps} substep{'s' * (told.substeps > 1)} in "
+            f"a sample and a {told.hold} hold; a prediction starts from a state estimated over {told.window} rows."
+        )
+        blocks.append(
+            Table(caption, ["state", "unit", "next value" if next_value else "derivative", "learner beside it"], rows)
+        )
+    if result.terms:
+        rows = [
+            [
+                t.term,
+                t.added_to,
+                number(t.coefficient),
+                t.unit or "–",
+                number(t.std, 2, t.coefficient),
+                interval(t.ci95),
+                number(t.largest, 3),
+            ]
+            for t in result.terms
+        ]
+        head = ["term", "added to", "coefficient", "unit", "standard error", "95 % interval", "largest contribution"]
+        blocks.append(Table("The learned terms, the largest first.", head, rows))
+    if result.equation:
+        blocks.append(Code(result.equation.text, "The fitted equations"))
+    return blocks
+
+
+def _runs(page: FitPage) -> list[Any]:
+    runs = [Run(part, free, page.alone.get(part)) for part, (_, free) in page.responses.items()]
+    train = next(iter(page.responses.values()))[1]
+    notes = [Text(w.text, "warning") for w in page.result.warnings if w.code in ("witness", "free_run_diverged")]
+    band, alone = error_band(train), bool(page.alone)
+    told = "A model in free run sees the inputs alone and lives on its own past; the residual is measured less model."
+    told += " Physics alone is the same model with the learner switched off." if alone else ""
+    told += " Between the limits of the band lie 95 % of the errors on the training data." if band else ""
+    how = Text(
+        "Drag over a stretch to zoom, double-click for the whole record; with the keyboard the arrows move, "
+        "+ and − zoom, 0 shows all.",
+        "hint",
+    )
+    return [*notes, Text(told), how, *run_plots(runs, band)]
+
+
+def _shares(page: FitPage) -> list[Any]:
+    """How much of the model's output, or of each equation, is physics and how much the learner."""
+    result = page.result
+    if result.motion is not None:
+        rows = [(part.equation, part.physics, part.learner, part.share, part.unit) for part in result.motion.parts]
+        what = "each learned equation along the training run"
+    else:
+        if page.learned is None:
+            return []
+        rows = [row for part, (one_step, _) in page.responses.items() for row in _part_shares(part, one_step)]
+        what = "the one-step prediction's deviation from its mean"
+    if not rows:
+        return []
+    cells = [
+        [name, number(physics, 3), number(learner, 3), unit or "–", percent(share)]
+        for name, physics, learner, share, unit in rows
+    ]
+    head = ["part", "physics", "learner", "unit", "share of the learner"]
+    table = Table(f"RMS of what physics and learner add to {what}.", head, cells)
+    bars = [
+        {
+            "type": "bar",
+            "orientation": "h",
+            "y": [row[0] for row in rows],
+            "name": name,
+            "x": [_of_both(row, i) for row in rows],
+            "marker": {"color": color},
+        }
+        for i, (name, color) in enumerate((("physics", "@physics"), ("learner", "@learner")))
+    ]
+    layout = {
+        "barmode": "stack",
+        "xaxis": {"title": {"text": "share of the two RMS [%]"}, "range": [0, 100]},
+        "yaxis": {"autorange": "reversed", "automargin": True, "type": "category"},
+    }
+    caption = "How the RMS of physics and learner divide."
+    if result.structure == "orthogonal":
+        caption += " The learner holds only what the physics cannot: its overlap with the physics is split off."
+    plot = Plot(
+        "Shares of physics and learner; the table has the numbers.", caption, bars, layout, 110 + 34 * len(rows)
+    )
+    return [table, plot]
+
+
+def _of_both(row: tuple[Any, ...], which: int) -> float:
+    physics, learner = (abs(part or 0.0) for part in row[1:3])
+    return 100 * (physics, learner)[which] / max(physics + learner, 1e-300)
+
+
+def _part_shares(part: str, response: Response) -> list[tuple[str, float, float, float | None, str]]:
+    found = []
+    for i, channel in enumerate(response.outputs):
+        both = [
+            np.concatenate([getattr(t, name)[t.start :, i] for t in response.trajectories])
+            for name in ("baseline", "learner")
+        ]
+        with np.errstate(all="ignore"):
+            physics, learner, total = (float(np.nanstd(values)) for values in (*both, both[0] + both[1]))
+        name = part if len(response.outputs) == 1 else f"{part}, {channel.name}"
+        found.append((name, physics, learner, learner / total if total else None, channel.unit))
+    return found
+
+
+def _learned(page: FitPage) -> list[Any]:
+    if page.learned is None or not page.learned.features:
+        return []
+    return list(learned_blocks(page.learned, page.result.measure or ""))
+
+
+def score_blocks(scores: Mapping[str, Mapping[str, PartScores]], outputs: Sequence[str]) -> list[Any]:
+    """Scores as a plot and a table; of one model, or of several by their names."""
+    rows = []
+    named = any(scores)
+    for row, parts in scores.items():
+        for part, both in parts.items():
+            for kind, score in both.kinds.items():
+                for j, output in enumerate(outputs):
+                    cells = [None if v is None or j >= len(v) else v[j] for v in (score.rmse, score.nrmse, score.fit)]
+                    horizon = "one step" if kind == "prediction" else "free run"
+                    rows.append(
+                        [
+                            *([row] if named else []),
+                            part,
+                            horizon,
+                            output,
+                            number(cells[0], 4),
+                            number(cells[1], 4),
+                            number(cells[2], 4),
+                        ]
+                    )
+    head = [*(["model"] if named else []), "part", "horizon", "output", "RMSE", "NRMSE", "FIT %"]
+    plot = score_plot(scores, outputs)
+    table = Table(
+        "Scores; RMSE is in the output's unit, FIT is 100 (1 − NRMSE), a dash where there is none.", head, rows
+    )
+    return [*([plot] if plot else []), table]
+
+
+def origin_blocks(origin: Origin, result: FitResult | CompareResult) -> list[Any]:
+    """Command, versions, files with their checksums, and the spec as it was written."""
+    rows = [["command", origin.command], ["seed", str(origin.seed)], ["date", origin.date], ["machine", origin.machine]]
+    rows += [[name, version] for name, version in origin.versions.items()]
+    return [
+        Table("How this result was made; the same versions, files and seed give the same numbers.", ["what", ""], rows),
+        _files(result.data),
+        Code(origin.toml, "The spec as it was written", long=True),
+    ]
+
+
+def _files(data: DataResult) -> Table:
+    rows = [[part, f.file, str(f.rows), f.sha256] for part, files in data.parts.items() for f in files]
+    return Table("The data files and their checksums.", ["part", "file", "rows", "sha256"], rows)

@@ -1,0 +1,182 @@
+"""What was learned, on a page: a curve over each input of the learner, and a surface over the two that matter most."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import Vector
+from orthaug.reports.learned_part import Curve, LearnedPart, curve_limits
+from orthaug.reports.page_blocks import Grid, Plot, Text, percent, with_unit
+
+_MOST_CURVES = 12
+_CLOUD = 600  # points of a cloud
+_COLOURED = 0.98  # of the cells of a surface have a colour of their own
+_LEVEL = 0.02  # share of the learned part below which an input is told to do next to nothing
+
+
+def learned_blocks(part: LearnedPart, measure: str) -> list[Text | Grid | Plot]:
+    """Curves over the inputs, the most telling first, and the surface."""
+    shares = part.shares()
+    ranked = list(part.ranked())
+    blocks: list[Text | Grid | Plot] = [Text(_told(part, ranked, shares, measure))]
+    plots = [
+        _curve_plot(part, k, feature, shares[part.features.index(feature), k])
+        for k in range(len(part.names))
+        for feature in ranked[:_MOST_CURVES]
+    ]
+    blocks.append(Grid(plots))
+    if len(ranked) > _MOST_CURVES:
+        blocks.append(Text(f"The {_MOST_CURVES} most telling of {len(ranked)} inputs are drawn.", "note"))
+    if len(ranked) > 1:
+        blocks += [_surface_plot(part, k, *part.telling_pair()) for k in range(len(part.names))]
+    return blocks
+
+
+def _told(part: LearnedPart, ranked: list[str], shares: Any, measure: str) -> str:
+    explained = shares.max(axis=1)
+    told = f"The learner sees {', '.join(part.features)}, and adds to {', '.join(part.names)}"
+    told += f" what the {measure} measure does not give to the physics" if measure else ""
+    told += ". The curves show what it adds over each input, the one that explains most of its variance first."
+    idle = [name for name in ranked[1:] if explained[part.features.index(name)] < _LEVEL]
+    if idle:
+        told += f" By themselves {', '.join(idle)} explain next to nothing of it."
+    return told
+
+
+def _curve_plot(part: LearnedPart, k: int, feature: str, share: float) -> Plot:
+    j = part.features.index(feature)
+    name, axis = part.names[k], with_unit(feature, part.units[j])
+    few = np.linspace(0, len(part.seen) - 1, min(len(part.seen), _CLOUD)).astype(int)
+    cloud = part.seen[few, j], part.values[few, k]
+    traces: list[dict[str, Any]] = [
+        {
+            "x": _numbers(cloud[0]),
+            "y": _numbers(cloud[1]),
+            "mode": "markers",
+            "name": "training data",
+            "marker": {"color": "@measured", "size": 4},
+        }
+    ]
+    layout: dict[str, Any] = {"xaxis": {"title": {"text": axis}}, "yaxis": {"title": {"text": name}}, "shapes": []}
+    curve = None if part.tied(feature) else part.curve(feature)
+    told = f"Over {feature}, which explains {percent(share)}"
+    if curve is not None:
+        traces += _curve_traces(curve, k)
+        layout["yaxis"]["range"] = list(curve_limits(curve.learned[:, k], cloud[1]))
+        reach = curve.along[curve.inside]
+        layout["shapes"].append(_stripe(float(reach[0]), float(reach[-1])))
+        told += ", all else at its median: solid where the data reach, dashed beyond"
+        told += "; the band is its 95 % interval." if curve.half is not None else "."
+    else:
+        centres, means = part.means(feature)
+        traces.append(
+            {
+                "x": _numbers(centres),
+                "y": _numbers(means[:, k]),
+                "mode": "lines+markers",
+                "name": "mean",
+                "line": {"color": "@learner", "width": 2},
+                "marker": {"color": "@learner", "size": 5},
+            }
+        )
+        told += ": the mean along the training data, on which other inputs move with it."
+    return Plot(f"Learned part of {name} over {feature}.", told, traces, layout, height=300, small=True)
+
+
+def _curve_traces(curve: Curve, k: int) -> list[dict[str, Any]]:
+    along, learned = curve.along, curve.learned[:, k]
+    found: list[dict[str, Any]] = []
+    if curve.half is not None:
+        edge: dict[str, Any] = {
+            "x": _numbers(along),
+            "mode": "lines",
+            "line": {"width": 0, "color": "@band"},
+            "hoverinfo": "skip",
+        }
+        found.append({**edge, "y": _numbers(learned - curve.half[:, k]), "showlegend": False, "name": "lower limit"})
+        found.append(
+            {
+                **edge,
+                "y": _numbers(learned + curve.half[:, k]),
+                "fill": "tonexty",
+                "name": "95 % interval",
+                "fillcolor": "@learned-band",
+            }
+        )
+    line = {"color": "@learner", "width": 2}
+    found.append(
+        {
+            "x": _numbers(along),
+            "y": _numbers(learned),
+            "mode": "lines",
+            "showlegend": False,
+            "name": "beyond the data",
+            "line": {**line, "dash": "dash", "width": 1.2},
+        }
+    )
+    inside = curve.inside
+    found.append(
+        {"x": _numbers(along[inside]), "y": _numbers(learned[inside]), "mode": "lines", "name": "learner", "line": line}
+    )
+    return found
+
+
+def _stripe(low: float, high: float) -> dict[str, Any]:
+    return {
+        "type": "rect",
+        "xref": "x",
+        "x0": low,
+        "x1": high,
+        "yref": "paper",
+        "y0": 0,
+        "y1": 1,
+        "fillcolor": "@reach",
+        "line": {"width": 0},
+        "layer": "below",
+    }
+
+
+def _surface_plot(part: LearnedPart, k: int, across: str, along: str) -> Plot:
+    surface = part.surface(across, along)
+    values = surface.learned[..., k].T
+    seen = np.abs(values[np.isfinite(values)])
+    reach = float(np.quantile(seen, _COLOURED)) or 1.0 if seen.size else 1.0
+    units = dict(zip(part.features, part.units, strict=True))
+    heat = {
+        "type": "heatmap",
+        "x": _numbers(surface.across),
+        "y": _numbers(surface.along),
+        "hoverongaps": False,
+        "z": [[None if not np.isfinite(v) else float(f"{v:.5g}") for v in row] for row in values],
+        "zmin": -reach,
+        "zmax": reach,
+        "colorscale": "@diverging",
+        "colorbar": {"title": {"text": part.names[k], "side": "right"}, "thickness": 14},
+    }
+    few = np.linspace(0, len(part.seen) - 1, min(len(part.seen), _CLOUD)).astype(int)
+    points = {
+        "x": _numbers(part.seen[few, part.features.index(across)]),
+        "mode": "markers",
+        "name": "training data",
+        "y": _numbers(part.seen[few, part.features.index(along)]),
+        "hoverinfo": "skip",
+        "marker": {"color": "@ink", "size": 2, "opacity": 0.45},
+    }
+    how = "all else at its median" if part.alone(across, along) else "the mean of the training data in each cell"
+    caption = (
+        f"What the learner adds to {part.names[k]} over {across} and {along}, two inputs that tell much of it, "
+        f"{how}. It is drawn where training data are near; the dots are these data."
+    )
+    layout = {
+        "xaxis": {"title": {"text": with_unit(across, units[across])}},
+        "yaxis": {"title": {"text": with_unit(along, units[along])}},
+        "showlegend": False,
+    }
+    return Plot(f"Learned part of {part.names[k]} over {across} and {along}.", caption, [heat, points], layout, 420)
+
+
+def _numbers(values: Vector) -> list[float | None]:
+    """Of six digits, for they are drawn only."""
+    return [float(f"{v:.6g}") if np.isfinite(v) else None for v in np.asarray(values, dtype=float).tolist()]

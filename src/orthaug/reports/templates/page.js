@@ -1,0 +1,186 @@
+"use strict";
+(async () => {
+  const COLUMNS = 1400; // of pixels for which the least and the largest value of a curve are drawn
+  const FONT = { family: "system-ui, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif", size: 12 };
+  const CONFIG = {
+    responsive: false, displaylogo: false, doubleClick: "reset", showTips: false,
+    modeBarButtons: [["zoom2d", "pan2d"], ["zoomIn2d", "zoomOut2d", "resetScale2d"]],
+  };
+  const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+  const figures = JSON.parse(document.getElementById("figures").textContent);
+  const places = [...document.querySelectorAll("[data-figure]")];
+  const dark = matchMedia("(prefers-color-scheme: dark)");
+  let onPaper = false;
+
+  /* Plotly's script stands in the page compressed. */
+  async function unpack() {
+    const packed = bytes(document.getElementById("plotly").textContent);
+    const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
+    const script = document.createElement("script");
+    script.textContent = await new Response(stream).text();
+    document.head.append(script);
+  }
+
+  function decode(series) {
+    if (!series.y) {
+      const raw = new Float32Array(bytes(series.f4).buffer);
+      series.y = Float64Array.from(raw, (value) => value + series.shift);
+    }
+    return series;
+  }
+
+  /* The long curve of a trace: its own, or the difference of two. */
+  function curve(figure, trace) {
+    if (trace.minus) {
+      const key = trace.minus.join(" less "), [a, b] = trace.minus.map((name) => decode(figure.series[name]));
+      figure.series[key] ??= { x0: a.x0, dx: a.dx, y: a.y.map((value, i) => value - b.y[i]) };
+      return figure.series[key];
+    }
+    return trace.series && decode(figure.series[trace.series]);
+  }
+
+  /* Points of a curve between two times: all, or the least and the largest in every column. */
+  function outline({ x0, dx, y }, from, to, edge, plus) {
+    const margin = to - from;
+    const first = Math.max(0, Math.floor((from - margin - x0) / dx));
+    const last = Math.min(y.length, Math.ceil((to + margin - x0) / dx) + 2);
+    const stride = Math.max(1, Math.floor((to - from) / dx / COLUMNS));
+    const xs = [], ys = [];
+    const put = (i, value) => { xs.push(x0 + i * dx); ys.push(value); };
+    for (let begin = first; begin < last; begin += stride) {
+      let low = -1, high = -1;
+      for (let i = begin; i < Math.min(begin + stride, last); i++) {
+        if (!Number.isFinite(y[i])) continue;
+        if (low < 0 || y[i] < y[low]) low = i;
+        if (high < 0 || y[i] > y[high]) high = i;
+      }
+      if (edge) { if (low >= 0) put(begin, y[edge === "min" ? low : high] + plus); continue; }
+      if (low < 0) { put(begin, null); continue; }
+      put(Math.min(low, high), y[Math.min(low, high)]);
+      if (low !== high) put(Math.max(low, high), y[Math.max(low, high)]);
+    }
+    return { x: xs, y: ys };
+  }
+
+  const style = () => getComputedStyle(document.documentElement);
+  const color = (name, from) => from.getPropertyValue(`--${name}`).trim();
+
+  /* Names such as @model become the colours of the theme. */
+  function coloured(value, from) {
+    if (value === "@diverging") {
+      return [[0, color("physics", from)], [0.5, color("paper", from)], [1, color("residual", from)]];
+    }
+    if (typeof value === "string") return value.startsWith("@") ? color(value.slice(1), from) : value;
+    if (Array.isArray(value)) return value.length && typeof value[0] === "number" ? value : value.map((v) => coloured(v, from));
+    if (value && typeof value === "object" && !ArrayBuffer.isView(value)) {
+      return Object.fromEntries(Object.entries(value).map(([key, v]) => [key, coloured(v, from)]));
+    }
+    return value;
+  }
+
+  function traces(figure, range) {
+    return figure.data.map((trace) => {
+      const series = curve(figure, trace);
+      const { series: _, minus, edge, plus, ...own } = trace;
+      return series ? { type: "scatter", mode: "lines", ...own, ...outline(series, range[0], range[1], edge, plus) } : own;
+    });
+  }
+
+  /* Every name of a category axis; on a narrow screen on several lines. */
+  function named(figure, narrow) {
+    const names = [...new Set(figure.data.flatMap((trace) => trace.y))];
+    const lines = (name) => name.replace(/(.{12,}?)[ ,](?=.{4})/g, "$1<br>");
+    return { tickvals: names, ticktext: narrow ? names.map(lines) : names, tickfont: { color: "@soft", size: narrow ? 9 : 12 } };
+  }
+
+  function layout(figure, from, width) {
+    const narrow = width < 520;
+    const axis = {
+      gridcolor: "@grid", linecolor: "@grid", zerolinecolor: "@grid", automargin: true, tickfont: { color: "@soft" },
+      exponentformat: "power",
+    };
+    const own = structuredClone(figure.layout);
+    for (const key of new Set([...Object.keys(own), "xaxis", "yaxis"])) {
+      if (/^[xy]axis/.test(key)) {
+        own[key] = { ...axis, ...own[key] };
+        if (own[key].title) own[key].title = { standoff: 6, ...own[key].title };
+        if (narrow) own[key].nticks = own[key].nticks ?? 5;
+        if (key === "yaxis" && own[key].type === "category") Object.assign(own[key], named(figure, narrow));
+      }
+    }
+    return coloured({
+      margin: { l: narrow ? 48 : 64, r: narrow ? 8 : 16, t: 34, b: 44 }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
+      font: { ...FONT, color: "@ink", size: narrow ? 11 : 12 }, dragmode: narrow ? false : "zoom", hovermode: "closest",
+      hoverlabel: { bgcolor: "@shade", font: { color: "@ink" } },
+      legend: { orientation: "h", x: 0, y: 1, yanchor: "bottom", xanchor: "left", bgcolor: "rgba(0,0,0,0)" },
+      modebar: { bgcolor: "rgba(0,0,0,0)", color: "@soft", activecolor: "@ink" },
+      height: figure.height, width, ...own,
+    }, from);
+  }
+
+  const widthOf = (place) => (onPaper ? (figures[place.dataset.figure].small ? 320 : 660) : place.clientWidth);
+  const home = (figure) => figure.layout.xaxis?.range ?? [0, 1];
+  const flown = (figure) => figure.data.some((trace) => trace.series || trace.minus);
+
+  function draw(place) {
+    const figure = figures[place.dataset.figure], from = style();
+    const now = place.layout && flown(figure) ? place.layout.xaxis.range : home(figure);
+    const shown = layout(figure, from, widthOf(place));
+    if (flown(figure)) shown.xaxis.range = [...now];
+    return Plotly.react(place, coloured(traces(figure, now), from), shown, CONFIG);
+  }
+
+  /* After a zoom the curves are drawn anew, as finely as they are now seen. */
+  function refine(place) {
+    const figure = figures[place.dataset.figure];
+    if (!flown(figure)) return;
+    const range = place.layout.xaxis.range.map(Number);
+    const fresh = traces(figure, range), which = figure.data.map((t, i) => (t.series || t.minus ? i : -1)).filter((i) => i >= 0);
+    Plotly.restyle(place, { x: which.map((i) => fresh[i].x), y: which.map((i) => fresh[i].y) }, which);
+  }
+
+  function keys(place, event) {
+    const figure = figures[place.dataset.figure];
+    if (event.target !== place || !flown(figure) || event.ctrlKey || event.metaKey || event.altKey) return;
+    const [low, high] = place.layout.xaxis.range.map(Number), width = high - low;
+    const moves = {
+      ArrowLeft: [low - width / 4, high - width / 4], ArrowRight: [low + width / 4, high + width / 4],
+      "+": [low + width / 4, high - width / 4], "-": [low - width / 2, high + width / 2], 0: home(figure),
+    };
+    const range = moves[event.key === "=" ? "+" : event.key];
+    if (!range) return;
+    event.preventDefault();
+    Plotly.relayout(place, { "xaxis.range": [...range] });
+  }
+
+  const redraw = () => places.forEach(draw);
+  try {
+    await unpack();
+    for (const place of places) {
+      await draw(place);
+      place.on("plotly_relayout", (changed) => {
+        if (Object.keys(changed).some((key) => key.startsWith("xaxis"))) refine(place);
+      });
+      place.addEventListener("keydown", (event) => keys(place, event));
+    }
+    dark.addEventListener("change", redraw);
+    let waiting, width = innerWidth;
+    addEventListener("resize", () => {
+      if (innerWidth === width || onPaper) return;
+      width = innerWidth;
+      clearTimeout(waiting);
+      waiting = setTimeout(redraw, 120);
+    });
+    const paper = (now) => { onPaper = now; document.documentElement.toggleAttribute("data-paper", now); redraw(); };
+    addEventListener("beforeprint", () => {
+      document.querySelectorAll("details").forEach((folded) => { folded.open = true; });
+      paper(true);
+    });
+    addEventListener("afterprint", () => paper(false));
+    document.documentElement.dataset.drawn = String(places.length);
+  } catch (error) {
+    document.getElementById("undrawn").hidden = false;
+    document.documentElement.dataset.drawn = "none";
+    throw error;
+  }
+})();

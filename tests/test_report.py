@@ -1,0 +1,334 @@
+"""report.html: its sections, numbers and words; that it needs nothing from outside; its size and its time."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from test_cli import MLP, SPEC, make_project
+from test_motion_cli import SPEC as MOTION
+from test_motion_cli import put
+
+import orthaug as oa
+from orthaug.commands.reporting import compare_report, fit_report, origin_of
+from orthaug.data.record import Channel
+from orthaug.models.response import Response, Trajectory
+from orthaug.reports.page import fit_page
+from orthaug.reports.page_blocks import interval, number, percent
+from orthaug.reports.page_fit import FitPage
+from orthaug.reports.page_runs import Run, compared_plots, error_band, packed, run_plots
+from orthaug.reports.page_verdict import compare_verdict, fit_verdict
+
+SUSPECT = '[[suspects]]\nname = "square"\non = "u[k-1]**2"\n'
+FIT = ["Verdict", "Parameters", "Free run", "Physics and learner", "What was learned", "Residual tests", "Stability",
+       "Excitation and suspects", "Training and restarts", "Scores", "How to reproduce it"]  # fmt: skip
+COMPARED = ["Verdict", "Models", "Scores", "Parameters", "Free run", "Residual tests", "How to reproduce it"]
+LARGEST = 6_000_000  # letters of a page
+
+
+class Read(HTMLParser):
+    """Elements of a page with their attributes, and the text of each."""
+
+    def __init__(self, page: str):
+        super().__init__()
+        self.found: list[tuple[str, dict, list[str]]] = []
+        self.open: list[int] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        self.found.append((tag, dict(attrs), []))
+        if tag not in ("meta", "link", "br", "img"):
+            self.open.append(len(self.found) - 1)
+
+    def handle_endtag(self, tag):
+        place = self.open.pop()
+        assert self.found[place][0] == tag, f"{tag} closes {self.found[place][0]}"
+
+    def handle_data(self, data):
+        for place in self.open:
+            self.found[place][2].append(data)
+
+    def text(self, tag: str, **wanted: str) -> list[str]:
+        return ["".join(text).strip() for name, attrs, text in self.found
+                if name == tag and all(attrs.get(k) == v for k, v in wanted.items())]  # fmt: skip
+
+    def attributes(self, name: str) -> list[str]:
+        return [attrs[name] for _, attrs, _ in self.found if name in attrs]
+
+
+@pytest.fixture(scope="module")
+def lagged(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("lagged")
+    return oa.fit_spec(str(make_project(folder, SPEC.replace('kind = "none"\n', MLP + "restarts = 3\n" + SUSPECT))))
+
+
+@pytest.fixture(scope="module")
+def motion(tmp_path_factory):
+    return oa.fit_spec(str(put(tmp_path_factory.mktemp("moving"), MOTION)))
+
+
+@pytest.fixture(scope="module")
+def compared(lagged):
+    return oa.compare(lagged.job)
+
+
+@pytest.fixture(scope="module")
+def pages(lagged, motion, compared):
+    return {"lagged": fit_report(lagged), "motion": fit_report(motion), "compared": compare_report(compared)}
+
+
+def figures(page: str) -> list[dict]:
+    def refuse(name: str):
+        raise AssertionError(f"{name} in the page")
+
+    (text,) = Read(page).text("script", id="figures")
+    return json.loads(text, parse_constant=refuse)
+
+
+def values(series: dict) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(series["f4"]), "<f4").astype(float) + series["shift"]
+
+
+KINDS = ("lagged", "motion", "compared")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_sections_stand_in_their_order_and_the_contents_lead_to_them(pages, kind):
+    page = Read(pages[kind])
+    wanted = COMPARED if kind == "compared" else FIT
+    shown = [title for title in page.text("h2") if title != "Warnings"]
+    assert shown == wanted
+    targets = [link.removeprefix("#") for link in page.attributes("href")]
+    assert len(targets) > len(wanted) and set(targets) <= set(page.attributes("id"))
+    assert len(page.attributes("id")) == len(set(page.attributes("id")))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_page_is_one_file_that_asks_nothing_of_a_network(pages, kind):
+    page = Read(pages[kind])
+    assert not page.attributes("src") and all(link.startswith("#") for link in page.attributes("href"))
+    assert "default-src 'none'" in " ".join(page.attributes("content"))
+    assert "http" not in re.sub(r'<script type="text/plain" id="plotly">.*?</script>', "", pages[kind]).replace(
+        "http-equiv", ""
+    )
+    assert len(pages[kind].encode()) < LARGEST
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_plot_is_told_in_words_and_every_caption_is_a_sentence(pages, kind):
+    page = Read(pages[kind])
+    plots = [attrs for _, attrs, _ in page.found if "data-figure" in attrs]
+    assert [int(plot["data-figure"]) for plot in plots] == list(range(len(figures(pages[kind])))) and len(plots) >= 5
+    assert all(len(plot["aria-label"]) > 20 and plot["tabindex"] == "0" for plot in plots)
+    captions = page.text("figcaption") + page.text("caption")
+    assert [caption for caption in captions if len(caption.split()) < 4 or not caption.endswith(".")] == []
+    assert len(page.text("figcaption")) == len(plots)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_curves_hold_the_whole_record_in_finite_numbers(pages, lagged, motion, compared, kind):
+    found = [figure for figure in figures(pages[kind]) if figure["series"]]
+    job = {"lagged": lagged, "motion": motion, "compared": compared}[kind].job
+    assert len(found) == len(job.parts)
+    for figure, part in zip(found, job.parts, strict=True):
+        (experiment,) = part.record.experiments
+        measured = values(figure["series"]["measured 0"])
+        assert measured == pytest.approx(experiment.outputs[:, 0], rel=1e-5, abs=1e-7)
+        for trace in figure["data"]:
+            for key in [trace["series"]] if "series" in trace else trace["minus"]:
+                assert np.isfinite(values(figure["series"][key])[2:]).all() and len(values(figure["series"][key])) > 50
+
+
+def test_physics_alone_is_the_model_without_its_learner(lagged, motion, pages):
+    part = lagged.job.parts[-1].record
+    own = lagged.fit.model.alone.simulate(part).trajectories[0].model  # of a motion from the same start
+    for kind, fitted, alone in (("lagged", lagged, own), ("motion", motion, None)):
+        (run,) = fitted.responses[fitted.job.parts[-1].name][1].trajectories
+        alone = run.baseline[:, 0] if alone is None else alone[:, 0]
+        assert not np.allclose(alone[5:], run.model[5:, 0])
+        drawn = [f for f in figures(pages[kind]) if f["series"]][-1]["series"]["physics 0"]
+        assert values(drawn)[2:] == pytest.approx(alone[2:], rel=1e-5, abs=1e-6)
+
+
+def test_a_page_tells_how_its_result_was_made(lagged, pages, monkeypatch):
+    page, origin = Read(pages["lagged"]), origin_of(lagged.job, "fit")
+    assert lagged.job.path.read_text().strip() in page.text("pre")[-1]
+    cells = page.text("td")
+    for file in lagged.result.data.train:
+        assert file.sha256 in cells
+    assert {"orthaug fit plant.toml", oa.__version__, origin.machine, "0"} <= set(cells)
+    assert page.text("title") == ["Model of y from u: plant"] == page.text("h1")
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
+    assert origin_of(lagged.job, "fit").date == "1970-01-02 00:00 UTC"
+
+
+def test_a_spec_that_was_changed_meanwhile_is_told_as_it_was_read(lagged):
+    path = lagged.job.path
+    written = path.read_text()
+    for changed in (written.replace("restarts = 3", "restarts = 4"), "not TOML"):
+        path.write_text(changed)
+        told = tomllib.loads(origin_of(lagged.job, "fit").toml)
+        assert told["training"]["restarts"] == 3 and told["baseline"]["terms"][0]["parameter"] == "a"
+    path.write_text(written)
+    assert origin_of(lagged.job, "fit").toml == written
+
+
+def test_what_a_motion_learned_is_a_curve_with_its_band_and_the_reach_of_the_data(motion, pages):
+    (curve,) = [f for f in figures(pages["motion"]) if f["layout"].get("xaxis", {}).get("title") == {"text": "v [m/s]"}]
+    traces = {trace["name"]: trace for trace in curve["data"]}
+    assert curve["layout"]["yaxis"]["title"] == {"text": "dv/dt [m/s²]"}
+    assert {"training data", "learner", "beyond the data", "95 % interval", "lower limit"} == set(traces)
+    inside, beyond = traces["learner"]["x"], traces["beyond the data"]["x"]
+    assert beyond[0] < inside[0] < inside[-1] < beyond[-1]
+    (stripe,) = curve["layout"]["shapes"]
+    assert [stripe["x0"], stripe["x1"]] == pytest.approx([inside[0], inside[-1]], rel=1e-4)
+
+
+def test_a_surface_stands_where_data_are_near_and_sees_the_learner(lagged, pages):
+    (surface,) = [f for f in figures(pages["lagged"]) if f["data"][0].get("colorbar")]
+    heat = surface["data"][0]
+    there = np.array(heat["z"], dtype=float)
+    assert np.isfinite(there).any() and np.isnan(there).any() and heat["zmin"] == -heat["zmax"]
+
+
+def test_the_parameters_have_their_intervals_and_the_suspect_its_bias(pages):
+    page, drawn = Read(pages["lagged"]), figures(pages["lagged"])
+    assert {"a [1]", "b", "c"} == {
+        re.sub("<br>.*|<.?b>", "", tick["ticktext"][0]) for k, tick in drawn[0]["layout"].items() if k[:5] == "yaxis"
+    }
+    assert [trace["name"] for trace in drawn[0]["data"]].count("95 % interval") == 3
+    assert "square" in page.text("th") and any(f["data"][0].get("y") == ["square"] for f in drawn)
+
+
+@pytest.mark.parametrize(("value", "scale", "shown"), [
+    (-9e-18, 1.0, "0"), (-9e-18, None, "−9·10⁻¹⁸"), (0.0, None, "0"), (None, None, "–"), (1234.5678, None, "1234.6"),
+    (1.02e6, None, "1020000"), (1.5e9, None, "1.5·10⁹"), (-0.25, 1.0, "−0.25"), (4.7e-5, 1.0, "4.7·10⁻⁵"),
+])  # fmt: skip
+def test_numbers_in_cells(value, scale, shown):
+    assert number(value, scale=scale) == shown
+
+
+def test_intervals_and_shares_in_cells():
+    assert interval([-1e-17, 2.0]) == "0 … 2" and interval(None) == "–"
+    assert percent(-1e-17, signed=True) == "0 %" and percent(0.0123, signed=True) == "+1.2 %"
+
+
+def wave(rows: int, *, wild: int | None = None, experiments: int = 1) -> Response:
+    """A response of one output over some experiments, the last of which may run away."""
+    found = []
+    for i in range(experiments):
+        random = np.random.default_rng(i)
+        model = np.sin(np.arange(rows) / 50)[:, None]
+        measured = model + 0.01 * random.normal(size=model.shape)
+        away = wild is not None and i == experiments - 1
+        if away:
+            model = np.where(np.arange(rows)[:, None] < wild, model * np.exp(np.arange(rows) / 9)[:, None], np.nan)
+        nothing = np.zeros_like(model)
+        found.append(Trajectory(model, nothing, nothing, measured, 0, diverged=(wild, "y") if away else None))
+    return Response(tuple(found), None, (Channel("y", "m"),), 0.01)
+
+
+def test_a_divergence_is_seen_and_does_not_flatten_the_rest():
+    (plot,) = run_plots([Run("tests.fast", wave(300, wild=200, experiments=2))], {})
+    (told,) = plot.layout["annotations"]
+    assert told["text"] == "free run diverges in y" and told["x"] == pytest.approx(0.01 * (301 + 200))
+    assert "leaves all bounds in y at row 200" in plot.caption and "2 experiments" in plot.caption
+    low, high = plot.layout["yaxis"]["range"]
+    assert -4 < low < -1 and 1 < high < 4
+    assert np.isnan(values(plot.series["model 0"])[300]) and np.isnan(values(plot.series["model 0"])[-50:]).all()
+
+
+def test_long_records_are_thinned_by_their_envelope_and_said_to_be():
+    long = wave(400_000)
+    peak = np.asarray(long.trajectories[0].measured)
+    peak[123_456] = 9.0
+    plots = run_plots(
+        [Run(name, long, long) for name in ("train", "validation", "tests.a", "tests.b")], error_band(long)
+    )
+    kept = values(plots[0].series["measured 0"])
+    assert kept.max() == pytest.approx(9.0, rel=1e-6) and kept.min() == pytest.approx(peak.min(), rel=1e-6)
+    assert "points are kept, the least and the largest value of every stretch" in plots[0].caption
+    assert sum(len(json.dumps([p.traces, p.series])) for p in plots) < LARGEST - 2_200_000  # the rest is Plotly's
+    short = run_plots([Run("train", wave(5000))], {})[0]
+    assert len(values(short.series["measured 0"])) == 5000 and "points are kept" not in short.caption
+    both = compared_plots({name: {"train": long} for name in "abc"})[0]
+    assert len(json.dumps([both.traces, both.series])) < LARGEST - 2_200_000
+
+
+def test_packed_curves_keep_their_digits_beside_an_offset():
+    given = 1e6 + np.sin(np.arange(100.0))
+    assert values(packed(given, 0.0, 1.0)) == pytest.approx(given, abs=1e-6)
+
+
+def test_the_band_holds_most_errors_of_training():
+    response = wave(4000)
+    (limits,) = error_band(response).values()
+    errors = response.trajectories[0].measured - response.trajectories[0].model
+    assert np.mean((errors > limits[0]) & (errors < limits[1])) == pytest.approx(0.95, abs=0.002)
+    assert error_band(wave(300, wild=100)) == {}
+
+
+def with_warning(fitted, code: str, text: str):
+    warning = fitted.result.warnings + [type("W", (), {"code": code, "text": text})()]
+    return type(fitted.result).model_validate({**dict(fitted.result), "warnings": warning})
+
+
+def test_the_verdict_is_built_from_the_findings(lagged, motion):
+    good = fit_verdict(motion.result)
+    assert good.level in ("good", "care") and "on tests.steps its free run leaves" in good.trust
+    assert "m and k as physics" in good.use and "c is what the physics nearest" in good.use
+    ran = fit_verdict(with_warning(lagged, "free_run_diverged", "tests.steps: the free run diverged."))
+    assert ran.level == "bad" and "its free run diverges on tests.steps" in ran.trust
+    untold = lagged.result.model_copy(update={"data": lagged.result.data.model_copy(update={"tests": None}),
+                                              "validation": None})  # fmt: skip
+    assert "never tried on data" in fit_verdict(untold).trust
+    row = lagged.result.parameters[0]
+    bias = {"value": 10 * (row.std or 1.0), "cause": "square", "share": 0.9}
+    biased = row.model_copy(update={"bias": type("B", (), bias)()})
+    one = lagged.result.model_copy(update={"parameters": [biased]})
+    assert "the estimate of a carries a bias larger than its standard error" in fit_verdict(one).trust
+    hurts = lagged.result.validation.model_copy(update={"verdict": "hurts"})
+    told = fit_verdict(lagged.result.model_copy(update={"validation": hurts}))
+    assert told.level == "bad" and "Take physics alone" in told.then
+    assert all(sentence.endswith(".") for verdict in (good, ran, told) for sentence in verdict.sentences)
+
+
+def test_the_verdict_of_a_comparison_names_a_model(compared):
+    verdict = compare_verdict(compared.result)
+    names = [row.name for row in compared.result.comparison]
+    assert any(f"Take “{name}”" in verdict.trust for name in names) and "validation part" in verdict.then
+
+
+def test_a_witness_is_told_where_runs_are_shown(lagged):
+    told = "train: findings and figures look at 10 of 99 rows, in windows spread over them."
+    page = Read(fit_report(replace(lagged, result=with_warning(lagged, "witness", told))))
+    (section,) = page.text("section", id="free-run")
+    assert told in section
+
+
+def test_what_looks_like_markup_is_text(lagged):
+    odd = "</script><b>&"
+    origin = replace(origin_of(lagged.job, "fit"), toml=odd, name=odd)
+    runs = {part: (one_step, replace(free, outputs=(Channel("y", odd),)))
+            for part, (one_step, free) in lagged.responses.items()}  # fmt: skip
+    page = Read(fit_page(FitPage(origin, lagged.result, runs)))
+    assert page.text("pre")[-1] == odd and not page.text("b") and page.text("h1")[0].endswith(odd)
+
+
+def test_the_page_does_not_import_plotly_nor_does_help():
+    program = "import sys; from orthaug.commands import cli; import orthaug.reports.page as page; page._plotly(); "
+    program += "print([name for name in sys.modules if name.split('.')[0] in ('plotly', 'narwhals')])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+    program = "import sys; sys.argv = ['orthaug', '--help']\nfrom orthaug.commands.cli import main\n"
+    program += "try: main()\nexcept SystemExit: print('reports.page' in str(sorted(sys.modules)), file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stderr.strip().endswith("False")
