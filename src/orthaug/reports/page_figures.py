@@ -272,7 +272,7 @@ def restart_plot(restarts: Sequence[RestartResult]) -> Plot | None:
     losses = [run.loss for run in restarts if run.loss]
     wide = bool(losses) and max(losses) > _DECADES * min(losses) > 0
     layout = _titled("run", "loss") | {"showlegend": False}
-    layout["xaxis"] |= {"tickformat": "d", "dtick": 1 + len(restarts) // 12}
+    layout["xaxis"] = {"title": {"text": "run"}, "tickformat": "d", "dtick": 1 + len(restarts) // 12}
     layout["yaxis"] = {"title": {"text": "loss"}, "type": "log" if wide else "linear"}
     caption = "The loss that every start came to; the large dot is the chosen one. "
     caption += "Where several starts end at the same loss, it is hardly a poor minimum."
