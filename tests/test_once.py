@@ -78,4 +78,4 @@ def test_the_counts_of_a_fit(spec: Path, tmp_path: Path, counted: Counter[str]) 
     run("fit", spec, "--out", tmp_path / "result")
     assert counted["pose"] == counted["factor"] == counted["stack_rows"] == 1
     assert counted["simulate"] == 2
-    assert counted["simulate physics alone"] <= 2
+    assert counted["simulate physics alone"] <= 3  # the verdict's on the test part; the page's on both

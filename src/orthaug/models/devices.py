@@ -17,7 +17,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax
 from orthaug._base.parallel import in_threads
-from orthaug.models.rows import CHUNK_ROWS, Chunk, chunk_shape, in_chunks, row_sum
+from orthaug.models.rows import CHUNK_ROWS, Chunk, brought, chunk_shape, in_chunks, row_sum
 
 _ROWS = "rows"
 
@@ -42,8 +42,7 @@ class Devices:
         return Chunk(sharded(z, repeat=True), *map(sharded, (q, e, gain)))
 
     def draw(self, source: Any, laying: Callable[[Any], Any]) -> Chunk:
-        pieces = [laid for partition in source.partitions for laid in laying(partition)]
-        return self.lay(*(np.concatenate(parts) for parts in zip(*pieces, strict=True)))
+        return self.lay(*brought(source, laying))
 
     def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
         return in_threads(function, partitions)

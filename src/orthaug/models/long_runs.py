@@ -40,9 +40,17 @@ def along(model: Model, source: Source) -> Iterator[Stretch]:
             if ended != (piece.source, piece.offset + first):
                 state = model.form.start(piece.outputs[:first], [first])[0]
             prediction = model.parts_at(model.form.regressors(piece, record))
-            state, simulation = model.fly(state, model.form.inputs(piece, record))
+            simulation = model.fly(state, model.form.inputs(piece, record))
+            state = _after(model, state, np.asarray(simulation.total))
             ended = piece.source, piece.offset + len(piece)
             yield Stretch(piece, first, prediction, simulation)
+
+
+def _after(model: Model, state: Any, outputs: Matrix) -> Any:
+    """The state after outputs (m, ny) of a run that began in a state."""
+    before = state.reshape(model.form.memory, len(model.outputs))[::-1]
+    past = np.concatenate([before, outputs])
+    return model.form.start(past, [len(past)])[0]
 
 
 def _nothing(source: Source) -> Experiment:

@@ -147,7 +147,7 @@ class Model(OnRecords):
             self.check_rows(experiment, self.form.first_row)
             measured = experiment.outputs if record.outputs else None
             start = self._start(initial, measured)
-            _, parts = self.fly(start, self.form.inputs(experiment, record))
+            parts = self.fly(start, self.form.inputs(experiment, record))
             outside = self._outside(start, parts, experiment, record)
             trajectories.append(replace(self.bounded(parts, experiment, measured), outside=outside))
         return Response(tuple(trajectories), None, self.outputs, record.sampling_time)
@@ -207,11 +207,10 @@ class Model(OnRecords):
             )
         return rows
 
-    def fly(self, state: Vector, inputs: Matrix) -> tuple[Vector, Parts]:
-        """The free run from a state along lagged inputs (T, nu), with the state after the last."""
+    def fly(self, state: Vector, inputs: Matrix) -> Parts:
+        """The free run from a state along lagged inputs (T, nu), in parts."""
         if not self.form.states:
-            return state, self.parts_at(inputs)
-        before = state.reshape(self.form.memory, len(self.outputs))[::-1]
+            return self.parts_at(inputs)
         size, pieces = min(_BATCH, padded_length(len(inputs))), []
         for begin in range(0, len(inputs), size):
             steps = min(size, len(inputs) - begin)
@@ -219,9 +218,7 @@ class Model(OnRecords):
             padded[:steps] = inputs[begin : begin + steps]
             state, parts = _free_run(self.form, self.numbers, state, padded)
             pieces.append([np.asarray(part)[:steps] for part in parts])
-        found = Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True)))
-        outputs = np.concatenate([before, np.asarray(found.total)])
-        return self.form.start(outputs, [len(outputs)])[0], found
+        return Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True)))
 
     def parts_at(self, x: Matrix) -> Parts:
         """The prediction at measured regressors (T, nx), in parts."""

@@ -86,8 +86,7 @@ class InMemory:
         return Chunk(*map(jax.device_put, (padded, *(in_chunks(piece, shape) for piece in (q, e, gain)))))
 
     def draw(self, source: Any, laying: Callable[[Any], Any]) -> Chunk:
-        pieces = [laid for partition in source.partitions for laid in laying(partition)]
-        return self.lay(*(np.concatenate(parts) for parts in zip(*pieces, strict=True)))
+        return self.lay(*brought(source, laying))
 
     def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
         return in_threads(function, partitions)
@@ -99,6 +98,12 @@ class InMemory:
 @partial(jax.jit, static_argnames="function")
 def _compiled_sum(function: Callable[..., Any], rows: Chunk, arguments: tuple[Any, ...]) -> Any:
     return row_sum(lambda chunk: function(chunk, *arguments), rows)
+
+
+def brought(source: Any, laying: Callable[[Any], Any]) -> tuple[np.ndarray, ...]:
+    """All rows of a source laid out: features, Q, P⊥Y and gain, (N, …) each."""
+    pieces = [laid for partition in source.partitions for laid in laying(partition)]
+    return tuple(np.concatenate(parts) for parts in zip(*pieces, strict=True))
 
 
 def row_sum(function: Callable[[Any], Any], rows: Any) -> Any:
