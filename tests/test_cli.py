@@ -450,8 +450,8 @@ def small_run(monkeypatch, ending):
     """The solver's compiled loop replaced by one that ends as told."""
     original = compiled.minimise
 
-    def minimise(*args, progress=None, **options):
-        return ending(lambda: original(*args, progress=progress, **options), progress)
+    def minimise(*args):
+        return ending(lambda: original(*args), args[-1].progress)
 
     monkeypatch.setattr(compiled, "minimise", minimise)
 

@@ -14,7 +14,7 @@ from orthaug.data.sources import Source, as_record
 from orthaug.models.dynamics import Parts
 from orthaug.models.model import Model
 from orthaug.models.on_records import RUNAWAY
-from orthaug.models.response import Scores
+from orthaug.models.response import Scores, scores_of
 from orthaug.physics.moments import Moments
 
 
@@ -78,11 +78,7 @@ class RunningScores:
         assert self.moments is not None and self.rows, "no row was scored"
         with np.errstate(all="ignore"):
             rmse = np.sqrt(self.squares / self.rows)
-        rmse = np.where(np.isfinite(rmse), rmse, np.nan)
-        deviation = np.sqrt(np.diag(self.moments.covariance))
-        moves = (deviation > 0) & np.isfinite(deviation)
-        nrmse = np.where(moves, rmse / np.where(moves, deviation, 1.0), np.nan)
-        return Scores(rmse, nrmse, 100 * (1 - nrmse), self.rows)
+        return scores_of(rmse, np.sqrt(np.diag(self.moments.covariance)), self.rows)
 
 
 class LongScores(NamedTuple):

@@ -47,10 +47,15 @@ def scores(measured: Matrix, model: Matrix) -> Scores:
         scored = True if there.all() else there
         rmse = np.sqrt(np.mean((measured - model) ** 2, axis=0, where=scored))
         deviation = measured.std(axis=0, where=scored)
+    return scores_of(rmse, deviation, int(np.count_nonzero(there.any(axis=1))))
+
+
+def scores_of(rmse: Vector, deviation: Vector, samples: int) -> Scores:
+    """Scores from the RMSE and the standard deviation of each output (ny,)."""
     rmse = np.where(np.isfinite(rmse), rmse, np.nan)
     moves = (deviation > 0) & np.isfinite(deviation)
     nrmse = np.where(moves, rmse / np.where(moves, deviation, 1.0), np.nan)
-    return Scores(rmse, nrmse, 100 * (1 - nrmse), int(np.count_nonzero(there.any(axis=1))))
+    return Scores(rmse, nrmse, 100 * (1 - nrmse), samples)
 
 
 @dataclass(frozen=True, eq=False)

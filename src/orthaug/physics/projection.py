@@ -109,7 +109,10 @@ class Projection(Factor):
 
 
 def _scale(rows: Matrix) -> Vector:
-    """Powers of two that bring the largest entry of each column (n, nθ) near 1; 1 for a column of zeros."""
-    largest = np.abs(rows).max(axis=0, initial=0.0)
+    return powers_of_two(np.abs(rows).max(axis=0, initial=0.0))
+
+
+def powers_of_two(largest: Vector) -> Vector:
+    """Those that bring the largest entry of each column (nθ,) near 1; 1 for a column of zeros."""
     moves = largest > 0
     return np.where(moves, 2.0 ** np.clip(-np.round(np.log2(np.where(moves, largest, 1.0))), -1000, 1000), 1.0)

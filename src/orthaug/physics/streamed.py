@@ -26,7 +26,7 @@ from orthaug.physics.excitation import excitation, require_rank
 from orthaug.physics.moments import Extent, Moments
 from orthaug.physics.output_weights import OutputWeights, weigh_outputs
 from orthaug.physics.problem import Problem, check_moving, check_physics, check_sizes, feature_rows, pose
-from orthaug.physics.projection import Projection
+from orthaug.physics.projection import Projection, powers_of_two
 
 Passes = Callable[[Callable[[Partition], Any], Sequence[Partition]], list[Any]]
 """`[function(partition) for partition in partitions]`, wherever that is done."""
@@ -328,9 +328,7 @@ def streamed(seen: Problem, source: Source, passes: Passes) -> StreamedProblem:
 def _factored(seen: Problem, source: Source, passes: Passes, survey: Survey, form: Form) -> StreamedProblem:
     """Two passes: R of `[Φ Y]`, and again of what it gives."""
     weight, nt = seen.weight, len(seen.baseline.names)
-    # powers of two of the largest whitened entry at most: exact, and the same wherever the rows are
-    sizes = survey.columns * np.abs(weight.matrix).max()
-    scale = np.where(sizes > 0, 2.0 ** -np.round(np.log2(np.where(sizes > 0, sizes, 1.0))), 1.0)
+    scale = powers_of_two(survey.columns * np.abs(weight.matrix).max())
     first = _merged(passes(Factoring(form, weight, scale), source.partitions), lambda a, b: _triangle([a, b]))
     r, coordinates = first[:nt, :nt], first[:nt, nt]
     excited = excitation(r, seen.baseline.names)

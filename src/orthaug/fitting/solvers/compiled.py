@@ -8,6 +8,7 @@ and this pass is also the linearisation for the next step.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -81,110 +82,112 @@ class TrainingRun(NamedTuple):
     """Whether a penalty or a bound held the learner, so that `normal` has its rows too."""
 
 
+@dataclass(frozen=True, eq=False)
+class Settings:
+    """What a run is made with.
+
+    Args:
+        iterations, tolerance: as of `LevenbergMarquardt`.
+        samples: residuals less the physics' own parameters, for the noise variance.
+        ridge: α in normalised units; with `evidence` where it starts.
+        evidence: choose α by MacKay's re-estimation after every accepted step.
+        groups: which weights share an α, by number; None where all do.
+        progress: told of the steps.
+        kept: where states are kept; a run goes on from the last one.
+    """
+
+    iterations: int
+    tolerance: float
+    samples: int
+    ridge: float = 0.0
+    evidence: bool = False
+    groups: Int[np.ndarray, "nw"] | None = None
+    progress: RunTell = quiet
+    kept: Keeper | None = None
+
+    def prepared(self, w: Any) -> tuple[Options, Any, State | None]:
+        """The numbers of the compiled program, the ridge it starts with, and the state to go on from."""
+        groups = self.groups
+        if groups is None and not self.evidence:  # the program of groups serves a fixed ridge as well
+            groups = np.zeros(len(w), dtype=int)
+        numbers = np.asarray(self.tolerance), np.asarray(self.evidence), np.asarray(float(self.samples))
+        options = Options(numbers[0], numbers[1], numbers[2], groups)
+        start = np.float64(self.ridge) if groups is None else np.full(len(groups), float(self.ridge))
+        return options, start, self.kept.state() if self.kept else None
+
+    def runs(self, state: State) -> bool:
+        """Whether there is a step to take."""
+        return int(state.code) == Ending.RUNNING and int(state.iteration) < self.iterations
+
+    def tell(self, state: State) -> None:
+        """Whoever listens, and whoever keeps states."""
+        self.progress(int(state.iteration), float(state.normal.loss))
+        if self.kept is not None:
+            self.kept.keep(state, ended=int(state.code) != Ending.RUNNING)
+
+    def ended(self, state: State, seconds: float) -> TrainingRun:
+        """The run, from its last state."""
+        held: Any = (
+            np.asarray(state.ridge)
+            if self.groups is not None
+            else np.float64(state.ridge if self.evidence else self.ridge)
+        )
+        ridge = held if self.groups is not None else float(held)
+        effective = float(effective_weights(state.normal, held))
+        ending, done = Ending(int(state.code)), int(state.iteration)
+        return TrainingRun(state.w, state.normal, ridge, effective, done, ending, seconds)
+
+
 def minimise(
     criterion: Callable[..., Normal],
     w: Float[Array, "nw"],
     arguments: tuple[Any, ...],
     overlap: Overlap,
-    *,
-    ridge: float = 0.0,
-    evidence: bool = False,
-    groups: Int[np.ndarray, "nw"] | None = None,
-    samples: int,
-    iterations: int,
-    tolerance: float,
-    progress: RunTell = quiet,
-    kept: Keeper | None = None,
+    settings: Settings,
 ) -> TrainingRun:
     """Minimise `‖r(w)‖² + α‖w‖²` from `w`.
 
     Args:
         criterion: hashable; `(w, *arguments, overlap) -> Normal`.
         overlap: a first guess of the learner's share in the physics; zeros do.
-        ridge: α in normalised units; with `evidence` where it starts.
-        evidence: choose α by MacKay's re-estimation after every accepted step.
-        groups: which weights share an α, by number; None where all do.
-        samples: residuals less the physics' own parameters, for the noise variance.
-        iterations, tolerance: as of `LevenbergMarquardt`.
-        kept: where states are kept; a run goes on from the last one.
     """
-    options, start = _prepared(w, ridge, evidence, groups, samples, tolerance)
-    state = kept.state() if kept else None
+    options, start, state = settings.prepared(w)
     state = _begun(w, linearise(criterion, w, arguments, overlap), start) if state is None else state
-    if int(state.code) == Ending.RUNNING and iterations:  # a run beside this one may be compiling: no time of this one
+    if settings.runs(state):  # a run beside this one may be compiling: no time of this one
         jax.block_until_ready(_advance(criterion, state, arguments, options, np.int64(0)))
     began = training_clock()
     burst = 1
-    while int(state.code) == Ending.RUNNING and int(state.iteration) < iterations:
+    while settings.runs(state):
         tick = training_clock()
-        stop = min(int(state.iteration) + burst, iterations)
+        stop = min(int(state.iteration) + burst, settings.iterations)
         state = jax.block_until_ready(_advance(criterion, state, arguments, options, np.int64(stop)))
-        spent = training_clock() - tick
-        burst = burst_length(burst, spent)
-        _tell(state, progress, kept)
-    return _ended(state, ridge, evidence, groups, training_clock() - began)
+        burst = burst_length(burst, training_clock() - tick)
+        settings.tell(state)
+    return settings.ended(state, training_clock() - began)
 
 
 def driven(
     normal_at: Callable[[Any, Overlap], Normal],
     w: Float[Array, "nw"],
     overlap: Overlap,
-    *,
-    ridge: float = 0.0,
-    evidence: bool = False,
-    groups: Int[np.ndarray, "nw"] | None = None,
-    samples: int,
-    iterations: int,
-    tolerance: float,
-    progress: RunTell = quiet,
-    kept: Keeper | None = None,
+    settings: Settings,
 ) -> TrainingRun:
     """`minimise` where every pass over the rows is asked for from here: the same steps, whoever makes the sums.
 
     Args:
         normal_at: the criterion at weights, with the overlap of the pass before.
     """
-    options, start = _prepared(w, ridge, evidence, groups, samples, tolerance)
-    state = kept.state() if kept else None
-    if state is None:
-        first = normal_at(w, overlap)  # compiles: no time of the run
-        began = training_clock()
+    options, start, state = settings.prepared(w)
+    first = normal_at(w, overlap) if state is None else None  # compiles: no time of the run
+    began = training_clock()
+    if first is not None:
         state = _begun(w, normal_at(w, first.overlap), start)  # less what rounding left of J in the physics
-    else:
-        began = training_clock()
-    while int(state.code) == Ending.RUNNING and int(state.iteration) < iterations:
+    assert state is not None
+    while settings.runs(state):
         step = _proposed(state)
         state = _judged(state, step, normal_at(state.w + step, state.normal.overlap), options)
-        _tell(state, progress, kept)
-    return _ended(state, ridge, evidence, groups, training_clock() - began)
-
-
-def _tell(state: State, progress: RunTell, kept: Keeper | None) -> None:
-    progress(int(state.iteration), float(state.normal.loss))
-    if kept is not None:
-        kept.keep(state, ended=int(state.code) != Ending.RUNNING)
-
-
-def _prepared(w: Any, ridge: float, evidence: bool, groups: Any, samples: int, tolerance: float) -> tuple[Options, Any]:
-    """The numbers of a run, and the ridge it starts with."""
-    if groups is None and not evidence:  # the program of groups serves a fixed ridge as well
-        groups = np.zeros(len(w), dtype=int)
-    options = Options(np.asarray(tolerance), np.asarray(evidence), np.asarray(float(samples)), groups)
-    return options, np.float64(ridge) if groups is None else np.full(len(groups), float(ridge))
-
-
-def _ended(state: State, ridge: float, evidence: bool, groups: Any, seconds: float) -> TrainingRun:
-    single = groups is None
-    end = np.asarray(state.ridge) if not single else np.float64(state.ridge if evidence else ridge)
-    return TrainingRun(
-        state.w,
-        state.normal,
-        float(end) if single else end,
-        float(effective_weights(state.normal, end)),
-        int(state.iteration),
-        Ending(int(state.code)),
-        seconds,
-    )
+        settings.tell(state)
+    return settings.ended(state, training_clock() - began)
 
 
 def burst_length(burst: int, spent: float) -> int:

@@ -14,7 +14,7 @@ from orthaug._base.jax import Array
 from orthaug._base.registry import LIBRARY_ONLY, InSpec, check_fields
 from orthaug.fitting.normal_equations import Normal
 from orthaug.fitting.solvers import compiled
-from orthaug.fitting.solvers.compiled import TrainingRun
+from orthaug.fitting.solvers.compiled import Settings, TrainingRun
 from orthaug.fitting.solvers.descent import Descent, SquaredResiduals, descend
 from orthaug.models.rows import Overlap
 
@@ -50,15 +50,13 @@ class LevenbergMarquardt:
         **options: Any,
     ) -> TrainingRun:
         """`‖r(w)‖² + α‖w‖²` from `w`, compiled whole: the rows are in memory; see `compiled.minimise`."""
-        limits: dict[str, Any] = {"iterations": self.iterations, "tolerance": self.tolerance}
-        return compiled.minimise(criterion, w, arguments, overlap, **limits, **options)
+        return compiled.minimise(criterion, w, arguments, overlap, Settings(self.iterations, self.tolerance, **options))
 
     def drive(
         self, normal_at: Callable[[Any, Overlap], Normal], w: Float[Array, "nw"], overlap: Overlap, **options: Any
     ) -> TrainingRun:
         """The same, pass by pass: the rows are elsewhere; see `compiled.driven`."""
-        limits: dict[str, Any] = {"iterations": self.iterations, "tolerance": self.tolerance}
-        return compiled.driven(normal_at, w, overlap, **limits, **options)
+        return compiled.driven(normal_at, w, overlap, Settings(self.iterations, self.tolerance, **options))
 
     def descend(self, objective: SquaredResiduals, p: Vector, start: Any, **options: Any) -> Descent:
         """`‖r(p)‖² + α‖w‖²` from p, driven by the host; see `descent.descend`."""
