@@ -22,7 +22,7 @@ from orthaug.data.record import Channel, Experiment, as_channels, check_channels
 from orthaug.data.sources import joined, stretches
 from orthaug.data.tables import check_present, check_readable, parquet_file
 
-BATCH_ROWS = 16_384  # what is laid out at once: several such blocks are in memory
+BATCH_ROWS = 32_768  # what is laid out at once: several such blocks are in memory
 _FEWEST_STEPS = 1000  # that tell the rate of a batch
 PARTITION_ROWS = 1_000_000
 """Rows of a partition at least, where the file has as many: row groups are never cut."""
@@ -352,7 +352,7 @@ def _batches(path: Path, start: int, stop: int, reading: Reading) -> Iterator[tu
             begin, end = max(start - position, 0), min(stop - position, len(batch))
             if begin < end:
                 values = {name: _numbers(batch, name)[begin:end] for name in reading.distinct}
-                yield position + begin, np.stack([values[name] for name in reading.columns], axis=1)
+                yield position + begin, np.stack([values[name] for name in reading.columns]).T
             position += len(batch)
 
 

@@ -86,10 +86,13 @@ def largest_lag(layout: Layout) -> int:
 
 
 def lag_matrix(experiment: Experiment, layout: Layout, record: Record, start: int) -> Matrix:
-    """Rows `start … N-1` of the regressor, (N - start, len(layout)); never reaches before the experiment."""
+    """Rows `start … N-1` of the regressor, (N - start, len(layout)), column by column in memory.
+
+    Never reaches before the experiment.
+    """
     column = {channel.name: experiment.outputs[:, i] for i, channel in enumerate(record.outputs)}
     column |= {channel.name: experiment.inputs[:, i] for i, channel in enumerate(record.inputs)}
-    matrix = np.empty((max(len(experiment) - start, 0), len(layout)))
+    matrix = np.empty((max(len(experiment) - start, 0), len(layout)), order="F")
     for j, lag in enumerate(layout):
         matrix[:, j] = column[lag.channel][start - lag.lag : start - lag.lag + len(matrix)]
     return matrix
@@ -163,4 +166,4 @@ class Features:
             return xp.zeros((*x.shape[:-1], 0))
         columns = {lag: x[..., j] for j, lag in enumerate(layout)}
         values = [xp.asarray(entry.evaluate(columns, xp), dtype=float) for entry in self.entries]
-        return xp.stack([xp.broadcast_to(v, x.shape[:-1]) for v in values], axis=-1)
+        return xp.moveaxis(xp.stack([xp.broadcast_to(v, x.shape[:-1]) for v in values]), 0, -1)  # a column in one piece

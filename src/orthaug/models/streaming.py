@@ -86,28 +86,22 @@ def _compiled(function: Callable[..., Any]) -> tuple[Any, Any]:
 
 def chunks_of(pieces: Iterable[Laid], size: int) -> Iterator[Chunk]:
     """Rows in chunks of one size, the row index last; the last one is padded with rows that count for nothing."""
-    waiting: list[Laid] = []
+    parts: list[Any] = []
     held = 0
     for piece in pieces:
-        waiting.append(piece)
-        held += len(piece[0])
-        if held < size:
-            continue
-        laid = _joined(waiting)
-        for begin in range(0, held - size + 1, size):
-            yield _chunk(tuple(part[begin : begin + size] for part in laid), size)
-        left = held % size
-        waiting, held = [tuple(part[len(part) - left :] for part in laid)] if left else [], left  # type: ignore[list-item]
-    if waiting:
-        yield _chunk(_joined(waiting), size)
-
-
-def _joined(pieces: Sequence[Laid]) -> Any:
-    return pieces[0] if len(pieces) == 1 else tuple(map(np.concatenate, zip(*pieces, strict=True)))
-
-
-def _chunk(laid: Any, size: int) -> Chunk:
-    return Chunk(*(in_chunks(np.asarray(part), (1, size), repeat=j == 0)[0] for j, part in enumerate(laid)))
+        rows, begin = len(piece[0]), 0
+        while begin < rows:
+            parts = parts or [np.zeros((*part.shape[1:], size)) for part in piece]
+            count = min(size - held, rows - begin)
+            for part, room in zip(piece, parts, strict=True):
+                room[..., held : held + count] = np.moveaxis(part[begin : begin + count], 0, -1)
+            held, begin = held + count, begin + count
+            if held == size:
+                yield Chunk(*parts)
+                parts, held = [], 0
+    if parts:
+        parts[0][..., held:] = parts[0][..., held - 1 : held]  # zeros may be where the learner has no value
+        yield Chunk(*parts)
 
 
 def read_ahead(items: Iterable[Any], ahead: int = _AHEAD) -> Iterator[Any]:

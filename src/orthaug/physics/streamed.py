@@ -153,8 +153,12 @@ class Basis:
     turn: Matrix
 
     def rows(self, phi: np.ndarray) -> Float[np.ndarray, "m ny nt"]:
-        flat = self.weight.rows(phi).reshape(len(phi) * phi.shape[1], len(self.turn))
-        return (flat @ self.inverse @ self.turn).reshape(phi.shape)
+        columns = np.moveaxis(self.weight.rows(phi), 0, -1)  # as they are in memory
+        return np.moveaxis(self.turn.T @ (self.inverse.T @ columns), -1, 0)
+
+    def left(self, target: Matrix, q: np.ndarray, coordinates: Vector) -> Matrix:
+        """What is left of a target (m, ny) by rows of Q at these coordinates, in whitened outputs."""
+        return self.weight.rows(target) - (coordinates @ np.moveaxis(q, 0, -1)).T
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +172,7 @@ class Refining:
         basis, found, nt = self.basis, None, len(self.coordinates)
         for _, rows, phi, known in basis.form.posed(partition):
             q = basis.rows(phi)
-            e = basis.weight.rows(rows.y - known) - q @ self.coordinates
+            e = basis.left(rows.y - known, q, self.coordinates)
             r = _triangle([np.concatenate([q.reshape(-1, nt), e.reshape(-1, 1)], axis=1)])
             seen = Refined(r, Moments.of(e), np.sum(q**2, axis=(0, 2)))
             found = seen if found is None else _both(found, seen)
@@ -208,7 +212,7 @@ class Laying:
         form = self.basis.form
         for _, rows, phi, known in form.posed(partition):
             q = self.basis.rows(phi)
-            e = (self.basis.weight.rows(rows.y - known) - q @ self.coordinates) / self.rms
+            e = self.basis.left(rows.y - known, q, self.coordinates) / self.rms
             z = np.asarray(form.features.evaluate(rows.x, form.layout, np)) if len(self.centre) else rows.x[:, :0]
             yield (z - self.centre) / self.halfwidth, q, e, np.broadcast_to(self.gain, (*e.shape, e.shape[1]))
 
