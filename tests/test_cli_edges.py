@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ import pytest
 from test_cli import MAIN, SPEC, make_project, one_line, run, signals, write_csv
 from test_cli import MLP as NETWORK
 
-from orthaug.models.storage import load
+from orthaug.models.storage import load, save
 
 
 @pytest.fixture
@@ -364,3 +365,41 @@ def test_more_refusals(project, change, words):
     message = refused("check", project)
     assert words in message
     assert "plant.toml" in message or "run.csv" in message
+
+
+# --- files that are not read at once
+
+
+@pytest.mark.parametrize("command", ["simulate", "predict"])
+def test_a_long_file_is_written_piece_by_piece(fitted, tmp_path, monkeypatch, command):
+    """The table and the scores are those of the file read at once; a run that leaves all bounds ends in both."""
+    pytest.importorskip("pyarrow")
+    rng = np.random.default_rng(3)
+    pd.DataFrame({"u": rng.uniform(-1, 1, 500), "y": rng.normal(size=500)}).to_parquet(tmp_path / "long.parquet")
+    monkeypatch.chdir(tmp_path)
+    whole = run(command, fitted / "out", "long.parquet", "--out", "whole.csv")
+    monkeypatch.setattr("orthaug.commands.long_run.LONG", 100)
+    monkeypatch.setattr("orthaug.data.parquet_source.BATCH_ROWS", 64)
+    pieces = run(command, fitted / "out", "long.parquet", "--out", "pieces.csv")
+    assert (whole.code, pieces.code, whole.err) == (0, 0, pieces.err)
+    assert pieces.out == whole.out.replace("whole.csv", "pieces.csv")
+    pd.testing.assert_frame_equal(pd.read_csv("pieces.csv"), pd.read_csv("whole.csv"), rtol=1e-9, atol=1e-12)
+    streamed = run(command, fitted / "out", "long.parquet")
+    assert streamed.out == Path("pieces.csv").read_text(encoding="utf-8")
+    assert run(command, fitted / "out", "long.parquet", "--out", "long.parquet").code == 2
+
+
+def test_a_long_run_that_leaves_all_bounds_has_no_more_values(fitted, tmp_path, monkeypatch):
+    pytest.importorskip("pyarrow")
+    model = load(fitted / "out")
+    numbers = model.numbers._replace(theta=np.array([1.2, 0.0, 0.5]), theta_aux=np.zeros_like(model.theta))
+    save(replace(model, numbers=numbers), tmp_path / "wild")
+    rng = np.random.default_rng(3)
+    pd.DataFrame({"u": rng.uniform(-1, 1, 300), "y": rng.normal(size=300)}).to_parquet(tmp_path / "l.parquet")
+    monkeypatch.chdir(tmp_path)
+    whole = run("simulate", "wild", "l.parquet", "--out", "whole.csv")
+    monkeypatch.setattr("orthaug.commands.long_run.LONG", 100)
+    monkeypatch.setattr("orthaug.data.parquet_source.BATCH_ROWS", 32)
+    pieces = run("simulate", "wild", "l.parquet", "--out", "pieces.csv")
+    assert "the free run diverged in output 'y' at step" in whole.err and pieces.err == whole.err
+    pd.testing.assert_frame_equal(pd.read_csv("pieces.csv"), pd.read_csv("whole.csv"), rtol=1e-6)

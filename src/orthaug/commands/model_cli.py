@@ -26,7 +26,7 @@ from orthaug.commands.program import (
 )
 
 if TYPE_CHECKING:
-    from orthaug.commands.run import ModelOnData
+    from orthaug.commands.run import ModelOnData, Reading
     from orthaug.models.response import Response
 
 
@@ -46,7 +46,10 @@ def simulate(
     from orthaug.commands import run
     from orthaug.commands.folder import check_file
 
-    opened = run.open_run(model, data, reading=run.Reading.of(missing, rows, every, column or ()))
+    reading = run.Reading.of(missing, rows, every, column or ())
+    if initial is None and _written_long(model, data, reading, out, force, free=True):
+        return
+    opened = run.open_run(model, data, reading=reading)
     start = run.read_initial(initial, opened)
     check_file(out, model, data, Path(initial or data), force=force)
     prepare_jax()
@@ -75,6 +78,9 @@ def predict(
     from orthaug.commands.folder import check_file
 
     reading = run.Reading.of(missing, rows, every, column or ())
+    plain = horizon == 1 and initial is None and not observer
+    if plain and _written_long(model, data, reading, out, force, free=False):
+        return
     opened = run.open_ahead(model, data, reading, horizon, initial, observer=observer)
     check_file(out, model, data, Path(initial or data), force=force)
     prepare_jax()
@@ -224,6 +230,29 @@ def track(
     text = track_text(tracked.result)
     tracking.write_tracked(tracked, folder, text, force=force)
     streams.echo(tracked.result.to_json() if as_json else f"{text}\n\nwritten to {folder}")
+
+
+def _written_long(model: Path, data: Path, reading: Reading, out: Path | None, force: bool, *, free: bool) -> bool:
+    """Whether the file is one that is not read at once; then its table is written piece by piece."""
+    from orthaug.commands import long_run
+    from orthaug.commands.folder import check_file
+    from orthaug.commands.run import prepared_notes
+    from orthaug.reports.text import scores_text
+
+    run = long_run.long_run(model, data, reading, free=free)
+    if run is None:
+        return False
+    check_file(out, model, data, force=force)
+    prepare_jax()
+    scored, warnings = long_run.write(run, out, force=force)
+    for line in (*prepared_notes(model), *(f"warning: {warning.text}" for warning in warnings)):
+        streams.say(line)
+    say = streams.say if out is None else streams.echo
+    if scored is not None:
+        say(scores_text(scored, run.model.outputs, None if free else 1))
+    if out is not None:
+        streams.echo(f"written to {out}")
+    return True
 
 
 def _write_response(

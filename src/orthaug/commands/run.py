@@ -17,7 +17,7 @@ from orthaug._base.folders import whole_file
 from orthaug._base.warning import Warning
 from orthaug.commands.parts import long_stretches
 from orthaug.data.readers import read_record
-from orthaug.data.record import Record
+from orthaug.data.record import Channel, Record
 from orthaug.data.tables import check_readable, has_column
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ def open_run(
             raise InputError(
                 f"--column: '{name}' is no channel of the model{nearest(name, names)}; it has {', '.join(names)}."
             )
-    held = [c for c in loaded.outputs if has_column(data, reading.columns.get(c.name, c.file_column))]
+    held = held_outputs(loaded, data, reading)
     if need_outputs or not loaded.inputs or len(held) == len(loaded.outputs):
         held = list(loaded.outputs)
     elif held:
@@ -109,7 +109,7 @@ def open_run(
         record = read_record(data, **channels, sampling_time=step, time=loaded.time_column, **options)
     except MissingSampleError as error:
         raise InputError(f"{error} --missing skip leaves such rows out.") from None
-    rows, told = len(record) + record.missing, _prepared(model)
+    rows, told = len(record) + record.missing, prepared_notes(model)
     if record.missing:
         estimated = need_outputs and loaded.form.states and not loaded.form.memory  # a state to predict from
         first = loaded.form.first_row + ahead + bool(estimated)
@@ -118,7 +118,12 @@ def open_run(
     return ModelOnData(loaded, record, data, rows, told)
 
 
-def _prepared(model: Path) -> tuple[str, ...]:
+def held_outputs(model: Model | MotionModel, data: Path, reading: Reading) -> list[Channel]:
+    """The outputs that a file has columns of."""
+    return [c for c in model.outputs if has_column(data, reading.columns.get(c.name, c.file_column))]
+
+
+def prepared_notes(model: Path) -> tuple[str, ...]:
     """What the result that a model lies in tells of the preparation of its data."""
     for folder in (model, model.parent):
         try:

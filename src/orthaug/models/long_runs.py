@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,36 +14,53 @@ from orthaug.data.sources import Source, as_record
 from orthaug.models.dynamics import Parts
 from orthaug.models.model import Model
 from orthaug.models.on_records import RUNAWAY
-from orthaug.models.response import Scores, scores_of
+from orthaug.models.response import Response, Scores, scores_of
 from orthaug.physics.moments import Moments
 
 
-class Stretch(NamedTuple):
-    """Rows of a piece that have a prediction: the one-step prediction and the free run, (m, ny) in parts."""
+class Flight(NamedTuple):
+    """A piece, the free run over its rows behind the history (m, ny) in parts, and the state it began in."""
 
     piece: Experiment
-    first: int
-    """The first of them, in the piece."""
-    prediction: Parts
-    simulation: Parts
+    state: Any
+    run: Parts
 
 
-def along(model: Model, source: Source) -> Iterator[Stretch]:
-    """The model along every experiment of a source. A free run starts from the measured outputs of each."""
+def pieces_of(model: Model, source: Source) -> Iterator[Experiment]:
+    """The pieces of a source that have rows behind the history that the model needs."""
+    first = model.form.first_row
+    return (piece for partition in source.partitions for piece in partition.pieces(first) if len(piece) > first)
+
+
+def flights(model: Model, source: Source) -> Iterator[Flight]:
+    """The free run along every experiment of a source, from the measured outputs of each."""
     record, first = as_record(source, (_nothing(source),)), model.form.first_row
     state: Any = None
     ended: tuple[str, int] = ("", -1)
-    for partition in source.partitions:
-        for piece in partition.pieces(first):
-            if len(piece) <= first:
-                continue
-            if ended != (piece.source, piece.offset + first):
-                state = model.form.start(piece.outputs[:first], [first])[0]
-            prediction = model.parts_at(model.form.regressors(piece, record))
-            simulation = model.fly(state, model.form.inputs(piece, record))
-            state = _after(model, state, np.asarray(simulation.total))
-            ended = piece.source, piece.offset + len(piece)
-            yield Stretch(piece, first, prediction, simulation)
+    for piece in pieces_of(model, source):
+        if ended != (piece.source, piece.offset + first):
+            state = model.form.start(piece.outputs[:first], [first])[0]
+        run = model.fly(state, model.form.inputs(piece, record))
+        yield Flight(piece, state, run)
+        state = _after(model, state, np.asarray(run.total))
+        ended = piece.source, piece.offset + len(piece)
+
+
+def responses(model: Model, source: Source, *, free: bool) -> Iterator[tuple[Experiment, Response]]:
+    """One-step predictions or free runs of a source, piece by piece; a run that left all bounds has no more values."""
+    record = as_record(source, (_nothing(source),))
+    if not free:
+        for piece in pieces_of(model, source):
+            yield piece, model.predict(replace(record, experiments=(piece,)))
+        return
+    lost: tuple[str, int] | None = None
+    for piece, state, run in flights(model, source):
+        told = model.flown(state, run, piece, record)
+        before = lost == (piece.source, piece.offset + model.form.first_row)
+        if before:
+            told = replace(told, baseline=told.baseline * np.nan, learner=told.learner * np.nan, diverged=None)
+        lost = (piece.source, piece.offset + len(piece)) if before or told.diverged else None
+        yield piece, Response((told,), None, model.outputs, source.sampling_time)
 
 
 def _after(model: Model, state: Any, outputs: Matrix) -> Any:
@@ -91,12 +108,12 @@ class LongScores(NamedTuple):
 
 def scores_along(model: Model, source: Source, skip: int = 0) -> LongScores:
     """Scores of the one-step prediction and the free run, without the first `skip` rows of each recording."""
+    record, first = as_record(source, (_nothing(source),)), model.form.first_row
     one_step, free, diverged = RunningScores(), RunningScores(), None
-    for piece, first, prediction, simulation in along(model, source):
+    for piece, _, parts in flights(model, source):
         kept = slice(max(skip - piece.offset - first, 0), None)
-        measured = piece.outputs[first:]
-        one_step.add(measured[kept], np.asarray(prediction.total)[kept])
-        run = np.asarray(simulation.total)
+        measured, run = piece.outputs[first:], np.asarray(parts.total)
+        one_step.add(measured[kept], np.asarray(model.parts_at(model.form.regressors(piece, record)).total)[kept])
         free.add(measured[kept], run[kept])
         diverged = diverged or _runaway(model, piece, first, run)
     return LongScores(one_step.scores(), free.scores(), diverged)

@@ -148,9 +148,13 @@ class Model(OnRecords):
             measured = experiment.outputs if record.outputs else None
             start = self._start(initial, measured)
             parts = self.fly(start, self.form.inputs(experiment, record))
-            outside = self._outside(start, parts, experiment, record)
-            trajectories.append(replace(self.bounded(parts, experiment, measured), outside=outside))
+            trajectories.append(self.flown(start, parts, experiment, record))
         return Response(tuple(trajectories), None, self.outputs, record.sampling_time)
+
+    def flown(self, start: Vector, parts: Parts, experiment: Experiment, record: Record) -> Trajectory:
+        """A free run from a state, cut where it left all bounds."""
+        outside = self._outside(start, parts, experiment, record)
+        return replace(self.bounded(parts, experiment, experiment.outputs if record.outputs else None), outside=outside)
 
     @cached_property
     def memory(self) -> Memory:

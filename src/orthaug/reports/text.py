@@ -22,9 +22,10 @@ from orthaug.reports.result import (
 
 if TYPE_CHECKING:
     from orthaug.analysis.validation import Verdict
+    from orthaug.data.record import Channel
     from orthaug.fitting.estimates import Estimate
     from orthaug.fitting.motion_estimates import MotionEstimate
-    from orthaug.models.response import Response
+    from orthaug.models.response import Response, Scores
 
 SHOWN = 8  # signals of a design that are listed
 WIDTH = 100  # of wrapped sentences
@@ -246,10 +247,14 @@ def response_text(response: Response) -> str:
     """Scores of a response where its outputs were measured and it has a value on every row; otherwise nothing."""
     if any(t.measured is None or t.diverged for t in response.trajectories):
         return ""
-    kind = "free run" if response.horizon is None else f"{response.horizon} step{'s' * (response.horizon > 1)} ahead"
-    scored = response.scores()
+    return scores_text(response.scores(), response.outputs, response.horizon)
+
+
+def scores_text(scored: Scores, outputs: Sequence[Channel], horizon: int | None) -> str:
+    """Scores of each output; `horizon` in steps, None for a free run."""
+    kind = "free run" if horizon is None else f"{horizon} step{'s' * (horizon > 1)} ahead"
     rows = [[f"{kind}, {scored.samples} rows", "RMSE", "NRMSE", "FIT %"]]
-    for channel, *numbers in zip(response.outputs, scored.rmse, scored.nrmse, scored.fit, strict=True):
+    for channel, *numbers in zip(outputs, scored.rmse, scored.nrmse, scored.fit, strict=True):
         rmse, nrmse, percent = ("–" if np.isnan(number) else f"{number:.6g}" for number in numbers)
         rows.append([channel.name, f"{rmse} {channel.unit}".strip(), nrmse, percent])
     return "\n".join(_table(rows))

@@ -1,0 +1,93 @@
+"""Saved models on Parquet files of many rows: read, computed and written piece by piece."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from orthaug._base.folders import whole_file
+from orthaug._base.warning import Warning
+from orthaug.commands.run import Reading, held_outputs
+from orthaug.data.parquet_source import open_parquet
+from orthaug.data.sources import Source, rows_of
+
+if TYPE_CHECKING:
+    from orthaug.models.model import Model
+    from orthaug.models.response import Scores
+
+LONG = 1_000_000
+"""Rows of a file that is not read at once."""
+
+
+@dataclass(frozen=True, eq=False)
+class LongRun:
+    """A model with a file that stays where it is; `free` for its free run, else one step ahead."""
+
+    model: Model
+    source: Source
+    free: bool
+
+
+def long_run(model: Path, data: Path, reading: Reading, *, free: bool) -> LongRun | None:
+    """The model on a long Parquet file with all its channels; None for what is read at once.
+
+    Raises:
+        InputError: no model, a file that cannot be read.
+    """
+    if data.suffix.lower() != ".parquet" or reading != Reading(columns=reading.columns) or not data.is_file():
+        return None
+    from orthaug.models.model import Model
+    from orthaug.models.storage import load
+
+    loaded = load(model)
+    if not isinstance(loaded, Model) or len(held_outputs(loaded, data, reading)) < len(loaded.outputs):
+        return None
+    source = open_parquet(
+        [data],
+        inputs=loaded.inputs,
+        outputs=loaded.outputs,
+        sampling_time=None if loaded.time_column else loaded.sampling_time,
+        time=loaded.time_column,
+        columns=reading.columns,
+    )
+    return LongRun(loaded, source, free) if rows_of(source) > LONG else None
+
+
+def write(run: LongRun, out: Path | None, *, force: bool = False) -> tuple[Scores | None, list[Warning]]:
+    """The table of `run.write_csv`, to a file (whole or not at all) or standard output; scores of all rows, warnings.
+
+    No scores where a free run left all bounds.
+    """
+    from orthaug.models.long_runs import RunningScores, responses
+
+    scored, warnings, first = RunningScores(), [], run.model.form.first_row
+    with _opened(out, force) as file:
+        for piece, response in responses(run.model, run.source, free=run.free):
+            (told,) = response.trajectories
+            frame = response.to_frame()
+            if piece.offset:
+                frame = frame.iloc[first:]
+                frame["time"] += piece.offset * response.sampling_time
+            frame.to_csv(file, index=False, header=not scored.rows)
+            with np.errstate(all="ignore"):
+                scored.add(piece.outputs[first:], told.model[first:])
+            if told.diverged is not None:
+                row, output = told.diverged
+                text = f"the free run diverged in output '{output}' at step {piece.offset + row}; "
+                warnings.append(Warning("free_run_diverged", text + "it has no values from there on."))
+    return (None if warnings or not scored.rows else scored.scores()), warnings
+
+
+@contextmanager
+def _opened(out: Path | None, force: bool) -> Iterator[Any]:
+    if out is None:
+        yield sys.stdout
+        return
+    with whole_file(out, force=force) as partial, partial.open("w", encoding="utf-8", newline="") as file:
+        yield file
