@@ -19,6 +19,7 @@ import orthaug as oa
 from orthaug.commands.fit import fit_job
 from orthaug.commands.opening import open_job
 from orthaug.commands.spec import load_spec
+from orthaug.data.sources import witness
 
 pytest.importorskip("pyarrow")
 ROWS, GROUP = 1200, 170
@@ -116,6 +117,19 @@ CASES = [("orthogonal", '"none"'), ("additive", "0.1"), ("orthogonal-penalty", '
 @pytest.mark.parametrize(("structure", "regularization"), CASES)
 def test_streamed_files_give_the_result_of_rows_in_memory(folder, structure, regularization):
     check_same(*(fitted(folder, kind, structure, regularization) for kind in ("stream", "memory")))
+
+
+def test_the_residual_of_all_rows_is_tested_where_a_witness_stands_for_them(folder, monkeypatch):
+    whole = fitted(folder, "memory")
+    assert whole["scores"]["train"]["residual"] is None
+    monkeypatch.setattr("orthaug.commands.parts.witness", lambda source: witness(source, 300))
+    found = fitted(folder, "stream")
+    assert [w["code"] for w in found["warnings"]].count("witness") == 1
+    (running,), (wanted,) = found["scores"]["train"]["residual"], whole["residuals"]["one_step"]
+    assert running["n"] == wanted["n"] > found["residuals"]["one_step"][0]["n"]
+    np.testing.assert_allclose(running["acf"], wanted["acf"], atol=1e-6)
+    np.testing.assert_allclose(running["cross"]["u"]["values"], wanted["cross"]["u"]["values"], atol=1e-6)
+    assert running["ljung_box"]["statistic"] == pytest.approx(wanted["ljung_box"]["statistic"], rel=1e-5)
 
 
 @pytest.fixture(scope="module")

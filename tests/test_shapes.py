@@ -21,12 +21,11 @@ with install_import_hook("orthaug", "beartype.beartype"):
     two = oa.Record.from_arrays(u, y)
     terms = [oa.Term("a", "y1[k-1]", output="y1"), oa.Term("b", "u1[k-1]", output="y1")]
     shared = [*terms, oa.Term("a", "y2[k-1]", output="y2")]
-    for record, physics in ((one, terms), (two, shared)):
-        for learner in (oa.MLP((3,)), None):
-            fit = oa.estimate(record, oa.Baseline.from_terms(physics), lags=oa.Lags(2, 2, 0), learner=learner,
-                              solver=oa.LevenbergMarquardt(5), regularization="evidence", structure=oa.Orthogonal())
-            fit.summary(), fit.parameters
-            fit.model.simulate(record).scores(), fit.model.predict(record, horizon=3).scores()
+    for record, physics, learner in ((one, terms, None), (two, shared, oa.MLP((3,)))):
+        fit = oa.estimate(record, oa.Baseline.from_terms(physics), lags=oa.Lags(2, 2, 0), learner=learner,
+                          solver=oa.LevenbergMarquardt(5), regularization="evidence", structure=oa.Orthogonal())
+        fit.summary(), fit.parameters
+        fit.model.simulate(record).scores(), fit.model.predict(record, horizon=3).scores()
 print("shapes hold")
 """
 

@@ -44,6 +44,11 @@ def ljung_box(signal: Pieces, lags: int = 25, fitted: int = 0) -> LjungBox | Non
     if acf is None or len(acf) < 2:
         return None
     pairs = np.maximum(lengths[:, None] - np.arange(1, len(acf)), 0).sum(axis=0)
+    return ljung_box_of(acf, pairs, n, fitted)
+
+
+def ljung_box_of(acf: Vector, pairs: Vector, n: int, fitted: int = 0) -> LjungBox:
+    """The same from `acf` (M + 1,) of n samples, of which n_τ = `pairs` (M,) are τ apart."""
     statistic = float(n * (n + 2.0) * np.sum(acf[1:] ** 2 / pairs))
     freedom = max(len(pairs) - fitted, 1)
     return LjungBox(statistic, freedom, float(scipy.special.chdtrc(freedom, statistic)))

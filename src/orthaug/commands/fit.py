@@ -194,17 +194,22 @@ def score_part(model: Any, part: Part, warnings: list[Any]) -> tuple[PartScores,
 
 
 def _scored_along(model: Any, part: Part, warnings: list[Any]) -> PartScores:
-    """Scores of all rows of a part of which only a witness is in memory."""
+    """Scores of all rows of a part of which only a witness is in memory, and tests of the residual of all of them."""
+    from orthaug.analysis.running_residuals import RunningResidual
+    from orthaug.data.sources import rows_of
     from orthaug.models.long_runs import scores_along
 
     assert part.source is not None
-    found = scores_along(model, part.source, part.skip)
+    whole = len(part.record) == rows_of(part.source)  # whose tests are those of the result
+    residual = RunningResidual([c.name for c in model.outputs], [c.name for c in model.inputs])
+    found = scores_along(model, part.source, part.skip, None if whole else residual.watch)
     if found.diverged is not None:
         file, row, output = found.diverged
         told = f"{part.name}: the free run diverged in output '{output}' at row {row} of {file}; no simulation scores."
         warnings.append(Warning("free_run_diverged", told))
     simulation = ScoreResult() if found.diverged is not None else found.simulation
-    return PartScores.model_validate({"prediction": found.prediction, "simulation": simulation})
+    tests = residual.tests() or None
+    return PartScores.model_validate({"prediction": found.prediction, "simulation": simulation, "residual": tests})
 
 
 def write_result(fitted: Fitted, folder: Path, *, force: bool = False) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -98,6 +98,10 @@ class RunningScores:
         return scores_of(rmse, np.sqrt(np.diag(self.moments.covariance)), self.rows)
 
 
+Watch = Callable[[Experiment, int, Matrix], None]
+"""Is shown a piece, its first row with a prediction, and the one-step residual from there on (m, ny)."""
+
+
 class LongScores(NamedTuple):
     """Scores over a whole source, and where its free run left all bounds: file, row and output."""
 
@@ -106,14 +110,17 @@ class LongScores(NamedTuple):
     diverged: tuple[str, int, str] | None
 
 
-def scores_along(model: Model, source: Source, skip: int = 0) -> LongScores:
+def scores_along(model: Model, source: Source, skip: int = 0, watch: Watch | None = None) -> LongScores:
     """Scores of the one-step prediction and the free run, without the first `skip` rows of each recording."""
     record, first = as_record(source, (_nothing(source),)), model.form.first_row
     one_step, free, diverged = RunningScores(), RunningScores(), None
     for piece, _, parts in flights(model, source):
         kept = slice(max(skip - piece.offset - first, 0), None)
         measured, run = piece.outputs[first:], np.asarray(parts.total)
-        one_step.add(measured[kept], np.asarray(model.parts_at(model.form.regressors(piece, record)).total)[kept])
+        ahead = np.asarray(model.parts_at(model.form.regressors(piece, record)).total)
+        if watch is not None:
+            watch(piece, first, measured - ahead)
+        one_step.add(measured[kept], ahead[kept])
         free.add(measured[kept], run[kept])
         diverged = diverged or _runaway(model, piece, first, run)
     return LongScores(one_step.scores(), free.scores(), diverged)

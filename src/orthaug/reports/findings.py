@@ -161,6 +161,19 @@ class ResidualTestResult(Content):
     largest_share: Number
 
 
+class RunningTestResult(Content):
+    """Whiteness and independence of one output's residual, from running sums over all rows."""
+
+    name: str
+    n: Whole
+    mean: Number
+    rms: Number
+    acf: Numbers
+    acf_band: Number
+    ljung_box: LjungBoxResult
+    cross: dict[str, CrossResult | None]
+
+
 class PredictableResult(Content):
     """What could be predicted of an output's error."""
 

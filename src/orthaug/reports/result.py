@@ -17,6 +17,7 @@ from orthaug.reports.findings import (
     MissingLagsResult,
     MotionCheckResult,
     MotionFitResult,
+    RunningTestResult,
     SharedResult,
     StabilityResult,
     SuspectResult,
@@ -200,6 +201,8 @@ class PartScores(Content):
 
     prediction: ScoreResult
     simulation: ScoreResult
+    residual: list[RunningTestResult] | None = None
+    """Tests of the one-step residual over all rows of a part that is too long to keep in memory."""
 
     @property
     def kinds(self) -> dict[str, ScoreResult]:

@@ -240,7 +240,23 @@ def _score_lines(fit: Estimate | MotionEstimate, result: FitResult) -> list[str]
                 cells = (None if values is None else values[i] for values in (score.rmse, score.nrmse, score.fit))
                 rmse, nrmse, percent = ("–" if c is None else f"{c:.6g}" for c in cells)
                 rows.append([part, kind, channel.name, f"{rmse} {channel.unit}".strip(), nrmse, percent])
-    return _table(rows) if len(rows) > 1 else []
+    return [*_table(rows), *_residual_lines(result)] if len(rows) > 1 else []
+
+
+def _residual_lines(result: FitResult) -> list[str]:
+    """How much the one-step residual follows its own past and the inputs, where all rows were looked at."""
+    lines = []
+    for part, scores in result.scores.items():
+        for test in scores.residual or ():
+            acf = np.array(test.acf, dtype=float)
+            lag = 1 + int(np.argmax(np.abs(acf[1:])))
+            largest = [(f"its own past by {acf[lag]:.2g} at lag {lag}", test.acf_band)]
+            found = ((name, cross) for name, cross in test.cross.items() if cross is not None)
+            largest += [(f"{name} by {cross.values[len(acf) - 1 + cross.lag]:.2g} at lag {cross.lag}", cross.band)
+                        for name, cross in found]  # fmt: skip
+            told = ", ".join(f"{words} (band {band:.1g})" for words, band in largest)
+            lines.append(f"{part}: over all {test.n} rows the one-step residual of {test.name} follows {told}.")
+    return [line for told in lines for line in textwrap.wrap(told, WIDTH)]
 
 
 def response_text(response: Response) -> str:
