@@ -15,7 +15,7 @@ from orthaug.analysis.correlation import autocorrelation, cross_correlation
 from orthaug.analysis.independence import against_input, against_regressor
 from orthaug.analysis.residuals import analyse
 from orthaug.analysis.whiteness import ljung_box, normality, whitening
-from orthaug.reports.findings import ResidualTestResult
+from orthaug.reports.residual_tests import ResidualTestResult
 
 RECORDS, ROWS, WARM_UP = 2000, 1000, 300
 BETWEEN = (0.005, 0.016)  # of 2000 records that a test at 1 % may reject; ± 0.0022 is one standard deviation

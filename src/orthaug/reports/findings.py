@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from orthaug.reports.fields import ByName, Content, Flag, Number, Numbers, WarningResult, Whole, Wholes
+from orthaug.reports.fields import ByName, Content, Flag, Number, Numbers, WarningResult, Whole
+from orthaug.reports.residual_tests import ResidualTestResult
 
 
 class AlternativeResult(Content):
@@ -98,80 +99,6 @@ class SuspectResult(Content):
         shares = {k: None if v is None or coefficient is None else 100 * v * coefficient for k, v in relative.items()}
         exact = {k: 100 * e.relative for k, e in (self.expected_physical_bias or {}).items() if e.relative}
         return shares | exact
-
-
-class LjungBoxResult(Content):
-    """Whether the residual is white."""
-
-    statistic: Number
-    freedom: Whole
-    p: Number
-
-
-class NormalityResult(Content):
-    """Whether the whitened residual is normal."""
-
-    statistic: Number
-    p: Number
-    skewness: Number
-    kurtosis: Number
-
-
-class CrossResult(Content):
-    """A residual against an input."""
-
-    values: Numbers
-    band: Number
-    p: Number
-    lag: Whole
-    largest: Number
-
-
-class RegressorResult(Content):
-    """A residual over a regressor, by bins."""
-
-    p: Number
-    share: Number
-    centres: Numbers
-    means: Numbers
-    errors: Numbers
-    counts: Wholes
-
-
-class ResidualTestResult(Content):
-    """All tests of one output's residual."""
-
-    name: str
-    n: Whole
-    level: Number
-    mean: Number
-    rms: Number
-    acf: Numbers | None
-    acf_band: Number
-    ljung_box: LjungBoxResult | None
-    white: Flag | None
-    order: Whole | None
-    cross: dict[str, CrossResult | None]
-    correlated_inputs: list[str]
-    regressors: dict[str, RegressorResult | None]
-    curved_regressors: list[str]
-    normality: NormalityResult | None
-    largest_acf: Number
-    largest_cross: Number
-    largest_share: Number
-
-
-class RunningTestResult(Content):
-    """Whiteness and independence of one output's residual, from running sums over all rows."""
-
-    name: str
-    n: Whole
-    mean: Number
-    rms: Number
-    acf: Numbers
-    acf_band: Number
-    ljung_box: LjungBoxResult
-    cross: dict[str, CrossResult | None]
 
 
 class PredictableResult(Content):

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from orthaug.reports.findings import ResidualTestResult, SuspectResult
+from orthaug.reports.findings import SuspectResult
 from orthaug.reports.page_blocks import Plot, percent, with_unit
+from orthaug.reports.residual_tests import ResidualTestResult
 from orthaug.reports.result import ParameterResult, PartScores, RestartResult, RowResult
 
 _ROW = 62  # pixels of a parameter

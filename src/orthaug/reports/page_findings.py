@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from orthaug.reports.findings import ResidualTestResult
 from orthaug.reports.page_blocks import Grid, Table, Text, number, percent
 from orthaug.reports.page_figures import bias_plot, residual_plots, restart_plot
+from orthaug.reports.residual_tests import ResidualTestResult
 from orthaug.reports.result import FitResult
 
 

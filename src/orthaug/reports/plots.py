@@ -30,7 +30,8 @@ from orthaug.reports.drawing import (
     save,
     window,
 )
-from orthaug.reports.findings import ResidualTestResult, SuspectResult
+from orthaug.reports.findings import SuspectResult
+from orthaug.reports.residual_tests import ResidualTestResult
 from orthaug.reports.result import RowResult
 
 __all__ = ["save"]

@@ -17,12 +17,12 @@ from orthaug.reports.findings import (
     MissingLagsResult,
     MotionCheckResult,
     MotionFitResult,
-    RunningTestResult,
     SharedResult,
     StabilityResult,
     SuspectResult,
     ValidationResult,
 )
+from orthaug.reports.residual_tests import RunningTestResult
 
 if TYPE_CHECKING:
     from orthaug.analysis.budget import ParameterBias
