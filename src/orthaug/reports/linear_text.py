@@ -80,15 +80,11 @@ def _poles(view: LinearView) -> list[str]:
         spans = [_interval(span) for span in (pole.magnitude_ci95, pole.hertz_ci95, pole.damping_ci95)]
         last = spans[2] if pole.time_constant is None else f"time constant {pole.time_constant:.5g} s"
         rows.append([_z(pole), f"{pole.magnitude:.6g}", spans[0], hertz, spans[1], rate, damping, last])
+    lines = table(rows) if len(rows) > 1 else []
     if view.at_zero:
-        rows.append(
-            [
-                "0, once" if view.at_zero == 1 else f"0, {view.at_zero} times",
-                "0",
-                "dead time, and what the state remembers of inputs",
-            ]
-        )
-    return table(rows) if len(rows) > 1 else ["no poles"]
+        times = "once" if view.at_zero == 1 else f"{view.at_zero} times"
+        lines.append(f"pole 0, {times}: dead time, and what the state remembers of inputs")
+    return lines or ["no poles"]
 
 
 def _z(pole: Pole) -> str:
