@@ -28,7 +28,7 @@ def on_terminal() -> bool:
     return sys.stderr is not None and sys.stderr.isatty()
 
 
-def _bar(*columns: ProgressColumn, transient: bool = True) -> Bar:
+def drawn_bar(*columns: ProgressColumn, transient: bool = True) -> Bar:
     """A bar with its description and these columns, drawn on a terminal only. NO_COLOR is heeded."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
@@ -52,7 +52,7 @@ def training_bar(runs: int, iterations: int, wanted: bool = True, rows: int = 0)
     reached, began = "the start of training", time.monotonic()
     with (
         _deferred_interrupt() as interrupted,
-        _bar(TimeElapsedColumn(), TimeRemainingColumn()) as bar,
+        drawn_bar(TimeElapsedColumn(), TimeRemainingColumn()) as bar,
         WATCH.telling(lambda: reached, bar.stop),
     ):
         task = bar.add_task("compiling", total=runs * iterations)
@@ -85,7 +85,7 @@ def study_bars() -> Iterator[Callable[[str, int, int], None]]:
     reached = "the start of the studies"
     with (
         _deferred_interrupt() as interrupted,
-        _bar(MofNCompleteColumn(), TimeElapsedColumn(), transient=False) as bar,
+        drawn_bar(MofNCompleteColumn(), TimeElapsedColumn(), transient=False) as bar,
         WATCH.telling(lambda: reached, bar.stop),
     ):
         tasks: dict[str, Any] = {}
@@ -112,7 +112,7 @@ def selection_bar(most: int) -> Iterator[Callable[[str, Any], None]]:
 
     with (
         _asked_to_stop() as asked,
-        _bar(MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()) as bar,
+        drawn_bar(MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()) as bar,
         WATCH.telling(lambda: "the selection of a structure", bar.stop),
     ):
         tasks: dict[str, Any] = {}

@@ -47,12 +47,30 @@ class Fitted:
 
         return fit_text(self.fit, self.result) or self.fit.status.message
 
+    def report(self, path: Any = None) -> Any:
+        """The page that `orthaug fit` writes; see `Estimate.report`."""
+        from orthaug.commands.from_python import page_of
+
+        return page_of(self, path)
+
+    @property
+    def plot(self) -> Any:
+        """Figures of the fit on matplotlib axes; see `Estimate.plot`."""
+        return self.fit.plot
+
+    def _repr_html_(self) -> str:
+        return self.fit._repr_html_()
+
 
 @one_blas_thread()
 def fit_job(job: Job, progress: Progress = SILENT) -> Fitted:
     """Train as the spec says, score every part, and ask whether the learner earns its place."""
-    fitted = fit_variant(job, AS_DECLARED, progress)
-    fit, warnings = fitted.fit, list(fitted.result.warnings)
+    return judged(fit_variant(job, AS_DECLARED, progress))
+
+
+def judged(fitted: Fitted) -> Fitted:
+    """With whether the learner earns its place."""
+    job, fit, warnings = fitted.job, fitted.fit, list(fitted.result.warnings)
     if not fit.status.ok or (fit.model.form.bound is None and fit.held_out is None):
         return fitted
     verdict = judge_fit(fitted)
@@ -83,7 +101,11 @@ def keeping(job: Job, folder: Path, *, resume: bool = False) -> Job:
 
 def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitted:
     """Train a variant of a job and score every part; `judge_fit` asks whether the learner helps."""
-    fit = job.run(variant, progress)
+    return told_of(job, job.run(variant, progress))
+
+
+def told_of(job: Job, fit: Any) -> Fitted:
+    """Scores of a fit on every part of its job, and all that results tell of it but the verdict on the learner."""
     warnings: list[Any] = [*job.warnings, *fit.warnings]
     if job.checkpoints is not None and job.checkpoints.lost:
         warnings.append(Warning("checkpoint_lost", f"the last state of training was not kept: {job.checkpoints.lost}."))

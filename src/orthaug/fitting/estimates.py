@@ -12,6 +12,7 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector, check_count, check_type
 from orthaug._base.errors import InputError
 from orthaug._base.lines import fold
+from orthaug._base.views import ShownFit
 from orthaug._base.warning import Warning
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout, lag_rows
@@ -58,7 +59,7 @@ class Restart:
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class Estimate(ShownFit):
     """What `estimate` returns. Print `fit.summary()`; use `fit.model`; read `fit.parameters`."""
 
     model: Model

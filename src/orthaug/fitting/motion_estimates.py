@@ -12,6 +12,7 @@ from jaxtyping import Bool
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError
 from orthaug._base.lines import fold
+from orthaug._base.views import ShownFit
 from orthaug._base.warning import Warning
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout
@@ -46,7 +47,7 @@ _ROUNDING = 1e-11  # of the largest eigenvalue of the information with unit colu
 
 
 @dataclass(frozen=True, eq=False)
-class MotionEstimate:
+class MotionEstimate(ShownFit):
     """What `estimate` returns for a motion. Print `fit.summary()`; use `fit.model`; read `fit.parameters`."""
 
     model: MotionModel
