@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from orthaug.commands.job import Job
 from orthaug.commands.lagged_job import LaggedJob
 from orthaug.commands.motion_job import MotionJob
 from orthaug.commands.parts import Part
-from orthaug.commands.reporting import fit_report
+from orthaug.commands.reporting import fit_report, origin_of
 from orthaug.commands.spec import TrainingSection, ValidationSection
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
@@ -102,14 +102,25 @@ def page_of(
     status = fitted.fit.status if fitted else fit.status
     if not status.ok:
         raise TrainingError(f"{status.message}. There is nothing to report.")
-    if fitted is None:
+    if fitted is not None:
+        text = fit_report(fitted)
+    else:
         job = job_of(fit, {} if tests is None else tests)
-        fitted = judged(told_of(job, fit))
-    text = fit_report(fitted)
+        made = replace(origin_of(job, "fit"), name="spec", command=f"{NAME} in Python", toml=_account(fit))
+        text = fit_report(judged(told_of(job, fit)), made)
     if path is not None:
         with whole_file(Path(path), force=True) as partial:
             partial.write_text(text, encoding="utf-8")
     return Page(text, None if path is None else Path(path))
+
+
+def _account(fit: Estimate | MotionEstimate) -> str:
+    """What stands in the place of the spec."""
+    physics = fit.problem.motion if isinstance(fit, MotionEstimate) else fit.problem.baseline
+    bound = fit.model.form.bound
+    told = (fit.problem.record, physics, f"learner: {'none' if bound is None else bound.learner}")
+    lines = ("Fitted in Python by orthaug.estimate; there is no spec.", *map(str, told))
+    return "".join(f"# {line}\n" for text in lines for line in text.splitlines())
 
 
 def job_of(fit: Any, tests: Mapping[str, Record]) -> Job:

@@ -12,6 +12,7 @@ import typer
 import typer.core
 
 from orthaug import __version__
+from orthaug._base.checks import check_choice
 from orthaug._base.errors import InputError, TrainingError
 from orthaug.commands import streams
 from orthaug.commands.signals import WATCH
@@ -116,13 +117,27 @@ def _version(show: bool) -> None:
         raise typer.Exit
 
 
+def _verbose(count: int) -> None:
+    """What -v, -vv and ORTHAUG_LOG ask for."""
+    level = os.environ.get("ORTHAUG_LOG", "").lower()
+    if not count and not level:
+        return
+    from orthaug._base.log import show_log
+
+    show_log(("info", "debug")[min(count, 2) - 1] if count else check_choice(level, ("info", "debug"), "ORTHAUG_LOG"))
+
+
 @app.callback()
 def options(
+    verbose: Annotated[
+        int, typer.Option("--verbose", "-v", count=True, help="Tell what is done; twice for more.", show_default=False)
+    ] = 0,
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     """What stands before a command."""
+    _verbose(verbose)
 
 
 def _fail(message: str, code: int) -> None:

@@ -192,9 +192,9 @@ def _told(facts: Mapping[str, str]) -> dict[str, str]:
 
 
 def _number(value: Any) -> str:
-    return "–" if value is None or np.isnan(value) else f"{value:.6g}"
+    return "–" if value is None or not np.isfinite(value) else f"{value:.6g}"
 
 
 def _interval(low: Any, high: Any) -> str:
-    ends = ("–" if end is None or np.isnan(end) else f"{end:.6g}" for end in (low, high))
+    ends = ("–" if end is None or not np.isfinite(end) else f"{end:.6g}" for end in (low, high))
     return "[{}, {}]".format(*ends)
