@@ -6,6 +6,7 @@ import subprocess
 import sys
 import types
 from html.parser import HTMLParser
+from pathlib import Path
 
 import matplotlib
 import numpy as np
@@ -223,3 +224,22 @@ def test_progress_is_shown_to_people_only(monkeypatch, capsys):
     with MAKERS["progress"]() as tell:
         tell(0, 1, 0.5)
     assert capsys.readouterr() == ("", "")
+
+
+def test_the_page_of_the_documents(tmp_path, monkeypatch):
+    """Its blocks run one after another, as in a notebook."""
+    rng = np.random.default_rng(1)
+    u, y = rng.standard_normal(300), np.zeros(300)
+    for k in range(2, 300):
+        y[k] = 1.5 * y[k - 1] - 0.7 * y[k - 2] + 0.1 * u[k - 1] - 0.1 * y[k - 1] ** 3
+    monkeypatch.chdir(tmp_path)
+    np.savetxt("run1.csv", np.column_stack([u, y]), delimiter=",", header="force,position", comments="")
+    text = (Path(__file__).resolve().parents[1] / "docs" / "notebook.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```python\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
+    names: dict[str, object] = {}
+    matplotlib.use("agg")
+    for block in blocks[:2]:
+        exec(block, names)
+    assert Path("report.html").is_file() and isinstance(names["upper"], Axes)
+    told = re.findall(r"^\| `(\w+)\(", text, flags=re.MULTILINE)
+    assert set(told) == set(KINDS)

@@ -16,9 +16,14 @@ from orthaug._base.log import LOG, show_log
 from orthaug.commands import bars
 
 COMMAND = [sys.executable, "-m", "orthaug"]
-LEARNS = SPEC.replace(
-    'kind = "none"', 'kind = "mlp"\nhidden = [3]\n[training]\niterations = 3\nrestarts = 2\n[validation]\nblocks = 0'
-)
+LEARNER = """kind = "mlp"
+hidden = [3]
+[training]
+iterations = 3
+restarts = 2
+[validation]
+blocks = 0"""
+LEARNS = SPEC.replace('kind = "none"', LEARNER)
 
 
 @pytest.fixture(scope="module")
