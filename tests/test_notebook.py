@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import types
@@ -11,6 +12,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import pytest
+from matplotlib import pyplot
 from matplotlib.figure import Figure
 
 import orthaug as oa
@@ -213,17 +215,18 @@ def test_progress_in_a_notebook(monkeypatch):
 
 
 def test_progress_is_shown_to_people_only(monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "ipykernel", types.ModuleType("ipykernel"))
-    monkeypatch.setitem(sys.modules, "IPython", types.ModuleType("IPython"))
-    for name, what in (("IPython.core.getipython", "get_ipython"), ("IPython.display", "display")):
-        module = types.ModuleType(name)
-        setattr(module, what, lambda *_: None)
-        monkeypatch.setitem(sys.modules, name, module)
-    monkeypatch.setitem(sys.modules, "IPython.core", types.ModuleType("IPython.core"))
+    """Neither in a pipe nor in a console of IPython that writes to one."""
+    ipython, display = types.ModuleType("IPython"), types.ModuleType("IPython.display")
+    ipython.get_ipython = lambda: type("TerminalInteractiveShell", (), {})()
+    monkeypatch.setitem(sys.modules, "IPython", ipython)
+    monkeypatch.setitem(sys.modules, "IPython.display", display)
     monkeypatch.setenv("FORCE_COLOR", "1")
     with MAKERS["progress"]() as tell:
         tell(0, 1, 0.5)
     assert capsys.readouterr() == ("", "")
+    ipython.get_ipython = lambda: type("ZMQInteractiveShell", (), {})()
+    display.display = _Notebook().display
+    assert shown_progress._display() == display.display
 
 
 def test_the_page_of_the_documents(tmp_path, monkeypatch):
@@ -240,6 +243,7 @@ def test_the_page_of_the_documents(tmp_path, monkeypatch):
     matplotlib.use("agg")
     for block in blocks[:2]:
         exec(block, names)
-    assert Path("report.html").is_file() and isinstance(names["upper"], Axes)
+    assert Path("report.html").is_file() and names["upper"].lines
+    pyplot.close("all")
     told = re.findall(r"^\| `(\w+)\(", text, flags=re.MULTILINE)
     assert set(told) == set(KINDS)

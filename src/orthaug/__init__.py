@@ -25,9 +25,9 @@ def _plot(fit: Any) -> Any:
 
 
 def _report(fit: Any, path: Any, tests: Any) -> Any:
-    from orthaug.commands.from_python import page_of
+    from orthaug.commands.from_python import page_of, page_of_spec
 
-    return page_of(fit, path, tests)
+    return (page_of_spec if hasattr(fit, "job") else page_of)(fit, path, tests)
 
 
 def _progress() -> Any:

@@ -13,6 +13,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
 from orthaug._base.parallel import one_blas_thread
 from orthaug._base.progress import SILENT, Progress
+from orthaug._base.views import MAKERS
 from orthaug._base.warning import Warning
 from orthaug.commands.folder import not_a_result
 from orthaug.commands.job import ALONE, AS_DECLARED, DEFAULT_BLOCKS, Job, Variant
@@ -49,9 +50,7 @@ class Fitted:
 
     def report(self, path: Any = None) -> Any:
         """The page that `orthaug fit` writes; see `Estimate.report`."""
-        from orthaug.commands.from_python import page_of
-
-        return page_of(self, path)
+        return MAKERS["report"](self, path, None)
 
     @property
     def plot(self) -> Any:

@@ -11,7 +11,7 @@ from typing import Any
 
 from orthaug._base.checks import check_type
 from orthaug._base.errors import InputError, TrainingError
-from orthaug._base.folders import whole_file
+from orthaug._base.folders import check_new_file, whole_file
 from orthaug.commands.fit import Fitted, judged, told_of
 from orthaug.commands.job import Job
 from orthaug.commands.lagged_job import LaggedJob
@@ -86,32 +86,41 @@ class Known:
 
 
 def page_of(
-    fit: Estimate | MotionEstimate | Fitted,
-    path: str | os.PathLike | None = None,
-    tests: Mapping[str, Record] | None = None,
+    fit: Estimate | MotionEstimate, path: str | os.PathLike | None = None, tests: Mapping[str, Record] | None = None
 ) -> Page:
     """What `fit.report` returns: parameters, free runs, what was learned, residuals, stability.
 
     Raises:
         TrainingError: a fit without a usable model. InputError: a path that cannot be written, records that do not fit.
     """
+    place = _checked(fit, path)
+    job = job_of(fit, {} if tests is None else tests)
+    made = replace(origin_of(job, "fit"), name="spec", command=f"{NAME} in Python", toml=_account(fit))
+    return _written(fit_report(judged(told_of(job, fit)), made), place)
+
+
+def page_of_spec(fitted: Fitted, path: str | os.PathLike | None, tests: None = None) -> Page:
+    """The page of what `fit_spec` returned, as the command line writes it; errors as `page_of`."""
+    place = _checked(fitted.fit, path)
+    return _written(fit_report(fitted), place)
+
+
+def _checked(fit: Estimate | MotionEstimate, path: str | os.PathLike | None) -> Path | None:
     check_type(path, str | os.PathLike | None, "path", "a file's name, or None")
     if path is not None and Path(path).suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{path}: a page is HTML; give a name that ends in .html.")
-    fitted = fit if isinstance(fit, Fitted) else None
-    status = fitted.fit.status if fitted else fit.status
-    if not status.ok:
-        raise TrainingError(f"{status.message}. There is nothing to report.")
-    if fitted is not None:
-        text = fit_report(fitted)
-    else:
-        job = job_of(fit, {} if tests is None else tests)
-        made = replace(origin_of(job, "fit"), name="spec", command=f"{NAME} in Python", toml=_account(fit))
-        text = fit_report(judged(told_of(job, fit)), made)
     if path is not None:
-        with whole_file(Path(path), force=True) as partial:
+        check_new_file(Path(path), force=True)
+    if not fit.status.ok:
+        raise TrainingError(f"{fit.status.message}. There is nothing to report.")
+    return None if path is None else Path(path)
+
+
+def _written(text: str, path: Path | None) -> Page:
+    if path is not None:
+        with whole_file(path, force=True) as partial:
             partial.write_text(text, encoding="utf-8")
-    return Page(text, None if path is None else Path(path))
+    return Page(text, path)
 
 
 def _account(fit: Estimate | MotionEstimate) -> str:

@@ -27,13 +27,11 @@ def shown_progress() -> Iterator[Tell]:
 
 
 def _display() -> Any:
-    """IPython's `display` in a notebook; None elsewhere."""
-    if "ipykernel" not in sys.modules:
+    """IPython's `display` in a notebook, which has loaded it; None elsewhere."""
+    ipython, shown = sys.modules.get("IPython"), sys.modules.get("IPython.display")
+    if ipython is None or shown is None:
         return None
-    from IPython.core.getipython import get_ipython
-    from IPython.display import display
-
-    return display if type(get_ipython()).__name__ == "ZMQInteractiveShell" else None
+    return shown.display if type(ipython.get_ipython()).__name__ == "ZMQInteractiveShell" else None
 
 
 def _in_notebook(display: Any) -> Iterator[Tell]:
