@@ -2,7 +2,7 @@
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test check bench claims clean
+.PHONY: help setup demo test check wheel smoke bench claims clean
 
 BIN := .venv/bin
 STAMP := .venv/ready
@@ -25,6 +25,17 @@ check: $(STAMP)  ## ruff, pyright and the architecture test
 	@$(BIN)/ruff format --check .
 	@$(BIN)/pyright
 	@$(BIN)/python -m pytest -q tests/test_architecture.py
+
+wheel: $(STAMP)  ## build sdist and wheel into dist
+	@rm -rf dist && $(BIN)/python -m build --outdir dist . >$(LOG) 2>&1 || { tail -n 20 $(LOG) | sed 's|[a-z+]*://[^ ]*|...|g' >&2; exit 1; }
+	@ls dist
+
+# PYTHON=python3.13 is tried instead of the environment's, OLDEST=1 with the oldest dependencies that are allowed.
+smoke: wheel  ## install the wheel into a bare environment and try it without a compiler
+	@rm -rf build/smoke && $(or $(PYTHON),$(BIN)/python) -m venv build/smoke
+	@build/smoke/bin/python -m pip install -q --disable-pip-version-check --only-binary :all: \
+	    $(if $(OLDEST),-c packaging/oldest.txt) dist/*.whl 2>&1 | sed '/Looking in /d; s|[a-z+]*://[^ ]*|...|g' >&2
+	@build/smoke/bin/python packaging/smoke.py dist/*.whl
 
 bench: $(STAMP)  ## run the benchmarks, one after another
 	@set -e; for file in $(filter-out benchmarks/claims.py,$(wildcard benchmarks/*.py)); do \

@@ -3,8 +3,39 @@
 Names load on first use, so that `orthaug --help` and reading data do not import JAX; `__init__.pyi` lists them.
 """
 
+from typing import Any
+
 import lazy_loader
 
+from orthaug._base.views import MAKERS
+
 __version__ = "0.1.0"
+
+
+def _html(shown: Any) -> str:
+    from orthaug.reports.html import html_of
+
+    return html_of(shown)
+
+
+def _plot(fit: Any) -> Any:
+    from orthaug.reports.fit_plots import FitPlots
+
+    return FitPlots(fit)
+
+
+def _report(fit: Any, path: Any, tests: Any) -> Any:
+    from orthaug.commands.from_python import page_of, page_of_spec
+
+    return (page_of_spec if hasattr(fit, "job") else page_of)(fit, path, tests)
+
+
+def _progress() -> Any:
+    from orthaug.commands.shown_progress import shown_progress
+
+    return shown_progress()
+
+
+MAKERS.update(html=_html, plot=_plot, report=_report, progress=_progress)
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

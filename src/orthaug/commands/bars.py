@@ -3,18 +3,38 @@
 from __future__ import annotations
 
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from orthaug._base.progress import SILENT, Progress
 from orthaug.commands.signals import WATCH
+from orthaug.commands.streams import say
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as Bar
+    from rich.progress import ProgressColumn
 
 _MANY = 1_000_000  # rows from which the rate is told
 _LONG = 5.0  # s of a search that are told beforehand
 _SEEN = 3  # models after which the time of the rest is told: the first ones compile
+
+
+def on_terminal() -> bool:
+    """Whether a person sees standard error. FORCE_COLOR, which build servers set, does not make it one."""
+    return sys.stderr is not None and sys.stderr.isatty()
+
+
+def drawn_bar(*columns: ProgressColumn, transient: bool = True) -> Bar:
+    """A bar with its description and these columns, drawn on a terminal only. NO_COLOR is heeded."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    shown = (TextColumn("{task.description}"), BarColumn(), *columns)
+    return Progress(*shown, console=Console(stderr=True), transient=transient, disable=not on_terminal())
 
 
 @contextmanager
@@ -27,16 +47,12 @@ def training_bar(runs: int, iterations: int, wanted: bool = True, rows: int = 0)
     if not wanted:
         yield SILENT
         return
-    from rich.console import Console
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-    from rich.progress import Progress as Bar
+    from rich.progress import TimeElapsedColumn, TimeRemainingColumn
 
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     reached, began = "the start of training", time.monotonic()
     with (
         _deferred_interrupt() as interrupted,
-        Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar,
+        drawn_bar(TimeElapsedColumn(), TimeRemainingColumn()) as bar,
         WATCH.telling(lambda: reached, bar.stop),
     ):
         task = bar.add_task("compiling", total=runs * iterations)
@@ -64,16 +80,12 @@ def training_bar(runs: int, iterations: int, wanted: bool = True, rows: int = 0)
 @contextmanager
 def study_bars() -> Iterator[Callable[[str, int, int], None]]:
     """A bar per study on standard error where that is a terminal; Ctrl-C stops after the run at hand."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bar
+    from rich.progress import MofNCompleteColumn, TimeElapsedColumn
 
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     reached = "the start of the studies"
     with (
         _deferred_interrupt() as interrupted,
-        Bar(*columns, console=console, disable=not console.is_terminal) as bar,
+        drawn_bar(MofNCompleteColumn(), TimeElapsedColumn(), transient=False) as bar,
         WATCH.telling(lambda: reached, bar.stop),
     ):
         tasks: dict[str, Any] = {}
@@ -96,16 +108,11 @@ def selection_bar(most: int) -> Iterator[Callable[[str, Any], None]]:
 
     Once terms have been judged for a while, it says what the rest takes at most, also where there is no terminal.
     """
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-    from rich.progress import Progress as Bar
+    from rich.progress import MofNCompleteColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    console = Console(stderr=True)
-    times = (TimeElapsedColumn(), TimeRemainingColumn())
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *times)
     with (
         _asked_to_stop() as asked,
-        Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar,
+        drawn_bar(MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()) as bar,
         WATCH.telling(lambda: "the selection of a structure", bar.stop),
     ):
         tasks: dict[str, Any] = {}
@@ -118,8 +125,8 @@ def selection_bar(most: int) -> Iterator[Callable[[str, Any], None]]:
                 tasks[stage] = bar.add_task(stage, total=most if stage == "terms" else None)
             bar.update(tasks[stage], advance=1)
             whole = done[-1] * most
-            if stage == "terms" and len(done) == _SEEN and whole > _LONG and not console.is_terminal:
-                console.print(f"note: a model takes {done[-1]:.1f} s; at most {most} are judged, {whole:.0f} s.")
+            if stage == "terms" and len(done) == _SEEN and whole > _LONG and not on_terminal():
+                say(f"note: a model takes {done[-1]:.1f} s; at most {most} are judged, {whole:.0f} s.")
             if asked.is_set():
                 raise KeyboardInterrupt
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from orthaug._base.folders import whole_folder
+from orthaug._base.lines import fold
 from orthaug._base.progress import SILENT, Progress
 from orthaug.commands.fit import Fitted, fill_result, fit_job
 from orthaug.commands.folder import not_a_result
@@ -95,21 +96,21 @@ def _comparison(example: Example, orthogonal: Fitted, additive: list[Estimate]) 
         "The paper's mass-spring-damper: linear physics, friction left to a network of 16 neurons.",
         f"{RESTARTS} initialisations; the same data, the same network, the same training.",
         "",
-        f"{'':<24}{'true':>12}{'initial':>12}{'orthogonal ± std':>26}   {'additive, lowest … highest':>28}",
+        f"{'':<24}{'true':>12}{'initial':>10}{'orthogonal ± std':>23}   {'additive, lowest … highest':>26}",
     ]
     for i, parameter in enumerate(fit.problem.baseline.parameters):
         spread = f"{thetas[:, i].min():.5g} … {thetas[:, i].max():.5g}"
         value = f"{fit.theta[i]:.6g} ± {std[i]:.2g}"
         lines.append(
-            f"{parameter.name:<24}{example.theta[i]:>12.6g}{parameter.initial:>12.4g}{value:>26}   {spread:>28}"
+            f"{parameter.name:<24}{example.theta[i]:>12.6g}{parameter.initial:>10.4g}{value:>23}   {spread:>26}"
         )
     errors = [np.linalg.norm((t - example.theta) / example.theta) for t in thetas]
     error = np.linalg.norm((fit.theta - example.theta) / example.theta)
-    lines.append(f"{'relative error of θ':<48}{error:>26.4g}   {f'{min(errors):.4g} … {max(errors):.4g}':>28}")
+    lines.append(f"{'relative error of θ':<46}{error:>23.4g}   {f'{min(errors):.4g} … {max(errors):.4g}':>26}")
     for label, verb in (("test RMSE, one step [m]", "predict"), ("test RMSE, free run [m]", "simulate")):
         ours = getattr(fit.model, verb)(example.test).scores().rmse[0]
         theirs = [getattr(a.model, verb)(example.test).scores().rmse[0] for a in additive]
-        lines.append(f"{label:<48}{ours:>26.3g}   {f'{min(theirs):.3g} … {max(theirs):.3g}':>28}")
+        lines.append(f"{label:<46}{ours:>23.3g}   {f'{min(theirs):.3g} … {max(theirs):.3g}':>26}")
     lines += ["", f"Both predict equally well; only the orthogonal structure keeps θ (‖QᵀF̃‖/‖F‖ = {fit.defect:.0e})."]
     lines += [f"warning: {warning.text}" for warning in orthogonal.result.warnings if warning.code == "biased"]
-    return "\n".join(lines)
+    return "\n".join(fold(lines))

@@ -13,6 +13,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
 from orthaug._base.parallel import one_blas_thread
 from orthaug._base.progress import SILENT, Progress
+from orthaug._base.views import MAKERS
 from orthaug._base.warning import Warning
 from orthaug.commands.folder import not_a_result
 from orthaug.commands.job import ALONE, AS_DECLARED, DEFAULT_BLOCKS, Job, Variant
@@ -47,12 +48,28 @@ class Fitted:
 
         return fit_text(self.fit, self.result) or self.fit.status.message
 
+    def report(self, path: Any = None) -> Any:
+        """The page that `orthaug fit` writes; see `Estimate.report`."""
+        return MAKERS["report"](self, path, None)
+
+    @property
+    def plot(self) -> Any:
+        """Figures of the fit on matplotlib axes; see `Estimate.plot`."""
+        return self.fit.plot
+
+    def _repr_html_(self) -> str:
+        return self.fit._repr_html_()
+
 
 @one_blas_thread()
 def fit_job(job: Job, progress: Progress = SILENT) -> Fitted:
     """Train as the spec says, score every part, and ask whether the learner earns its place."""
-    fitted = fit_variant(job, AS_DECLARED, progress)
-    fit, warnings = fitted.fit, list(fitted.result.warnings)
+    return judged(fit_variant(job, AS_DECLARED, progress))
+
+
+def judged(fitted: Fitted) -> Fitted:
+    """With whether the learner earns its place."""
+    job, fit, warnings = fitted.job, fitted.fit, list(fitted.result.warnings)
     if not fit.status.ok or (fit.model.form.bound is None and fit.held_out is None):
         return fitted
     verdict = judge_fit(fitted)
@@ -83,7 +100,11 @@ def keeping(job: Job, folder: Path, *, resume: bool = False) -> Job:
 
 def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitted:
     """Train a variant of a job and score every part; `judge_fit` asks whether the learner helps."""
-    fit = job.run(variant, progress)
+    return told_of(job, job.run(variant, progress))
+
+
+def told_of(job: Job, fit: Any) -> Fitted:
+    """Scores of a fit on every part of its job, and all that results tell of it but the verdict on the learner."""
     warnings: list[Any] = [*job.warnings, *fit.warnings]
     if job.checkpoints is not None and job.checkpoints.lost:
         warnings.append(Warning("checkpoint_lost", f"the last state of training was not kept: {job.checkpoints.lost}."))

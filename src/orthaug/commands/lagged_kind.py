@@ -123,9 +123,9 @@ def physics_alone(
 
 def learned(job: LaggedJob, fit: Estimate) -> LearnedPart | None:
     """What was learned, as a function; None where nothing was."""
-    from orthaug.reports.learned_part import LearnedPart
+    from orthaug.reports.learned_part import learned_of
 
-    return None if fit.model.form.bound is None else LearnedPart.of_lagged(fit.model, job.train.record)
+    return learned_of(fit, job.train.record)
 
 
 def _physical_content(job: LaggedJob, fit: Estimate, warnings: list[Any]) -> dict[str, Any]:

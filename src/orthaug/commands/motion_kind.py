@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError, RankError
 from orthaug._base.warning import Warning
 from orthaug.commands.motion_job import MotionJob
@@ -204,17 +203,9 @@ def physics_alone(
 
 def learned(job: MotionJob, fit: MotionEstimate) -> LearnedPart | None:
     """What was learned, as a function; None where nothing was."""
-    from orthaug.analysis.learned_part import learned_reach
-    from orthaug.reports.learned_part import LearnedPart
+    from orthaug.reports.learned_part import learned_of
 
-    if fit.model.form.bound is None:
-        return None
-    size = fit.model.form.states
-
-    def reach(points: Matrix) -> Matrix | None:
-        return learned_reach(fit, *np.split(points, [size], axis=1))
-
-    return LearnedPart.of_motion(fit.model, job.train.record, reach)
+    return learned_of(fit, job.train.record)
 
 
 def _parameters(fit: MotionEstimate, budget: MotionBudget | None) -> list[ParameterResult]:

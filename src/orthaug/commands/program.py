@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ import typer
 import typer.core
 
 from orthaug import __version__
+from orthaug._base.checks import check_choice
 from orthaug._base.errors import InputError, TrainingError
 from orthaug.commands import streams
 from orthaug.commands.signals import WATCH
@@ -20,23 +22,31 @@ class Interrupted(Exception):
     """Ctrl-C, with what it stopped; typer would turn a KeyboardInterrupt into a bare exit code."""
 
 
+class Unread(Exception):
+    """Nobody reads the output any more, as after `| head`; typer would turn a BrokenPipeError into exit code 1."""
+
+
 class _Group(typer.core.TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
         except (Interrupted, KeyboardInterrupt) as interrupt:
             raise Interrupted(*interrupt.args) from None
+        except OSError as error:
+            if error.errno in _NO_READER and error.filename is None:
+                raise Unread from None
+            raise
 
 
 app = typer.Typer(
     name="orthaug",
     cls=_Group,
     help="Fit physics together with a learned correction, so that the physics keeps all that physics can explain.",
-    add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
+_NO_READER = (errno.EPIPE, errno.EINVAL) if os.name == "nt" else (errno.EPIPE,)
 SpecPath = Annotated[Path, typer.Argument(metavar="SPEC", help="Spec file (TOML).")]
 ModelPath = Annotated[Path, typer.Argument(metavar="MODEL", help="Result folder of `fit`, or its model/.")]
 DataPath = Annotated[Path, typer.Argument(metavar="DATA", help="Data file with the model's channels.")]
@@ -62,7 +72,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the 
 def main() -> None:
     """Entry point: runs the command and turns errors into one line and an exit code."""
     try:
-        code = app(standalone_mode=False)
+        code = app(prog_name="orthaug", standalone_mode=False)
         sys.stdout.flush()
     except InputError as error:
         _fail(f"error: {error}", 2)
@@ -70,7 +80,7 @@ def main() -> None:
         _fail(f"training failed: {error}", 1)
     except (Interrupted, KeyboardInterrupt) as interrupt:
         _fail(f"interrupted{''.join(f' during {text}' for text in interrupt.args)}; nothing was written", 130)
-    except BrokenPipeError:
+    except (Unread, BrokenPipeError):
         streams.silence(sys.stdout)
         sys.exit(0)
     except OSError as error:
@@ -107,13 +117,27 @@ def _version(show: bool) -> None:
         raise typer.Exit
 
 
+def _verbose(count: int) -> None:
+    """What -v, -vv and ORTHAUG_LOG ask for."""
+    level = os.environ.get("ORTHAUG_LOG", "").lower()
+    if not count and not level:
+        return
+    from orthaug._base.log import show_log
+
+    show_log(("info", "debug")[min(count, 2) - 1] if count else check_choice(level, ("info", "debug"), "ORTHAUG_LOG"))
+
+
 @app.callback()
 def options(
+    verbose: Annotated[
+        int, typer.Option("--verbose", "-v", count=True, help="Tell what is done; twice for more.", show_default=False)
+    ] = 0,
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     """What stands before a command."""
+    _verbose(verbose)
 
 
 def _fail(message: str, code: int) -> None:

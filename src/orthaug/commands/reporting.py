@@ -49,11 +49,11 @@ class HasFits(Protocol):
     def result(self) -> CompareResult: ...
 
 
-def fit_report(fitted: HasFit) -> str:
-    """The page of a fit that has a model."""
+def fit_report(fitted: HasFit, origin: Origin | None = None) -> str:
+    """The page of a fit that has a model; `origin` is where it comes from, None for its spec."""
     job, fit, kind = fitted.job, fitted.fit, kind_of(fitted.job)
     alone = kind.physics_alone(job, fit, fitted.responses)
-    page = FitPage(origin_of(job, "fit"), fitted.result, fitted.responses, alone, kind.learned(job, fit))
+    page = FitPage(origin or origin_of(job, "fit"), fitted.result, fitted.responses, alone, kind.learned(job, fit))
     return fit_page(page)
 
 

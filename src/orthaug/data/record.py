@@ -10,6 +10,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, as_signal, check_choice, check_label, check_type, check_unique, is_number
 from orthaug._base.errors import LONGEST, InputError, shown, visible
+from orthaug._base.views import Shown
 from orthaug.data.expressions import RESERVED, is_name
 
 _LONGEST_STEP = 1e12  # s; a longer one overflows somewhere in a time axis
@@ -160,7 +161,7 @@ class Prepared:
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
+class Record(Shown):
     """Experiments that share channels and sampling time; lags never reach across experiments.
 
     `sampling_time` is in seconds. `outputs` is empty for a record that only carries inputs (something

@@ -88,10 +88,10 @@ class Kept:
     def state(self) -> State | None:
         """The last one that was written whole; None where there is none."""
         from safetensors import SafetensorError
-        from safetensors.numpy import load_file
+        from safetensors.numpy import load
 
         try:
-            held = load_file(self.path)
+            held = load(self.path.read_bytes())  # mapped into memory, it could not be replaced on Windows
             leaves = [held[str(i)] for i in range(len(held))]
             return jax.tree.unflatten(jax.tree.structure(_LEAVES), leaves)
         except (OSError, KeyError, ValueError, SafetensorError):

@@ -11,6 +11,8 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_count, check_type
 from orthaug._base.errors import InputError
+from orthaug._base.lines import fold
+from orthaug._base.views import ShownFit
 from orthaug._base.warning import Warning
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout, lag_rows
@@ -57,7 +59,7 @@ class Restart:
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class Estimate(ShownFit):
     """What `estimate` returns. Print `fit.summary()`; use `fit.model`; read `fit.parameters`."""
 
     model: Model
@@ -281,7 +283,7 @@ class Estimate:
     def summary(self) -> str:
         """A page of text: status, parameters, excitation, warnings."""
         warnings = ["", *(f"warning: {warning}" for warning in self.warnings)] if self.warnings else []
-        return "\n".join([*self.lines(), *warnings])
+        return "\n".join(fold([*self.lines(), *warnings]))
 
 
 def order_of(physics: PhysicsMap, names: Sequence[str], sampling_time: float) -> list[int]:

@@ -12,6 +12,7 @@ from orthaug._base.checks import Vector, check_choice, check_count, check_type, 
 from orthaug._base.errors import InputError, shown
 from orthaug._base.jax import jax
 from orthaug._base.progress import SILENT, Tell
+from orthaug._base.views import with_progress
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
 from orthaug.data.sources import Source
@@ -62,7 +63,7 @@ class Options(TypedDict, total=False):
     initial: Estimate | Model | None
     validation: Record | None
     output_weights: str | Sequence[float]
-    progress: Tell
+    progress: Tell | bool
     engine: Engine | None
 
 
@@ -70,6 +71,7 @@ class Options(TypedDict, total=False):
 def estimate(record: Record | Source, baseline: Baseline, **options: Unpack[Options]) -> Estimate: ...
 @overload
 def estimate(record: Record, baseline: Motion, **options: Unpack[Options]) -> MotionEstimate: ...
+@with_progress
 def estimate(
     record: Record | Source,
     baseline: Baseline | Motion,
@@ -126,7 +128,7 @@ def estimate(
             the plain sum of squares, as in the paper; "std" for each in its standard deviation; "covariance" by that
             of their errors, fit and weights in turn until they agree; numbers for the weights of the squared errors.
             "auto" is "std" one step ahead and "covariance" on the free run.
-        progress: called about twice a second with (restart, iteration, loss).
+        progress: called about twice a second with (restart, iteration, loss); True for a bar.
         engine: who sums over the rows: `Stream()`, `Devices()`, `Dask(client)`; None for what suits the record.
 
     Raises:

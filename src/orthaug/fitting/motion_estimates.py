@@ -11,6 +11,8 @@ from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError
+from orthaug._base.lines import fold
+from orthaug._base.views import ShownFit
 from orthaug._base.warning import Warning
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout
@@ -45,7 +47,7 @@ _ROUNDING = 1e-11  # of the largest eigenvalue of the information with unit colu
 
 
 @dataclass(frozen=True, eq=False)
-class MotionEstimate:
+class MotionEstimate(ShownFit):
     """What `estimate` returns for a motion. Print `fit.summary()`; use `fit.model`; read `fit.parameters`."""
 
     model: MotionModel
@@ -202,7 +204,7 @@ class MotionEstimate:
     def summary(self) -> str:
         """A page of text: status, parameters, what is shared, warnings."""
         warnings = ["", *(f"warning: {warning}" for warning in self.warnings)] if self.warnings else []
-        return "\n".join([*self.lines(), *warnings])
+        return "\n".join(fold([*self.lines(), *warnings]))
 
 
 def fitted_numbers(numbers: Numbers) -> Numbers:

@@ -13,6 +13,7 @@ import numpy as np
 from orthaug._base.checks import finite_or_none
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jax
+from orthaug._base.log import LOG
 from orthaug._base.parallel import one_blas_thread, spread
 from orthaug._base.progress import Tell
 from orthaug._base.warning import Warning
@@ -90,6 +91,7 @@ def train(
     """
     with one_blas_thread():
         task = task.prepared(solver, structure, partial(progress, 0))
+    LOG.info("training: %d runs of %s, %s", len(starts), type(solver).__name__, structure.name)
     starts, runs = _run(task, starts, structure, solver, progress)
     losses = [task.loss(run) for run in runs]
     concluded = cache(lambda i: _concluded(conclude, task, structure, task.learned(runs[i])))
@@ -104,6 +106,9 @@ def train(
         flies = task.criterion.flown is not None and task.start_loss is not None
         if choice.fallback and flies and held_out.ratio.code != "helps":
             told, best = [_fell_back(held_out)], -1
+            LOG.info("no free run is better than physics alone where it was not fitted: physics alone is handed over")
+    if best >= 0:
+        LOG.info("run %d is chosen of %d", best + 1, len(runs))
     alike = _members(starts, ranking, best) if choice.scored else _alike(starts, best)
     shown = alike if choice.scored and held_out is None else list(range(len(starts)))
     members = [best]
@@ -165,7 +170,10 @@ def _run(
             check()
             progress(i, iteration, loss)
 
-        return task.run(solver, start.weights, structure, start.regularization, tell)
+        run = task.run(solver, start.weights, structure, start.regularization, tell)
+        told = (i + 1, start.seed, run.ending.code, run.iterations, task.loss(run), run.seconds)
+        LOG.info("run %d, seed %d: %s after %d iterations, loss %.4g, %.2f s", *told)
+        return run
 
     made = list(starts)
     runs = spread(one, list(enumerate(made)))
@@ -174,6 +182,7 @@ def _run(
         return made, runs
     following = max(start.seed for start in made) + 1
     bound = task.bound
+    LOG.debug("%d runs failed and are made again from the seeds after %d", len(failed), following - 1)
     again = [
         start._replace(seed=seed, weights=bound.init(jax.random.key(seed)))
         for seed, start in enumerate(failed, following)
@@ -213,7 +222,9 @@ def _held_out(
     try:
         folds = blocked(task.problem.record, choice.blocks, task.problem.first_row)
     except InputError:  # too few rows to leave some out
+        LOG.debug("too few rows for %d blocks of cross-validation; the lowest loss chooses", choice.blocks)
         return None
+    LOG.info("cross-validation: %d folds of %d runs", len(folds), len(starts))
     shorter, unit = solver.at_most(FOLD_ITERATIONS), task.problem.deviation
 
     def one(fold: tuple[Record, Record], check: Callable[[], None]) -> list[Pieces]:

@@ -42,6 +42,8 @@ class MeasureSplit:
     """Standard error of each θ over that under the training measure (nθ,)."""
     slope: Matrix | None = None
     """∂θ_aux/∂w (nθ, nw)."""
+    measure: Measure | None = None
+    """What it was split under."""
 
     def __str__(self) -> str:
         told = f"{self.name}, {self.points} points, {100 * self.support:.0f} % of it within reach of the data"
@@ -89,7 +91,7 @@ def split_under(measure: Measure, model: Model, support: Support, joint: JointCo
     warnings = (told,) if share < SUPPORTED and learns else ()
     condition = weighed.excitation.condition
     told_of = (share, len(points.x), condition, warnings)
-    return MeasureSplit(measure.name, theta, aux, covariance, defect, *told_of, slope=slope)
+    return MeasureSplit(measure.name, theta, aux, covariance, defect, *told_of, slope=slope, measure=measure)
 
 
 def learner_slope(model: Model, points: Points, projection: Projection, unit: np.ndarray) -> Matrix:

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector, as_signal, check_count
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, jnp, padded_length
+from orthaug._base.views import Shown
 from orthaug.data.record import Channel, Experiment, Record
 from orthaug.models.dynamics import Dynamics, Numbers, Parts
 from orthaug.models.lagged import Lagged
@@ -56,7 +57,7 @@ def _ahead(
 
 
 @dataclass(frozen=True, eq=False)
-class Model(OnRecords):
+class Model(OnRecords, Shown):
     """A fitted model; `estimate` makes it, `orthaug.save` and `orthaug.load` keep it.
 
     `weight` (ny, ny) is the inner product of criterion and measure: rows multiplied by it are whitened. `deviation`

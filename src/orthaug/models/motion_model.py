@@ -17,6 +17,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector, as_signal, check_count
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, padded_length
+from orthaug._base.views import Shown
 from orthaug.data.record import Channel, Experiment, Record
 from orthaug.models.dynamics import Numbers, Parts
 from orthaug.models.motion_filter import MotionFilter
@@ -82,7 +83,7 @@ class Trained(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class MotionModel(OnRecords):
+class MotionModel(OnRecords, Shown):
     """A fitted motion; `estimate` makes it, `orthaug.save` and `orthaug.load` keep it.
 
     `window` rows tell a state from which to predict. `weight` (ny, ny) is the inner product of the outputs; `loose`

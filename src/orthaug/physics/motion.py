@@ -15,6 +15,7 @@ import numpy as np
 
 from orthaug._base.checks import Vector, check_choice, check_label, check_unique, is_number, nearest
 from orthaug._base.errors import InputError, shown
+from orthaug._base.views import Shown
 from orthaug.data.expressions import FUNCTIONS, SAMPLING_TIME, Expression, is_name, parse_named
 from orthaug.physics.coordinates import Coordinates
 from orthaug.physics.parameters import PhysicalParameter, check_parameters
@@ -56,7 +57,7 @@ class Output:
 
 
 @dataclass(frozen=True)
-class Motion:
+class Motion(Shown):
     """Equations of motion; make one with `from_equations` or `from_functions`. Hashable.
 
     Examples:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -11,6 +12,7 @@ from typing import Any, ParamSpec
 
 import numpy as np
 
+from orthaug._base.checks import check_type
 from orthaug._base.errors import InputError
 from orthaug.models.response import Response
 
@@ -50,6 +52,27 @@ def plain(draw: Callable[Drawn, Figure]) -> Callable[Drawn, Figure]:
             return draw(*arguments, **options)
 
     return drawn
+
+
+def axes_for(ax: Axes | None) -> Axes:
+    """The given axes, or new ones: of pyplot where that is in use, so that a notebook shows them.
+
+    Raises:
+        InputError: something else.
+    """
+    check_type(ax, Axes | None, "ax", "axes of matplotlib, or None")
+    if ax is not None:
+        return ax
+    if "matplotlib.pyplot" in sys.modules or "ipykernel" in sys.modules:
+        from matplotlib import pyplot
+
+        figure = pyplot.figure(figsize=(SIZE[0], SIZE[1] + TOP + BOTTOM), layout="constrained")
+    else:
+        figure = Figure(figsize=(SIZE[0], SIZE[1] + TOP + BOTTOM), layout="constrained")
+    axis = figure.add_subplot()
+    axis.grid(alpha=0.25)
+    axis.spines[["top", "right"]].set_visible(False)
+    return axis
 
 
 def panels(response: Response, title: str, heights: tuple[int, ...] = (1,)) -> tuple[Figure, list]:

@@ -11,9 +11,11 @@ from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug.data.record import Record
+from orthaug.fitting.estimates import Estimate
 from orthaug.models.motion_parts import labels_of, parts_at
 
 if TYPE_CHECKING:
+    from orthaug.fitting.motion_estimates import MotionEstimate
     from orthaug.models.model import Model
     from orthaug.models.motion_model import MotionModel
 
@@ -193,6 +195,20 @@ class LearnedPart:
         else:
             learned = _mean_in_cells(cells, self.values, count)
         return Surface(first, second, learned)
+
+
+def learned_of(fit: Estimate | MotionEstimate, record: Record) -> LearnedPart | None:
+    """What a fit learned along a record, with intervals where it has some; None where nothing was learned."""
+    if fit.model.form.bound is None:
+        return None
+    if isinstance(fit, Estimate):
+        return LearnedPart.of_lagged(fit.model, record)
+    from orthaug.analysis.learned_part import learned_reach
+
+    size = fit.model.form.states
+    return LearnedPart.of_motion(
+        fit.model, record, lambda points: learned_reach(fit, *np.split(points, [size], axis=1))
+    )
 
 
 def _near(cells: np.ndarray) -> Bool[np.ndarray, "a b"]:

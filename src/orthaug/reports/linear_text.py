@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from orthaug._base.lines import fold, table
 from orthaug.analysis.continuous_time import Continuous
 from orthaug.analysis.linear_view import COHERENT, Linearization, LinearView, Pole
 from orthaug.reports.linear import gain_unit
@@ -34,7 +34,7 @@ def linear_text(found: Linearization) -> str:
     if all(view.system.moved is not None for view in found):
         blocks.append(["Numbers after ± and in brackets are 95 % (delta method, joint covariance of θ and weights)."])
     blocks.append([f"warning: {warning.text}" for warning in found.warnings])
-    return "\n\n".join("\n".join(lines) for lines in blocks if lines)
+    return "\n\n".join("\n".join(fold(lines)) for lines in blocks if lines)
 
 
 def _stability(view: LinearView) -> str:
@@ -65,7 +65,7 @@ def _gains(view: LinearView) -> list[str]:
         interval = _interval(None if view.gain_ci95 is None else view.gain_ci95[i, j])
         unit = gain_unit(view, view.outputs[i], view.inputs[j])
         rows.append([f"{view.outputs[i]} / {view.inputs[j]}", f"{view.gain[i, j]:.6g}", interval, unit])
-    return _table(rows)
+    return table(rows)
 
 
 def _poles(view: LinearView) -> list[str]:
@@ -80,16 +80,11 @@ def _poles(view: LinearView) -> list[str]:
         spans = [_interval(span) for span in (pole.magnitude_ci95, pole.hertz_ci95, pole.damping_ci95)]
         last = spans[2] if pole.time_constant is None else f"time constant {pole.time_constant:.5g} s"
         rows.append([_z(pole), f"{pole.magnitude:.6g}", spans[0], hertz, spans[1], rate, damping, last])
+    lines = table(rows) if len(rows) > 1 else []
     if view.at_zero:
-        rows.append(
-            [
-                "0, once" if view.at_zero == 1 else f"0, {view.at_zero} times",
-                "0",
-                "dead time, and what the state remembers of inputs",
-            ]
-        )
-    width = max(map(len, rows))
-    return _table([row + [""] * (width - len(row)) for row in rows]) if len(rows) > 1 else ["no poles"]
+        times = "once" if view.at_zero == 1 else f"{view.at_zero} times"
+        lines.append(f"pole 0, {times}: dead time, and what the state remembers of inputs")
+    return lines or ["no poles"]
 
 
 def _z(pole: Pole) -> str:
@@ -110,7 +105,7 @@ def _matrices(view: LinearView) -> list[list[str]]:
         label = f"δ{name} next" if i < n else f"δ{name}"
         cells = [_cell(view.system.matrix[i, j], None if half is None else half[i, j]) for j in range(n + nu)]
         rows.append([label, *cells])
-    return [[f"Ts = {view.sampling_time:.6g} s; rows of [A B] and [C D]:", *_table(rows)]]
+    return [[f"Ts = {view.sampling_time:.6g} s; rows of [A B] and [C D]:", *table(rows)]]
 
 
 def _cell(value: float, half: float | None) -> str:
@@ -132,7 +127,7 @@ def _continuous(view: LinearView) -> list[str]:
     for i, name in enumerate((*found.states, *view.outputs)):
         label = f"d/dt δ{name}" if i < n else f"δ{name}"
         rows.append([label, *(f"{value:.6g}" for value in found.system.matrix[i])])
-    lines += _table(rows)
+    lines += table(rows)
     late = [f"{name} {dead:.6g} s" for name, dead in zip(view.inputs, found.dead_time, strict=True) if dead > 0]
     return [*lines, *([f"dead time of inputs: {', '.join(late)}"] if late else [])]
 
@@ -157,8 +152,3 @@ def _interval(ends: Any) -> str:
 
 def _shown(value: float) -> str:
     return f"{value + 0.0:.6g}"
-
-
-def _table(rows: Sequence[Sequence[str]]) -> list[str]:
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]

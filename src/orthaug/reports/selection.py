@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import textwrap
 from typing import Any
 
+from orthaug._base.lines import fold
 from orthaug.reports.fields import Content, Flag, Number, WarningResult, Whole
 from orthaug.reports.result import DataResult, Headed
 
 _SHOWN = 12  # models of a stage in the text
-_WIDTH = 100
 
 
 class OrdersResult(Content):
@@ -90,8 +89,8 @@ def selection_text(result: SelectResult) -> str:
     for stage in dict.fromkeys(row.stage for row in result.models):
         lines += ["", *_table(stage, [row for row in result.models if row.stage == stage])]
     for warning in result.warnings:
-        lines += ["", *textwrap.wrap(f"note: {warning.text}", _WIDTH, subsequent_indent="      ")]
-    return "\n".join(lines)
+        lines += ["", f"note: {warning.text}"]
+    return "\n".join(fold(lines))
 
 
 def _learner(result: SelectResult) -> str:

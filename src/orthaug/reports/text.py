@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from orthaug._base.lines import fold, table
 from orthaug.reports.fields import WarningResult
 from orthaug.reports.findings import SharedResult, SuspectResult
 from orthaug.reports.result import (
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from orthaug.models.response import Response, Scores
 
 SHOWN = 8  # signals of a design that are listed
-WIDTH = 100  # of wrapped sentences
 
 
 def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
@@ -46,7 +45,7 @@ def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
     findings += [result.stability] if result.motion is not None else []
     told = [finding.text for finding in findings if finding]
     blocks += [told, warning_lines(w for w in dict.fromkeys(result.warnings) if w.text not in told)]
-    return "\n\n".join("\n".join(lines) for lines in blocks if lines)
+    return "\n\n".join("\n".join(fold(lines)) for lines in blocks if lines)
 
 
 def check_text(result: CheckResult) -> str:
@@ -69,7 +68,7 @@ def check_text(result: CheckResult) -> str:
         for group in data.collinear:
             lines.append(f"  not excited separately by these data: {', '.join(group)}")
     if result.motion is not None and result.motion.text:
-        lines += ["", *textwrap.wrap(result.motion.text, WIDTH)]
+        lines += ["", result.motion.text]
     if result.shared is not None:
         lines += ["", *_shared_lines(result.shared)]
     if result.bias:
@@ -80,25 +79,25 @@ def check_text(result: CheckResult) -> str:
             "the learner, if it sees the term, from what it could not imitate.",
             *_suspect_lines(result.bias),
         ]
-    return "\n".join([*lines, *warning_lines(result.warnings)])
+    return "\n".join(fold([*lines, *warning_lines(result.warnings)]))
 
 
 def _shared_lines(shared: SharedResult) -> list[str]:
     """What the learner could imitate, and a table of what other inputs would make of it."""
-    lines = textwrap.wrap(shared.text, WIDTH)
+    lines = [shared.text]
     if shared.alternatives:
         head = ["with learner.inputs", "shared directions", "determined beside it"]
         rows = [
             [", ".join(other.inputs), str(other.shared), ", ".join([*other.determined, *(other.physical or [])]) or "–"]
             for other in shared.alternatives
         ]
-        lines += [f"  {line}" for line in _table([head, *rows])]
+        lines += [f"  {line}" for line in table([head, *rows])]
     return lines
 
 
 def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
     """Two tables, parameters with standard errors and scores on every part; then the verdicts on each row."""
-    lines = [*_table(_parameter_cells(result)), "", *_table(_score_cells(result.comparison))]
+    lines = [*table(_parameter_cells(result)), "", *table(_score_cells(result.comparison))]
     if result.chosen:
         lines += ["", "* chosen on the validation part"]
     told = [f"{row.name}: {row.residuals.text}" for row in result.comparison if row.residuals is not None]
@@ -111,7 +110,7 @@ def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
     lines += warning_lines(result.warnings)
     for row in result.comparison:
         lines += [f"warning: {row.name}: {w.text}" for w in row.warnings if w not in result.warnings]
-    return "\n".join(lines).rstrip()
+    return "\n".join(fold(lines)).rstrip()
 
 
 def split_text(result: SplitResult) -> str:
@@ -122,7 +121,7 @@ def split_text(result: SplitResult) -> str:
         f"measure     {result.measure}, {detail.points} points, {support} of it within reach of the data",
         *parameter_table("parameter", result.parameters),
     ]
-    return "\n".join([*lines, *warning_lines(result.warnings)])
+    return "\n".join(fold([*lines, *warning_lines(result.warnings)]))
 
 
 def parameter_table(name: str, rows: Sequence[ParameterResult]) -> list[str]:
@@ -152,9 +151,9 @@ def design_text(result: DesignResult) -> str:
         ),
         "",
         "what was tried, relative errors of θ:",
-        *_table(rows),
+        *table(rows),
     ]
-    return "\n".join(lines)
+    return "\n".join(fold(lines))
 
 
 def _or_infinite(value: float | None, digits: int = 4) -> str:
@@ -175,7 +174,7 @@ def _suspect_lines(suspects: Sequence[SuspectResult]) -> list[str]:
         size = "1 %" if guess is None else "–" if suspect.size is None else f"{100 * abs(guess) * suspect.size:.2g} %"
         biases = ("–" if share is None else f"{_rounded(share):+.2g} %" for share in suspect.percent.values())
         rows.append([suspect.name, size, *biases, cosine, suspect.removed_by or "–"])
-    return _table(rows)
+    return table(rows)
 
 
 def _bias_lines(result: FitResult) -> list[str]:
@@ -240,7 +239,7 @@ def _score_lines(fit: Estimate | MotionEstimate, result: FitResult) -> list[str]
                 cells = (None if values is None else values[i] for values in (score.rmse, score.nrmse, score.fit))
                 rmse, nrmse, percent = ("–" if c is None else f"{c:.6g}" for c in cells)
                 rows.append([part, kind, channel.name, f"{rmse} {channel.unit}".strip(), nrmse, percent])
-    return [*_table(rows), *_residual_lines(result)] if len(rows) > 1 else []
+    return [*table(rows), *_residual_lines(result)] if len(rows) > 1 else []
 
 
 def _residual_lines(result: FitResult) -> list[str]:
@@ -256,7 +255,7 @@ def _residual_lines(result: FitResult) -> list[str]:
                         for name, cross in found]  # fmt: skip
             told = ", ".join(f"{words} (band {band:.1g})" for words, band in largest)
             lines.append(f"{part}: over all {test.n} rows the one-step residual of {test.name} follows {told}.")
-    return [line for told in lines for line in textwrap.wrap(told, WIDTH)]
+    return lines
 
 
 def response_text(response: Response) -> str:
@@ -273,7 +272,7 @@ def scores_text(scored: Scores, outputs: Sequence[Channel], horizon: int | None)
     for channel, *numbers in zip(outputs, scored.rmse, scored.nrmse, scored.fit, strict=True):
         rmse, nrmse, percent = ("–" if np.isnan(number) else f"{number:.6g}" for number in numbers)
         rows.append([channel.name, f"{rmse} {channel.unit}".strip(), nrmse, percent])
-    return "\n".join(_table(rows))
+    return "\n".join(table(rows))
 
 
 def _parameter_cells(result: CompareResult) -> list[list[str]]:
@@ -314,11 +313,3 @@ def _estimate(parameter: ParameterResult) -> str:
 
 def _numbers(values: Sequence[float | None] | None) -> str:
     return "–" if values is None else ", ".join("–" if v is None else f"{v:.4g}" for v in values)
-
-
-def _table(rows: list[list[str]]) -> list[str]:
-    """Rows of cells as lines; rows of other models may have other parameters."""
-    width = max(len(row) for row in rows)
-    rows = [row + [""] * (width - len(row)) for row in rows]
-    widths = [max(len(row[i]) for row in rows) for i in range(width)]
-    return ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]

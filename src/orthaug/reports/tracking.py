@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from orthaug._base.lines import fold
 from orthaug.reports.fields import Content, Flag, Number, WarningResult, Whole
 from orthaug.reports.result import FileResult, Headed, ParameterResult
 from orthaug.reports.text import parameter_table, warning_lines
@@ -49,4 +50,4 @@ def track_text(result: TrackResult) -> str:
     if result.physical_parameters:
         blocks.append(parameter_table("physical", result.physical_parameters))
     blocks.append(warning_lines(result.warnings))
-    return "\n\n".join("\n".join(lines) for lines in blocks if lines)
+    return "\n\n".join("\n".join(fold(lines)) for lines in blocks if lines)

@@ -1,0 +1,81 @@
+"""Text for a terminal: tables, and lines that fit its width."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections.abc import Iterable, Sequence
+
+WIDTH = 100  # columns of what is printed
+_LAST_CELL = re.compile(r"^.*\S {2,}(?=\S)|^ +(?=\S)")
+_LATEST = 64  # column at which the last cell of a row may begin for it to be folded there
+_GAP = "  "
+
+
+def table(rows: Sequence[Sequence[str]], width: int = WIDTH) -> list[str]:
+    """Rows of cells as lines, the first row the head. Rows may be of different lengths.
+
+    Columns that do not fit stand below, under the first column again; an interval stays beside its value.
+
+    Examples:
+        >>> table([["part", "RMSE", "FIT %"], ["test", "0.1 m", "90"]])
+        ['part  RMSE   FIT %', 'test  0.1 m  90']
+        >>> table([["part", "RMSE", "FIT %"], ["test", "0.1 m", "90"]], width=12)
+        ['part  RMSE', 'test  0.1 m', '', 'part  FIT %', 'test  90']
+    """
+    count = max(len(row) for row in rows)
+    whole = [[*row, *[""] * (count - len(row))] for row in rows]
+    widths = [max(len(row[i]) for row in whole) for i in range(count)]
+    lines: list[str] = []
+    for block in _blocks(whole[0], widths, width):
+        lines += [""] if lines else []
+        lines += [_GAP.join(row[i].ljust(widths[i]) for i in block).rstrip() for row in whole]
+    return lines
+
+
+def _blocks(head: Sequence[str], widths: Sequence[int], width: int) -> list[list[int]]:
+    """Columns that stand side by side. A last one that is too wide by itself is left for `fold`."""
+    groups: list[list[int]] = []
+    for i in range(1, len(head)):
+        if groups and (not head[i] or head[i].startswith("95 %")):
+            groups[-1].append(i)
+        else:
+            groups.append([i])
+    blocks, taken = [[0]], widths[0]
+    for group in groups:
+        more = sum(len(_GAP) + widths[i] for i in group)
+        if taken + more > width and len(blocks[-1]) > 1 and widths[0] + more <= width:
+            blocks.append([0])
+            taken = widths[0]
+        blocks[-1] += group
+        taken += more
+    return blocks
+
+
+def fold(lines: Iterable[str], width: int = WIDTH) -> list[str]:
+    """Lines of at most `width` columns: sentences go on indented, the last cell of a row under itself.
+
+    Examples:
+        >>> fold(["warning: the interval does not cover it"], width=30)
+        ['warning: the interval does not', '  cover it']
+        >>> fold(["regressor  position[k-1], force[k-1]"], width=28)
+        ['regressor  position[k-1],', '           force[k-1]']
+    """
+    return [part for line in lines for part in (_folded(line, width) if len(line) > width else [line])]
+
+
+def _folded(line: str, width: int) -> list[str]:
+    cell = _LAST_CELL.match(line)
+    indent = cell.end() if cell and cell.end() <= _LATEST else 0 if cell else 2
+    if cell and not indent:  # a table of numbers: it cannot be broken
+        return [line]
+    return textwrap.wrap(
+        line,
+        width,
+        subsequent_indent=" " * indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+        drop_whitespace=True,
+        expand_tabs=False,
+        replace_whitespace=False,
+    )

@@ -1,0 +1,200 @@
+"""How notebooks show records, physics, fits and models: a title, a few facts, a table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import singledispatch
+from typing import Any
+
+import jinja2
+import numpy as np
+
+from orthaug.data.record import Record
+from orthaug.fitting.estimates import Estimate
+from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.models.model import Model
+from orthaug.models.motion_model import MotionModel
+from orthaug.physics.baseline import Baseline
+from orthaug.physics.motion import Motion
+
+# Colours are the notebook's own, so that a card is read on light and on dark.
+_TEMPLATE = """<div class="orthaug" style="max-width:60em;overflow-x:auto">
+<style>.orthaug table{border-collapse:collapse;margin:.4em 0;font-variant-numeric:tabular-nums}\
+.orthaug th,.orthaug td{text-align:left;padding:.15em .8em .15em 0;border-bottom:1px solid rgba(128,128,128,.35)}\
+.orthaug th{font-weight:600}.orthaug .facts{opacity:.8}.orthaug p{margin:.2em 0}</style>
+<p><strong>{{ card.title }}</strong></p>
+{% for name, value in card.facts.items() %}
+<p class="facts">{{ name }}: {{ value }}</p>
+{% endfor %}
+{% for table in card.tables if table.rows %}
+<table><thead><tr>{% for head in table.columns %}<th scope="col">{{ head }}</th>{% endfor %}</tr></thead><tbody>
+{% for row in table.rows %}
+<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>
+{% endfor %}
+</tbody></table>
+{% endfor %}
+{% for note in card.notes %}
+<p>⚠ {{ note }}</p>
+{% endfor %}
+</div>
+"""
+_MOST_ROWS = 40  # of a table
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns and rows of text."""
+
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True)
+class Card:
+    """What is shown of an object."""
+
+    title: str
+    facts: Mapping[str, str] = field(default_factory=dict)
+    tables: Sequence[Table] = ()
+    notes: Sequence[str] = ()
+
+
+def html_of(shown: Any) -> str:
+    """The object as HTML, escaped."""
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    card = card_of(shown)
+    tables = [Table(t.columns, _shortened(t)) for t in card.tables]
+    return environment.from_string(_TEMPLATE).render(card=Card(card.title, card.facts, tables, card.notes))
+
+
+def _shortened(table: Table) -> Sequence[Sequence[str]]:
+    more = len(table.rows) - _MOST_ROWS
+    if more <= 1:
+        return table.rows
+    return [*table.rows[:_MOST_ROWS], [f"and {more} more", *[""] * (len(table.columns) - 1)]]
+
+
+@singledispatch
+def card_of(shown: Any) -> Card:
+    """What is shown of an object."""
+    return Card(repr(shown))
+
+
+@card_of.register
+def _record(record: Record) -> Card:
+    count, step = len(record.experiments), record.sampling_time
+    facts = {
+        "samples": f"{len(record)} in {count} experiment{'s' * (count != 1)}, {step:g} s apart, "
+        f"{len(record) * step:g} s in all"
+    }
+    rows = []
+    for role, channels in (("input", record.inputs), ("output", record.outputs)):
+        for i, channel in enumerate(channels):
+            values = np.concatenate([np.asarray(getattr(e, role + "s"))[:, i] for e in record.experiments])
+            there = values[np.isfinite(values)]
+            numbers = (there.min(), there.max(), there.mean(), there.std()) if len(there) else (np.nan,) * 4
+            missing = len(values) - len(there)
+            rows.append([channel.name, role, channel.unit or "–", *map(_number, numbers), str(missing or "–")])
+    columns = ["channel", "role", "unit", "least", "largest", "mean", "deviation", "missing"]
+    return Card("Record", facts, [Table(columns, rows)])
+
+
+@card_of.register
+def _baseline(baseline: Baseline) -> Card:
+    facts = {"constants": ", ".join(f"{k} = {v:g}" for k, v in dict(baseline.constants).items())}
+    if baseline.function is not None:
+        facts["terms"] = "a function of the regressor"
+    terms = Table(
+        ["output", "parameter", "regressor"],
+        [[t.output or "–", f"{t.parameter} (fixed)" if t.fixed else t.parameter, t.regressor] for t in baseline.terms],
+    )
+    return Card("Baseline", _told(facts), [terms, _declared(baseline.parameters)])
+
+
+@card_of.register
+def _motion(motion: Motion) -> Card:
+    facts = {
+        "inputs": ", ".join(motion.inputs),
+        "constants": ", ".join(f"{k} = {v:g}" for k, v in motion.constants),
+        "integrator": f"{motion.integrator}, inputs held by {motion.hold}",
+    }
+    if motion.functions is not None:
+        facts["equations"] = "functions of states, inputs and parameters"
+    rows = [[f"d/dt {s.name}", s.derivative or "–", s.unit or "–", "yes" if s.learned else "–"] for s in motion.states]
+    rows += [[o.name, o.expression or "–", "–", "yes" if o.learned else "–"] for o in motion.outputs]
+    defined = [[name, str(expression)] for name, expression in motion.definitions]
+    equations = Table(["", "equation", "unit of the state", "learned beside it"], rows)
+    return Card("Motion", _told(facts), [equations, Table(["defined", "as"], defined), _declared(motion.parameters)])
+
+
+@card_of.register(Estimate)
+@card_of.register(MotionEstimate)
+def _fit(fit: Estimate | MotionEstimate) -> Card:
+    bound, status = fit.model.form.bound, fit.status
+    facts = {
+        "structure": fit.model.structure,
+        "learner": "none" if bound is None else f"{bound.learner}, {bound.size} weights",
+        "data": repr(fit.problem.record),
+        "status": f"{status.code}, {status.iterations} iterations, {status.seconds:.2f} s, loss {status.loss:.6g}",
+        "": status.message or "",
+    }
+    rows = [
+        [
+            name,
+            _number(row["value"]),
+            _number(row["std"]),
+            _interval(row["ci95_low"], row["ci95_high"]),
+            row["unit"] or "–",
+        ]
+        for name, row in fit.parameters.to_dict("index").items()
+    ]
+    parameters = Table(["parameter", "value", "std", "95 % interval", "unit"], rows)
+    return Card(type(fit).__name__, _told(facts), [parameters], [warning.text for warning in fit.warnings])
+
+
+@card_of.register(Model)
+@card_of.register(MotionModel)
+def _model(model: Model | MotionModel) -> Card:
+    bound = model.form.bound
+    facts = {
+        "structure": model.structure,
+        "learner": "none" if bound is None else f"{bound.learner}, {bound.size} weights",
+        "outputs": ", ".join(channel.label for channel in model.outputs),
+        "inputs": ", ".join(channel.label for channel in model.inputs),
+        "sampling time": f"{model.sampling_time:g} s",
+    }
+    parameters, values = model.estimated
+    rows = [[p.name, _number(value), p.unit or "–"] for p, value in zip(parameters, values, strict=True)]
+    return Card(type(model).__name__, _told(facts), [Table(["parameter", "value", "unit"], rows)])
+
+
+def _declared(parameters: Sequence[Any]) -> Table:
+    """Parameters as they were declared."""
+    rows = []
+    for p in parameters:
+        low, high = getattr(p, "min", None), getattr(p, "max", None)
+        bounded = any(end is not None and np.isfinite(end) for end in (low, high))
+        rows.append([p.name, _number(p.initial), p.unit or "–", _interval(low, high) if bounded else "–"])
+    return Table(["parameter", "initial", "unit", "bounds"], rows)
+
+
+def _told(facts: Mapping[str, str]) -> dict[str, str]:
+    """Without what is empty; a sentence without a name goes on with the fact before it."""
+    told: dict[str, str] = {}
+    for name, value in facts.items():
+        if value and not name and told:
+            last = list(told)[-1]
+            told[last] += f"; {value}"
+        elif value:
+            told[name] = value
+    return told
+
+
+def _number(value: Any) -> str:
+    return "–" if value is None or not np.isfinite(value) else f"{value:.6g}"
+
+
+def _interval(low: Any, high: Any) -> str:
+    ends = ("–" if end is None or not np.isfinite(end) else f"{end:.6g}" for end in (low, high))
+    return "[{}, {}]".format(*ends)

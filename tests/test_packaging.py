@@ -1,0 +1,105 @@
+"""What is packaged: one version, one list of dependencies, recipes and workflows that can be read."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+
+import orthaug
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+CONDA_NAMES = {"matplotlib": "matplotlib-base"}
+BROUGHT = {"jaxlib": "jax"}  # pinned along with the package that brings it
+
+
+def text(name: str) -> str:
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+def recipe() -> dict:
+    return yaml.safe_load(text("packaging/conda/recipe.yaml"))
+
+
+def bounds(requirements: list[str]) -> dict[str, str]:
+    """What is allowed of each package, by its name in small letters."""
+    split = (re.fullmatch(r"([A-Za-z0-9_.-]+?)\s*([<>=].*)", entry) for entry in requirements)
+    return {match[1].lower(): match[2] for match in split if match}
+
+
+def test_the_version_stands_in_one_place():
+    assert PROJECT["project"]["dynamic"] == ["version"] and "version" not in PROJECT["project"]
+    assert PROJECT["tool"]["hatch"]["version"]["path"] == "src/orthaug/__init__.py"
+    told = {
+        "citation": yaml.safe_load(text("CITATION.cff"))["version"],
+        "recipe": recipe()["context"]["version"],
+        "changelog": re.search(r"^## \[(.+?)\]", text("CHANGELOG.md"), re.MULTILINE)[1],
+    }
+    assert told == dict.fromkeys(told, orthaug.__version__)
+
+
+def test_the_recipe_asks_for_what_the_package_asks_for():
+    wanted = {CONDA_NAMES.get(name, name): what for name, what in bounds(PROJECT["project"]["dependencies"]).items()}
+    given = bounds(recipe()["requirements"]["run"])
+    assert given.pop("python") == ">=${{ python_min }}"
+    assert given == wanted
+    assert f">={recipe()['context']['python_min']}" == PROJECT["project"]["requires-python"]
+    (build,) = PROJECT["build-system"]["requires"]
+    assert bounds(recipe()["requirements"]["host"])["hatchling"] == bounds([build])["hatchling"]
+    entry = f"orthaug = {PROJECT['project']['scripts']['orthaug']}"
+    assert recipe()["build"]["python"]["entry_points"] == [entry]
+
+
+def test_the_oldest_dependencies_are_the_lower_bounds():
+    lines = [line.partition(";")[0].strip() for line in text("packaging/oldest.txt").splitlines()]
+    pins = dict.fromkeys(line for line in lines if line and not line.startswith("#"))
+    oldest: dict[str, list[str]] = {}
+    for pin in pins:
+        name, _, version = pin.partition("==")
+        oldest.setdefault(name.lower(), []).append(version)
+    for name, what in bounds(PROJECT["project"]["dependencies"]).items():
+        padded = {tuple(map(int, version.split("."))) for version in oldest.pop(name)}
+        low = tuple(map(int, re.match(r">=([\d.]+)", what)[1].split(".")))
+        assert min(padded)[: len(low)] == low and not any(min(padded)[len(low) :]), name
+    assert set(oldest) <= set(BROUGHT)
+
+
+def test_constraints_name_every_dependency():
+    pinned = {line.partition("==")[0].lower().replace("_", "-") for line in text("constraints.txt").splitlines()}
+    extras = PROJECT["project"]["optional-dependencies"]
+    asked = [*PROJECT["project"]["dependencies"], *(entry for group in extras.values() for entry in group)]
+    names = {re.match(r"[A-Za-z0-9_.-]+", entry)[0].lower().replace("_", "-") for entry in asked} - {"orthaug"}
+    assert names <= pinned
+
+
+def test_the_workflow_tries_every_python_on_every_system():
+    workflow = yaml.safe_load(text(".github/workflows/test.yml"))
+    matrix = workflow["jobs"]["wheel"]["strategy"]["matrix"]
+    assert {name.partition("-")[0] for name in matrix["os"]} == {"ubuntu", "macos", "windows"}
+    named = {c.rpartition(" ")[2] for c in PROJECT["project"]["classifiers"] if re.search(r"3\.\d+$", c)}
+    assert set(matrix["python"]) == named
+    steps = [step.get("run", "") for job in workflow["jobs"].values() for step in job["steps"]]
+    files = re.findall(r"(?:packaging|tests)/[\w./]+|\.ci/run", " ".join(steps))
+    assert files and all((ROOT / file).is_file() for file in files)
+
+
+def test_the_container_copies_what_is_there():
+    copied = re.findall(r"^COPY (?!--from)(.+) \S+$", text("packaging/Containerfile"), re.MULTILINE)
+    names = [name for line in copied for name in line.split()]
+    assert {"pyproject.toml", "src"} <= set(names) and all((ROOT / name).exists() for name in names)
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion(shell, tmp_path):
+    words = {"COMP_WORDS": "orthaug fit --r", "COMP_CWORD": "2", "_TYPER_COMPLETE_ARGS": "orthaug fit --r"}
+    settings = {"PATH": "", "HOME": str(tmp_path), "PYTHONPATH": str(ROOT / "src"), **words}
+    settings |= {"_ORTHAUG_COMPLETE": f"complete_{shell}", "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
+    command = [sys.executable, "-m", "orthaug"]
+    done = subprocess.run(command, env=settings, capture_output=True, text=True, timeout=60, check=False)
+    assert "--resume" in done.stdout and done.stderr == ""

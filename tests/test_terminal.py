@@ -1,0 +1,131 @@
+"""What the program shows: lines that fit, nothing but text in pipes, a closed pipe, colours, the log."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from test_cli import SPEC, make_project, run
+
+from orthaug._base.lines import WIDTH, fold, table
+from orthaug._base.log import LOG, show_log
+from orthaug.commands import bars
+
+COMMAND = [sys.executable, "-m", "orthaug"]
+LEARNER = """kind = "mlp"
+hidden = [3]
+[training]
+iterations = 3
+restarts = 2
+[validation]
+blocks = 0"""
+LEARNS = SPEC.replace('kind = "none"', LEARNER)
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("project")
+    make_project(folder, LEARNS)
+    return folder
+
+
+def fits(text: str) -> bool:
+    return all(len(line) <= WIDTH for line in text.splitlines())
+
+
+def test_every_summary_fits(project, monkeypatch):
+    monkeypatch.chdir(project)
+    for command in ("check", "fit"):
+        options = [] if command == "check" else ["--out", f"out-{command}", "--force"]
+        done = run(command, "plant.toml", *options)
+        assert done.code == 0 and fits(done.out), command
+
+
+def test_help_fits():
+    names = ("fit", "predict", "track", "linearize", "reproduce")
+    for arguments in (("--help",), *((name, "--help") for name in names)):
+        assert fits(run(*arguments).out)
+
+
+def test_sentences_and_cells_go_on_in_the_next_line():
+    words = " ".join(["word"] * 40)
+    folded = fold([f"warning: {words}", f"label       {words}", "x" * 150, "-1.5  " * 30])
+    assert all(len(line) <= WIDTH for line in folded if "word" in line)
+    assert folded[1].startswith("  word") and folded[-4].startswith(" " * 12 + "word")
+    assert folded[-2:] == ["x" * 150, "-1.5  " * 30]
+    assert " ".join(" ".join(folded[:3]).split()) == f"warning: {words}"
+
+
+def test_wide_tables_stand_one_below_the_other():
+    head = ["name", *(f"column {i}" for i in range(12)), "95 % interval"]
+    lines = table([head, [f"cell {i}" for i in range(14)]])
+    assert fits("\n".join(lines)) and "" in lines
+    assert [line.split("  ")[0] for line in lines if line] == ["name", "cell 0"] * (len(lines) // 3 + 1)
+    last = lines[lines.index("") + 1 :]
+    assert "column 11" in last[0] and "95 % interval" in last[0]
+
+
+def test_a_reader_that_leaves_is_no_error(project):
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [*COMMAND, "schema", "fit"]
+    try:
+        done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, cwd=project, timeout=60, check=False)
+    finally:
+        os.close(writer)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+def test_pipes_hold_text_only(monkeypatch):
+    """FORCE_COLOR, which build servers set, makes no terminal of a pipe."""
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    assert not bars.on_terminal() and bars.drawn_bar().disable
+
+
+def test_bars_have_no_colours_where_none_are_wanted(monkeypatch):
+    monkeypatch.setattr(bars, "on_terminal", lambda: True)
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert bars.drawn_bar().live.console.no_color and not bars.drawn_bar().disable
+    monkeypatch.delenv("NO_COLOR")
+    assert not bars.drawn_bar().live.console.no_color
+
+
+@pytest.fixture
+def no_log():
+    before = LOG.handlers[:]
+    yield
+    LOG.handlers[:], LOG.propagate = before, True
+    LOG.setLevel(logging.NOTSET)
+
+
+def test_the_log_tells_the_stages_of_a_fit(project, monkeypatch, caplog, no_log):
+    monkeypatch.chdir(project)
+    with caplog.at_level(logging.DEBUG, logger="orthaug"):
+        assert run("fit", "plant.toml", "--out", "logged", "--force").code == 0
+    told = [record.getMessage() for record in caplog.records if record.name == "orthaug"]
+    assert told[0].startswith("training: 4 runs of LevenbergMarquardt, orthogonal")
+    assert sum("seed" in line and "iterations" in line for line in told) == 4 and "is chosen of 4" in " ".join(told)
+
+
+def test_the_log_is_silent_until_somebody_listens(capsys, no_log):
+    LOG.warning("unheard")
+    assert capsys.readouterr() == ("", "")
+    show_log("info")
+    show_log("debug")  # once is enough
+    LOG.info("heard")
+    LOG.debug("unheard")
+    assert capsys.readouterr().err.endswith("INFO heard\n") and len(LOG.handlers) == 2
+
+
+def test_verbose(no_log):
+    assert run("-v", "schema", "fit").code == 0 and LOG.level == logging.INFO
+
+
+def test_what_the_log_may_be(monkeypatch, no_log):
+    monkeypatch.setenv("ORTHAUG_LOG", "loud")
+    done = run("schema", "fit")
+    assert (done.code, done.out, done.err) == (2, "", "error: ORTHAUG_LOG must be one of info, debug; got 'loud'.\n")
