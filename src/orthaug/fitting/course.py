@@ -14,6 +14,7 @@ from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.initial_states import Start
 from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, errors_of
 from orthaug.fitting.rules import check_scored
+from orthaug.fitting.segment_sums import SegmentSums
 from orthaug.fitting.segments import Segments, lay_segments
 from orthaug.fitting.solvers.descent import MARQUARDT, Descent
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
@@ -48,7 +49,9 @@ class Layout(NamedTuple):
     colour: Segments | None
 
     @classmethod
-    def of(cls, record: Record, dynamics: Dynamics, criterion: Criterion, like: Course | None = None) -> Layout:
+    def of(
+        cls, record: Record, dynamics: Dynamics, criterion: Criterion, like: Course | None = None, shares: int = 1
+    ) -> Layout:
         """As a criterion of several steps declares; padded to the shapes of another course where that is larger.
 
         Raises:
@@ -59,7 +62,7 @@ class Layout(NamedTuple):
         longest = max(len(e) for e in record.experiments) - dynamics.first_row
         check_scored(criterion, longest)
         shapes = (None, None) if like is None else (like.segments, like.whole)
-        segments = lay_segments(record, dynamics, flown.segment, flown.washout, shapes[0])
+        segments = lay_segments(record, dynamics, flown.segment, flown.washout, shapes[0], shares)
         if not (criterion.simulates and flown.segment):
             return cls(segments, segments, None)
         whole, colour = lay_segments(record, dynamics, 0, flown.washout, shapes[1]), None
@@ -91,6 +94,13 @@ class Course:
     output_weights: str | tuple[float, ...]
     scaling: Scaling
     unit: Vector
+    sums: SegmentSums | None = None
+    """Who sums over the segments, where an engine keeps them."""
+
+    @property
+    def shares(self) -> int:
+        """How many sum over segments at a time."""
+        return 1 if self.sums is None else self.sums.engine.shares
 
     @property
     def residuals(self) -> int:

@@ -150,7 +150,8 @@ def estimate(
         problem = pose_for(record, baseline, learner, output_weights)
         options = {"structure": structure, "criterion": criterion or DEFAULT, "solver": solver, "fallback": fallback}
         options |= {"regularization": regularization, "restarts": restarts, "seed": seed, "validation": validation}
-        return fit_motion(problem, learner=learner, blocks=_check_blocks(blocks), progress=progress, **options)
+        options |= {"blocks": _check_blocks(blocks), "progress": progress, "engine": engine or InMemory()}
+        return fit_motion(problem, learner=learner, **options)
     _check_record(record, baseline, lags, learner, initial)
     criterion = Prediction() if criterion is None else criterion
     model = initial.model if isinstance(initial, Estimate) else initial

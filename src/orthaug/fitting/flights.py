@@ -217,7 +217,7 @@ class FlightTask(ABC):
             states=flown.states,
             weight=objective.weight,
             unit=objective.rms**2,
-            slope=linear.start.slope,
+            slope=objective.slope(linear.start),
             pull=missed @ (rows.T @ rows) if objective.initial.free else None,
         )
 

@@ -19,6 +19,7 @@ from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.fitting.training import Choice, PlannedRun, train
 from orthaug.models.learners import Learner
+from orthaug.models.rows import Engine, InMemory
 from orthaug.physics.motion import Motion
 from orthaug.physics.motion_problem import MotionProblem, pose_motion
 
@@ -53,6 +54,7 @@ def fit_motion(
     fallback: bool = True,
     validation: Record | None = None,
     progress: Tell = SILENT,
+    engine: Engine = InMemory(),  # noqa: B008  (frozen)
 ) -> MotionEstimate:
     """`estimate` for a motion that is posed already; arguments as there.
 
@@ -66,7 +68,7 @@ def fit_motion(
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
     check_starts(restarts, seed, ensemble=False)
     check_solver(solver, criterion, () if learner is None else choices)
-    task = MotionTask.of(problem, learner, criterion)
+    task = MotionTask.of(problem, learner, criterion, engine)
     starts = [PlannedRun(seed, (), "none")]
     if task.bound is not None:
         keyed = {s: task.bound.init(jax.random.key(s)) for s in range(seed, seed + restarts)}

@@ -352,7 +352,9 @@ class OneStepTask:
         return from_chunks(row_values(self.bound, w, self.rows.z), len(self.problem.rows)) * self.unit
 
     def share_of(self, w: Vector) -> Vector:
-        """QᵀF (nθ,) of the learner with the weights w, in whitened outputs; the rows are in memory."""
+        """QᵀF (nθ,) of the learner with the weights w, in whitened outputs."""
+        if not self.engine.resident:
+            return np.asarray(self.engine.sum(LearnerSums(self.bound), self.rows, w, None, self._nothing.values)[0]) * self.rms
         return self.problem.projection.coordinates(self.problem.weight.rows(self.values(w)))
 
     def share_slope(self, w: Vector) -> Matrix:

@@ -72,6 +72,27 @@ class Engine(Protocol):
         """Σ function(chunk, *arguments) over all chunks; `function` is hashable, its result any pytree of arrays."""
         ...
 
+    @property
+    def shares(self) -> int:
+        """How many can sum at a time: chunks that are placed should be a multiple."""
+        ...
+
+    def place(self, chunks: Any, like: Any = None) -> Any:
+        """Chunks of any pytree, (k, …) each, as rows; where those of `like` are, which are as many."""
+        ...
+
+    def beside(self, *rows: Any) -> Any:
+        """Rows whose chunks are tuples of the chunks of others."""
+        ...
+
+    def keep(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> tuple[Any, Any]:
+        """Of `function(chunk, *arguments)`, a pair: the first ones as rows that stay where they are, Σ of the second."""
+        ...
+
+    def fetch(self, rows: Any) -> Any:
+        """What was placed or kept, (k, …) each, in NumPy."""
+        ...
+
 
 @dataclass(frozen=True)
 class InMemory:
@@ -94,6 +115,27 @@ class InMemory:
     def sum(self, function: Callable[..., Any], rows: Chunk, *arguments: Any) -> Any:
         return _compiled_sum(function, rows, arguments)
 
+    @property
+    def shares(self) -> int:
+        return 1
+
+    def place(self, chunks: Any, like: Any = None) -> Any:
+        return jax.tree.map(jax.device_put, chunks)
+
+    def beside(self, *rows: Any) -> Any:
+        return rows
+
+    def keep(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> tuple[Any, Any]:
+        return _compiled_fold(function, rows, arguments)
+
+    def fetch(self, rows: Any) -> Any:
+        return jax.tree.map(np.asarray, rows)
+
+
+@partial(jax.jit, static_argnames="function")
+def _compiled_fold(function: Callable[..., Any], rows: Any, arguments: tuple[Any, ...]) -> tuple[Any, Any]:
+    return row_fold(lambda chunk: function(chunk, *arguments), rows)
+
 
 @partial(jax.jit, static_argnames="function")
 def _compiled_sum(function: Callable[..., Any], rows: Chunk, arguments: tuple[Any, ...]) -> Any:
@@ -108,11 +150,21 @@ def brought(source: Any, laying: Callable[[Any], Any]) -> tuple[np.ndarray, ...]
 
 def row_sum(function: Callable[[Any], Any], rows: Any) -> Any:
     """Σ function(chunk) over the leading axis of every array in `rows`; any pytree in, any pytree out."""
+    return row_fold(lambda chunk: (None, function(chunk)), rows)[1]
+
+
+def row_fold(function: Callable[[Any], tuple[Any, Any]], rows: Any) -> tuple[Any, Any]:
+    """Of function(chunk), a pair: the first ones (k, …), and Σ of the second."""
     function = jax.jit(function)  # traced once for its shape and the sum
     first = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), rows)
-    zero = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(function, first))
-    total, _ = jax.lax.scan(lambda acc, chunk: (jax.tree.map(jnp.add, acc, function(chunk)), None), zero, rows)
-    return total
+    zero = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(function, first)[1])
+
+    def step(total: Any, chunk: Any) -> tuple[Any, Any]:
+        kept, share = function(chunk)
+        return jax.tree.map(jnp.add, total, share), kept
+
+    total, kept = jax.lax.scan(step, zero, rows)
+    return kept, total
 
 
 def chunk_shape(rows: int, limit: int = CHUNK_ROWS) -> tuple[int, int]:
