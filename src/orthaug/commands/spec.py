@@ -320,13 +320,17 @@ class Spec(Section):
         Raises:
             InputError: rows that are not in memory, for training that flies over them.
         """
-        flies = self.motion is not None or not self.declared_criterion().one_step
-        if flies and self.engine.kind not in ("auto", "memory"):
+        if self.flies and self.engine.kind == "stream":
             raise InputError(
-                f"`engine.kind`: found {self.engine.kind}; expected memory: a free run, and a motion, need their rows "
-                "in memory."
+                "`engine.kind`: found stream; expected memory, devices or dask: a free run, and a motion, read their "
+                "rows into memory, and dask shares them among its workers."
             )
-        return "memory" if flies else self.engine.chosen(files)
+        return "memory" if self.flies and self.engine.kind == "auto" else self.engine.chosen(files)
+
+    @property
+    def flies(self) -> bool:
+        """Whether training makes free runs."""
+        return self.motion is not None or not self.declared_criterion().one_step
 
     def regularizations(self, *, linear: bool, validated: bool) -> tuple[str | float, ...]:
         """Those that every start is run with."""

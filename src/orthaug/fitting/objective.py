@@ -90,17 +90,22 @@ class FreeRunObjective:
             trials.append(Flown(p, theta, c, w, states, errors, misfit, misfit, squares))
             if total < start.misfit:
                 break
-        return min(trials, key=lambda trial: trial.misfit)
+        best = min(trials, key=lambda trial: trial.misfit)
+        if self.sums is not None and best is trials[0] and self.initial.free and start.follows:
+            return best._replace(states=self.sums.moved(start, np.concatenate([c, w]) - start.unknowns))
+        return best
 
     def _tried(self, c: Vector, w: Vector, start: Start, follows: bool) -> tuple[float, Any, Any, Matrix | None]:
-        """`‖r‖²`, states, errors and their squares from the start's states, or from those that follow (c, w)."""
+        """`‖r‖²`, states, errors and their squares from the start's states, or from those that follow (c, w).
+
+        An engine's states stay where they are: given are those of the start.
+        """
         unknowns = np.concatenate([c, w])
         if self.sums is not None:
             step = unknowns - start.unknowns if follows and start.unknowns is not None else None
             made = (self.weight, self.start_rows)
             total, squares = self.sums.tried(self.dynamics, self.numbers(c, w), self.segments, start, step, *made)
-            moves = step is not None and total < min(self._largest, start.misfit)
-            return total, self.sums.moved(start, step) if moves else start.values, None, squares
+            return total, start.values, None, squares
         states = start.at(unknowns) if follows else start.values
         errors = self.errors(c, w, states, self.segments)
         with np.errstate(all="ignore"):
