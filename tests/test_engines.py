@@ -19,6 +19,7 @@ import orthaug as oa
 from orthaug.commands.fit import fit_job
 from orthaug.commands.opening import open_job
 from orthaug.commands.spec import load_spec
+from orthaug.models.streaming import Stream
 
 pytest.importorskip("pyarrow")
 ROWS, GROUP = 1200, 170
@@ -157,7 +158,7 @@ def test_files_as_a_record(folder):
     found = oa.estimate(source, BASELINE, **OPTIONS)
     np.testing.assert_allclose(found.theta, expected.theta, rtol=1e-10)
     assert found.status.loss == pytest.approx(expected.status.loss, rel=1e-8)
-    with pytest.raises(oa.InputError, match="a free run, and a motion, need their rows in memory"):
+    with pytest.raises(oa.InputError, match="a free run, and a motion, take a Record"):
         oa.estimate(source, BASELINE, criterion=oa.Simulation(50), **OPTIONS)
 
 
@@ -178,6 +179,54 @@ def test_a_frame_on_a_cluster_as_a_record(folder, cluster):
     emptied = dd.concat([frame, frame[frame["u"] > 9]])
     with pytest.raises(oa.InputError, match="partition .* of the DataFrame is empty"):
         oa.open_frame(emptied, client=cluster, **COLUMNS)
+
+
+def flown(engine, kind):
+    """A free run of 40 segments with evidence, whose noise has colour, or a motion in one of its integrators."""
+    rng = np.random.default_rng(2)
+    u, y = rng.uniform(-1, 1, 480), np.zeros(480)
+    for k in range(2, 480):
+        y[k] = 1.5 * y[k - 1] - 0.7 * y[k - 2] + 0.1 * u[k - 1] - 0.05 * math.tanh(8 * (y[k - 1] - y[k - 2]))
+    y += 1e-3 * rng.normal(size=480)
+    record = oa.Record.join([oa.Record.from_arrays(u=u[i : i + 240], y=y[i : i + 240]) for i in (0, 240)])
+    options = {"solver": oa.LevenbergMarquardt(20), "regularization": "evidence", "blocks": 0, "engine": engine}
+    options["fallback"] = False
+    if kind == "lagged":
+        return oa.estimate(record, BASELINE, lags=oa.Lags(na=2, nb=2), learner=oa.MLP((3,)),
+                           criterion=oa.Simulation(24, 12), **options)  # fmt: skip
+    states = [oa.State("x", "a*x + b*z + c*u", start="y", learned=True), oa.State("z", "x")]
+    values = [oa.PhysicalParameter("a", 1.4), oa.PhysicalParameter("b", -0.6), oa.PhysicalParameter("c", 0.1)]
+    motion = oa.Motion.from_equations(states, [oa.Output("y", "x")], values, ["u"], integrator="discrete")
+    return oa.estimate(record, motion, learner=oa.MLP((2,)), criterion=oa.Simulation(40, 0), **options)
+
+
+def told_of(fit):
+    return {"theta": fit.theta.tolist(), "loss": fit.status.loss, "noise": np.ravel(fit.covariance).tolist(),
+            "iterations": fit.status.iterations}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def in_memory():
+    return {kind: told_of(flown(None, kind)) for kind in ("lagged", "motion")}
+
+
+def check_flown(found, expected):
+    np.testing.assert_allclose(found["theta"], expected["theta"], rtol=1e-10)
+    assert found["loss"] == pytest.approx(expected["loss"], rel=1e-8)
+    np.testing.assert_allclose(found["noise"], expected["noise"], rtol=1e-6)
+    assert found["iterations"] == expected["iterations"]
+
+
+@pytest.mark.parametrize("kind", ["lagged", "motion"])
+def test_segments_in_chunks_give_the_free_run_of_rows_in_memory(in_memory, kind):
+    check_flown(told_of(flown(Stream(), kind)), in_memory[kind])
+
+
+@pytest.mark.parametrize("kind", ["lagged", "motion"])
+def test_segments_on_workers_give_the_free_run_of_rows_in_memory(in_memory, cluster, kind):
+    from orthaug.models.cluster import Dask
+
+    check_flown(told_of(flown(Dask(cluster), kind)), in_memory[kind])
 
 
 def test_a_study_on_a_cluster(cluster):
@@ -211,16 +260,19 @@ DEVICES = """
 import sys
 sys.path.insert(0, {tests!r})
 import pathlib, json, test_engines as t
+from orthaug.models.devices import Devices
 folder = pathlib.Path({folder!r})
 for kind, more in (("memory", ""), ("devices", "devices = 2"), ("devices", "")):
     result = t.fitted(folder, kind, more=more)
     (folder / f"{{kind}}{{more[-1:]}}.json").write_text(json.dumps(result))
+for kind in ("lagged", "motion"):
+    (folder / f"{{kind}}.json").write_text(json.dumps(t.told_of(t.flown(Devices(), kind))))
 from orthaug._base.jax import jax
 assert len(jax.devices()) == 4
 """
 
 
-def test_devices_give_the_result_of_rows_in_memory(folder):
+def test_devices_give_the_result_of_rows_in_memory(folder, in_memory):
     """Two of four, and all four."""
     script = DEVICES.format(tests=os.path.dirname(__file__), folder=str(folder))
     environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
@@ -229,6 +281,8 @@ def test_devices_give_the_result_of_rows_in_memory(folder):
     expected, *found = (json.loads((folder / f"{kind}.json").read_text()) for kind in ("memory", "devices2", "devices"))
     for result in found:
         check_same(result, expected)
+    for kind, other in in_memory.items():
+        check_flown(json.loads((folder / f"{kind}.json").read_text()), other)
 
 
 def bad(folder, match, frame=None, name="c.parquet", **changes):
@@ -268,7 +322,11 @@ def test_what_is_wrong_with_a_partition_is_named(folder):
         timed=timed)  # fmt: skip
     bad(folder, "no file fits 'nothing/", pattern=("runs/*", "nothing/*"))
     bad(folder, "`rows` and `every` need the rows in memory", rows=('*.parquet"]', '*.parquet"], every = 2'))
-    bad(folder, "found stream; expected memory: a free run", focus=("[training]", '[training]\nfocus = "simulation"'))
+    bad(
+        folder,
+        "found stream; expected memory, devices or dask: a free run",
+        focus=("[training]", '[training]\nfocus = "simulation"'),
+    )
 
 
 def test_a_file_that_changes_is_noticed(folder):

@@ -354,7 +354,10 @@ class OneStepTask:
     def share_of(self, w: Vector) -> Vector:
         """QᵀF (nθ,) of the learner with the weights w, in whitened outputs."""
         if not self.engine.resident:
-            return np.asarray(self.engine.sum(LearnerSums(self.bound), self.rows, w, None, self._nothing.values)[0]) * self.rms
+            return (
+                np.asarray(self.engine.sum(LearnerSums(self.bound), self.rows, w, None, self._nothing.values)[0])
+                * self.rms
+            )
         return self.problem.projection.coordinates(self.problem.weight.rows(self.values(w)))
 
     def share_slope(self, w: Vector) -> Matrix:

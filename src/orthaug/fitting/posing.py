@@ -47,4 +47,7 @@ def check_record(record: Any, *, flies: bool) -> None:
     if not isinstance(record, Source):
         check_type(record, Record, "record", "a Record")
     elif flies and not isinstance(record, Record):
-        raise InputError("a free run, and a motion, need their rows in memory; give a Record.")
+        raise InputError(
+            "a free run, and a motion, take a Record, whose segments an engine may share out; read these rows into "
+            "memory (read_record, Record.join), or train one step ahead."
+        )

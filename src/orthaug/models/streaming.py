@@ -100,9 +100,7 @@ def together(chunks: Sequence[Any]) -> Any:
     return jax.tree.map(lambda *parts: np.stack(parts), *chunks)
 
 
-def folded(
-    function: Callable[..., Any], rows: Iterable[Any], arguments: tuple[Any, ...]
-) -> tuple[list[Any], Any]:
+def folded(function: Callable[..., Any], rows: Iterable[Any], arguments: tuple[Any, ...]) -> tuple[list[Any], Any]:
     """Of function(chunk, *arguments), a pair: the first ones on the host, and Σ of the second."""
     arguments = jax.tree.map(jax.numpy.asarray, arguments)
     first, _ = _compiled(function)
