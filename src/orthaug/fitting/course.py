@@ -12,7 +12,7 @@ from orthaug._base.progress import RunTell, quiet
 from orthaug.data.record import Record
 from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.initial_states import Start
-from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, errors_of
+from orthaug.fitting.objective import RUNAWAY, Flown, FreeRunObjective, errors_of
 from orthaug.fitting.rules import check_scored
 from orthaug.fitting.segment_sums import SegmentSums
 from orthaug.fitting.segments import Segments, lay_segments
@@ -23,8 +23,8 @@ from orthaug.inference.covariance import noise_covariance, whitening
 from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.learners import Scaling
 
-_COLOURED_STEPS = 256  # shorter segments do not show how long the errors remember
-_COLOUR_ROWS = 4096  # of each experiment: they show it instead
+COLOURED_STEPS = 256  # shorter segments do not show how long the errors remember
+COLOUR_ROWS = 4096  # of each experiment: they show it instead
 
 
 class Flight(NamedTuple):
@@ -39,6 +39,14 @@ class Flight(NamedTuple):
     @property
     def ending(self) -> Ending:
         return self.end.ending
+
+
+class Looked(NamedTuple):
+    """A trial whose segments are in memory, to be looked at, and how its states follow (c, w)."""
+
+    objective: FreeRunObjective
+    flown: Flown
+    slope: Any
 
 
 class Layout(NamedTuple):
@@ -66,8 +74,8 @@ class Layout(NamedTuple):
         if not (criterion.simulates and flown.segment):
             return cls(segments, segments, None)
         whole, colour = lay_segments(record, dynamics, 0, flown.washout, shapes[1]), None
-        if segments.steps < _COLOURED_STEPS <= longest:
-            first = tuple(e.rows(0, _COLOUR_ROWS) for e in record.experiments)
+        if segments.steps < COLOURED_STEPS <= longest:
+            first = tuple(e.rows(0, COLOUR_ROWS) for e in record.experiments)
             colour = lay_segments(replace(record, experiments=first), dynamics, 0, flown.washout)
         return cls(segments, whole, colour)
 
@@ -152,6 +160,11 @@ class Course:
         mean_square = self.mean_square(end.flown.c, end.flown.w)
         return Flight(objective, end, mean_square, end.iterations, end.seconds)
 
+    def looked_at(self, objective: FreeRunObjective, end: Descent) -> Looked:
+        """Where a run ended, on segments in memory; its end has a derivative."""
+        assert end.linear is not None
+        return Looked(objective, end.flown, objective.slope(end.linear.start))
+
     def noise(self, objective: FreeRunObjective, end: Descent) -> Matrix | None:
         """Covariance (ny, ny) of the errors, in the outputs' units."""
         squares, ny = objective.squares(end.flown), len(objective.weight)
@@ -161,7 +174,11 @@ class Course:
     def mean_square(self, c: Vector, w: Any, tilt: Any = None) -> float:
         """Mean of squared errors over whole experiments, in deviations of the outputs; NaN where it diverges."""
         with np.errstate(all="ignore"):
-            errors = errors_of(self.dynamics, self.numbers(c, w, tilt), self.whole.start, self.whole)
-            scaled = errors / self.deviation[:, None]
-            mean = float(np.sum(scaled**2)) / (self.whole.count * len(self.dynamics.outputs))
+            if self.sums is not None and self.whole is self.segments:
+                squares = self.sums.squares(self.dynamics, self.numbers(c, w, tilt), self.segments)
+                total = float(np.sum(np.diag(squares) / self.deviation**2))
+            else:
+                errors = errors_of(self.dynamics, self.numbers(c, w, tilt), self.whole.start, self.whole)
+                total = float(np.sum((errors / self.deviation[:, None]) ** 2))
+            mean = total / (self.whole.count * len(self.dynamics.outputs))
         return mean if mean < RUNAWAY else np.nan

@@ -144,7 +144,7 @@ def estimate(
     if isinstance(baseline, Motion):
         if lags is not None or initial is not None or ensemble:
             raise InputError("a motion has no `lags`, no `initial` and no `ensemble`; leave them out.")
-        check_record(record, flies=True)
+        check_record(record, moves=True)
         assert isinstance(record, Record)
         learner = over_states(learner, baseline)
         problem = pose_for(record, baseline, learner, output_weights)
@@ -161,7 +161,6 @@ def estimate(
     if model is not None:
         inputs = tuple(str(entry) for entry in model.form.features.entries)
     check_type(criterion, Criterion, "criterion", "Prediction(…) or Simulation(…)")
-    check_record(record, flies=not criterion.one_step)
     problem, engine = posed_on(record, engine, baseline, lags, inputs, output_weights=output_weights)
     return fit(
         problem,
@@ -353,7 +352,7 @@ def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStep
 
 
 def _check_record(record: Any, baseline: Any, lags: Any, learner: Any, initial: Any) -> None:
-    check_record(record, flies=False)
+    check_record(record)
     check_type(baseline, Baseline, "baseline", "a Baseline or a Motion")
     check_type(lags, Lags | None, "lags", "Lags(…) or None")
     check_type(learner, Learner | None, "learner", "a learner such as MLP(), or None")

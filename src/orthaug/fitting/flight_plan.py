@@ -68,6 +68,11 @@ class FlightPlan(Course):
         alone, task = replace(self.dynamics, features=Features(()), bound=None), self.task.alone
         return replace(self, task=task, dynamics=alone, scaling=task.scaling, unit=task.unit)
 
+    @property
+    def lengthens(self) -> bool:
+        """Whether whole experiments can be segments to train on."""
+        return True
+
     def over(self, segment: int) -> FlightPlan:
         """The same over segments of another length; 0 for whole experiments."""
         washout = min(self.flown.washout, segment // 2) if segment else self.flown.washout

@@ -205,9 +205,9 @@ class FlightTask(ABC):
 
     def _scores(self, run: Flight) -> FreeRunScores | None:
         """What robust standard errors are made of; None for a run that ended nowhere."""
-        flown, linear, objective = run.end.flown, run.end.linear, run.objective
-        if linear is None or not run.end.ending.usable:
+        if run.end.linear is None or not run.end.ending.usable:
             return None
+        objective, flown, slope = self.plan.looked_at(run.objective, run.end)
         rows = objective.start_rows
         missed = np.moveaxis(objective.initial.measured - flown.states, -1, 1)
         return FreeRunScores(
@@ -217,7 +217,7 @@ class FlightTask(ABC):
             states=flown.states,
             weight=objective.weight,
             unit=objective.rms**2,
-            slope=objective.slope(linear.start),
+            slope=slope,
             pull=missed @ (rows.T @ rows) if objective.initial.free else None,
         )
 

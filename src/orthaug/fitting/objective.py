@@ -145,20 +145,35 @@ class FreeRunObjective:
     def samples(self, flown: Flown) -> tuple[float, float]:
         """Number of residuals less the physics' own parameters, and the share of them that is independent."""
         ny, errors = len(self.weight), flown.errors
+        segments, states = self.segments, flown.states
         if self.colour is not None:
-            long = self.errors(flown.c, flown.w, self.colour.start, self.colour)
-            errors = long if np.abs(long).max() < _LARGEST_ERROR else errors
+            long = self._colour_errors(flown)
+            if long is None:
+                segments, states = self.colour, self.colour.start
+            else:
+                errors = long if np.abs(long).max() < _LARGEST_ERROR else errors
         if errors is not None:
             moved = np.moveaxis(errors, 1, -1).swapaxes(1, 2)  # (k, m, ny, T)
             shares = [independent_share(moved[:, :, i].reshape(-1, moved.shape[-1])) for i in range(ny)]
         else:
-            assert self.sums is not None
-            steps, numbers = self.segments.steps, self.numbers(flown.c, flown.w)
-            spectra, counts = self.sums.spectra(
-                self.dynamics, numbers, self.segments, flown.states, spectrum_size(steps)
-            )
-            shares = [share_of(spectrum, steps, n) for spectrum, n in zip(spectra, counts, strict=True)]
+            shares = self._shares(flown, segments, states)
         return self.segments.count * ny - self.physics, float(np.mean(shares))
+
+    def _colour_errors(self, flown: Flown) -> Any:
+        """Errors of the longer segments; None where they are not in memory, or the run is lost there."""
+        if not isinstance(self.colour, Segments):
+            return None
+        return self.errors(flown.c, flown.w, self.colour.start, self.colour)
+
+    def _shares(self, flown: Flown, segments: Any, states: Any) -> list[float]:
+        """Independent shares of each output's errors, from sums; of the own segments where a longer run is lost."""
+        assert self.sums is not None
+        numbers = self.numbers(flown.c, flown.w)
+        for one, start in ((segments, states), (self.segments, flown.states)):
+            found = self.sums.spectra(self.dynamics, numbers, one, start, spectrum_size(one.steps))
+            if np.all(found[0] < _LARGEST_ERROR**2):
+                return [share_of(spectrum, one.steps, n) for spectrum, n in zip(*found, strict=True)]
+        return [1.0] * len(self.weight)
 
     def squares(self, flown: Flown) -> Matrix | None:
         """Σ e eᵀ (ny, ny) of a trial's errors, in the outputs' units; None where they are too large to square."""

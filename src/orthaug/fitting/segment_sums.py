@@ -123,7 +123,8 @@ class SegmentSums:
             if known is None:
                 while len(self.placed) >= _KEPT:
                     self.placed.pop(next(iter(self.placed)))
-                known = self.placed[id(segments)] = (segments, self.engine.place(segments))
+                there = self.engine.place(segments) if isinstance(segments, Segments) else segments.rows
+                known = self.placed[id(segments)] = (segments, there)
             return known[1]
 
     def with_states(self, segments: Any, states: Any) -> Any:
@@ -146,6 +147,12 @@ class SegmentSums:
             rows, trying = self.engine.beside(self.rows(segments), start.there), Trying(dynamics, moves=True)
         found = self.engine.sum(trying, rows, numbers, *made, step)
         return float(found.misfit), np.asarray(found.errors)
+
+    def squares(self, dynamics: Dynamics, numbers: Numbers, segments: Any) -> Matrix:
+        """Σ e eᵀ (ny, ny) from the measured states."""
+        ny, n0 = len(dynamics.outputs), dynamics.states
+        start = Start(np.asarray(segments.start))
+        return self.tried(dynamics, numbers, segments, start, None, np.eye(ny), np.eye(n0))[1]
 
     def moved(self, start: Start, step: Vector) -> Float[np.ndarray, "k n0 m"]:
         """The states after a step of (c, w)."""

@@ -17,7 +17,7 @@ from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import Differentiated, Dynamics, Numbers
 from orthaug.models.rows import gram
 
-_CHUNK = 256  # segments that run side by side
+CHUNK = 256  # segments that run side by side
 _BLOCK = 1 << 15  # numbers: slopes that are known at once
 _FEWEST = 8  # steps for which that pays
 
@@ -60,9 +60,9 @@ def lay_segments(
     for experiment, rows in zip(record.experiments, usable, strict=True):
         inputs = dynamics.inputs(experiment, record)
         begins = begins_of(rows, steps, washout)
-        pieces += [_segment(experiment, inputs, begin, steps, washout, dynamics) for begin in begins]
+        pieces += [segment_of(experiment, inputs, begin, steps, washout, dynamics) for begin in begins]
     count = len(pieces)
-    chunks = -(-count // (_CHUNK * shares)) * shares
+    chunks = -(-count // (CHUNK * shares)) * shares
     width = -(-count // chunks)
     width += -width % 8 if width > 8 else 0  # about as many segments run by the same program
     if like is not None and chunks * width <= like.scored.shape[0] * like.scored.shape[2]:
@@ -79,7 +79,9 @@ def begins_of(rows: int, steps: int, washout: int) -> list[int]:
     return [begin for begin in range(0, rows, steps - washout) if begin == 0 or begin + washout < rows]
 
 
-def _segment(experiment: Experiment, inputs: Any, begin: int, steps: int, washout: int, dynamics: Dynamics) -> Segments:
+def segment_of(
+    experiment: Experiment, inputs: Any, begin: int, steps: int, washout: int, dynamics: Dynamics
+) -> Segments:
     """One segment. Where the experiment is shorter, its end is repeated."""
     rows = np.arange(begin, begin + steps)
     there = np.minimum(rows, len(inputs) - 1)

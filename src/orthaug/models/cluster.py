@@ -100,6 +100,18 @@ class Dask:
             groups = [pieces[end - count : end] for end, count in zip(ends, counts, strict=True)]
             return Held([self.client.submit(_kept, group, pure=False) for group in groups], tuple(counts))
 
+    def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> Held:
+        with told():
+            return Held([self._on(partial(_listed, function), partition) for partition in partitions], tuple(counts))
+
+    def along(self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any) -> Any:
+        with told():
+            for partition in partitions:
+                held = getattr(partition, "held", ())
+                bare = replace(partition, held=()) if held else partition
+                carry = self.client.submit(_carried, function, bare, carry, *held, pure=False)
+            return self.client.gather(carry)
+
     def beside(self, *rows: Held) -> Held:
         with told():
             return Held([self.client.submit(_beside, parts, pure=False) for parts in zip(*rows, strict=True)],
@@ -136,6 +148,14 @@ def _laid(partition: Any, laying: Callable[[Any], Iterator[Laid]], size: int) ->
 
 def _where_held(function: Callable[[Any], Any], partition: Any, *held: Any) -> Any:
     return function(partition.on(*held))
+
+
+def _listed(function: Callable[[Any], Any], partition: Any) -> list[Any]:
+    return list(function(partition))
+
+
+def _carried(function: Callable[[Any, Any], Any], partition: Any, carry: Any, *held: Any) -> Any:
+    return function(partition.on(*held) if held else partition, carry)
 
 
 def _kept(chunks: list[Any]) -> list[Any]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, reduce
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax
 from orthaug._base.parallel import in_threads
-from orthaug.models.rows import CHUNK_ROWS, Chunk, brought, chunk_shape, in_chunks, row_fold
+from orthaug.models.rows import CHUNK_ROWS, Chunk, all_chunks, brought, chunk_shape, in_chunks, row_fold
 
 _ROWS = "rows"
 _ONE_AT_A_TIME = threading.Lock()  # devices that wait for each other in two programs would wait for ever
@@ -58,6 +58,15 @@ class Devices:
             return jax.make_array_from_callback(held.shape, sharding, lambda index: held[index])
 
         return jax.tree.map(sharded, chunks)
+
+    def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> Any:
+        def even(part: Any) -> Any:
+            return np.concatenate([part, np.zeros((-len(part) % self.shares, *part.shape[1:]), part.dtype)])
+
+        return self.place(jax.tree.map(even, all_chunks(function, partitions)))
+
+    def along(self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any) -> Any:
+        return reduce(lambda carry, partition: function(partition, carry), partitions, carry)
 
     def beside(self, *rows: Any) -> Any:
         return rows

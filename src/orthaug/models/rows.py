@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -81,6 +81,14 @@ class Engine(Protocol):
         """Chunks of any pytree, (k, …) each, as rows; where those of `like` are, which are as many."""
         ...
 
+    def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> Any:
+        """Rows of the chunks, `counts` of each, that `function(partition)` gives one by one."""
+        ...
+
+    def along(self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any) -> Any:
+        """`carry = function(partition, carry)` over all partitions in their order."""
+        ...
+
     def beside(self, *rows: Any) -> Any:
         """Rows whose chunks are tuples of the chunks of others."""
         ...
@@ -122,6 +130,12 @@ class InMemory:
     def place(self, chunks: Any, like: Any = None) -> Any:
         return jax.tree.map(jax.device_put, chunks)
 
+    def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> Any:
+        return self.place(all_chunks(function, partitions))
+
+    def along(self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any) -> Any:
+        return reduce(lambda carry, partition: function(partition, carry), partitions, carry)
+
     def beside(self, *rows: Any) -> Any:
         return rows
 
@@ -140,6 +154,12 @@ def _compiled_fold(function: Callable[..., Any], rows: Any, arguments: tuple[Any
 @partial(jax.jit, static_argnames="function")
 def _compiled_sum(function: Callable[..., Any], rows: Chunk, arguments: tuple[Any, ...]) -> Any:
     return row_sum(lambda chunk: function(chunk, *arguments), rows)
+
+
+def all_chunks(function: Callable[[Any], Any], partitions: Sequence[Any]) -> Any:
+    """The chunks that a function gives of every partition, (k, …) each."""
+    chunks = [chunk for partition in partitions for chunk in function(partition)]
+    return jax.tree.map(lambda *parts: np.stack(parts), *chunks)
 
 
 def brought(source: Any, laying: Callable[[Any], Any]) -> tuple[np.ndarray, ...]:

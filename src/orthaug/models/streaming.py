@@ -9,7 +9,7 @@ import queue
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, reduce
 from typing import Any
 
 import numpy as np
@@ -69,6 +69,12 @@ class Stream:
     def place(self, chunks: Any, like: Any = None) -> list[Any]:
         return apart(chunks)
 
+    def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> Read:
+        return Read(function, partitions)
+
+    def along(self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any) -> Any:
+        return reduce(lambda carry, partition: function(partition, carry), partitions, carry)
+
     def beside(self, *rows: Iterable[Any]) -> Beside:
         return Beside(rows)
 
@@ -77,6 +83,17 @@ class Stream:
 
     def fetch(self, rows: Iterable[Any]) -> Any:
         return together(list(rows))
+
+
+@dataclass(frozen=True, eq=False)
+class Read:
+    """Chunks of partitions, read at every pass."""
+
+    function: Callable[[Any], Any]
+    partitions: Sequence[Any]
+
+    def __iter__(self) -> Iterator[Any]:
+        return (chunk for partition in self.partitions for chunk in self.function(partition))
 
 
 @dataclass(frozen=True, eq=False)
