@@ -320,17 +320,21 @@ class Spec(Section):
         Raises:
             InputError: rows that are not in memory, for training that flies over them.
         """
-        if self.flies and self.engine.kind == "stream":
+        if not self.brought:
+            return self.engine.chosen(files)
+        if self.engine.kind == "stream":
+            what = "`training.segment` = 0, whole experiments," if self.motion is None else "a motion"
             raise InputError(
-                "`engine.kind`: found stream; expected memory, devices or dask: a free run, and a motion, read their "
-                "rows into memory, and dask shares them among its workers."
+                f"`engine.kind`: found stream; expected memory, devices or dask: {what} reads its rows into memory, "
+                "which dask then shares among its workers."
             )
-        return "memory" if self.flies and self.engine.kind == "auto" else self.engine.chosen(files)
+        return "memory" if self.engine.kind == "auto" else self.engine.kind
 
     @property
-    def flies(self) -> bool:
-        """Whether training makes free runs."""
-        return self.motion is not None or not self.declared_criterion().one_step
+    def brought(self) -> bool:
+        """Whether training reads all rows into memory: of a motion, and of free runs over whole experiments."""
+        flown = self.declared_criterion().flown
+        return self.motion is not None or (flown is not None and not flown.segment)
 
     def regularizations(self, *, linear: bool, validated: bool) -> tuple[str | float, ...]:
         """Those that every start is run with."""

@@ -94,7 +94,7 @@ class Engine(Protocol):
         ...
 
     def keep(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> tuple[Any, Any]:
-        """Of `function(chunk, *arguments)`, a pair: the first ones as rows that stay where they are, Σ of the second."""
+        """Of `function(chunk, *arguments)`, a pair: the first as rows that stay where they are, Σ of the second."""
         ...
 
     def fetch(self, rows: Any) -> Any:
