@@ -158,8 +158,10 @@ def test_files_as_a_record(folder):
     found = oa.estimate(source, BASELINE, **OPTIONS)
     np.testing.assert_allclose(found.theta, expected.theta, rtol=1e-10)
     assert found.status.loss == pytest.approx(expected.status.loss, rel=1e-8)
-    with pytest.raises(oa.InputError, match="a free run, and a motion, take a Record"):
-        oa.estimate(source, BASELINE, criterion=oa.Simulation(50), **OPTIONS)
+    with pytest.raises(oa.InputError, match="`segment` is 0, whole experiments, which need their rows in memory"):
+        oa.estimate(source, BASELINE, criterion=oa.Simulation(0), **OPTIONS)
+    with pytest.raises(oa.InputError, match="a motion takes a Record, whose segments an engine may share out"):
+        flown_motion(source)
 
 
 def test_a_frame_on_a_cluster_as_a_record(folder, cluster):
@@ -181,23 +183,22 @@ def test_a_frame_on_a_cluster_as_a_record(folder, cluster):
         oa.open_frame(emptied, client=cluster, **COLUMNS)
 
 
-def flown(engine, kind):
-    """A free run of 40 segments with evidence, whose noise has colour, or a motion in one of its integrators."""
-    rng = np.random.default_rng(2)
-    u, y = rng.uniform(-1, 1, 480), np.zeros(480)
-    for k in range(2, 480):
-        y[k] = 1.5 * y[k - 1] - 0.7 * y[k - 2] + 0.1 * u[k - 1] - 0.05 * math.tanh(8 * (y[k - 1] - y[k - 2]))
-    y += 1e-3 * rng.normal(size=480)
-    record = oa.Record.join([oa.Record.from_arrays(u=u[i : i + 240], y=y[i : i + 240]) for i in (0, 240)])
-    options = {"solver": oa.LevenbergMarquardt(20), "regularization": "evidence", "blocks": 0, "engine": engine}
-    options["fallback"] = False
-    if kind == "lagged":
-        return oa.estimate(record, BASELINE, lags=oa.Lags(na=2, nb=2), learner=oa.MLP((3,)),
-                           criterion=oa.Simulation(24, 12), **options)  # fmt: skip
+FLIGHT = {"regularization": "evidence", "blocks": 0, "fallback": False, "solver": oa.LevenbergMarquardt(20)}
+
+
+def flown_lagged(record, engine=None):
+    """A free run with evidence over segments that are too short for the colour of its noise."""
+    criterion = oa.Simulation(40, 20, start_iterations=0)
+    return oa.estimate(record, BASELINE, **(OPTIONS | FLIGHT), criterion=criterion, engine=engine)
+
+
+def flown_motion(record, engine=None):
+    """A motion in discrete time, whose segments show that colour themselves."""
     states = [oa.State("x", "a*x + b*z + c*u", start="y", learned=True), oa.State("z", "x")]
     values = [oa.PhysicalParameter("a", 1.4), oa.PhysicalParameter("b", -0.6), oa.PhysicalParameter("c", 0.1)]
     motion = oa.Motion.from_equations(states, [oa.Output("y", "x")], values, ["u"], integrator="discrete")
-    return oa.estimate(record, motion, learner=oa.MLP((2,)), criterion=oa.Simulation(40, 0), **options)
+    learner, criterion = oa.MLP((2,)), oa.Simulation(60, 0)
+    return oa.estimate(record, motion, learner=learner, **FLIGHT, criterion=criterion, engine=engine)
 
 
 def told_of(fit):
@@ -206,8 +207,9 @@ def told_of(fit):
 
 
 @pytest.fixture(scope="module")
-def in_memory():
-    return {kind: told_of(flown(None, kind)) for kind in ("lagged", "motion")}
+def in_memory(folder):
+    record = from_files(folder)
+    return {"lagged": told_of(flown_lagged(record)), "motion": told_of(flown_motion(record))}
 
 
 def check_flown(found, expected):
@@ -217,16 +219,21 @@ def check_flown(found, expected):
     assert found["iterations"] == expected["iterations"]
 
 
-@pytest.mark.parametrize("kind", ["lagged", "motion"])
-def test_segments_in_chunks_give_the_free_run_of_rows_in_memory(in_memory, kind):
-    check_flown(told_of(flown(Stream(), kind)), in_memory[kind])
+def opened(folder):
+    """Partitions that segments reach across."""
+    return oa.open_parquet(sorted((folder / "runs").glob("*.parquet")), partition_rows=200, **COLUMNS)
 
 
-@pytest.mark.parametrize("kind", ["lagged", "motion"])
-def test_segments_on_workers_give_the_free_run_of_rows_in_memory(in_memory, cluster, kind):
+def test_segments_of_files_give_the_free_run_of_rows_in_memory(folder, in_memory):
+    check_flown(told_of(flown_lagged(opened(folder))), in_memory["lagged"])
+    check_flown(told_of(flown_motion(from_files(folder), Stream())), in_memory["motion"])
+
+
+def test_segments_on_workers_give_the_free_run_of_rows_in_memory(folder, in_memory, cluster):
     from orthaug.models.cluster import Dask
 
-    check_flown(told_of(flown(Dask(cluster), kind)), in_memory[kind])
+    check_flown(told_of(flown_lagged(opened(folder), Dask(cluster))), in_memory["lagged"])
+    check_flown(told_of(flown_motion(from_files(folder), Dask(cluster))), in_memory["motion"])
 
 
 def test_a_study_on_a_cluster(cluster):
@@ -265,8 +272,8 @@ folder = pathlib.Path({folder!r})
 for kind, more in (("memory", ""), ("devices", "devices = 2"), ("devices", "")):
     result = t.fitted(folder, kind, more=more)
     (folder / f"{{kind}}{{more[-1:]}}.json").write_text(json.dumps(result))
-for kind in ("lagged", "motion"):
-    (folder / f"{{kind}}.json").write_text(json.dumps(t.told_of(t.flown(Devices(), kind))))
+for kind, fly in (("lagged", t.flown_lagged), ("motion", t.flown_motion)):
+    (folder / f"{{kind}}.json").write_text(json.dumps(t.told_of(fly(t.from_files(folder), Devices()))))
 from orthaug._base.jax import jax
 assert len(jax.devices()) == 4
 """
@@ -322,11 +329,8 @@ def test_what_is_wrong_with_a_partition_is_named(folder):
         timed=timed)  # fmt: skip
     bad(folder, "no file fits 'nothing/", pattern=("runs/*", "nothing/*"))
     bad(folder, "`rows` and `every` need the rows in memory", rows=('*.parquet"]', '*.parquet"], every = 2'))
-    bad(
-        folder,
-        "found stream; expected memory, devices or dask: a free run",
-        focus=("[training]", '[training]\nfocus = "simulation"'),
-    )
+    whole = '[training]\nfocus = "simulation"\nsegment = 0'
+    bad(folder, "found stream; expected memory, devices or dask: `training.segment` = 0", focus=("[training]", whole))
 
 
 def test_a_file_that_changes_is_noticed(folder):
