@@ -77,7 +77,7 @@ class MotionJob(Job):
         structure = self.structure if variant.fold is None else self.spec.declared_structure()
         options = self.training_options(variant)
         if variant.fold is None:  # a fold is small
-            options["engine"] = self.engine
+            options |= {"engine": self.engine, "checkpoints": self.checkpoints}
         return fit_motion(problem, structure=structure, progress=progress, **options)
 
 

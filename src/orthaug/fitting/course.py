@@ -10,6 +10,7 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.progress import RunTell, quiet
 from orthaug.data.record import Record
+from orthaug.fitting.checkpoints import OF_DESCENT, Checkpoints, Kept
 from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.initial_states import Start
 from orthaug.fitting.objective import RUNAWAY, Flown, FreeRunObjective, errors_of
@@ -104,6 +105,8 @@ class Course:
     unit: Vector
     sums: SegmentSums | None = None
     """Who sums over the segments, where an engine keeps them."""
+    checkpoints: Checkpoints | None = None
+    """Where the states of its descents are kept."""
 
     @property
     def shares(self) -> int:
@@ -140,25 +143,36 @@ class Course:
         two_legs = ny > 1 and self.output_weights in ("auto", "covariance")
         first = solver.at_most(solver.iterations // 2) if two_legs else solver
         start = Start(objective.initial.measured if states is None else states)
-        end = first.descend(objective, p, start, progress=tell, **options)
+        kept = self._kept(objective, p, start, options)
+        end = first.descend(objective, p, start, progress=tell, kept=kept, **options)
         noise = self.noise(objective, end) if two_legs and end.ending.usable else None
         white = None if noise is None else whitening(noise)
         if noise is not None and white is not None:
             size = np.trace(objective.weight @ noise @ objective.weight.T) / ny  # so that the ridge keeps its place
             objective = replace(objective, weight=np.sqrt(size) * white)
             done = end.iterations
+            begun, options = Start(end.flown.states), options | {"ridge": end.ridge, "ceiling": np.inf}
             again = solver.at_most(solver.iterations - done).descend(
                 objective,
                 end.flown.p,
-                Start(end.flown.states),
+                begun,
                 progress=lambda i, loss: tell(done + i, loss),
-                **(options | {"ridge": end.ridge, "ceiling": np.inf}),
+                kept=self._kept(objective, end.flown.p, begun, options),
+                **options,
             )
             path = (*end.path, *again.path)
             spent = {"iterations": done + again.iterations, "seconds": end.seconds + again.seconds}
             end = again._replace(path=path, **spent)
         mean_square = self.mean_square(end.flown.c, end.flown.w)
         return Flight(objective, end, mean_square, end.iterations, end.seconds)
+
+    def _kept(self, objective: FreeRunObjective, p: Vector, start: Start, options: dict[str, Any]) -> Kept | None:
+        """Where the pauses of a descent from there are kept."""
+        if self.checkpoints is None:
+            return None
+        chosen = [options.get(name) for name in ("ridge", "evidence", "evidence_settled", "ceiling")]
+        size = (self.segments.steps, self.segments.count, objective.weight, objective.dynamics.unknowns)
+        return self.checkpoints.of_run("flight", p, np.asarray(start.values), *size, *chosen, form=OF_DESCENT)
 
     def looked_at(self, objective: FreeRunObjective, end: Descent) -> Looked:
         """Where a run ended, on segments in memory; its end has a derivative."""

@@ -236,7 +236,8 @@ def fit(
         estimate = conclude(task, structure, task.physics_learned())
         estimate = replace(estimate, status=replace(estimate.status, start_loss=estimate.status.loss))
     else:
-        trained = replace(task, checkpoints=checkpoints) if solved else FreeRunTask.of(task, criterion, warm)
+        flies = None if solved else FreeRunTask.of(task, criterion, warm).keeping(checkpoints)
+        trained = replace(task, checkpoints=checkpoints) if flies is None else flies
         chosen = Choice(validation, blocks if initial is None else 0, fallback, ensemble, scored=auto and solved)
         estimate = train(trained, starts, structure, solver, chosen, progress)
         if _splits(structure) and estimate.status.ok and estimate.model.form.bound is not None:

@@ -7,8 +7,8 @@ so that no run ends above physics alone.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.progress import RunTell, quiet
 from orthaug._base.warning import Warning
 from orthaug.fitting.block_scores import FreeRunScores
+from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.course import Flight
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.initial_states import Start
@@ -67,6 +68,10 @@ class FlightTask(ABC):
         regularization: str | float,
     ) -> list[Place]:
         """Where a run from the weights w may start; arguments as in `estimate`."""
+
+    def keeping(self, checkpoints: Checkpoints | None) -> Self:
+        """The same with the states of its descents kept."""
+        return replace(self, plan=replace(self.plan, checkpoints=checkpoints))
 
     @property
     def problem(self) -> Any:

@@ -119,6 +119,19 @@ class FreeRunObjective:
         start = Start(flown.states, flown.misfit, np.concatenate([flown.c, flown.w]), **following)
         return LinearisedFreeRun(information, gradient, information, start)
 
+    def kept(self, flown: Flown) -> tuple[Any, ...]:
+        """What `again` makes the trial of, bit by bit."""
+        squares = np.zeros((0, 0)) if flown.squares is None else flown.squares
+        return flown.p, np.asarray(flown.states), flown.misfit, flown.loss, squares
+
+    def again(self, kept: tuple[Any, ...]) -> Flown:
+        """The trial that was `kept`."""
+        p, states, misfit, loss, squares = kept
+        theta, c, w = self.place(p)
+        known = self.sums is not None
+        errors = None if known else self.errors(c, w, states, self.segments)
+        return Flown(p, theta, c, w, states, errors, float(misfit), float(loss), squares if known else None)
+
     def eliminated(self, flown: Flown, rows: Matrix) -> tuple[Matrix, Vector, dict[str, Any]]:
         """Normal matrix and right-hand side of (c, w), L = `rows`, and how the states follow, as `Start` has it."""
         numbers, states = self.numbers(flown.c, flown.w), flown.states
