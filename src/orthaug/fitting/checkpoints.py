@@ -103,7 +103,7 @@ class Kept:
             return None
 
     def keep(self, state: Any, *, ended: bool = False) -> None:
-        """Write the state, or what makes it, if it is time or the run has `ended`. A full disk leaves the one before."""
+        """Write the state, or what makes it, if it is time or the run `ended`. A full disk leaves the one before."""
         now = time.monotonic()
         if now - self.written < self.checkpoints.every and not (ended and self.path.exists()):
             return

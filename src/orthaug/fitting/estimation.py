@@ -205,7 +205,7 @@ def fit(
     Args:
         problem: record, physics and learner inputs; the other arguments as of `estimate`.
         learner: None for physics alone, on the rows of the problem.
-        engine: where the rows of a one-step criterion are, and who sums over them.
+        engine: where the rows are, or segments of a free run, and who sums over them.
         checkpoints: where the states of its runs are kept, to go on from; None to keep none.
 
     Raises:
@@ -220,13 +220,12 @@ def fit(
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
     check_starts(restarts if initial is None else 1, seed, ensemble=ensemble)
     check_solver(solver, criterion, () if learner is None else choices)
-    if initial is None:
-        _check_cost(problem, learner, solver, restarts * len(choices))
     warm, told = None, ()
     if initial is not None:
         task, weights, warm = _warm_start(problem, initial, engine)
         starts = [PlannedRun(0, weights, choice) for choice in choices]
     else:
+        _check_cost(problem, learner, solver, restarts * len(choices))
         problem, learner, told = independent_terms(problem, learner)
         task = OneStepTask.of(problem, learner, engine=engine)
         starts = _starts(task.bound, range(seed, seed + restarts), choices)
@@ -236,8 +235,8 @@ def fit(
         estimate = conclude(task, structure, task.physics_learned())
         estimate = replace(estimate, status=replace(estimate.status, start_loss=estimate.status.loss))
     else:
-        flies = None if solved else FreeRunTask.of(task, criterion, warm).keeping(checkpoints)
-        trained = replace(task, checkpoints=checkpoints) if flies is None else flies
+        task = replace(task, checkpoints=checkpoints)
+        trained = task if solved else FreeRunTask.of(task, criterion, warm)
         chosen = Choice(validation, blocks if initial is None else 0, fallback, ensemble, scored=auto and solved)
         estimate = train(trained, starts, structure, solver, chosen, progress)
         if _splits(structure) and estimate.status.ok and estimate.model.form.bound is not None:

@@ -50,7 +50,7 @@ class FreeRunTask(FlightTask):
             InputError: nothing would be scored; whole experiments of rows that are not in memory.
         """
         plan = SourcePlan if isinstance(task.problem, StreamedProblem) else FlightPlan
-        return cls(plan.of(task, criterion), None, warm)
+        return cls(plan.of(task, criterion), None, warm).keeping(task.checkpoints)
 
     @property
     def task(self) -> OneStepTask:

@@ -106,7 +106,7 @@ class FreeRunObjective:
             made = (self.weight, self.start_rows)
             total, squares = self.sums.tried(self.dynamics, self.numbers(c, w), self.segments, start, step, *made)
             return total, start.values, None, squares
-        states = start.at(unknowns) if follows else start.values
+        states: Any = start.at(unknowns) if follows else start.values
         errors = self.errors(c, w, states, self.segments)
         with np.errstate(all="ignore"):
             total = float(np.sum(np.einsum("oi,ktim->ktom", self.weight, errors) ** 2))

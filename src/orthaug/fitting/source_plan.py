@@ -58,7 +58,8 @@ class SourcePlan(FlightPlan):
         check_scored(criterion, longest)
         made = (task.engine, source, found, dynamics, empty)
         segments: Any = SourceSegments.cut(*made, flown.segment, washout)
-        whole, colour = segments, None
+        whole: Any = segments
+        colour: Any = None
         if criterion.simulates:
             count = sum(max(rows - dynamics.first_row - min(washout, longest - 1), 0) for rows in found.rows)
             whole = WholeRuns(task.engine, source.partitions, empty, min(washout, longest - 1), count)

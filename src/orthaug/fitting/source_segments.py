@@ -120,9 +120,8 @@ def _slices(part: Part) -> Iterator[Experiment]:
         while begin + len(inputs[0]) <= first:
             begin += len(inputs.pop(0))
             outputs.pop(0)
-        held = [group[0] if len(group) == 1 else np.concatenate(group) for group in (inputs, outputs)]
-        yield Experiment(*(group[first - begin : last - begin] for group in held))
-        inputs, outputs = [held[0]], [held[1]]
+        inputs, outputs = ([np.concatenate(group)] if len(group) > 1 else group for group in (inputs, outputs))
+        yield Experiment(inputs[0][first - begin : last - begin], outputs[0][first - begin : last - begin])
 
 
 @dataclass(frozen=True)

@@ -34,8 +34,8 @@ class Devices:
 
     def lay(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Chunk:
         shape = _even(chunk_shape(-(-len(z) // self.shares), self.limit), self.shares)
-        pieces = (in_chunks(np.asarray(part), shape, repeat=j == 0) for j, part in enumerate((z, q, e, gain)))
-        return self.place(Chunk(*pieces))
+        laid: Any = [in_chunks(np.asarray(part), shape, repeat=j == 0) for j, part in enumerate((z, q, e, gain))]
+        return self.place(Chunk(*laid))
 
     def draw(self, source: Any, laying: Callable[[Any], Any]) -> Chunk:
         return self.lay(*brought(source, laying))
