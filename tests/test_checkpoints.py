@@ -8,7 +8,7 @@ import os
 import numpy as np
 import pytest
 from test_engine import Streaming, posed
-from test_engines import SPEC, fitted, folder  # noqa: F401  (a fixture)
+from test_engines import BASELINE, FLIGHT, SPEC, fitted, folder, from_files  # noqa: F401  (a fixture)
 from typer.testing import CliRunner
 
 import orthaug as oa
@@ -21,6 +21,8 @@ from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import BaselinePenalty, Orthogonal
 from orthaug.models.learners import MLP
 from orthaug.models.rows import InMemory
+from orthaug.models.streaming import Stream
+from orthaug.physics.problem import pose
 
 
 class Killed(BaseException):
@@ -60,6 +62,25 @@ def test_a_run_that_was_ended_goes_on_bit_by_bit(tmp_path, engine, step):
     np.testing.assert_array_equal(found.theta, whole.theta)
     assert found.status.loss == whole.status.loss and found.status.iterations == whole.status.iterations
     assert steps[0] > 1 or step == 1
+
+
+@pytest.mark.parametrize("engine", [Stream(), InMemory()], ids=["stream", "memory"])
+def test_a_free_run_goes_on_bit_by_bit(folder, tmp_path, engine):  # noqa: F811
+    """Killed once in the run of physics alone, once in that of the learner."""
+    problem = pose(from_files(folder), BASELINE, oa.Lags(na=2, nb=2))
+    chosen = {"learner": MLP(hidden=(3,)), "criterion": oa.Simulation(40, 20, start_iterations=0), "engine": engine}
+    chosen |= FLIGHT
+    whole = fit(problem, **chosen)
+    for step in (2, 17):
+        kept = Checkpoints(tmp_path / "kept", "this fit", every=0.0).opened(resume=step > 2)
+        with pytest.raises(Killed):
+            fit(problem, **chosen, checkpoints=kept, progress=dies_at(step))
+    steps = []
+    kept = Checkpoints(tmp_path / "kept", "this fit", every=0.0).opened(resume=True)
+    found = fit(problem, **chosen, checkpoints=kept, progress=lambda run, i, loss: steps.append(i))
+    np.testing.assert_array_equal(found.theta, whole.theta)
+    np.testing.assert_array_equal(found.model.numbers.weights, whole.model.numbers.weights)
+    assert found.status.loss == whole.status.loss and steps[0] == 17
 
 
 def test_runs_that_were_done_are_not_made_again(tmp_path):

@@ -269,9 +269,14 @@ def test_sums_over_lists_are_sums_over_chunks():
             assert apart(two, one) <= 1e-13
 
 
-def test_a_free_run_needs_rows_in_memory():
-    with pytest.raises(InputError, match="a free run needs its rows in memory"):
-        fit(posed(1), learner=MLP(hidden=(3,)), criterion=Simulation(20, 2), engine=Streaming())
+def test_a_free_run_of_two_outputs_with_a_bound():
+    """θ's bound makes c follow the learner's share; the outputs' covariance is taken in a second leg."""
+    options = {"learner": MLP(hidden=(2,)), "criterion": Simulation(20, 2, start_iterations=0), "blocks": 0}
+    options |= {"structure": Orthogonal(), "solver": LevenbergMarquardt(12), "fallback": False}
+    memory, streamed = (fit(posed(2, 0.55), engine=engine, **options) for engine in (InMemory(), Streaming()))
+    np.testing.assert_allclose(streamed.theta, memory.theta, rtol=1e-10)
+    assert streamed.status.loss == pytest.approx(memory.status.loss, rel=1e-8)
+    assert streamed.at_bound == memory.at_bound
 
 
 def test_chunks_of_another_size():

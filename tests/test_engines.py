@@ -20,6 +20,7 @@ from orthaug.commands.fit import fit_job
 from orthaug.commands.opening import open_job
 from orthaug.commands.spec import load_spec
 from orthaug.data.sources import witness
+from orthaug.models.streaming import Stream
 
 pytest.importorskip("pyarrow")
 ROWS, GROUP = 1200, 170
@@ -171,8 +172,10 @@ def test_files_as_a_record(folder):
     found = oa.estimate(source, BASELINE, **OPTIONS)
     np.testing.assert_allclose(found.theta, expected.theta, rtol=1e-10)
     assert found.status.loss == pytest.approx(expected.status.loss, rel=1e-8)
-    with pytest.raises(oa.InputError, match="a free run, and a motion, need their rows in memory"):
-        oa.estimate(source, BASELINE, criterion=oa.Simulation(50), **OPTIONS)
+    with pytest.raises(oa.InputError, match="`segment` is 0, whole experiments, which need their rows in memory"):
+        oa.estimate(source, BASELINE, criterion=oa.Simulation(0), **OPTIONS)
+    with pytest.raises(oa.InputError, match="a motion takes a Record, whose segments an engine may share out"):
+        flown_motion(source)
 
 
 def test_a_frame_on_a_cluster_as_a_record(folder, cluster):
@@ -192,6 +195,59 @@ def test_a_frame_on_a_cluster_as_a_record(folder, cluster):
     emptied = dd.concat([frame, frame[frame["u"] > 9]])
     with pytest.raises(oa.InputError, match="partition .* of the DataFrame is empty"):
         oa.open_frame(emptied, client=cluster, **COLUMNS)
+
+
+FLIGHT = {"regularization": "evidence", "blocks": 0, "fallback": False, "solver": oa.LevenbergMarquardt(20)}
+
+
+def flown_lagged(record, engine=None):
+    """A free run with evidence over segments that are too short for the colour of its noise."""
+    criterion = oa.Simulation(40, 20, start_iterations=0)
+    return oa.estimate(record, BASELINE, **(OPTIONS | FLIGHT), criterion=criterion, engine=engine)
+
+
+def flown_motion(record, engine=None):
+    """A motion in discrete time, whose segments show that colour themselves."""
+    states = [oa.State("x", "a*x + b*z + c*u", start="y", learned=True), oa.State("z", "x")]
+    values = [oa.PhysicalParameter("a", 1.4), oa.PhysicalParameter("b", -0.6), oa.PhysicalParameter("c", 0.1)]
+    motion = oa.Motion.from_equations(states, [oa.Output("y", "x")], values, ["u"], integrator="discrete")
+    learner, criterion = oa.MLP((2,)), oa.Simulation(60, 0)
+    return oa.estimate(record, motion, learner=learner, **FLIGHT, criterion=criterion, engine=engine)
+
+
+def told_of(fit):
+    return {"theta": fit.theta.tolist(), "loss": fit.status.loss, "noise": np.ravel(fit.covariance).tolist(),
+            "iterations": fit.status.iterations}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def in_memory(folder):
+    record = from_files(folder)
+    return {"lagged": told_of(flown_lagged(record)), "motion": told_of(flown_motion(record))}
+
+
+def check_flown(found, expected):
+    np.testing.assert_allclose(found["theta"], expected["theta"], rtol=1e-10)
+    assert found["loss"] == pytest.approx(expected["loss"], rel=1e-8)
+    np.testing.assert_allclose(found["noise"], expected["noise"], rtol=1e-6)
+    assert found["iterations"] == expected["iterations"]
+
+
+def opened(folder):
+    """Partitions that segments reach across."""
+    return oa.open_parquet(sorted((folder / "runs").glob("*.parquet")), partition_rows=200, **COLUMNS)
+
+
+def test_segments_of_files_give_the_free_run_of_rows_in_memory(folder, in_memory):
+    check_flown(told_of(flown_lagged(opened(folder))), in_memory["lagged"])
+    check_flown(told_of(flown_motion(from_files(folder), Stream())), in_memory["motion"])
+
+
+def test_segments_on_workers_give_the_free_run_of_rows_in_memory(folder, in_memory, cluster):
+    from orthaug.models.cluster import Dask
+
+    check_flown(told_of(flown_lagged(opened(folder), Dask(cluster))), in_memory["lagged"])
+    check_flown(told_of(flown_motion(from_files(folder), Dask(cluster))), in_memory["motion"])
 
 
 def test_a_study_on_a_cluster(cluster):
@@ -225,16 +281,19 @@ DEVICES = """
 import sys
 sys.path.insert(0, {tests!r})
 import pathlib, json, test_engines as t
+from orthaug.models.devices import Devices
 folder = pathlib.Path({folder!r})
 for kind, more in (("memory", ""), ("devices", "devices = 2"), ("devices", "")):
     result = t.fitted(folder, kind, more=more)
     (folder / f"{{kind}}{{more[-1:]}}.json").write_text(json.dumps(result))
+for kind, fly in (("lagged", t.flown_lagged), ("motion", t.flown_motion)):
+    (folder / f"{{kind}}.json").write_text(json.dumps(t.told_of(fly(t.from_files(folder), Devices()))))
 from orthaug._base.jax import jax
 assert len(jax.devices()) == 4
 """
 
 
-def test_devices_give_the_result_of_rows_in_memory(folder):
+def test_devices_give_the_result_of_rows_in_memory(folder, in_memory):
     """Two of four, and all four."""
     script = DEVICES.format(tests=os.path.dirname(__file__), folder=str(folder))
     environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
@@ -243,6 +302,8 @@ def test_devices_give_the_result_of_rows_in_memory(folder):
     expected, *found = (json.loads((folder / f"{kind}.json").read_text()) for kind in ("memory", "devices2", "devices"))
     for result in found:
         check_same(result, expected)
+    for kind, other in in_memory.items():
+        check_flown(json.loads((folder / f"{kind}.json").read_text()), other)
 
 
 def bad(folder, match, frame=None, name="c.parquet", **changes):
@@ -282,7 +343,8 @@ def test_what_is_wrong_with_a_partition_is_named(folder):
         timed=timed)  # fmt: skip
     bad(folder, "no file fits 'nothing/", pattern=("runs/*", "nothing/*"))
     bad(folder, "`rows` and `every` need the rows in memory", rows=('*.parquet"]', '*.parquet"], every = 2'))
-    bad(folder, "found stream; expected memory: a free run", focus=("[training]", '[training]\nfocus = "simulation"'))
+    whole = '[training]\nfocus = "simulation"\nsegment = 0'
+    bad(folder, "found stream; expected memory, devices or dask: `training.segment` = 0", focus=("[training]", whole))
 
 
 def test_a_file_that_changes_is_noticed(folder):

@@ -86,7 +86,7 @@ def case(name):
     if bound is not None:
         scaling = (rng.normal(size=nz), 1 + rng.random(nz), 0.5 * (1 + rng.random(ny)))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(orthaug.fitting.segments, "_CHUNK", 9)
+        patch.setattr(orthaug.fitting.segments, "CHUNK", 9)
         segments = lay_segments(posed.record, form, SEGMENT, WASHOUT)
     states = np.asarray(segments.start) + 0.3 * rng.normal(size=segments.start.shape)
     return Case(posed.record, form, Numbers(c, 0 * c, w, *scaling), segments, states, rng.normal(size=(ny, ny)))
@@ -151,7 +151,7 @@ def test_every_usable_row_is_scored_once_but_the_first_washout(segment, washout)
 
 def test_segments_stand_in_chunks_of_one_width(monkeypatch):
     record, form = case("one output").record, case("one output").form
-    monkeypatch.setattr(orthaug.fitting.segments, "_CHUNK", 4)
+    monkeypatch.setattr(orthaug.fitting.segments, "CHUNK", 4)
     chunked = lay_segments(record, form, SEGMENT, WASHOUT)
     monkeypatch.undo()
     one = lay_segments(record, form, SEGMENT, WASHOUT)

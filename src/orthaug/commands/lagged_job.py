@@ -145,7 +145,7 @@ def open_lagged(path: Path, spec: Spec, *, require_full_rank: bool = True) -> La
         options = {"output_weights": spec.training.output_weights, "require_full_rank": require_full_rank}
         kind = spec.engine_kind([path.parent / entry.file for entry in train.files])
         engine = engine_of(spec.engine, kind)
-        if kind in ("memory", "devices"):
+        if kind in ("memory", "devices") or spec.brought:
             problem = pose(train.record, baseline, lags, learner_inputs, **options)
         else:
             source = train.source or RecordSource(train.record, first, spec.engine.partition_rows)

@@ -11,6 +11,7 @@ import numpy as np
 from orthaug._base.errors import InputError, KeyedError
 from orthaug._base.progress import SILENT, Progress
 from orthaug.analysis.motion_suspects import MotionSuspect
+from orthaug.commands.engine_section import engine_of
 from orthaug.commands.job import ALONE, AS_DECLARED, Job, Variant
 from orthaug.commands.motion_suspects import declared_terms
 from orthaug.commands.parts import Part, load_parts
@@ -30,6 +31,7 @@ from orthaug.physics.motion_problem import MotionProblem, pose_motion
 if TYPE_CHECKING:
     from orthaug.fitting.motion_estimates import MotionEstimate
     from orthaug.models.motion_model import MotionModel
+    from orthaug.models.rows import Engine
 
 _SECTIONS = {"learner": "learner", "kind": "structure.kind"}  # of keys that are not in [training]
 WITH_LEARNER = "orthogonal"
@@ -41,6 +43,8 @@ class MotionJob(Job):
 
     problem: MotionProblem
     measure: Measure
+    engine: Engine
+    """Who sums over the segments."""
     suspects: tuple[MotionSuspect, ...] = ()
 
     @property
@@ -71,7 +75,10 @@ class MotionJob(Job):
 
         problem = self.problem if variant.fold is None else self.problem.on(variant.fold)
         structure = self.structure if variant.fold is None else self.spec.declared_structure()
-        return fit_motion(problem, structure=structure, progress=progress, **self.training_options(variant))
+        options = self.training_options(variant)
+        if variant.fold is None:  # a fold is small
+            options |= {"engine": self.engine, "checkpoints": self.checkpoints}
+        return fit_motion(problem, structure=structure, progress=progress, **options)
 
 
 def open_motion(path: Path, spec: Spec) -> MotionJob:
@@ -99,7 +106,8 @@ def open_motion(path: Path, spec: Spec) -> MotionJob:
         problem = pose_motion(train.record, motion, inputs, spec.training.output_weights)
         named = {"path": path, "spec": spec, "train": train, "validation": validation, "tests": tuple(tests)}
         own = {"measure": _measure_of(spec, problem, path.parent), "suspects": declared_terms(spec.suspects, problem)}
-        job = MotionJob(**named, problem=problem, **own)
+        kind = spec.engine_kind([path.parent / entry.file for entry in train.files])
+        job = MotionJob(**named, problem=problem, engine=engine_of(spec.engine, kind), **own)
         for part in job.parts:
             part.check_scorable(problem.first_row, train.record.sampling_time, least)
         _check_sizes(spec, problem)

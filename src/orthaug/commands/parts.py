@@ -115,7 +115,7 @@ def long_stretches(
 def load_parts(path: Path, spec: Spec) -> tuple[Part, Part | None, tuple[Part, ...]]:
     """Training, validation and test parts of the spec at `path`, as their files hold them."""
     files = [path.parent / file for file in expanded(path, spec.data.train.files, "train")]
-    stays = spec.engine_kind(files) in ("stream", "dask")
+    stays = spec.engine_kind(files) in ("stream", "dask") and not spec.brought
     train = _load(path, spec, spec.data.train, "train", stays=stays)
     validation = _load(path, spec, spec.data.validation, "validation") if spec.data.validation else None
     tests = [_load(path, spec, part, f"tests.{name}", stays=stays) for name, part in spec.data.tests.items()]

@@ -320,13 +320,21 @@ class Spec(Section):
         Raises:
             InputError: rows that are not in memory, for training that flies over them.
         """
-        flies = self.motion is not None or not self.declared_criterion().one_step
-        if flies and self.engine.kind not in ("auto", "memory"):
+        if not self.brought:
+            return self.engine.chosen(files)
+        if self.engine.kind == "stream":
+            what = "`training.segment` = 0, whole experiments," if self.motion is None else "a motion"
             raise InputError(
-                f"`engine.kind`: found {self.engine.kind}; expected memory: a free run, and a motion, need their rows "
-                "in memory."
+                f"`engine.kind`: found stream; expected memory, devices or dask: {what} reads its rows into memory, "
+                "which dask then shares among its workers."
             )
-        return "memory" if flies else self.engine.chosen(files)
+        return "memory" if self.engine.kind == "auto" else self.engine.kind
+
+    @property
+    def brought(self) -> bool:
+        """Whether training reads all rows into memory: of a motion, and of free runs over whole experiments."""
+        flown = self.declared_criterion().flown
+        return self.motion is not None or (flown is not None and not flown.segment)
 
     def regularizations(self, *, linear: bool, validated: bool) -> tuple[str | float, ...]:
         """Those that every start is run with."""

@@ -33,6 +33,11 @@ class FramePartition:
         """The same where the rows are."""
         return HeldFrame(replace(self, held=()), frame, before)
 
+    def head(self, rows: int) -> FramePartition:
+        """Its first rows, taken where they are."""
+        first = self.held[0].client.submit(_rows, self.held[0], 0, rows, pure=False)
+        return replace(self, rows=min(rows, self.rows), held=(first, self.held[1]))
+
     def pieces(self, lead: int) -> Iterator[Experiment]:
         """Brings the rows here; an engine of the cluster reads them where they are."""
         frame, before = (future.result() for future in self.held)

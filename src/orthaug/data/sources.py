@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -109,6 +109,49 @@ class HeldRows:
         yield _later(self.experiment, max(self.start - lead, 0), None)
 
 
+@dataclass(frozen=True, eq=False)
+class Span:
+    """A partition and those that follow it, from which what begins in it may have to be read on.
+
+    `held` are the futures of those that have any, `counts` how many each.
+    """
+
+    partitions: tuple[Any, ...]
+    held: tuple[Any, ...]
+    counts: tuple[int, ...]
+
+    @classmethod
+    def of(cls, partitions: Sequence[Any], rows: int) -> Span:
+        """The first with the others, of the last of which no more than the first `rows` are needed."""
+        if len(partitions) > 1 and hasattr(partitions[-1], "head"):
+            partitions = (*partitions[:-1], partitions[-1].head(rows))
+        held = [getattr(partition, "held", ()) for partition in partitions]
+        bare = (replace(p, held=()) if own else p for p, own in zip(partitions, held, strict=True))
+        return cls(tuple(bare), tuple(future for own in held for future in own), tuple(map(len, held)))
+
+    def on(self, *held: Any) -> Span:
+        """The same where the rows are."""
+        ends = np.cumsum(self.counts).tolist()
+        there = (
+            p.on(*held[end - count : end]) if count else p
+            for p, end, count in zip(self.partitions, ends, self.counts, strict=True)
+        )
+        return replace(self, partitions=tuple(there), held=(), counts=(0,) * len(self.counts))
+
+    @property
+    def name(self) -> str:
+        return self.partitions[0].name
+
+    @property
+    def rows(self) -> int:
+        """Of the first partition."""
+        return self.partitions[0].rows
+
+    def pieces(self, lead: int) -> Iterator[Experiment]:
+        """Of all its partitions."""
+        return (piece for partition in self.partitions for piece in partition.pieces(lead))
+
+
 def _later(experiment: Experiment, start: int, stop: int | None) -> Experiment:
     """Rows of an experiment that know how far into the recording they begin."""
     return replace(experiment.rows(start, stop), offset=experiment.offset + start)
@@ -173,13 +216,18 @@ def stretches(experiment: Experiment, lead: int) -> Iterator[Experiment]:
             yield _later(experiment, begin, end)
 
 
+def follows(one: Any, other: Any) -> bool:
+    """Whether the other experiment is of the same recording, from where the one ends."""
+    ends = (one.source, one.first_row + len(one), one.offset + len(one))
+    return ends == (other.source, other.first_row, other.offset)
+
+
 def joined(pieces: Sequence[Experiment]) -> list[Experiment]:
     """Pieces that follow one another within an experiment as one."""
     joined: list[list[Experiment]] = []
     for piece in pieces:
         last = joined[-1][-1] if joined else None
-        follows = last is not None and (last.source, last.first_row + len(last)) == (piece.source, piece.first_row)
-        if follows and last is not None and piece.offset == last.offset + len(last):
+        if last is not None and follows(last, piece):
             joined[-1].append(piece)
         else:
             joined.append([piece])

@@ -20,12 +20,16 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import jax
 from orthaug.fitting.normal_equations import Normal
 from orthaug.fitting.solvers.compiled import State
+from orthaug.fitting.solvers.descent import Pause
 from orthaug.models.rows import Overlap
 
 EVERY = 10.0  # s
 _ABOUT = "training.json"
 _ONE: Any = 0
 _LEAVES = State(_ONE, Normal(_ONE, _ONE, _ONE, Overlap(_ONE, _ONE)), _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE)
+
+OF_DESCENT = Pause((_ONE,) * 5, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE)
+"""The form of what a descent keeps."""
 
 
 @dataclass(eq=False)
@@ -59,12 +63,12 @@ class Checkpoints:
             self.discard()
         return self
 
-    def of_run(self, *parts: Any) -> Kept:
-        """What is kept of a run that begins with these weights and choices."""
+    def of_run(self, *parts: Any, form: Any = _LEAVES) -> Kept:
+        """What is kept of a run that begins with these weights and choices, in the form of the solver's states."""
         digest = hashlib.sha256(self.fingerprint.encode())
         for part in parts:
             digest.update(np.ascontiguousarray(part).tobytes() if isinstance(part, np.ndarray) else repr(part).encode())
-        return Kept(self, self.folder / f"{digest.hexdigest()[:24]}.safetensors")
+        return Kept(self, self.folder / f"{digest.hexdigest()[:24]}.safetensors", form)
 
     def discard(self) -> None:
         """Remove the states: the fit is done."""
@@ -83,9 +87,10 @@ class Kept:
 
     checkpoints: Checkpoints
     path: Path
+    form: Any
     written: float = field(default_factory=time.monotonic)
 
-    def state(self) -> State | None:
+    def state(self) -> Any:
         """The last one that was written whole; None where there is none."""
         from safetensors import SafetensorError
         from safetensors.numpy import load
@@ -93,23 +98,23 @@ class Kept:
         try:
             held = load(self.path.read_bytes())  # mapped into memory, it could not be replaced on Windows
             leaves = [held[str(i)] for i in range(len(held))]
-            return jax.tree.unflatten(jax.tree.structure(_LEAVES), leaves)
+            return jax.tree.unflatten(jax.tree.structure(self.form), leaves)
         except (OSError, KeyError, ValueError, SafetensorError):
             return None
 
-    def keep(self, state: State, *, ended: bool = False) -> None:
-        """Write the state if it is time, or the run has `ended`. A full disk leaves the one before."""
+    def keep(self, state: Any, *, ended: bool = False) -> None:
+        """Write the state, or what makes it, if it is time or the run `ended`. A full disk leaves the one before."""
         now = time.monotonic()
         if now - self.written < self.checkpoints.every and not (ended and self.path.exists()):
             return
         self.written = now
         try:
-            self._write(state)
+            self._write(state() if callable(state) else state)
             self.checkpoints.lost = ""
         except OSError as error:
             self.checkpoints.lost = f"{self.checkpoints.folder}: {error.strerror or error}"
 
-    def _write(self, state: State) -> None:
+    def _write(self, state: Any) -> None:
         from safetensors.numpy import save
 
         folder = self.checkpoints.folder

@@ -17,12 +17,26 @@ def independent_share(residuals: Matrix) -> float:
     Args:
         residuals: stretches (s, T), 0 where there is no residual; lags never reach from one into the next.
     """
-    rho = _correlations(residuals)
+    longest = residuals.shape[1]
+    return share_of(_spectrum(residuals), longest, int(np.count_nonzero(residuals)))
+
+
+def share_of(spectrum: Vector, longest: int, count: int) -> float:
+    """The same of a spectrum, `Σ |DFT|²` over stretches of `longest` steps that have `count` residuals.
+
+    The DFT has `spectrum_size(longest)` points.
+    """
+    rho = _correlations(spectrum, longest)
     if rho is None:
         return 1.0
-    noise = max(_NO_CORRELATION, 2 / np.sqrt(np.count_nonzero(residuals)))
+    noise = max(_NO_CORRELATION, 2 / np.sqrt(count))
     end = int(np.argmax(np.append(rho < noise, True)))
     return float(1 / (1 + 2 * np.sum(rho[:end])))
+
+
+def spectrum_size(longest: int) -> int:
+    """Points of a DFT in which products of lags do not wrap around."""
+    return 1 << (2 * longest - 1).bit_length()
 
 
 def correlation_length(residuals: Matrix) -> int | None:
@@ -36,10 +50,11 @@ def correlation_length(residuals: Matrix) -> int | None:
         residuals: as above.
     """
     there, rows = residuals != 0, np.count_nonzero(residuals)
-    rho = _correlations(np.where(there, residuals - residuals.sum() / max(rows, 1), 0.0))
+    centred = np.where(there, residuals - residuals.sum() / max(rows, 1), 0.0)
+    rho = _correlations(_spectrum(centred), centred.shape[1])
     if rho is None:
         return None
-    pairs = np.maximum(np.rint(_autocovariances(there.astype(float))[1:]), 1.0)
+    pairs = np.maximum(np.rint(_autocovariances(_spectrum(there), there.shape[1])[1:]), 1.0)
     rho = rho * rows / pairs
     before = np.concatenate([[0.0], np.cumsum(rho**2)])
     for lag in range(1, min(int(there.sum(axis=1).max()) // 2, rows // _ROWS_PER_LAG) + 1):
@@ -49,17 +64,18 @@ def correlation_length(residuals: Matrix) -> int | None:
     return None
 
 
-def _correlations(residuals: Matrix) -> Vector | None:
+def _correlations(spectrum: Vector, longest: int) -> Vector | None:
     """ρ_1, ρ_2, …; None where there are none."""
-    if residuals.shape[1] < 3:
+    if longest < 3:
         return None
-    covariance = _autocovariances(residuals)
+    covariance = _autocovariances(spectrum, longest)
     return covariance[1:] / covariance[0] if covariance[0] > 0 else None
 
 
-def _autocovariances(residuals: Matrix) -> Vector:
+def _autocovariances(spectrum: Vector, longest: int) -> Vector:
     """`Σ e_k e_{k−τ}` over all stretches, from τ = 0 on."""
-    longest = residuals.shape[1]
-    size = 1 << (2 * longest - 1).bit_length()
-    spectrum = np.sum(np.abs(np.fft.rfft(residuals, size, axis=1)) ** 2, axis=0)
-    return np.fft.irfft(spectrum, size)[:longest]
+    return np.fft.irfft(spectrum, spectrum_size(longest))[:longest]
+
+
+def _spectrum(residuals: Matrix) -> Vector:
+    return np.sum(np.abs(np.fft.rfft(residuals, spectrum_size(residuals.shape[1]), axis=1)) ** 2, axis=0)

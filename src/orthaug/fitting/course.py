@@ -10,10 +10,12 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.progress import RunTell, quiet
 from orthaug.data.record import Record
+from orthaug.fitting.checkpoints import OF_DESCENT, Checkpoints, Kept
 from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.initial_states import Start
-from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, errors_of
+from orthaug.fitting.objective import RUNAWAY, Flown, FreeRunObjective, errors_of
 from orthaug.fitting.rules import check_scored
+from orthaug.fitting.segment_sums import SegmentSums
 from orthaug.fitting.segments import Segments, lay_segments
 from orthaug.fitting.solvers.descent import MARQUARDT, Descent
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
@@ -22,8 +24,8 @@ from orthaug.inference.covariance import noise_covariance, whitening
 from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.learners import Scaling
 
-_COLOURED_STEPS = 256  # shorter segments do not show how long the errors remember
-_COLOUR_ROWS = 4096  # of each experiment: they show it instead
+COLOURED_STEPS = 256  # shorter segments do not show how long the errors remember
+COLOUR_ROWS = 4096  # of each experiment: they show it instead
 
 
 class Flight(NamedTuple):
@@ -40,6 +42,14 @@ class Flight(NamedTuple):
         return self.end.ending
 
 
+class Looked(NamedTuple):
+    """A trial whose segments are in memory, to be looked at, and how its states follow (c, w)."""
+
+    objective: FreeRunObjective
+    flown: Flown
+    slope: Any
+
+
 class Layout(NamedTuple):
     """Segments of a record: to train on, to compare runs over, and to see the colour of the errors by."""
 
@@ -48,7 +58,9 @@ class Layout(NamedTuple):
     colour: Segments | None
 
     @classmethod
-    def of(cls, record: Record, dynamics: Dynamics, criterion: Criterion, like: Course | None = None) -> Layout:
+    def of(
+        cls, record: Record, dynamics: Dynamics, criterion: Criterion, like: Course | None = None, shares: int = 1
+    ) -> Layout:
         """As a criterion of several steps declares; padded to the shapes of another course where that is larger.
 
         Raises:
@@ -59,12 +71,12 @@ class Layout(NamedTuple):
         longest = max(len(e) for e in record.experiments) - dynamics.first_row
         check_scored(criterion, longest)
         shapes = (None, None) if like is None else (like.segments, like.whole)
-        segments = lay_segments(record, dynamics, flown.segment, flown.washout, shapes[0])
+        segments = lay_segments(record, dynamics, flown.segment, flown.washout, shapes[0], shares)
         if not (criterion.simulates and flown.segment):
             return cls(segments, segments, None)
         whole, colour = lay_segments(record, dynamics, 0, flown.washout, shapes[1]), None
-        if segments.steps < _COLOURED_STEPS <= longest:
-            first = tuple(e.rows(0, _COLOUR_ROWS) for e in record.experiments)
+        if segments.steps < COLOURED_STEPS <= longest:
+            first = tuple(e.rows(0, COLOUR_ROWS) for e in record.experiments)
             colour = lay_segments(replace(record, experiments=first), dynamics, 0, flown.washout)
         return cls(segments, whole, colour)
 
@@ -91,6 +103,15 @@ class Course:
     output_weights: str | tuple[float, ...]
     scaling: Scaling
     unit: Vector
+    sums: SegmentSums | None = None
+    """Who sums over the segments, where an engine keeps them."""
+    checkpoints: Checkpoints | None = None
+    """Where the states of its descents are kept."""
+
+    @property
+    def shares(self) -> int:
+        """How many sum over segments at a time."""
+        return 1 if self.sums is None else self.sums.engine.shares
 
     @property
     def residuals(self) -> int:
@@ -122,25 +143,41 @@ class Course:
         two_legs = ny > 1 and self.output_weights in ("auto", "covariance")
         first = solver.at_most(solver.iterations // 2) if two_legs else solver
         start = Start(objective.initial.measured if states is None else states)
-        end = first.descend(objective, p, start, progress=tell, **options)
+        kept = self._kept(objective, p, start, options)
+        end = first.descend(objective, p, start, progress=tell, kept=kept, **options)
         noise = self.noise(objective, end) if two_legs and end.ending.usable else None
         white = None if noise is None else whitening(noise)
         if noise is not None and white is not None:
             size = np.trace(objective.weight @ noise @ objective.weight.T) / ny  # so that the ridge keeps its place
             objective = replace(objective, weight=np.sqrt(size) * white)
             done = end.iterations
+            begun, options = Start(end.flown.states), options | {"ridge": end.ridge, "ceiling": np.inf}
             again = solver.at_most(solver.iterations - done).descend(
                 objective,
                 end.flown.p,
-                Start(end.flown.states),
+                begun,
                 progress=lambda i, loss: tell(done + i, loss),
-                **(options | {"ridge": end.ridge, "ceiling": np.inf}),
+                kept=self._kept(objective, end.flown.p, begun, options),
+                **options,
             )
             path = (*end.path, *again.path)
             spent = {"iterations": done + again.iterations, "seconds": end.seconds + again.seconds}
             end = again._replace(path=path, **spent)
         mean_square = self.mean_square(end.flown.c, end.flown.w)
         return Flight(objective, end, mean_square, end.iterations, end.seconds)
+
+    def _kept(self, objective: FreeRunObjective, p: Vector, start: Start, options: dict[str, Any]) -> Kept | None:
+        """Where the pauses of a descent from there are kept."""
+        if self.checkpoints is None:
+            return None
+        chosen = [options.get(name) for name in ("ridge", "evidence", "evidence_settled", "ceiling")]
+        size = (self.segments.steps, self.segments.count, objective.weight, objective.dynamics.unknowns)
+        return self.checkpoints.of_run("flight", p, np.asarray(start.values), *size, *chosen, form=OF_DESCENT)
+
+    def looked_at(self, objective: FreeRunObjective, end: Descent) -> Looked:
+        """Where a run ended, on segments in memory; its end has a derivative."""
+        assert end.linear is not None
+        return Looked(objective, end.flown, objective.slope(end.linear.start))
 
     def noise(self, objective: FreeRunObjective, end: Descent) -> Matrix | None:
         """Covariance (ny, ny) of the errors, in the outputs' units."""
@@ -151,7 +188,11 @@ class Course:
     def mean_square(self, c: Vector, w: Any, tilt: Any = None) -> float:
         """Mean of squared errors over whole experiments, in deviations of the outputs; NaN where it diverges."""
         with np.errstate(all="ignore"):
-            errors = errors_of(self.dynamics, self.numbers(c, w, tilt), self.whole.start, self.whole)
-            scaled = errors / self.deviation[:, None]
-            mean = float(np.sum(scaled**2)) / (self.whole.count * len(self.dynamics.outputs))
+            if self.sums is not None and self.whole is self.segments:
+                squares = self.sums.squares(self.dynamics, self.numbers(c, w, tilt), self.segments)
+                total = float(np.sum(np.diag(squares) / self.deviation**2))
+            else:
+                errors = errors_of(self.dynamics, self.numbers(c, w, tilt), self.whole.start, self.whole)
+                total = float(np.sum((errors / self.deviation[:, None]) ** 2))
+            mean = total / (self.whole.count * len(self.dynamics.outputs))
         return mean if mean < RUNAWAY else np.nan

@@ -146,13 +146,14 @@ def estimate(
     if isinstance(baseline, Motion):
         if lags is not None or initial is not None or ensemble:
             raise InputError("a motion has no `lags`, no `initial` and no `ensemble`; leave them out.")
-        check_record(record, flies=True)
+        check_record(record, moves=True)
         assert isinstance(record, Record)
         learner = over_states(learner, baseline)
         problem = pose_for(record, baseline, learner, output_weights)
         options = {"structure": structure, "criterion": criterion or DEFAULT, "solver": solver, "fallback": fallback}
         options |= {"regularization": regularization, "restarts": restarts, "seed": seed, "validation": validation}
-        return fit_motion(problem, learner=learner, blocks=_check_blocks(blocks), progress=progress, **options)
+        options |= {"blocks": _check_blocks(blocks), "progress": progress, "engine": engine or InMemory()}
+        return fit_motion(problem, learner=learner, **options)
     _check_record(record, baseline, lags, learner, initial)
     criterion = Prediction() if criterion is None else criterion
     model = initial.model if isinstance(initial, Estimate) else initial
@@ -162,7 +163,6 @@ def estimate(
     if model is not None:
         inputs = tuple(str(entry) for entry in model.form.features.entries)
     check_type(criterion, Criterion, "criterion", "Prediction(…) or Simulation(…)")
-    check_record(record, flies=not criterion.one_step)
     problem, engine = posed_on(record, engine, baseline, lags, inputs, output_weights=output_weights)
     return fit(
         problem,
@@ -207,7 +207,7 @@ def fit(
     Args:
         problem: record, physics and learner inputs; the other arguments as of `estimate`.
         learner: None for physics alone, on the rows of the problem.
-        engine: where the rows of a one-step criterion are, and who sums over them.
+        engine: where the rows are, or segments of a free run, and who sums over them.
         checkpoints: where the states of its runs are kept, to go on from; None to keep none.
 
     Raises:
@@ -222,13 +222,12 @@ def fit(
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
     check_starts(restarts if initial is None else 1, seed, ensemble=ensemble)
     check_solver(solver, criterion, () if learner is None else choices)
-    if initial is None:
-        _check_cost(problem, learner, solver, restarts * len(choices))
     warm, told = None, ()
     if initial is not None:
         task, weights, warm = _warm_start(problem, initial, engine)
         starts = [PlannedRun(0, weights, choice) for choice in choices]
     else:
+        _check_cost(problem, learner, solver, restarts * len(choices))
         problem, learner, told = independent_terms(problem, learner)
         task = OneStepTask.of(problem, learner, engine=engine)
         starts = _starts(task.bound, range(seed, seed + restarts), choices)
@@ -238,7 +237,8 @@ def fit(
         estimate = conclude(task, structure, task.physics_learned())
         estimate = replace(estimate, status=replace(estimate.status, start_loss=estimate.status.loss))
     else:
-        trained = replace(task, checkpoints=checkpoints) if solved else FreeRunTask.of(task, criterion, warm)
+        task = replace(task, checkpoints=checkpoints)
+        trained = task if solved else FreeRunTask.of(task, criterion, warm)
         chosen = Choice(validation, blocks if initial is None else 0, fallback, ensemble, scored=auto and solved)
         estimate = train(trained, starts, structure, solver, chosen, progress)
         if _splits(structure) and estimate.status.ok and estimate.model.form.bound is not None:
@@ -354,7 +354,7 @@ def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStep
 
 
 def _check_record(record: Any, baseline: Any, lags: Any, learner: Any, initial: Any) -> None:
-    check_record(record, flies=False)
+    check_record(record)
     check_type(baseline, Baseline, "baseline", "a Baseline or a Motion")
     check_type(lags, Lags | None, "lags", "Lags(…) or None")
     check_type(learner, Learner | None, "learner", "a learner such as MLP(), or None")

@@ -7,13 +7,13 @@ from functools import cached_property
 
 import numpy as np
 
-from orthaug._base.errors import InputError
 from orthaug.data.regressors import Features
 from orthaug.fitting.course import Course, Layout
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.elimination import eliminate
 from orthaug.fitting.initial_states import InitialStates
 from orthaug.fitting.one_step import OneStepTask
+from orthaug.fitting.segment_sums import SegmentSums
 from orthaug.fitting.segments import lay_segments
 from orthaug.fitting.structured_objective import StructuredObjective
 from orthaug.fitting.structures import Structure
@@ -34,17 +34,15 @@ class FlightPlan(Course):
         """Lay the problem's record out as a criterion of several steps declares.
 
         Raises:
-            InputError: nothing would be scored, or the rows are not in memory.
+            InputError: nothing would be scored.
         """
-        if not task.engine.resident:
-            raise InputError("a free run needs its rows in memory; train one step ahead, or take the default engine.")
-        problem, flown = task.problem, criterion.flown
+        problem, flown, sums = task.problem, criterion.flown, SegmentSums.of(task.engine)
         assert flown is not None, "one step ahead is `OneStepTask`'s"
         dynamics = Lagged(problem.baseline, problem.features, problem.layout, problem.outputs, task.bound)
         return cls(
             record=problem.record,
             dynamics=dynamics,
-            **Layout.of(problem.record, dynamics, criterion)._asdict(),
+            **Layout.of(problem.record, dynamics, criterion, shares=task.engine.shares)._asdict(),
             criterion=criterion,
             flown=flown,
             rms=task.rms,
@@ -52,6 +50,7 @@ class FlightPlan(Course):
             output_weights=problem.weight.choice,
             scaling=task.scaling,
             unit=task.unit,
+            sums=sums,
             task=task,
         )
 
@@ -69,11 +68,16 @@ class FlightPlan(Course):
         alone, task = replace(self.dynamics, features=Features(()), bound=None), self.task.alone
         return replace(self, task=task, dynamics=alone, scaling=task.scaling, unit=task.unit)
 
+    @property
+    def lengthens(self) -> bool:
+        """Whether whole experiments can be segments to train on."""
+        return True
+
     def over(self, segment: int) -> FlightPlan:
         """The same over segments of another length; 0 for whole experiments."""
         washout = min(self.flown.washout, segment // 2) if segment else self.flown.washout
         flown = replace(self.flown, segment=segment, washout=washout)
-        segments = lay_segments(self.record, self.dynamics, segment, washout)
+        segments = lay_segments(self.record, self.dynamics, segment, washout, shares=self.shares)
         return replace(self, segments=segments, flown=flown)
 
     def objective(self, structure: Structure) -> StructuredObjective:
@@ -91,6 +95,7 @@ class FlightPlan(Course):
             physics=len(self.problem.baseline.names),
             bounds=None if free else (elimination.lower, elimination.upper),
             colour=self.colour,
+            sums=self.sums,
             task=self.task,
             elimination=elimination,
         )

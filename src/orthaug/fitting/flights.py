@@ -7,8 +7,8 @@ so that no run ends above physics alone.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.progress import RunTell, quiet
 from orthaug._base.warning import Warning
 from orthaug.fitting.block_scores import FreeRunScores
+from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.course import Flight
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.initial_states import Start
@@ -67,6 +68,10 @@ class FlightTask(ABC):
         regularization: str | float,
     ) -> list[Place]:
         """Where a run from the weights w may start; arguments as in `estimate`."""
+
+    def keeping(self, checkpoints: Checkpoints | None) -> Self:
+        """The same with the states of its descents kept."""
+        return replace(self, plan=replace(self.plan, checkpoints=checkpoints))
 
     @property
     def problem(self) -> Any:
@@ -205,9 +210,9 @@ class FlightTask(ABC):
 
     def _scores(self, run: Flight) -> FreeRunScores | None:
         """What robust standard errors are made of; None for a run that ended nowhere."""
-        flown, linear, objective = run.end.flown, run.end.linear, run.objective
-        if linear is None or not run.end.ending.usable:
+        if run.end.linear is None or not run.end.ending.usable:
             return None
+        objective, flown, slope = self.plan.looked_at(run.objective, run.end)
         rows = objective.start_rows
         missed = np.moveaxis(objective.initial.measured - flown.states, -1, 1)
         return FreeRunScores(
@@ -217,7 +222,7 @@ class FlightTask(ABC):
             states=flown.states,
             weight=objective.weight,
             unit=objective.rms**2,
-            slope=linear.start.slope,
+            slope=slope,
             pull=missed @ (rows.T @ rows) if objective.initial.free else None,
         )
 

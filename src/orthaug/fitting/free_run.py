@@ -23,9 +23,11 @@ from orthaug.fitting.learned import Learned
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.physics_alone import fly_alone
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.source_plan import SourcePlan
 from orthaug.fitting.structured_objective import StructuredObjective
 from orthaug.fitting.structures import Structure
 from orthaug.models.learners import Bound
+from orthaug.physics.streamed import StreamedProblem
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,9 +47,10 @@ class FreeRunTask(FlightTask):
         """Lay the problem's record out as a criterion of several steps declares.
 
         Raises:
-            InputError: nothing would be scored, or the rows are not in memory.
+            InputError: nothing would be scored; whole experiments of rows that are not in memory.
         """
-        return cls(FlightPlan.of(task, criterion), None, warm)
+        plan = SourcePlan if isinstance(task.problem, StreamedProblem) else FlightPlan
+        return cls(plan.of(task, criterion), None, warm).keeping(task.checkpoints)
 
     @property
     def task(self) -> OneStepTask:

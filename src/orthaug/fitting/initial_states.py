@@ -8,7 +8,7 @@ in a segment's measured lags would be a disturbance that the model has to explai
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -27,6 +27,13 @@ class Start(NamedTuple):
     """(c, w) there; None before anything was linearised."""
     offset: Float[np.ndarray, "k m n0"] | None = None
     slope: Float[np.ndarray, "k m n0 n"] | None = None
+    there: Any = None
+    """`Best` of the segments of an engine that keeps them, instead of `offset` and `slope`."""
+
+    @property
+    def follows(self) -> bool:
+        """Whether it is known how the best states follow (c, w)."""
+        return self.slope is not None or self.there is not None
 
     def at(self, unknowns: Vector) -> Float[np.ndarray, "k n0 m"] | None:
         """The best states to first order where (c, w) is `unknowns`; None where that is not known."""
@@ -59,17 +66,28 @@ class InitialStates:
         if not self.free:
             return shared[:-1, :-1], shared[:-1, -1], None, None
         own = np.moveaxis(np.asarray(sensitivity.own), -1, 1)  # (k, m, n0, n0+n+1)
-        n0 = own.shape[2]
-        prior = rows.T @ rows
         missed = np.moveaxis(self.measured - values, -1, 1)
-        inner = own[..., :n0] + prior
-        across, right = own[..., n0:-1], own[..., -1] + missed @ prior
         try:
-            solved = np.linalg.solve(inner, np.concatenate([across, right[..., None]], axis=-1))
+            return without_states(shared, own, missed, rows.T @ rows, np)
         except np.linalg.LinAlgError:  # states that no output shows: no normal equations, and the trial is rejected
             nothing = np.full_like(shared[:-1, :-1], np.nan)
             return nothing, nothing[0], None, None
-        slope, offset = solved[..., :-1], solved[..., -1]
-        hessian = shared[:-1, :-1] - np.tensordot(across, slope, axes=([0, 1, 2], [0, 1, 2]))
-        gradient = shared[:-1, -1] - np.tensordot(across, offset, axes=([0, 1, 2], [0, 1, 2]))
-        return (hessian + hessian.T) / 2, gradient, offset, slope
+
+
+def without_states(shared: Any, own: Any, missed: Any, prior: Any, xp: Any) -> tuple[Any, Any, Any, Any]:
+    """Normal matrix and right-hand side of (c, w), offset and slope of the states: a Schur complement per segment.
+
+    Args:
+        own: (…, n0, n0 + n + 1), of the segments in front.
+        missed: (…, n0), measured states less those that were run from.
+        prior: (n0, n0), LᵀL.
+        xp: NumPy, which raises where a block is singular, or JAX, which gives no finite numbers.
+    """
+    n0, segments = own.shape[-2], tuple(range(own.ndim - 1))
+    inner = own[..., :n0] + prior
+    across, right = own[..., n0:-1], own[..., -1] + missed @ prior
+    solved = xp.linalg.solve(inner, xp.concatenate([across, right[..., None]], axis=-1))
+    slope, offset = solved[..., :-1], solved[..., -1]
+    hessian = shared[:-1, :-1] - xp.tensordot(across, slope, axes=(segments, segments))
+    gradient = shared[:-1, -1] - xp.tensordot(across, offset, axes=(segments, segments))
+    return (hessian + hessian.T) / 2, gradient, offset, slope

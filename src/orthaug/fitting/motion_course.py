@@ -15,6 +15,7 @@ from orthaug.fitting.course import Course, Layout
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.initial_states import InitialStates
 from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, errors_of
+from orthaug.fitting.segment_sums import SegmentSums
 from orthaug.fitting.segments import Segments, begins_of, lay_segments
 from orthaug.fitting.structures import Structure
 from orthaug.models.dynamics import Numbers
@@ -46,7 +47,12 @@ class MotionCourse(Course):
 
     @classmethod
     def of(
-        cls, problem: MotionProblem, bound: Bound | None, criterion: Criterion, like: MotionCourse | None = None
+        cls,
+        problem: MotionProblem,
+        bound: Bound | None,
+        criterion: Criterion,
+        like: MotionCourse | None = None,
+        sums: SegmentSums | None = None,
     ) -> MotionCourse:
         """Lay a record out as a criterion of several steps declares, for the motion with a learner of unit scaling.
 
@@ -61,10 +67,11 @@ class MotionCourse(Course):
         substeps = problem.substeps if like is None else like.dynamics.substeps
         dynamics = Moving(problem.motion, features, bound, record.sampling_time, substeps)
         nz, nl = len(features), 0 if bound is None else bound.ny
+        shares = 1 if sums is None else sums.engine.shares
         return cls(
             record=record,
             dynamics=dynamics,
-            **Layout.of(record, dynamics, criterion, like)._asdict(),
+            **Layout.of(record, dynamics, criterion, like, shares)._asdict(),
             criterion=criterion,
             flown=flown,
             rms=1.0,
@@ -72,6 +79,7 @@ class MotionCourse(Course):
             output_weights=problem.weight.choice,
             scaling=Scaling(np.zeros(nz), np.ones(nz)),
             unit=np.ones(nl),
+            sums=sums,
             problem=problem,
             loose=LOOSE * sizes(problem),
         )
@@ -88,7 +96,7 @@ class MotionCourse(Course):
 
     def over(self, segment: int) -> MotionCourse:
         """The same over segments of another length, without washout; 0 for whole experiments."""
-        segments = lay_segments(self.record, self.dynamics, segment, 0)
+        segments = lay_segments(self.record, self.dynamics, segment, 0, shares=self.shares)
         return replace(self, segments=segments, flown=replace(self.flown, segment=segment, washout=0))
 
     def refined(self, substeps: int) -> MotionCourse:
@@ -97,7 +105,7 @@ class MotionCourse(Course):
         finer = replace(self, dynamics=dynamics)
         if dynamics.motion.hold != "spline":  # otherwise steps read the input at the points of the substeps
             return finer
-        laid = Layout.of(self.record, dynamics, self.criterion)
+        laid = Layout.of(self.record, dynamics, self.criterion, shares=self.shares)
         segments = laid.segments if self.flown == self.criterion.flown else finer.over(self.flown.segment).segments
         start = np.asarray(self.segments.start)
         return replace(finer, segments=segments._replace(start=start), whole=laid.whole, colour=laid.colour)
@@ -119,6 +127,7 @@ class MotionCourse(Course):
             physics=len(self.problem.motion.parameters),
             bounds=self.problem.motion.coordinates.bounds,
             colour=None,
+            sums=self.sums,
             loose=self.loose,
         )
 

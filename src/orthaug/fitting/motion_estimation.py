@@ -9,6 +9,7 @@ from orthaug._base.checks import check_count, check_type
 from orthaug._base.jax import jax
 from orthaug._base.progress import SILENT, Tell
 from orthaug.data.record import Record
+from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.motion_conclusion import conclude_motion
 from orthaug.fitting.motion_estimates import MotionEstimate
@@ -19,6 +20,7 @@ from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.fitting.training import Choice, PlannedRun, train
 from orthaug.models.learners import Learner
+from orthaug.models.rows import Engine, InMemory
 from orthaug.physics.motion import Motion
 from orthaug.physics.motion_problem import MotionProblem, pose_motion
 
@@ -53,6 +55,8 @@ def fit_motion(
     fallback: bool = True,
     validation: Record | None = None,
     progress: Tell = SILENT,
+    engine: Engine = InMemory(),  # noqa: B008  (frozen)
+    checkpoints: Checkpoints | None = None,
 ) -> MotionEstimate:
     """`estimate` for a motion that is posed already; arguments as there.
 
@@ -66,7 +70,7 @@ def fit_motion(
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
     check_starts(restarts, seed, ensemble=False)
     check_solver(solver, criterion, () if learner is None else choices)
-    task = MotionTask.of(problem, learner, criterion)
+    task = MotionTask.of(problem, learner, criterion, engine).keeping(checkpoints)
     starts = [PlannedRun(seed, (), "none")]
     if task.bound is not None:
         keyed = {s: task.bound.init(jax.random.key(s)) for s in range(seed, seed + restarts)}

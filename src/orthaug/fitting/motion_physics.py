@@ -90,9 +90,13 @@ def _descended(
 
 def _follows(course: MotionCourse, flight: Flight) -> bool:
     """Whether the runs follow most of what the outputs do."""
-    with np.errstate(all="ignore"):
-        left = np.sum((flight.end.flown.errors / course.deviation[:, None]) ** 2)
-    return bool(left < _POOR**2 * course.residuals)
+    return bool(_left(course, flight) < _POOR**2 * course.residuals)
+
+
+def _left(course: MotionCourse, flight: Flight) -> float:
+    """The sum of squared errors, each output in its deviation; infinite where they are too large to square."""
+    squares = flight.objective.squares(flight.end.flown)
+    return np.inf if squares is None else float(np.sum(np.diag(squares) / course.deviation**2))
 
 
 def _fine_enough(course: MotionCourse, flight: Flight, solver: LevenbergMarquardt) -> tuple[MotionCourse, Flight]:
@@ -118,8 +122,7 @@ def moved_by(course: MotionCourse, finer: MotionCourse, flight: Flight) -> float
     scored = np.asarray(course.segments.scored)[:, :, None]
     with np.errstate(all="ignore"):
         moved = np.where(scored, runs[1] - runs[0], 0.0) / course.deviation[:, None]
-        left = flown.errors / course.deviation[:, None]
-        ratio = np.sqrt(np.sum(moved**2) / max(np.sum(left**2), 1e-300))
+        ratio = np.sqrt(np.sum(moved**2) / max(_left(course, flight), 1e-300))
     return float(ratio) if np.isfinite(ratio) else 0.0
 
 

@@ -18,11 +18,12 @@ from orthaug.fitting.learned import ErrorStatistics, Learned
 from orthaug.fitting.motion_course import MotionCourse
 from orthaug.fitting.motion_measures import sizes_learned
 from orthaug.fitting.motion_physics import fly_motion
-from orthaug.fitting.segments import sensitivity
+from orthaug.fitting.segment_sums import SegmentSums
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Structure
 from orthaug.models.learners import Bound, Learner, Scaling
+from orthaug.models.rows import Engine
 from orthaug.models.terms import scaling_of
 from orthaug.physics.motion_problem import MotionProblem
 
@@ -37,7 +38,9 @@ class MotionTask(FlightTask):
     physics: Flight | None = None
 
     @classmethod
-    def of(cls, problem: MotionProblem, learner: Learner | None, criterion: Criterion) -> MotionTask:
+    def of(
+        cls, problem: MotionProblem, learner: Learner | None, criterion: Criterion, engine: Engine | None = None
+    ) -> MotionTask:
         """Bind a learner to the equations and outputs that it is added to, and lay the record out.
 
         Raises:
@@ -45,7 +48,7 @@ class MotionTask(FlightTask):
         """
         states, outputs = problem.motion.learned
         bound = None if learner is None else Bound(learner, len(problem.features), len(states) + len(outputs))
-        return cls(MotionCourse.of(problem, bound, criterion))
+        return cls(MotionCourse.of(problem, bound, criterion, sums=None if engine is None else SegmentSums.of(engine)))
 
     @property
     def bound(self) -> Bound | None:
@@ -57,7 +60,8 @@ class MotionTask(FlightTask):
 
     def on(self, record: Record) -> MotionTask:
         """The same motion on another record."""
-        course = MotionCourse.of(self.problem.on(record), self.bound, self.criterion, self.plan)
+        sums = None if self.plan.sums is None else SegmentSums.of(self.plan.sums.engine)
+        course = MotionCourse.of(self.problem.on(record), self.bound, self.criterion, self.plan, sums)
         return MotionTask(course)
 
     def physics_alone(self) -> tuple[MotionTask, Learned]:
@@ -79,10 +83,7 @@ class MotionTask(FlightTask):
         end, objective = run.end, run.objective
         if end.linear is None:
             return super().learned(run)
-        flown = end.flown
-        numbers, made = objective.numbers(flown.c, flown.w), (objective.segments, flown.states, objective.weight)
-        slopes = sensitivity(objective.dynamics, numbers, *made)
-        information = objective.initial.eliminate(slopes, flown.states, _LOOSER * objective.start_rows)[0]
+        information = objective.eliminated(end.flown, _LOOSER * objective.start_rows)[0]
         return super().learned(run._replace(end=end._replace(linear=end.linear._replace(information=information))))
 
     def prepared(self, solver: LevenbergMarquardt, structure: Structure, progress: RunTell = quiet) -> MotionTask:

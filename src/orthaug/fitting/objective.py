@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.fitting.colour import independent_share
+from orthaug.fitting.colour import independent_share, share_of, spectrum_size
 from orthaug.fitting.initial_states import InitialStates, Start
+from orthaug.fitting.segment_sums import SegmentSums
 from orthaug.fitting.segments import Segments, respond, sensitivity
 from orthaug.models.dynamics import Dynamics, Numbers
 
@@ -20,18 +21,22 @@ _LARGEST_ERROR = 1e120
 
 
 class Flown(NamedTuple):
-    """A trial at p: the unknown θ, c and w, the states that its segments started from, and the errors (k, T, ny, m)."""
+    """A trial at p: the unknown θ, c and w, the states that its segments started from, and the errors (k, T, ny, m).
+
+    Where an engine keeps the segments, their `squares` Σ e eᵀ (ny, ny) are known instead of the errors.
+    """
 
     p: Vector
     theta: Vector
     c: Vector
     w: Vector
     states: Float[np.ndarray, "k n0 m"]
-    errors: Float[np.ndarray, "k T ny m"]
+    errors: Float[np.ndarray, "k T ny m"] | None
     misfit: float
     """`‖r‖²` of the errors and the states; infinite where a free run diverges."""
     loss: float
     """The same with further rows, such as a structure's."""
+    squares: Matrix | None = None
 
 
 class LinearisedFreeRun(NamedTuple):
@@ -50,7 +55,8 @@ class FreeRunObjective:
 
     `numbers` makes a model's numbers of (c, w). `weight` (ny, ny) multiplies the errors of a step; `rms` is their unit,
     in whitened outputs; `deviation` (ny,) is that of the measured outputs. `physics` is nθ, and `bounds` are θ's.
-    `colour` holds longer segments, where the others are too short to show how long the errors remember.
+    `colour` holds longer segments, where the others are too short to show how long the errors remember. `sums` makes
+    the sums where an engine keeps the segments.
     """
 
     dynamics: Dynamics
@@ -63,6 +69,7 @@ class FreeRunObjective:
     physics: int
     bounds: tuple[Vector, Vector] | None = None
     colour: Segments | None = None
+    sums: SegmentSums | None = None
 
     @property
     def start_rows(self) -> Matrix:
@@ -76,26 +83,69 @@ class FreeRunObjective:
     def fly(self, p: Vector, start: Start) -> Flown:
         """A trial at p. The states follow p to first order. Where that does not lower the misfit, they stay."""
         theta, c, w = self.place(p)
-        following = start.at(np.concatenate([c, w])) if self.initial.free else None
-        trials = []
-        for states in (start.values,) if following is None else (following, start.values):
-            errors = self.errors(c, w, states, self.segments)
-            with np.errstate(all="ignore"):
-                total = float(np.sum(np.einsum("oi,ktim->ktom", self.weight, errors) ** 2))
-                total += self.initial.loss(states, self.start_rows)
-            trials.append((total if total < self._largest else np.inf, states, errors))
+        trials: list[Flown] = []
+        for follows in (True, False) if self.initial.free and start.follows else (False,):
+            total, states, errors, squares = self._tried(c, w, start, follows)
+            misfit = total if total < self._largest else np.inf
+            trials.append(Flown(p, theta, c, w, states, errors, misfit, misfit, squares))
             if total < start.misfit:
                 break
-        misfit, states, errors = min(trials, key=lambda trial: trial[0])
-        return Flown(p, theta, c, w, states, errors, misfit, misfit)
+        best = min(trials, key=lambda trial: trial.misfit)
+        if self.sums is not None and best is trials[0] and self.initial.free and start.follows:
+            return best._replace(states=self.sums.moved(start, np.concatenate([c, w]) - start.unknowns))
+        return best
+
+    def _tried(self, c: Vector, w: Vector, start: Start, follows: bool) -> tuple[float, Any, Any, Matrix | None]:
+        """`‖r‖²`, states, errors and their squares from the start's states, or from those that follow (c, w).
+
+        An engine's states stay where they are: given are those of the start.
+        """
+        unknowns = np.concatenate([c, w])
+        if self.sums is not None:
+            step = unknowns - start.unknowns if follows and start.unknowns is not None else None
+            made = (self.weight, self.start_rows)
+            total, squares = self.sums.tried(self.dynamics, self.numbers(c, w), self.segments, start, step, *made)
+            return total, start.values, None, squares
+        states: Any = start.at(unknowns) if follows else start.values
+        errors = self.errors(c, w, states, self.segments)
+        with np.errstate(all="ignore"):
+            total = float(np.sum(np.einsum("oi,ktim->ktom", self.weight, errors) ** 2))
+            total += self.initial.loss(states, self.start_rows)
+        return total, states, errors, None
 
     def linearise(self, flown: Flown) -> LinearisedFreeRun:
         """Normal equations about a trial, with its states at their best."""
-        numbers, states = self.numbers(flown.c, flown.w), flown.states
-        slopes = sensitivity(self.dynamics, numbers, self.segments, states, self.weight)
-        information, gradient, offset, slope = self.initial.eliminate(slopes, flown.states, self.start_rows)
-        start = Start(flown.states, flown.misfit, np.concatenate([flown.c, flown.w]), offset, slope)
+        information, gradient, following = self.eliminated(flown, self.start_rows)
+        start = Start(flown.states, flown.misfit, np.concatenate([flown.c, flown.w]), **following)
         return LinearisedFreeRun(information, gradient, information, start)
+
+    def kept(self, flown: Flown) -> tuple[Any, ...]:
+        """What `again` makes the trial of, bit by bit."""
+        squares = np.zeros((0, 0)) if flown.squares is None else flown.squares
+        return flown.p, np.asarray(flown.states), flown.misfit, flown.loss, squares
+
+    def again(self, kept: tuple[Any, ...]) -> Flown:
+        """The trial that was `kept`."""
+        p, states, misfit, loss, squares = kept
+        theta, c, w = self.place(p)
+        known = self.sums is not None
+        errors = None if known else self.errors(c, w, states, self.segments)
+        return Flown(p, theta, c, w, states, errors, float(misfit), float(loss), squares if known else None)
+
+    def eliminated(self, flown: Flown, rows: Matrix) -> tuple[Matrix, Vector, dict[str, Any]]:
+        """Normal matrix and right-hand side of (c, w), L = `rows`, and how the states follow, as `Start` has it."""
+        numbers, states = self.numbers(flown.c, flown.w), flown.states
+        if self.sums is not None:
+            made = (self.dynamics, numbers, self.segments, self.initial, states, self.weight, rows)
+            information, gradient, there = self.sums.linearised(*made)
+            return information, gradient, {"there": there}
+        slopes = sensitivity(self.dynamics, numbers, self.segments, states, self.weight)
+        information, gradient, offset, slope = self.initial.eliminate(slopes, states, rows)
+        return information, gradient, {"offset": offset, "slope": slope}
+
+    def slope(self, start: Start) -> Float[np.ndarray, "k m n0 n"] | None:
+        """How the best states follow (c, w)."""
+        return start.slope if self.sums is None or start.there is None else self.sums.slope(start.there)
 
     def theta_information(self, linear: LinearisedFreeRun, w: Vector) -> Matrix:
         """The information of (θ, w), with θ as it is split from the learner."""
@@ -107,17 +157,42 @@ class FreeRunObjective:
 
     def samples(self, flown: Flown) -> tuple[float, float]:
         """Number of residuals less the physics' own parameters, and the share of them that is independent."""
-        errors = flown.errors
+        ny, errors = len(self.weight), flown.errors
+        segments, states = self.segments, flown.states
         if self.colour is not None:
-            long = self.errors(flown.c, flown.w, self.colour.start, self.colour)
-            errors = long if np.abs(long).max() < _LARGEST_ERROR else errors
-        moved = np.moveaxis(errors, 1, -1).swapaxes(1, 2)  # (k, m, ny, T)
-        ny = len(self.weight)
-        shares = [independent_share(moved[:, :, i].reshape(-1, moved.shape[-1])) for i in range(ny)]
+            long = self._colour_errors(flown)
+            if long is None:
+                segments, states = self.colour, self.colour.start
+            else:
+                errors = long if np.abs(long).max() < _LARGEST_ERROR else errors
+        if errors is not None:
+            moved = np.moveaxis(errors, 1, -1).swapaxes(1, 2)  # (k, m, ny, T)
+            shares = [independent_share(moved[:, :, i].reshape(-1, moved.shape[-1])) for i in range(ny)]
+        else:
+            shares = self._shares(flown, segments, states)
         return self.segments.count * ny - self.physics, float(np.mean(shares))
+
+    def _colour_errors(self, flown: Flown) -> Any:
+        """Errors of the longer segments; None where they are not in memory, or the run is lost there."""
+        if not isinstance(self.colour, Segments):
+            return None
+        return self.errors(flown.c, flown.w, self.colour.start, self.colour)
+
+    def _shares(self, flown: Flown, segments: Any, states: Any) -> list[float]:
+        """Independent shares of each output's errors, from sums; of the own segments where a longer run is lost."""
+        assert self.sums is not None
+        numbers = self.numbers(flown.c, flown.w)
+        for one, start in ((segments, states), (self.segments, flown.states)):
+            found = self.sums.spectra(self.dynamics, numbers, one, start, spectrum_size(one.steps))
+            if np.all(found[0] < _LARGEST_ERROR**2):
+                return [share_of(spectrum, one.steps, n) for spectrum, n in zip(*found, strict=True)]
+        return [1.0] * len(self.weight)
 
     def squares(self, flown: Flown) -> Matrix | None:
         """Σ e eᵀ (ny, ny) of a trial's errors, in the outputs' units; None where they are too large to square."""
+        if flown.errors is None:
+            found = flown.squares
+            return found if found is not None and np.abs(found).max(initial=0.0) < _LARGEST_ERROR**2 else None
         errors = np.moveaxis(flown.errors, 2, -1).reshape(-1, len(self.weight))
         return errors.T @ errors if np.abs(errors).max(initial=0.0) < _LARGEST_ERROR else None
 

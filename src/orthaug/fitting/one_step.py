@@ -82,8 +82,7 @@ class OneStepTask:
         whitened, spread = problem.unexplained_sizes(centred=bound is not None)
         rms = float(np.sqrt(np.mean(whitened**2)))
         scaling = scaling_of(learner, z) if scaling is None else scaling
-        unit = np.asarray(OUTPUT_UNIT * spread if unit is None else unit)
-        unit = unit if bound is not None else np.zeros_like(unit)
+        unit = np.asarray(OUTPUT_UNIT * spread if unit is None else unit) * (bound is not None)
         gain = problem.weight.matrix * unit / rms
         if isinstance(problem, StreamedProblem):
             laying = problem.laying(scaling.centre, scaling.halfwidth, rms, gain)
@@ -352,7 +351,10 @@ class OneStepTask:
         return from_chunks(row_values(self.bound, w, self.rows.z), len(self.problem.rows)) * self.unit
 
     def share_of(self, w: Vector) -> Vector:
-        """QᵀF (nθ,) of the learner with the weights w, in whitened outputs; the rows are in memory."""
+        """QᵀF (nθ,) of the learner with the weights w, in whitened outputs."""
+        if not self.engine.resident or isinstance(self.problem, StreamedProblem):
+            sums = self.engine.sum(LearnerSums(self.bound), self.rows, w, None, self._nothing.values)
+            return np.asarray(sums[0]) * self.rms
         return self.problem.projection.coordinates(self.problem.weight.rows(self.values(w)))
 
     def share_slope(self, w: Vector) -> Matrix:

@@ -43,7 +43,7 @@ def fly_alone(
         ends.append(plan.descend(objective, starts[int(np.argmin(losses))], solver, tell))
     if not np.isfinite(losses[0]) or not ends or not np.isfinite(ends[0].mean_square):
         ends += _lengthening(plan, solver, structure, starts)
-    if plan.whole is not plan.segments:
+    if plan.whole is not plan.segments and plan.lengthens:
         ends += _over_whole(plan, solver, structure, starts, ends)
     best = _best(ends)
     spent = {"iterations": sum(e.iterations for e in ends), "seconds": sum(e.seconds for e in ends)}

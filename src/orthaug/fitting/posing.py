@@ -42,9 +42,12 @@ def _engine_of(source: Source) -> Engine:
     return Stream()
 
 
-def check_record(record: Any, *, flies: bool) -> None:
-    """Raise InputError for what holds no rows, or none in memory where a free run needs them."""
+def check_record(record: Any, *, moves: bool = False) -> None:
+    """Raise InputError for what holds no rows, or none in memory where a motion needs them."""
     if not isinstance(record, Source):
         check_type(record, Record, "record", "a Record")
-    elif flies and not isinstance(record, Record):
-        raise InputError("a free run, and a motion, need their rows in memory; give a Record.")
+    elif moves and not isinstance(record, Record):
+        raise InputError(
+            "a motion takes a Record, whose segments an engine may share out; read these rows into memory "
+            "(read_record, Record.join), or fit the physics in its lagged form."
+        )

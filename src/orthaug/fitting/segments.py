@@ -17,7 +17,7 @@ from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import Differentiated, Dynamics, Numbers
 from orthaug.models.rows import gram
 
-_CHUNK = 256  # segments that run side by side
+CHUNK = 256  # segments that run side by side
 _BLOCK = 1 << 15  # numbers: slopes that are known at once
 _FEWEST = 8  # steps for which that pays
 
@@ -43,9 +43,9 @@ class Segments(NamedTuple):
 
 
 def lay_segments(
-    record: Record, dynamics: Dynamics, segment: int, washout: int, like: Segments | None = None
+    record: Record, dynamics: Dynamics, segment: int, washout: int, like: Segments | None = None, shares: int = 1
 ) -> Segments:
-    """Segments of `segment` steps; 0 for whole experiments.
+    """Segments of `segment` steps; 0 for whole experiments. The number of chunks is a multiple of `shares`.
 
     With `like` they are padded to its shape where they are fewer or shorter, so that the same programs run over them.
 
@@ -60,9 +60,9 @@ def lay_segments(
     for experiment, rows in zip(record.experiments, usable, strict=True):
         inputs = dynamics.inputs(experiment, record)
         begins = begins_of(rows, steps, washout)
-        pieces += [_segment(experiment, inputs, begin, steps, washout, dynamics) for begin in begins]
+        pieces += [segment_of(experiment, inputs, begin, steps, washout, dynamics) for begin in begins]
     count = len(pieces)
-    chunks = -(-count // _CHUNK)
+    chunks = -(-count // (CHUNK * shares)) * shares
     width = -(-count // chunks)
     width += -width % 8 if width > 8 else 0  # about as many segments run by the same program
     if like is not None and chunks * width <= like.scored.shape[0] * like.scored.shape[2]:
@@ -79,7 +79,9 @@ def begins_of(rows: int, steps: int, washout: int) -> list[int]:
     return [begin for begin in range(0, rows, steps - washout) if begin == 0 or begin + washout < rows]
 
 
-def _segment(experiment: Experiment, inputs: Any, begin: int, steps: int, washout: int, dynamics: Dynamics) -> Segments:
+def segment_of(
+    experiment: Experiment, inputs: Any, begin: int, steps: int, washout: int, dynamics: Dynamics
+) -> Segments:
     """One segment. Where the experiment is shorter, its end is repeated."""
     rows = np.arange(begin, begin + steps)
     there = np.minimum(rows, len(inputs) - 1)
@@ -95,13 +97,18 @@ def respond(
 ) -> Float[Array, "k T ny m"]:
     """Outputs of every segment from its state."""
     numbers = dynamics.prepared(numbers)
+    return jax.lax.map(lambda chunk: chunk_response(dynamics, numbers, *chunk), (states, segments.inputs))
+
+
+def chunk_response(dynamics: Dynamics, numbers: Numbers, states: Any, inputs: Any) -> Float[Array, "T ny m"]:
+    """Outputs of the segments of one chunk, of prepared numbers."""
     side_by_side = jax.vmap(partial(dynamics.step, numbers), in_axes=-1, out_axes=-1)
 
     def step(state: Any, inputs: Any) -> tuple[Any, Any]:
         state, parts = side_by_side(state, inputs)
         return state, parts.total
 
-    return jax.lax.map(lambda chunk: jax.lax.scan(step, *chunk)[1], (states, segments.inputs))
+    return jax.lax.scan(step, states, inputs)[1]
 
 
 class Sensitivity(NamedTuple):
@@ -123,20 +130,26 @@ def sensitivity(
 ) -> Sensitivity:
     """Gram matrices of the sensitivities `∂ŷ/∂(start, c, w)` and the error, rows multiplied by `weight`."""
     numbers = dynamics.prepared(numbers)
-    _, n0, width = segments.start.shape
     n = dynamics.unknowns
-    at_once = _BLOCK // (width * (n0 + len(dynamics.outputs)) * (n0 + n)) if n0 else 0
-    blocks = isinstance(dynamics, Differentiated) and at_once >= _FEWEST
-    advance = partial(_steps_at_once, at_once) if blocks else _step_by_step
 
     def one_chunk(total: Any, chunk: tuple[Any, ...]) -> tuple[Any, Any]:
-        state, *rows = chunk
-        nothing = (jnp.zeros((n + 1, n + 1)), jnp.zeros((n0, n0 + n + 1, width)))
-        shared, own = advance(dynamics, numbers, (state, dynamics.first_slopes(width), *nothing), rows, weight)
+        shared, own = chunk_sensitivity(dynamics, numbers, chunk, weight)
         return total + shared, own
 
     rows = (states, segments.inputs, segments.target, segments.scored)
     return Sensitivity(*jax.lax.scan(one_chunk, jnp.zeros((n + 1, n + 1)), rows))
+
+
+def chunk_sensitivity(dynamics: Dynamics, numbers: Numbers, chunk: tuple[Any, ...], weight: Any) -> Sensitivity:
+    """The same of one chunk (states, inputs, target, scored), of prepared numbers."""
+    state, *rows = chunk
+    n0, width = state.shape
+    n = dynamics.unknowns
+    at_once = _BLOCK // (width * (n0 + len(dynamics.outputs)) * (n0 + n)) if n0 else 0
+    blocks = isinstance(dynamics, Differentiated) and at_once >= _FEWEST
+    advance = partial(_steps_at_once, at_once) if blocks else _step_by_step
+    nothing = (jnp.zeros((n + 1, n + 1)), jnp.zeros((n0, n0 + n + 1, width)))
+    return Sensitivity(*advance(dynamics, numbers, (state, dynamics.first_slopes(width), *nothing), rows, weight))
 
 
 def _step_by_step(dynamics: Dynamics, numbers: Numbers, carry: Any, rows: Any, weight: Any) -> tuple[Any, Any]:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import jax
 from orthaug.data.sources import Source
 from orthaug.models.rows import CHUNK_ROWS, Chunk, chunk_shape, in_chunks
-from orthaug.models.streaming import Laid, chunks_of, summed
+from orthaug.models.streaming import Beside, Laid, apart, chunks_of, folded, summed, together
 
 _SINGLE_THREADED = {
     "OMP_NUM_THREADS": "1",
@@ -32,6 +33,17 @@ _SINGLE_THREADED = {
 """Of a worker of a local cluster: there is one for each core."""
 _BRANCHES = 8  # partial sums that one task adds up
 _PATIENCE = "20 s"  # to reach a scheduler
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """Futures of groups of chunks, and how many chunks each has."""
+
+    futures: list[Any]
+    counts: tuple[int, ...]
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self.futures)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +59,7 @@ class Dask:
 
     def lay(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> list[Any]:
         """Rows that are in memory here, sent to the workers."""
-        workers = max(len(self.client.scheduler_info()["workers"]), 1)
+        workers = self.shares
         shape = chunk_shape(len(z), min(self.limit, -(-len(z) // workers)))
         pieces = (in_chunks(z, shape, repeat=True), *(in_chunks(piece, shape) for piece in (q, e, gain)))
         chunks = [Chunk(*parts) for parts in zip(*pieces, strict=True)]
@@ -65,11 +77,56 @@ class Dask:
     def sum(self, function: Callable[..., Any], rows: Sequence[Any], *arguments: Any) -> Any:
         given = jax.tree.map(np.asarray, arguments)
         with told():
-            parts = [self.client.submit(_partial_sum, function, part, given, pure=False) for part in rows]
-            while len(parts) > 1:
-                groups = [parts[i : i + _BRANCHES] for i in range(0, len(parts), _BRANCHES)]
-                parts = [self.client.submit(_added, group, pure=False) for group in groups]
-            return self.client.gather(parts[0])
+            return self._added([self.client.submit(_partial_sum, function, part, given, pure=False) for part in rows])
+
+    def _added(self, parts: list[Any]) -> Any:
+        """The sum of partial sums, in their order."""
+        while len(parts) > 1:
+            groups = [parts[i : i + _BRANCHES] for i in range(0, len(parts), _BRANCHES)]
+            parts = [self.client.submit(_added, group, pure=False) for group in groups]
+        return self.client.gather(parts[0])
+
+    @property
+    def shares(self) -> int:
+        return max(len(self.client.scheduler_info()["workers"]), 1)
+
+    def place(self, chunks: Any, like: Sequence[Any] | None = None) -> Held:
+        pieces = apart(chunks)
+        each = -(-len(pieces) // min(self.shares, len(pieces)))
+        whole, rest = divmod(len(pieces), each)
+        counts = like.counts if isinstance(like, Held) else (*[each] * whole, *([rest] if rest else []))
+        ends = np.cumsum(counts).tolist()
+        with told():
+            groups = [pieces[end - count : end] for end, count in zip(ends, counts, strict=True)]
+            return Held([self.client.submit(_kept, group, pure=False) for group in groups], tuple(counts))
+
+    def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> Held:
+        with told():
+            return Held([self._on(partial(_listed, function), partition) for partition in partitions], tuple(counts))
+
+    def along(self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any) -> Any:
+        with told():
+            for partition in partitions:
+                held = getattr(partition, "held", ())
+                bare = replace(partition, held=()) if held else partition
+                carry = self.client.submit(_carried, function, bare, carry, *held, pure=False)
+            return self.client.gather(carry)
+
+    def beside(self, *rows: Held) -> Held:
+        with told():
+            return Held([self.client.submit(_beside, parts, pure=False) for parts in zip(*rows, strict=True)],
+                        rows[0].counts)  # fmt: skip
+
+    def keep(self, function: Callable[..., Any], rows: Held, *arguments: Any) -> tuple[Held, Any]:
+        given = jax.tree.map(np.asarray, arguments)
+        with told():
+            both = [self.client.submit(_folded, function, part, given, pure=False) for part in rows]
+            kept, parts = ([self.client.submit(itemgetter(i), one, pure=False) for one in both] for i in (0, 1))
+            return Held(kept, rows.counts), self._added(parts)
+
+    def fetch(self, rows: Held) -> Any:
+        with told():
+            return together([chunk for group in self.client.gather(list(rows)) for chunk in group])
 
     def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
         """A function of every partition, where the workers are."""
@@ -93,8 +150,25 @@ def _where_held(function: Callable[[Any], Any], partition: Any, *held: Any) -> A
     return function(partition.on(*held))
 
 
-def _kept(chunks: list[Chunk]) -> list[Chunk]:
+def _listed(function: Callable[[Any], Any], partition: Any) -> list[Any]:
+    return list(function(partition))
+
+
+def _carried(function: Callable[[Any, Any], Any], partition: Any, carry: Any, *held: Any) -> Any:
+    return function(partition.on(*held) if held else partition, carry)
+
+
+def _kept(chunks: list[Any]) -> list[Any]:
     return chunks
+
+
+def _beside(parts: Sequence[list[Any]]) -> list[Any]:
+    return list(Beside(tuple(parts)))
+
+
+def _folded(function: Callable[..., Any], chunks: Sequence[Any], arguments: tuple[Any, ...]) -> tuple[list[Any], Any]:
+    """What one partition keeps, and its share of a sum."""
+    return folded(function, chunks, arguments)
 
 
 def _partial_sum(function: Callable[..., Any], chunks: Sequence[Chunk], arguments: tuple[Any, ...]) -> Any:

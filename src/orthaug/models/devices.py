@@ -6,9 +6,10 @@ shards.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, reduce
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,10 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax
 from orthaug._base.parallel import in_threads
-from orthaug.models.rows import CHUNK_ROWS, Chunk, brought, chunk_shape, in_chunks, row_sum
+from orthaug.models.rows import CHUNK_ROWS, Chunk, all_chunks, brought, chunk_shape, in_chunks, row_fold
 
 _ROWS = "rows"
+_ONE_AT_A_TIME = threading.Lock()  # devices that wait for each other in two programs would wait for ever
 
 
 @dataclass(frozen=True)
@@ -31,15 +33,9 @@ class Devices:
     resident: bool = False
 
     def lay(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Chunk:
-        mesh, shares = _mesh(self.count)
-        shape = _even(chunk_shape(-(-len(z) // shares), self.limit), shares)
-        sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec(_ROWS))
-
-        def sharded(values: Any, repeat: bool = False) -> Any:
-            chunks = in_chunks(np.asarray(values), shape, repeat=repeat)
-            return jax.make_array_from_callback(chunks.shape, sharding, lambda index: chunks[index])
-
-        return Chunk(sharded(z, repeat=True), *map(sharded, (q, e, gain)))
+        shape = _even(chunk_shape(-(-len(z) // self.shares), self.limit), self.shares)
+        laid: Any = [in_chunks(np.asarray(part), shape, repeat=j == 0) for j, part in enumerate((z, q, e, gain))]
+        return self.place(Chunk(*laid))
 
     def draw(self, source: Any, laying: Callable[[Any], Any]) -> Chunk:
         return self.lay(*brought(source, laying))
@@ -48,7 +44,42 @@ class Devices:
         return in_threads(function, partitions)
 
     def sum(self, function: Callable[..., Any], rows: Chunk, *arguments: Any) -> Any:
-        return _compiled(function, self.count, len(arguments))(rows, *arguments)
+        return self._run(_total, function, rows, arguments)
+
+    @property
+    def shares(self) -> int:
+        return _mesh(self.count)[1]
+
+    def place(self, chunks: Any, like: Any = None) -> Any:
+        sharding = jax.sharding.NamedSharding(_mesh(self.count)[0], jax.sharding.PartitionSpec(_ROWS))
+
+        def sharded(values: Any) -> Any:
+            held = np.asarray(values)
+            return jax.make_array_from_callback(held.shape, sharding, lambda index: held[index])
+
+        return jax.tree.map(sharded, chunks)
+
+    def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> Any:
+        def even(part: Any) -> Any:
+            return np.concatenate([part, np.zeros((-len(part) % self.shares, *part.shape[1:]), part.dtype)])
+
+        return self.place(jax.tree.map(even, all_chunks(function, partitions)))
+
+    def along(self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any) -> Any:
+        return reduce(lambda carry, partition: function(partition, carry), partitions, carry)
+
+    def beside(self, *rows: Any) -> Any:
+        return rows
+
+    def keep(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> tuple[Any, Any]:
+        return self._run(_both, function, rows, arguments)
+
+    def fetch(self, rows: Any) -> Any:
+        return jax.tree.map(np.asarray, rows)
+
+    def _run(self, compiled: Callable[..., Any], function: Any, rows: Any, arguments: tuple[Any, ...]) -> Any:
+        with _ONE_AT_A_TIME:
+            return jax.block_until_ready(compiled(function, self.count, len(arguments))(rows, *arguments))
 
 
 def _even(shape: tuple[int, int], shares: int) -> tuple[int, int]:
@@ -63,13 +94,26 @@ def _mesh(count: int | None) -> tuple[Any, int]:
 
 
 @cache
-def _compiled(function: Callable[..., Any], count: int | None, arguments: int) -> Any:
+def _total(function: Callable[..., Any], count: int | None, arguments: int) -> Any:
     """Each device sums over its own chunks; then all of them have the sum."""
+    return _compiled(lambda *given: (None, function(*given)), count, arguments, second=True)
+
+
+@cache
+def _both(function: Callable[..., Any], count: int | None, arguments: int) -> Any:
+    """The same beside what each device keeps."""
+    return _compiled(function, count, arguments)
+
+
+def _compiled(function: Callable[..., Any], count: int | None, arguments: int, second: bool = False) -> Any:
     spec = jax.sharding.PartitionSpec
     mesh, _ = _mesh(count)
 
-    def share(chunks: Chunk, *given: Any) -> Any:
-        return jax.lax.psum(row_sum(lambda chunk: function(chunk, *given), chunks), _ROWS)
+    def share(chunks: Any, *given: Any) -> Any:
+        kept, total = row_fold(lambda chunk: function(chunk, *given), chunks)
+        total = jax.lax.psum(total, _ROWS)
+        return total if second else (kept, total)
 
     specs = (spec(_ROWS), *(spec() for _ in range(arguments)))
-    return jax.jit(jax.shard_map(share, mesh=mesh, in_specs=specs, out_specs=spec(), check_vma=False))
+    out = spec() if second else (spec(_ROWS), spec())
+    return jax.jit(jax.shard_map(share, mesh=mesh, in_specs=specs, out_specs=out, check_vma=False))

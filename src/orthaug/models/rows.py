@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -72,6 +72,35 @@ class Engine(Protocol):
         """Σ function(chunk, *arguments) over all chunks; `function` is hashable, its result any pytree of arrays."""
         ...
 
+    @property
+    def shares(self) -> int:
+        """How many can sum at a time: chunks that are placed should be a multiple."""
+        ...
+
+    def place(self, chunks: Any, like: Any = None) -> Any:
+        """Chunks of any pytree, (k, …) each, as rows; where those of `like` are, which are as many."""
+        ...
+
+    def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> Any:
+        """Rows of the chunks, `counts` of each, that `function(partition)` gives one by one."""
+        ...
+
+    def along(self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any) -> Any:
+        """`carry = function(partition, carry)` over all partitions in their order."""
+        ...
+
+    def beside(self, *rows: Any) -> Any:
+        """Rows whose chunks are tuples of the chunks of others."""
+        ...
+
+    def keep(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> tuple[Any, Any]:
+        """Of `function(chunk, *arguments)`, a pair: the first as rows that stay where they are, Σ of the second."""
+        ...
+
+    def fetch(self, rows: Any) -> Any:
+        """What was placed or kept, (k, …) each, in NumPy."""
+        ...
+
 
 @dataclass(frozen=True)
 class InMemory:
@@ -94,10 +123,43 @@ class InMemory:
     def sum(self, function: Callable[..., Any], rows: Chunk, *arguments: Any) -> Any:
         return _compiled_sum(function, rows, arguments)
 
+    @property
+    def shares(self) -> int:
+        return 1
+
+    def place(self, chunks: Any, like: Any = None) -> Any:
+        return jax.tree.map(jax.device_put, chunks)
+
+    def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> Any:
+        return self.place(all_chunks(function, partitions))
+
+    def along(self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any) -> Any:
+        return reduce(lambda carry, partition: function(partition, carry), partitions, carry)
+
+    def beside(self, *rows: Any) -> Any:
+        return rows
+
+    def keep(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> tuple[Any, Any]:
+        return _compiled_fold(function, rows, arguments)
+
+    def fetch(self, rows: Any) -> Any:
+        return jax.tree.map(np.asarray, rows)
+
+
+@partial(jax.jit, static_argnames="function")
+def _compiled_fold(function: Callable[..., Any], rows: Any, arguments: tuple[Any, ...]) -> tuple[Any, Any]:
+    return row_fold(lambda chunk: function(chunk, *arguments), rows)
+
 
 @partial(jax.jit, static_argnames="function")
 def _compiled_sum(function: Callable[..., Any], rows: Chunk, arguments: tuple[Any, ...]) -> Any:
     return row_sum(lambda chunk: function(chunk, *arguments), rows)
+
+
+def all_chunks(function: Callable[[Any], Any], partitions: Sequence[Any]) -> Any:
+    """The chunks that a function gives of every partition, (k, …) each."""
+    chunks = [chunk for partition in partitions for chunk in function(partition)]
+    return jax.tree.map(lambda *parts: np.stack(parts), *chunks)
 
 
 def brought(source: Any, laying: Callable[[Any], Any]) -> tuple[np.ndarray, ...]:
@@ -108,11 +170,21 @@ def brought(source: Any, laying: Callable[[Any], Any]) -> tuple[np.ndarray, ...]
 
 def row_sum(function: Callable[[Any], Any], rows: Any) -> Any:
     """Σ function(chunk) over the leading axis of every array in `rows`; any pytree in, any pytree out."""
+    return row_fold(lambda chunk: (None, function(chunk)), rows)[1]
+
+
+def row_fold(function: Callable[[Any], tuple[Any, Any]], rows: Any) -> tuple[Any, Any]:
+    """Of function(chunk), a pair: the first ones (k, …), and Σ of the second."""
     function = jax.jit(function)  # traced once for its shape and the sum
     first = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), rows)
-    zero = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(function, first))
-    total, _ = jax.lax.scan(lambda acc, chunk: (jax.tree.map(jnp.add, acc, function(chunk)), None), zero, rows)
-    return total
+    zero = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(function, first)[1])
+
+    def step(total: Any, chunk: Any) -> tuple[Any, Any]:
+        kept, share = function(chunk)
+        return jax.tree.map(jnp.add, total, share), kept
+
+    total, kept = jax.lax.scan(step, zero, rows)
+    return kept, total
 
 
 def chunk_shape(rows: int, limit: int = CHUNK_ROWS) -> tuple[int, int]:

@@ -9,7 +9,7 @@ import queue
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, reduce
 from typing import Any
 
 import numpy as np
@@ -61,6 +61,72 @@ class Stream:
     def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
         """A function of every partition, as many at a time as there are cores."""
         return in_threads(function, partitions)
+
+    @property
+    def shares(self) -> int:
+        return 1
+
+    def place(self, chunks: Any, like: Any = None) -> list[Any]:
+        return apart(chunks)
+
+    def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> Read:
+        return Read(function, partitions)
+
+    def along(self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any) -> Any:
+        return reduce(lambda carry, partition: function(partition, carry), partitions, carry)
+
+    def beside(self, *rows: Iterable[Any]) -> Beside:
+        return Beside(rows)
+
+    def keep(self, function: Callable[..., Any], rows: Iterable[Any], *arguments: Any) -> tuple[list[Any], Any]:
+        return folded(function, rows, arguments)
+
+    def fetch(self, rows: Iterable[Any]) -> Any:
+        return together(list(rows))
+
+
+@dataclass(frozen=True, eq=False)
+class Read:
+    """Chunks of partitions, read at every pass."""
+
+    function: Callable[[Any], Any]
+    partitions: Sequence[Any]
+
+    def __iter__(self) -> Iterator[Any]:
+        return (chunk for partition in self.partitions for chunk in self.function(partition))
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """Chunks of several rows, as tuples."""
+
+    rows: tuple[Iterable[Any], ...]
+
+    def __iter__(self) -> Iterator[Any]:
+        return zip(*self.rows, strict=True)
+
+
+def apart(chunks: Any) -> list[Any]:
+    """Chunks (k, …) of any pytree one by one."""
+    leaves, form = jax.tree.flatten(jax.tree.map(np.asarray, chunks))
+    return [jax.tree.unflatten(form, parts) for parts in zip(*leaves, strict=True)]
+
+
+def together(chunks: Sequence[Any]) -> Any:
+    """The inverse of `apart`."""
+    return jax.tree.map(lambda *parts: np.stack(parts), *chunks)
+
+
+def folded(function: Callable[..., Any], rows: Iterable[Any], arguments: tuple[Any, ...]) -> tuple[list[Any], Any]:
+    """Of function(chunk, *arguments), a pair: the first ones on the host, and Σ of the second."""
+    arguments = jax.tree.map(jax.numpy.asarray, arguments)
+    first, _ = _compiled(function)
+    kept, total = [], None
+    for chunk in read_ahead(rows):
+        own, share = jax.tree.map(np.asarray, first(chunk, *arguments))
+        kept.append(own)
+        total = share if total is None else jax.tree.map(np.add, total, share)
+    return kept, total
 
 
 def summed(function: Callable[..., Any], rows: Iterable[Chunk], arguments: tuple[Any, ...]) -> Any:

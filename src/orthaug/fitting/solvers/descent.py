@@ -10,6 +10,7 @@ Where the rows of a one-step criterion are in memory, the loop is compiled whole
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -108,6 +109,30 @@ class Descent(NamedTuple):
     """p of every accepted trial, the start first."""
 
 
+class Pause(NamedTuple):
+    """A descent between two steps, in arrays: it goes on from there at the same bits."""
+
+    flown: Any
+    """What the objective needs to make the last accepted trial again."""
+    ridge: Any
+    damping: Any
+    growth: Any
+    small: Any
+    path: Any
+    coloured: Any
+    counts: Any
+    ending: Any
+
+
+class _Counts(NamedTuple):
+    """Steps that were tried, accepted ones before the last, whether evidence has begun, and the loss of the start."""
+
+    done: int
+    taken: int
+    begun: bool
+    first_loss: float
+
+
 class _Iterate(NamedTuple):
     """An accepted trial, and what the rest of the run knows of the way there."""
 
@@ -141,6 +166,7 @@ def descend(
     ceiling: float = np.inf,
     bounds: tuple[Vector, Vector] | None = None,
     progress: RunTell = quiet,
+    kept: Any = None,
 ) -> Descent:
     """Minimise `‖r‖² + α‖w‖²` from p.
 
@@ -152,19 +178,24 @@ def descend(
             none are needed (w = 0 is its fixed point).
         ceiling: a trial with a larger `‖r‖²` is rejected.
         bounds: of θ, each (physics,); the start is moved inside.
+        kept: where pauses are kept; a descent goes on from the last one.
     """
     began = training_clock()
     limits = tuple(np.full(len(p), side) for side in (-np.inf, np.inf))
     if bounds is not None:
         for limit, side in zip(limits, bounds, strict=True):
             limit[: objective.physics] = side
-    flown = objective.fly(np.clip(p, *limits), start)
-    linear = objective.linearise(flown) if np.isfinite(flown.loss) else None
-    if linear is None or not np.isfinite(linear.hessian).all():
-        return Descent(flown, None, ridge, 0.0, 0, Ending.NON_FINITE, training_clock() - began)
-    largest = 1.0 if damping.diagonal else float(np.diag(linear.hessian).max(initial=1e-300))
-    iterate, first_loss = _Iterate(flown, linear, ridge, damping.first * largest, path=(flown.p,)), flown.loss
-    ending, done, taken, begun = Ending.RUNNING, 0, 1, not evidence_settled
+    paused = None if kept is None else kept.state()
+    if paused is not None:
+        iterate, (done, taken, begun, first_loss), ending = _resumed(objective, paused)
+    else:
+        flown = objective.fly(np.clip(p, *limits), start)
+        linear = objective.linearise(flown) if np.isfinite(flown.loss) else None
+        if linear is None or not np.isfinite(linear.hessian).all():
+            return Descent(flown, None, ridge, 0.0, 0, Ending.NON_FINITE, training_clock() - began)
+        largest = 1.0 if damping.diagonal else float(np.diag(linear.hessian).max(initial=1e-300))
+        iterate, first_loss = _Iterate(flown, linear, ridge, damping.first * largest, path=(flown.p,)), flown.loss
+        ending, done, taken, begun = Ending.RUNNING, 0, 1, not evidence_settled
     while ending is Ending.RUNNING and done < iterations:
         iterate, ending = _trial(objective, iterate, limits, tolerance, damping, ceiling)
         if evidence and not begun:
@@ -177,9 +208,27 @@ def descend(
         taken = len(iterate.path)
         done += 1
         progress(done, iterate.flown.loss)
+        if kept is not None:
+            counts = _Counts(done, taken, begun, first_loss)
+            kept.keep(partial(_paused, objective, iterate, counts, ending), ended=ending is not Ending.RUNNING)
     effective = effective_weights(iterate.linear.hessian, iterate.ridge, objective.physics)
     seconds = training_clock() - began
     return Descent(iterate.flown, iterate.linear, iterate.ridge, effective, done, ending, seconds, iterate.path)
+
+
+def _paused(objective: Any, iterate: _Iterate, counts: _Counts, ending: Ending) -> Pause:
+    own = (iterate.ridge, iterate.damping, iterate.growth, iterate.small)
+    held = (objective.kept(iterate.flown), *own, np.stack(iterate.path), iterate.coloured)
+    return Pause(*held, np.array(counts, dtype=float), int(ending))
+
+
+def _resumed(objective: Any, paused: Pause) -> tuple[_Iterate, _Counts, Ending]:
+    flown = objective.again(paused.flown)
+    ridge, damping, growth = (float(paused[i]) for i in (1, 2, 3))
+    path, done = tuple(paused.path), paused.counts.tolist()
+    iterate = _Iterate(flown, objective.linearise(flown), ridge, damping, growth, int(paused.small), path)
+    counts = _Counts(int(done[0]), int(done[1]), bool(done[2]), done[3])
+    return iterate._replace(coloured=bool(paused.coloured)), counts, Ending(int(paused.ending))
 
 
 def _trial(

@@ -1,0 +1,127 @@
+"""The course of a lagged model over rows that stay in a source."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import Vector
+from orthaug._base.errors import InputError
+from orthaug.data.record import Record
+from orthaug.data.sources import Source
+from orthaug.fitting.course import COLOUR_ROWS, COLOURED_STEPS, Looked
+from orthaug.fitting.criteria import Criterion
+from orthaug.fitting.flight_plan import FlightPlan
+from orthaug.fitting.initial_states import InitialStates, Start
+from orthaug.fitting.objective import RUNAWAY, FreeRunObjective
+from orthaug.fitting.one_step import OneStepTask
+from orthaug.fitting.rules import check_scored
+from orthaug.fitting.segment_sums import SegmentSums
+from orthaug.fitting.segments import lay_segments
+from orthaug.fitting.solvers.descent import Descent
+from orthaug.fitting.source_runs import WholeRuns
+from orthaug.fitting.source_segments import Found, SourceSegments, look
+from orthaug.models.lagged import Lagged
+from orthaug.physics.streamed import StreamedProblem
+
+_SETTLING = 4  # Gauss-Newton steps of a witness's states
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SourcePlan(FlightPlan):
+    """A source's rows cut into segments where an engine reads or keeps them. `record` is a witness of them."""
+
+    source: Source
+    found: Found
+    empty: Record
+
+    @classmethod
+    def of(cls, task: OneStepTask, criterion: Criterion) -> SourcePlan:
+        """Cut the problem's source as a criterion of several steps declares.
+
+        Raises:
+            InputError: nothing would be scored; whole experiments as segments, which would have to fit into memory.
+        """
+        problem, flown, sums = task.problem, criterion.flown, SegmentSums(task.engine)
+        assert flown is not None and isinstance(problem, StreamedProblem)
+        if not flown.segment:
+            raise InputError(
+                "`segment` is 0, whole experiments, which need their rows in memory; give a number of steps, such as "
+                "512, or a Record."
+            )
+        dynamics = Lagged(problem.baseline, problem.features, problem.layout, problem.outputs, task.bound)
+        empty, source, washout = problem.basis.form.empty, problem.source, flown.washout
+        found = Found.of(task.engine.passes(look, source.partitions))
+        longest = max(found.rows) - dynamics.first_row
+        check_scored(criterion, longest)
+        made = (task.engine, source, found, dynamics, empty)
+        segments: Any = SourceSegments.cut(*made, flown.segment, washout)
+        whole: Any = segments
+        colour: Any = None
+        if criterion.simulates:
+            count = sum(max(rows - dynamics.first_row - min(washout, longest - 1), 0) for rows in found.rows)
+            whole = WholeRuns(task.engine, source.partitions, empty, min(washout, longest - 1), count)
+            if segments.steps < COLOURED_STEPS <= longest:
+                colour = SourceSegments.cut(*made, 0, washout, COLOUR_ROWS)
+        return cls(
+            record=problem.record,
+            dynamics=dynamics,
+            segments=segments,
+            whole=whole,
+            colour=colour,
+            criterion=criterion,
+            flown=flown,
+            rms=task.rms,
+            deviation=problem.deviation,
+            output_weights=problem.weight.choice,
+            scaling=task.scaling,
+            unit=task.unit,
+            sums=sums,
+            task=task,
+            source=source,
+            found=found,
+            empty=empty,
+        )
+
+    @property
+    def lengthens(self) -> bool:
+        return False
+
+    def over(self, segment: int) -> SourcePlan:
+        """The same over segments of another length."""
+        washout = min(self.flown.washout, segment // 2)
+        flown = replace(self.flown, segment=segment, washout=washout)
+        made = (self.task.engine, self.source, self.found, self.dynamics, self.empty)
+        segments: Any = SourceSegments.cut(*made, segment, washout)
+        return replace(self, segments=segments, flown=flown)
+
+    def mean_square(self, c: Vector, w: Any, tilt: Any = None) -> float:
+        if not isinstance(self.whole, WholeRuns):
+            return super().mean_square(c, w, tilt)
+        with np.errstate(all="ignore"):
+            squares = self.whole.squares(self.dynamics, self.numbers(c, w, tilt))
+            mean = float(np.sum(squares / self.deviation**2)) / (self.whole.count * len(self.deviation))
+        return mean if mean < RUNAWAY else np.nan
+
+    def looked_at(self, objective: FreeRunObjective, end: Descent) -> Looked:
+        """The segments of the witness; where that is all rows, with the states that were trained."""
+        flown = self.flown
+        segments = lay_segments(self.record, self.dynamics, flown.segment, flown.washout)
+        initial = InitialStates(np.asarray(segments.start), objective.initial.free)
+        p, start = end.flown.p, Start(initial.measured)
+        seen = replace(objective, segments=segments, initial=initial, sums=None, colour=None)
+        if len(self.record) == sum(self.found.rows):
+            trained: Any = self.segments
+            own = np.moveaxis(end.flown.states, 1, -1)[np.asarray(trained.there)]  # (segments, n0)
+            place = np.zeros((initial.measured.shape[0] * initial.measured.shape[2], own.shape[1]))
+            place[: len(own)] = own
+            k, n0, m = initial.measured.shape
+            start = Start(np.moveaxis(place.reshape(k, m, n0), -1, 1))
+        else:
+            for _ in range(_SETTLING if initial.free else 0):
+                start = seen.linearise(seen.fly(p, start)).start
+        there = seen.fly(p, start)
+        linear = seen.linearise(there)
+        return Looked(seen, there, linear.start.slope)
