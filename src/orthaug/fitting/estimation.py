@@ -37,10 +37,12 @@ from orthaug.inference.measures import Training
 from orthaug.models.learners import MLP, Bound, External, Function, Learner, Scaling
 from orthaug.models.model import Model
 from orthaug.models.rows import Engine, InMemory
+from orthaug.models.tasks import Tasks, runs_on
 from orthaug.models.terms import over_lags, over_states
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.motion import Motion
 from orthaug.physics.problem import Problem, pose
+from orthaug.physics.streamed import StreamedProblem
 
 Regularization = str | float
 
@@ -205,7 +207,8 @@ def fit(
     Args:
         problem: record, physics and learner inputs; the other arguments as of `estimate`.
         learner: None for physics alone, on the rows of the problem.
-        engine: where the rows of a one-step criterion are, and who sums over them.
+        engine: where the rows of a one-step criterion are, and who sums over them. On a cluster several runs over rows
+            that are in memory are tasks, each whole on one worker, and so are their held-out blocks.
         checkpoints: where the states of its runs are kept, to go on from; None to keep none.
 
     Raises:
@@ -222,6 +225,9 @@ def fit(
     check_solver(solver, criterion, () if learner is None else choices)
     if initial is None:
         _check_cost(problem, learner, solver, restarts * len(choices))
+    if len(choices) * (restarts if initial is None else 1) > 1 and not isinstance(problem, StreamedProblem):
+        engine = runs_on(engine)
+    checkpoints = None if isinstance(engine, Tasks) else checkpoints  # a worker may have another disk
     warm, told = None, ()
     if initial is not None:
         task, weights, warm = _warm_start(problem, initial, engine)
@@ -238,7 +244,7 @@ def fit(
     else:
         trained = replace(task, checkpoints=checkpoints) if solved else FreeRunTask.of(task, criterion, warm)
         chosen = Choice(validation, blocks if initial is None else 0, fallback, ensemble, scored=auto and solved)
-        estimate = train(trained, starts, structure, solver, chosen, progress)
+        estimate = train(trained, starts, structure, solver, chosen, progress, runner=engine)
         if _splits(structure) and estimate.status.ok and estimate.model.form.bound is not None:
             estimate = estimate.split(structure.measure)
     estimate = replace(estimate, warnings=(*told, *estimate.warnings))

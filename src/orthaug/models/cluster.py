@@ -20,6 +20,7 @@ from orthaug import __version__
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jax
+from orthaug._base.parallel import Threads
 from orthaug.data.sources import Source
 from orthaug.models.rows import CHUNK_ROWS, Chunk, chunk_shape, in_chunks
 from orthaug.models.streaming import Laid, chunks_of, summed
@@ -35,7 +36,7 @@ _PATIENCE = "20 s"  # to reach a scheduler
 
 
 @dataclass(frozen=True, eq=False)
-class Dask:
+class Dask(Threads):
     """Rows on the workers of a cluster.
 
     `client` is a `distributed.Client`; `orthaug[dask]` brings it. `limit` is the rows of a chunk.
@@ -54,7 +55,7 @@ class Dask:
         each = -(-len(chunks) // workers)
         with told():
             groups = [chunks[i : i + each] for i in range(0, len(chunks), each)]
-            return [self.client.submit(_kept, group, pure=False) for group in groups]
+            return [self.client.submit(kept, group, pure=False) for group in groups]
 
     def draw(self, source: Source, laying: Callable[[Any], Iterator[Laid]]) -> list[Any]:
         """The partitions of a source, laid out where they will be summed."""
@@ -93,8 +94,9 @@ def _where_held(function: Callable[[Any], Any], partition: Any, *held: Any) -> A
     return function(partition.on(*held))
 
 
-def _kept(chunks: list[Chunk]) -> list[Chunk]:
-    return chunks
+def kept(value: Any) -> Any:
+    """What a worker keeps; made again from what the scheduler knows where that worker is lost."""
+    return value
 
 
 def _partial_sum(function: Callable[..., Any], chunks: Sequence[Chunk], arguments: tuple[Any, ...]) -> Any:

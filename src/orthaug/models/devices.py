@@ -16,14 +16,14 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax
-from orthaug._base.parallel import in_threads
+from orthaug._base.parallel import Threads, in_threads
 from orthaug.models.rows import CHUNK_ROWS, Chunk, brought, chunk_shape, in_chunks, row_sum
 
 _ROWS = "rows"
 
 
 @dataclass(frozen=True)
-class Devices:
+class Devices(Threads):
     """All rows in the memory of the devices, in equal shares; `count` of them, None for all there are."""
 
     count: int | None = None

@@ -7,7 +7,7 @@ know where the rows are.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import Array, jax, jnp
-from orthaug._base.parallel import in_threads
+from orthaug._base.parallel import Heard, Threads, in_threads, nobody
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
 from orthaug.models.learners import Bound
@@ -72,9 +72,13 @@ class Engine(Protocol):
         """Σ function(chunk, *arguments) over all chunks; `function` is hashable, its result any pytree of arrays."""
         ...
 
+    def map(self, function: Any, given: Any, items: Sequence[Any], heard: Heard = nobody) -> Iterator[Any]:
+        """Independent runs, `function(given, item, tell)` each; as `Threads.map`."""
+        ...
+
 
 @dataclass(frozen=True)
-class InMemory:
+class InMemory(Threads):
     """All rows on the device, summed by one compiled loop over chunks."""
 
     limit: int = CHUNK_ROWS
