@@ -160,12 +160,10 @@ def cross_validated(job: Job, blocks: int, variants: Sequence[Variant]) -> list[
     """Trials of every variant on every block; none where the record is too short for that."""
     from orthaug.analysis.validation import block_trials, cross_validate
 
-    def fit_of(variant: Variant) -> Any:
-        return lambda fold: job.run(variant.on(fold))
-
-    fits = [fit_of(variant) for variant in (Variant(ALONE), *variants)]
+    fits = [job.fold_fit(variant) for variant in (Variant(ALONE), *variants)]
     try:
-        errors = cross_validate(job.train.record, fits, blocks=blocks, start=job.first_row)
+        options: dict[str, Any] = {"start": job.first_row, "runner": job.runner}
+        errors = cross_validate(job.train.record, fits, blocks=blocks, **options)
     except InputError:
         return [[] for _ in variants]
     return [block_trials(errors, 1 + j) for j in range(len(variants))]

@@ -159,7 +159,6 @@ def _run(
     task: Task, starts: Sequence[PlannedRun], structure: Structure, solver: Solver, progress: Tell, runner: Any
 ) -> tuple[list[PlannedRun], list[Any]]:
     """Every planned run; one that fails is made again from the seeds that follow."""
-
     made, given = list(starts), (task, solver, structure)
     runs = list(runner.map(_one_run, given, made, progress))
     failed = [start for start, run in zip(made, runs, strict=True) if not run.ending.usable]

@@ -11,13 +11,13 @@ import uuid
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from orthaug._base.jax import jax
 from orthaug._base.parallel import Heard, Stopped, each, nobody, one_blas_thread, one_core
 from orthaug.models.cluster import Dask, kept, told
-from orthaug.models.rows import CHUNK_ROWS, InMemory
+from orthaug.models.rows import InMemory
 
 _WAIT = 0.5  # s between two looks at whether a run is still wanted, and two tellings of a run
 _ANY_SIZE = {"distributed.admin.large-graph-warning-threshold": "1 PB"}  # rows are sent on purpose, and once
@@ -31,6 +31,7 @@ class Tasks(InMemory):
     """
 
     client: Any = None
+    _sent: dict[int, Any] = field(default_factory=dict, compare=False, repr=False)
 
     def __reduce__(self) -> Any:
         return InMemory, (self.limit,)  # on a worker
@@ -42,11 +43,8 @@ class Tasks(InMemory):
         items: Sequence[Any],
         heard: Heard = nobody,
     ) -> Iterator[Any]:
-        """As `Threads.map`; the function, its arguments and results are pickled."""
-        from dask import config
-
-        with told(), config.set(_ANY_SIZE):
-            shared = self.client.submit(kept, Sealed((function, given)), pure=False)
+        """As `Threads.map`; the function, its arguments and results are pickled, `given` once while it is the same."""
+        shared = self._shared(given)
         with _heard_on(self.client) as (topic, said):
 
             def one(numbered: tuple[int, Any], check: Callable[[], None]) -> Any:
@@ -57,9 +55,19 @@ class Tasks(InMemory):
                     while said[i]:
                         heard(i, *said[i].popleft())
 
-                return ask(self.client, look, _made, shared, Sealed(item), topic, i)
+                return ask(self.client, look, _made, shared, Sealed((function, item)), topic, i)
 
             yield from each(one, list(enumerate(items)), places(self.client))
+
+    def _shared(self, given: Any) -> Any:
+        """What the workers know `given` by."""
+        from dask import config
+
+        if id(given) not in self._sent:
+            self._sent.clear()
+            with told(), config.set(_ANY_SIZE):
+                self._sent[id(given)] = given, self.client.submit(kept, Sealed(given), pure=False)
+        return self._sent[id(given)][1]
 
 
 def runs_on(engine: Any) -> Any:
@@ -121,14 +129,14 @@ class Sealed:
 def _unsealed(content: bytes) -> Sealed:
     import pickle
 
-    jax.config.jax_enable_x64  # noqa: B018  (what turns it on)
+    _ = jax.config  # what turns it on
     return Sealed(pickle.loads(content))
 
 
-def _made(shared: Sealed, item: Sealed, topic: str, number: int) -> Any:
+def _made(shared: Sealed, asked: Sealed, topic: str, number: int) -> Any:
     """A run on a worker. What it tells goes to the client, from time to time."""
+    from dask.context import thread_state
     from distributed import get_worker
-    from distributed.worker import thread_state
 
     worker, key, last = get_worker(), thread_state.key, time.monotonic()
 
@@ -143,5 +151,5 @@ def _made(shared: Sealed, item: Sealed, topic: str, number: int) -> Any:
         worker.log_event(topic, (number, tuple(float(value) for value in what)))
 
     with one_blas_thread(), one_core():
-        function, given = shared.value
-        return function(given, item.value, tell)
+        function, item = asked.value
+        return function(shared.value, item, tell)
