@@ -170,7 +170,7 @@ def open_lagged(path: Path, spec: Spec, *, require_full_rank: bool = True) -> La
             problem, _, left_out = independent_terms(problem, learner)
         problem.feature_rows()
         _check_scored(spec, problem)
-        _check_cost(spec, problem)
+        _check_cost(spec, problem, engine)
         weighed = weigh_problem(measure_of(spec, problem, path.parent), problem)
         _check_measure(weighed, problem)
         named: dict[str, Any] = {"path": path, "spec": spec, "train": train, "validation": validation, "tests": tests}
@@ -195,12 +195,12 @@ def _check_scored(spec: Spec, problem: Problem) -> None:
         raise InputError(f"'training.{error.key}'{error.words}.") from None
 
 
-def _check_cost(spec: Spec, problem: Problem) -> None:
+def _check_cost(spec: Spec, problem: Problem, engine: Engine) -> None:
     """`check_cost` before JAX is loaded."""
     sizes = {"rows": problem.count, "features": len(problem.features.entries), "outputs": len(problem.outputs)}
     runs = spec.runs(linear=problem.baseline.linear)
-    held = len(problem.rows)
-    check_cost(spec.declared_learner(), **sizes, held=held, iterations=spec.declared_solver().iterations, runs=runs)
+    options: dict[str, Any] = {"held": len(problem.rows), "iterations": spec.declared_solver().iterations, "runs": runs}
+    check_cost(spec.declared_learner(), **sizes, **options, room=engine.room())
 
 
 def structure_of(spec: Spec, kind: str | None = None, measure: Measure | None = None) -> Structure:

@@ -140,7 +140,7 @@ def _check_sizes(spec: Spec, problem: MotionProblem) -> None:
     except KeyedError as error:
         raise InputError(f"'{_place(error)}'{error.words}.") from None
     states, outputs = problem.motion.learned
-    sizes = {
+    sizes: dict[str, Any] = {
         "rows": len(problem.record),
         "features": len(problem.features),
         "outputs": max(len(states) + len(outputs), 1),

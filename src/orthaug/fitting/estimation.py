@@ -223,11 +223,11 @@ def fit(
     restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
     check_starts(restarts if initial is None else 1, seed, ensemble=ensemble)
     check_solver(solver, criterion, () if learner is None else choices)
-    if initial is None:
-        _check_cost(problem, learner, solver, restarts * len(choices))
     if len(choices) * (restarts if initial is None else 1) > 1 and not isinstance(problem, StreamedProblem):
         engine = runs_on(engine)
     checkpoints = None if isinstance(engine, Tasks) else checkpoints  # a worker may have another disk
+    if initial is None:
+        _check_cost(problem, learner, solver, restarts * len(choices), engine)
     warm, told = None, ()
     if initial is not None:
         task, weights, warm = _warm_start(problem, initial, engine)
@@ -260,10 +260,10 @@ def fit(
     return reweighted(estimate, again)
 
 
-def _check_cost(problem: Problem, learner: Learner | None, solver: Solver, runs: int) -> None:
+def _check_cost(problem: Problem, learner: Learner | None, solver: Solver, runs: int, engine: Engine) -> None:
     """Raise InputError for what would take more memory or time than there is."""
     sizes = {"rows": problem.count, "features": len(problem.features.entries), "outputs": len(problem.outputs)}
-    check_cost(learner, **sizes, held=len(problem.rows), iterations=solver.iterations, runs=runs)
+    check_cost(learner, **sizes, held=len(problem.rows), iterations=solver.iterations, runs=runs, room=engine.room())
 
 
 def _starts(bound: Bound | None, seeds: range, choices: Sequence[Regularization]) -> list[PlannedRun]:

@@ -6,6 +6,7 @@ of the partitions: whoever computes them, and however often after a worker was l
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -22,7 +23,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import jax
 from orthaug._base.parallel import Threads
 from orthaug.data.sources import Source
-from orthaug.models.rows import CHUNK_ROWS, Chunk, chunk_shape, in_chunks
+from orthaug.models.rows import CHUNK_ROWS, Chunk, Room, chunk_shape, in_chunks
 from orthaug.models.streaming import Laid, chunks_of, summed
 
 _SINGLE_THREADED = {
@@ -77,6 +78,10 @@ class Dask(Threads):
         with told():
             return self.client.gather([self._on(function, partition) for partition in partitions])
 
+    def room(self) -> Room:
+        """Of the smallest worker, which may have to add up a whole branch of the tree."""
+        return smallest_worker(self.client, _BRANCHES + 1)
+
     def _on(self, function: Callable[[Any], Any], partition: Any) -> Any:
         """A task; rows that the cluster holds already go to it by their futures."""
         held = getattr(partition, "held", ())
@@ -109,6 +114,15 @@ def _added(parts: Sequence[Any]) -> Any:
     for part in parts[1:]:
         total = jax.tree.map(np.add, total, part)
     return total
+
+
+def smallest_worker(client: Any, matrices: int) -> Room:
+    """The worker with the least memory; without a limit it is infinite."""
+    with told():
+        workers = client.scheduler_info(n_workers=-1)["workers"]
+    limits = {address: float(worker["memory_limit"] or math.inf) for address, worker in workers.items()}
+    smallest = min(limits, key=lambda address: limits[address], default="")
+    return Room(limits.get(smallest, math.inf), f"the worker {smallest}", matrices)
 
 
 @contextmanager

@@ -16,10 +16,12 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax
+from orthaug._base.memory import available
 from orthaug._base.parallel import Threads, in_threads
-from orthaug.models.rows import CHUNK_ROWS, Chunk, brought, chunk_shape, in_chunks, row_sum
+from orthaug.models.rows import CHUNK_ROWS, Chunk, Room, brought, chunk_shape, in_chunks, row_sum
 
 _ROWS = "rows"
+_MATRICES = 3  # the sum so far, what a chunk adds, and what all devices have
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,13 @@ class Devices(Threads):
 
     def sum(self, function: Callable[..., Any], rows: Chunk, *arguments: Any) -> Any:
         return _compiled(function, self.count, len(arguments))(rows, *arguments)
+
+    def room(self) -> Room:
+        """Of a device: its own memory, or a share of this machine's."""
+        devices = jax.devices()[: self.count]
+        own = [(device.memory_stats() or {}).get("bytes_limit", available() / len(devices)) for device in devices]
+        smallest = min(range(len(devices)), key=lambda i: own[i])
+        return Room(own[smallest], f"the device {devices[smallest]}", _MATRICES)
 
 
 def _even(shape: tuple[int, int], shares: int) -> tuple[int, int]:

@@ -47,6 +47,17 @@ class Overlap(NamedTuple):
     """QᵀF."""
 
 
+class Room(NamedTuple):
+    """The smallest of the places that add up apart from this process."""
+
+    size: float
+    """Its memory in bytes."""
+    place: str
+    """What it is called: "the worker tcp://…"."""
+    matrices: int
+    """Gram matrices that it holds at once, where sums are made and added."""
+
+
 @runtime_checkable
 class Engine(Protocol):
     """Where rows are, and who adds up over them."""
@@ -76,6 +87,10 @@ class Engine(Protocol):
         """Independent runs, `function(given, item, tell)` each; as `Threads.map`."""
         ...
 
+    def room(self) -> Room | None:
+        """Where memory may be short beside this process; None where all sums are made here."""
+        ...
+
 
 @dataclass(frozen=True)
 class InMemory(Threads):
@@ -97,6 +112,9 @@ class InMemory(Threads):
 
     def sum(self, function: Callable[..., Any], rows: Chunk, *arguments: Any) -> Any:
         return _compiled_sum(function, rows, arguments)
+
+    def room(self) -> Room | None:
+        return None
 
 
 @partial(jax.jit, static_argnames="function")

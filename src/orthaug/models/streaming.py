@@ -62,6 +62,9 @@ class Stream(Threads):
         """A function of every partition, as many at a time as there are cores."""
         return in_threads(function, partitions)
 
+    def room(self) -> None:
+        """None: all sums are made here."""
+
 
 def summed(function: Callable[..., Any], rows: Iterable[Chunk], arguments: tuple[Any, ...]) -> Any:
     """Σ function(chunk, *arguments), in the order of the rows."""

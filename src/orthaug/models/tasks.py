@@ -16,9 +16,10 @@ from typing import Any
 
 from orthaug._base.jax import jax
 from orthaug._base.parallel import Heard, Stopped, each, nobody, one_blas_thread, one_core
-from orthaug.models.cluster import Dask, kept, told
-from orthaug.models.rows import InMemory
+from orthaug.models.cluster import Dask, kept, smallest_worker, told
+from orthaug.models.rows import InMemory, Room
 
+_MATRICES = 3  # of a run in memory
 _WAIT = 0.5  # s between two looks at whether a run is still wanted, and two tellings of a run
 _ANY_SIZE = {"distributed.admin.large-graph-warning-threshold": "1 PB"}  # rows are sent on purpose, and once
 
@@ -58,6 +59,10 @@ class Tasks(InMemory):
                 return ask(self.client, look, _made, shared, Sealed((function, item)), topic, i)
 
             yield from each(one, list(enumerate(items)), places(self.client))
+
+    def room(self) -> Room:
+        """Of the smallest worker, which makes whole runs."""
+        return smallest_worker(self.client, _MATRICES)
 
     def _shared(self, given: Any) -> Any:
         """What the workers know `given` by."""
