@@ -228,7 +228,7 @@ def test_memory_for_the_matrices_of_a_learner_is_asked_of_the_workers(cluster, m
         with pytest.raises(oa.InputError, match=match.format(size)):
             oa.estimate(record, physics, engine=oa.Dask(cluster), restarts=restarts, **wide)
     monkeypatch.setattr("orthaug.models.devices.available", lambda: 1 << 30)
-    with pytest.raises(oa.InputError, match="the device .*CPU.* has 1 GiB"):
+    with pytest.raises(oa.InputError, match="the device cpu:0 has 1 GiB"):
         oa.estimate(record, physics, engine=oa.Devices(), **wide)
 
 
@@ -274,9 +274,11 @@ def in_memory(folder):
 
 def test_runs_on_a_cluster_have_the_bits_of_runs_here(folder, cluster, in_memory):
     """Two regularizations, the blocks that choose between them, and those of the verdict: whole runs are tasks."""
-    expected, found = tables(
-        folder, cluster, in_memory, lambda path: json.loads(fit_job(open_job(path)).result.to_json())
-    )
+
+    def fitted_to(path):
+        return json.loads(fit_job(open_job(path)).result.to_json())
+
+    expected, found = tables(folder, cluster, in_memory, fitted_to)
     for result in (expected, found):
         result["spec"].pop("engine"), result["status"].pop("seconds")
     assert found == expected
@@ -292,17 +294,16 @@ def test_a_selection_on_a_cluster_has_the_bits_of_one_here(folder, cluster, in_m
         timer.join()
         return found.selection
 
-    text = in_memory.replace("hidden = [3]", 'kind = "terms"\ndegree = 2').replace(
-        "[training]", '[training]\nfocus = "prediction"'
-    )
+    text = in_memory.replace("hidden = [3]", 'kind = "terms"\ndegree = 2')
+    text = text.replace("[training]", '[training]\nfocus = "prediction"')
+    workers = {*cluster.run(os.getpid).values()}
     expected, found = tables(folder, cluster, text, selected)
-    pd.testing.assert_frame_equal(
-        found.table.drop(columns="seconds"), expected.table.drop(columns="seconds"), check_exact=True
-    )
+    here, there = (one.table.drop(columns="seconds") for one in (expected, found))
+    pd.testing.assert_frame_equal(there, here, check_exact=True)
     assert found.learner == expected.learner and found.shares == expected.shares
-    (folder / "streamed.toml").write_text(
-        text.format(kind="stream", structure="orthogonal", regularization="0.1"), "utf-8"
-    )
+    assert {*cluster.run(os.getpid).values()}.isdisjoint(workers)
+    streamed = text.format(kind="stream", structure="orthogonal", regularization="0.1")
+    (folder / "streamed.toml").write_text(streamed, "utf-8")
     with pytest.raises(oa.InputError, match="found stream; expected memory, or dask, to select"):
         open_select(folder / "streamed.toml")
 

@@ -54,7 +54,8 @@ class Devices(Threads):
 
     def room(self) -> Room:
         """Of a device: its own memory, or a share of this machine's."""
-        devices = jax.devices()[: self.count]
+        own_process = jax.process_index()
+        devices = [device for device in jax.devices()[: self.count] if device.process_index == own_process]
         own = [(device.memory_stats() or {}).get("bytes_limit", available() / len(devices)) for device in devices]
         smallest = min(range(len(devices)), key=lambda i: own[i])
         return Room(own[smallest], f"the device {devices[smallest]}", _MATRICES)
