@@ -72,10 +72,16 @@ def keeping(job: Job, folder: Path, *, resume: bool = False) -> Job:
     """The job with the states of its training kept beside the result folder; with `resume` it goes on from them.
 
     Raises:
-        InputError: states of another fit.
+        InputError: states of another fit; hosts that do not run the same one.
     """
     from orthaug.fitting.checkpoints import Checkpoints
+    from orthaug.models import hosts
 
+    if job.spec.engine.kind == "devices" and hosts.several():
+        hosts.check_alike(job.fingerprint)
+        if resume:
+            raise InputError("--resume: a fit over several hosts keeps no states to go on from; leave it out.")
+        return job
     place = folder.with_name(f"{folder.name}.training")
     kept = Checkpoints(place, job.fingerprint, job.spec.engine.checkpoint)
     return replace(job, checkpoints=kept.opened(resume=resume))

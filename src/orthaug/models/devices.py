@@ -6,9 +6,9 @@ shards.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax
 from orthaug._base.memory import available
-from orthaug._base.parallel import Threads, in_threads
+from orthaug._base.parallel import Heard, Threads, in_threads, nobody
 from orthaug.models.rows import CHUNK_ROWS, Chunk, Room, brought, chunk_shape, in_chunks, row_sum
 
 _ROWS = "rows"
@@ -51,6 +51,11 @@ class Devices(Threads):
 
     def sum(self, function: Callable[..., Any], rows: Chunk, *arguments: Any) -> Any:
         return _compiled(function, self.count, len(arguments))(rows, *arguments)
+
+    def map(self, function: Any, given: Any, items: Sequence[Any], heard: Heard = nobody) -> Iterator[Any]:
+        """One after another: programs that share devices wait for each other, on all hosts in the same order."""
+        for i, item in enumerate(items):
+            yield function(given, item, partial(heard, i))
 
     def room(self) -> Room:
         """Of a device: its own memory, or a share of this machine's."""
