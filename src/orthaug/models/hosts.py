@@ -6,6 +6,8 @@ Every process reads all rows and takes every step; only the sums over rows are s
 from __future__ import annotations
 
 import os
+import socket
+import time
 from collections.abc import Mapping
 
 import numpy as np
@@ -36,12 +38,29 @@ def join(environment: Mapping[str, str] = os.environ) -> None:
         if text is not None and not text.isdecimal():
             raise InputError(f"{name}: found {shown(text)}; expected a whole number.")
         numbers[key] = None if text is None else int(text)
+    if numbers["process_id"]:
+        _await(address)
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     try:
         jax.distributed.initialize(address, **numbers, initialization_timeout=_PATIENCE)
     except (RuntimeError, ValueError) as error:
         first = str(error).splitlines()[0]
         raise InputError(f"the processes of {COORDINATOR}={address} do not find each other ({first}).") from None
+
+
+def _await(address: str) -> None:
+    """Wait until the first process listens; JAX itself would end the program without a word of ours."""
+    host, _, port = address.rpartition(":")
+    end = time.monotonic() + _PATIENCE
+    while True:
+        try:
+            socket.create_connection((host, int(port)), timeout=_PATIENCE).close()
+            return
+        except (OSError, ValueError, OverflowError) as error:
+            if time.monotonic() > end or not isinstance(error, OSError):
+                told = f"{COORDINATOR}={address}: no first process answers there ({type(error).__name__})."
+                raise InputError(told) from None
+        time.sleep(0.2)
 
 
 def several() -> bool:
