@@ -28,7 +28,7 @@ from orthaug.fitting.motion_estimation import DEFAULT, fit_motion, pose_for
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.posing import check_record, posed_on
 from orthaug.fitting.reweighting import reweighted
-from orthaug.fitting.rules import check_solver, check_starts, tried
+from orthaug.fitting.rules import check_solver, checked_starts, tried
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Orthogonal, Structure
@@ -220,12 +220,9 @@ def fit(
     conditions = {"linear": problem.baseline.linear, "validated": validation is not None}
     choices = tried(regularization, solver, criterion, structure, learner=learner, **conditions)
     auto = _check_regularizations(regularization, choices, validation is not None or blocks > 0)
-    restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
-    check_starts(restarts if initial is None else 1, seed, ensemble=ensemble)
+    restarts, seed = checked_starts(restarts, seed, warm=initial is not None, ensemble=ensemble)
     check_solver(solver, criterion, () if learner is None else choices)
-    if len(choices) * (restarts if initial is None else 1) > 1 and not isinstance(problem, StreamedProblem):
-        engine = runs_on(engine)
-    checkpoints = None if isinstance(engine, Tasks) else checkpoints  # a worker may have another disk
+    engine = _engine_of(engine, problem, len(choices) * (restarts if initial is None else 1))
     if initial is None:
         _check_cost(problem, learner, solver, restarts * len(choices), engine)
     warm, told = None, ()
@@ -242,7 +239,9 @@ def fit(
         estimate = conclude(task, structure, task.physics_learned())
         estimate = replace(estimate, status=replace(estimate.status, start_loss=estimate.status.loss))
     else:
-        trained = replace(task, checkpoints=checkpoints) if solved else FreeRunTask.of(task, criterion, warm)
+        trained = (
+            replace(task, checkpoints=_kept(checkpoints, engine)) if solved else FreeRunTask.of(task, criterion, warm)
+        )
         chosen = Choice(validation, blocks if initial is None else 0, fallback, ensemble, scored=auto and solved)
         estimate = train(trained, starts, structure, solver, chosen, progress, runner=engine)
         if _splits(structure) and estimate.status.ok and estimate.model.form.bound is not None:
@@ -258,6 +257,16 @@ def fit(
         return fit(problem, structure=structure, criterion=criterion, solver=solver, progress=progress, **more)
 
     return reweighted(estimate, again)
+
+
+def _engine_of(engine: Engine, problem: Problem, runs: int) -> Engine:
+    """With a cluster several runs over rows in memory are its tasks."""
+    return runs_on(engine) if runs > 1 and not isinstance(problem, StreamedProblem) else engine
+
+
+def _kept(checkpoints: Checkpoints | None, engine: Engine) -> Checkpoints | None:
+    """None for tasks: a worker may have another disk."""
+    return None if isinstance(engine, Tasks) else checkpoints
 
 
 def _check_cost(problem: Problem, learner: Learner | None, solver: Solver, runs: int, engine: Engine) -> None:

@@ -121,21 +121,27 @@ def _heard_on(client: Any) -> Iterator[tuple[str, dict[int, deque[Any]]]]:
 
 @dataclass(frozen=True, eq=False)
 class Sealed:
-    """A value that is unpickled in double precision only: JAX would cut its arrays where that is not turned on yet."""
+    """A value that reaches a worker in double precision: JAX would cut its arrays where that is not turned on yet."""
 
     value: Any
 
     def __reduce__(self) -> Any:
-        import cloudpickle
-
-        return _unsealed, (cloudpickle.dumps(self.value),)
+        return _sealed, (_Double(), self.value)  # made in this order there
 
 
-def _unsealed(content: bytes) -> Sealed:
-    import pickle
+class _Double:
+    """Turns on double precision where it arrives."""
 
+    def __reduce__(self) -> Any:
+        return _in_double, ()
+
+
+def _in_double() -> None:
     _ = jax.config  # what turns it on
-    return Sealed(pickle.loads(content))
+
+
+def _sealed(_: None, value: Any) -> Sealed:
+    return Sealed(value)
 
 
 def _made(shared: Sealed, asked: Sealed, topic: str, number: int) -> Any:

@@ -111,7 +111,7 @@ class Selection:
 
         `stage` is orders, terms or learner; `size` the number of lags, terms or weights; `score` the RMS error of free
         runs on held-out blocks in the output's unit, `standard_error` its own; `within` whether it is as good as the
-        best of its stage; `seconds` what it took.
+        best of its stage; `seconds` what it took (of orders and learners the sum over its fits).
         """
         import pandas as pd
 
