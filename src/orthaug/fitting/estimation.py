@@ -233,15 +233,13 @@ def fit(
         problem, learner, told = independent_terms(problem, learner)
         task = OneStepTask.of(problem, learner, engine=engine)
         starts = _starts(task.bound, range(seed, seed + restarts), choices)
-    solved, ensemble = criterion.one_step and problem.baseline.linear, ensemble and task.bound is not None
-    _check_ensemble(ensemble, problem)
+    solved = criterion.one_step and problem.baseline.linear
+    ensemble = _check_ensemble(ensemble and task.bound is not None, problem)
     if task.bound is None and solved:
         estimate = conclude(task, structure, task.physics_learned())
         estimate = replace(estimate, status=replace(estimate.status, start_loss=estimate.status.loss))
     else:
-        trained = (
-            replace(task, checkpoints=_kept(checkpoints, engine)) if solved else FreeRunTask.of(task, criterion, warm)
-        )
+        trained = _keeping(task, checkpoints) if solved else FreeRunTask.of(task, criterion, warm)
         chosen = Choice(validation, blocks if initial is None else 0, fallback, ensemble, scored=auto and solved)
         estimate = train(trained, starts, structure, solver, chosen, progress, runner=engine)
         if _splits(structure) and estimate.status.ok and estimate.model.form.bound is not None:
@@ -264,9 +262,9 @@ def _engine_of(engine: Engine, problem: Problem, runs: int) -> Engine:
     return runs_on(engine) if runs > 1 and not isinstance(problem, StreamedProblem) else engine
 
 
-def _kept(checkpoints: Checkpoints | None, engine: Engine) -> Checkpoints | None:
-    """None for tasks: a worker may have another disk."""
-    return None if isinstance(engine, Tasks) else checkpoints
+def _keeping(task: OneStepTask, checkpoints: Checkpoints | None) -> OneStepTask:
+    """With the states of its runs kept, unless they are a cluster's tasks: a worker may have another disk."""
+    return replace(task, checkpoints=None if isinstance(task.engine, Tasks) else checkpoints)
 
 
 def _check_cost(problem: Problem, learner: Learner | None, solver: Solver, runs: int, engine: Engine) -> None:
@@ -295,10 +293,11 @@ def _check_blocks(blocks: int) -> int:
     return blocks
 
 
-def _check_ensemble(ensemble: bool, problem: Problem) -> None:
-    """Raise InputError for a median of outputs that are mixed with each other."""
+def _check_ensemble(ensemble: bool, problem: Problem) -> bool:
+    """Whether there is one; raise InputError for a median of outputs that are mixed with each other."""
     if ensemble and problem.weight.choice == "covariance":
         raise InputError("an ensemble takes the median of each output; use `output_weights` std, none or numbers.")
+    return ensemble
 
 
 def _check_splittable(structure: Structure, baseline: Baseline, learner: Learner | None) -> None:
