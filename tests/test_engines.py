@@ -18,6 +18,7 @@ import pytest
 import orthaug as oa
 from orthaug.commands.fit import fit_job
 from orthaug.commands.opening import open_job
+from orthaug.commands.select import open_select, select_for
 from orthaug.commands.spec import load_spec
 from orthaug.data.sources import witness
 from orthaug.models.streaming import Stream
@@ -264,17 +265,41 @@ def pow_of(base, exp):
     return {"value": base**exp, "process": os.getpid()}
 
 
-def test_a_worker_that_is_killed_changes_nothing(folder, cluster):
-    """Its partitions are laid out again elsewhere; sums keep their order, so θ keeps its bits."""
+@pytest.mark.parametrize("count", [1, 2])
+def test_workers_that_are_killed_change_nothing(folder, cluster, count):
+    """Their partitions are laid out again elsewhere; sums keep their order, so θ keeps its bits."""
     before = on_cluster(folder, cluster)
     workers = cluster.run(os.getpid)
-    timer = threading.Timer(0.4, os.kill, (next(iter(workers.values())), signal.SIGKILL))
-    timer.start()
+    timers = [killed_in(0.4, process) for process in [*workers.values()][:count]]
     after = on_cluster(folder, cluster)
-    timer.join()
-    assert set(cluster.run(os.getpid).values()) != set(workers.values())
+    for timer in timers:
+        timer.join()
+    assert len({*cluster.run(os.getpid).values()} & {*workers.values()}) <= 2 - count
     assert [p["value"] for p in after["parameters"]] == [p["value"] for p in before["parameters"]]
     assert after["status"]["loss"] == pytest.approx(before["status"]["loss"], rel=1e-12)
+
+
+def killed_in(seconds, process):
+    timer = threading.Timer(seconds, os.kill, (process, signal.SIGKILL))
+    timer.start()
+    return timer
+
+
+def test_memory_for_the_matrices_of_a_learner_is_asked_of_the_workers(cluster, monkeypatch):
+    """Told before anything is sent; the limits are those that the scheduler knows."""
+    u = np.linspace(-1, 1, 300)
+    record, physics = oa.Record.from_arrays(u=u, y=u + u**3), oa.Baseline.from_terms([oa.Term("a", "u[k]")])
+    wide = {"learner": oa.MLP(hidden=(3000,)), "regularization": "none"}  # 9001 weights, 0.6 GiB a matrix
+    limits = {"workers": {"tcp://a:1": {"memory_limit": 8 << 30}, "tcp://b:1": {"memory_limit": 1 << 30}}}
+    monkeypatch.setattr(cluster, "scheduler_info", lambda **_: limits)
+    monkeypatch.setattr("orthaug._base.memory.available", lambda: math.inf)
+    match = "takes {} on each worker or device, for . matrices of its weights; the worker tcp://b:1 has 1 GiB"
+    for restarts, size in ((1, "5.43 GiB"), (2, "1.81 GiB")):  # sums over the workers; whole runs on them
+        with pytest.raises(oa.InputError, match=match.format(size)):
+            oa.estimate(record, physics, engine=oa.Dask(cluster), restarts=restarts, **wide)
+    monkeypatch.setattr("orthaug.models.devices.available", lambda: 1 << 30)
+    with pytest.raises(oa.InputError, match="the device cpu:0 has 1 GiB"):
+        oa.estimate(record, physics, engine=oa.Devices(), **wide)
 
 
 DEVICES = """
@@ -304,6 +329,58 @@ def test_devices_give_the_result_of_rows_in_memory(folder, in_memory):
         check_same(result, expected)
     for kind, other in in_memory.items():
         check_flown(json.loads((folder / f"{kind}.json").read_text()), other)
+
+
+def tables(folder, cluster, text, function):
+    """What a function gives for a spec in memory, and on a cluster."""
+    for kind, more in (("memory", ""), ("dask", f'scheduler = "{cluster.scheduler.address}"\n')):
+        path = folder / f"runs-{kind}.toml"
+        path.write_text(text.format(kind=kind, structure="orthogonal", regularization="[0.1, 1.0]") + more, "utf-8")
+        yield function(path)
+
+
+@pytest.fixture(scope="module")
+def held_here(folder):
+    """A spec whose rows are in memory wherever it is fitted."""
+    whole = pd.concat([pd.read_parquet(file) for file in sorted((folder / "runs").glob("*.parquet"))])
+    whole[whole["run"] < 3].to_csv(folder / "rows.csv", index=False)
+    return SPEC.replace("runs/*.parquet", "rows.csv").replace("blocks = 0", "blocks = 2")
+
+
+def test_runs_on_a_cluster_have_the_bits_of_runs_here(folder, cluster, held_here):
+    """Two regularizations, the blocks that choose between them, and those of the verdict: whole runs are tasks."""
+
+    def fitted_to(path):
+        return json.loads(fit_job(open_job(path)).result.to_json())
+
+    expected, found = tables(folder, cluster, held_here, fitted_to)
+    for result in (expected, found):
+        result["spec"].pop("engine"), result["status"].pop("seconds")
+    assert found == expected
+    assert len(found["restarts"]) == 2 and len(found["validation"]["trials"]) == 3
+
+
+def test_a_selection_on_a_cluster_has_the_bits_of_one_here(folder, cluster, held_here):
+    """Also where a worker is killed meanwhile."""
+
+    def selected(path):
+        timer = killed_in(0.5, workers[0]) if "dask" in path.name else threading.Timer(0, str)
+        found = select_for(*open_select(path), folder / "selected", lambda *_: None)
+        timer.cancel()
+        return found.selection
+
+    text = held_here.replace("hidden = [3]", 'kind = "terms"\ndegree = 2')
+    text = text.replace("[training]", '[training]\nfocus = "prediction"')
+    workers = [*cluster.run(os.getpid).values()]
+    expected, found = tables(folder, cluster, text, selected)
+    here, there = (one.table.drop(columns="seconds") for one in (expected, found))
+    pd.testing.assert_frame_equal(there, here, check_exact=True)
+    assert found.learner == expected.learner and found.shares == expected.shares
+    assert workers[0] not in cluster.run(os.getpid).values()
+    streamed = text.format(kind="stream", structure="orthogonal", regularization="0.1")
+    (folder / "streamed.toml").write_text(streamed, "utf-8")
+    with pytest.raises(oa.InputError, match="found stream; expected memory, or dask, to select"):
+        open_select(folder / "streamed.toml")
 
 
 def bad(folder, match, frame=None, name="c.parquet", **changes):

@@ -74,6 +74,9 @@ class KeyedError(InputError):
         super().__init__(text)
         self.key, self.words = key, words
 
+    def __reduce__(self) -> Any:
+        return type(self), (str(self), self.key, self.words)
+
 
 class MissingColumnError(InputError):
     """A data file lacks a column or variable that is asked for."""

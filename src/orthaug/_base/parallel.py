@@ -5,15 +5,34 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from threadpoolctl import ThreadpoolController
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Heard = Callable[..., None]
+"""Called with the number of a run, and what that run tells of itself."""
+_own_cores: ContextVar[int | None] = ContextVar("own_cores", default=None)
+
+
+def cores() -> int:
+    """How many runs this process makes at a time: the machine's cores, or those that it was left."""
+    return _own_cores.get() or os.cpu_count() or 1
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """Runs inside are made one after another: others have the other cores."""
+    before = _own_cores.set(1)
+    try:
+        yield
+    finally:
+        _own_cores.reset(before)
 
 
 @contextmanager
@@ -47,7 +66,16 @@ class Stopped(Exception):
 def spread(
     function: Callable[[Item, Callable[[], None]], Result], items: Sequence[Item], workers: int | None = None
 ) -> list[Result]:
-    """`[function(item, check) for item in items]`, several at a time.
+    """`[function(item, check) for item in items]`, several at a time; arguments as of `each`."""
+    return list(each(function, items, workers))
+
+
+def each(
+    function: Callable[[Item, Callable[[], None]], Result], items: Sequence[Item], workers: int | None = None
+) -> Iterator[Result]:
+    """`function(item, check)` of every item, in their order as they come, several at a time.
+
+    The first that fails ends the others, and so does a caller that takes no more.
 
     Args:
         function: calls `check()` now and then, which raises `Stopped` once the results are not wanted.
@@ -59,25 +87,63 @@ def spread(
         if stop.is_set():
             raise Stopped
 
-    workers = min(len(items), workers or os.cpu_count() or 1)
+    workers = min(len(items), workers or cores())
     if workers <= 1:
         with one_blas_thread():
-            return [function(item, check) for item in items]
+            yield from (function(item, check) for item in items)
+        return
     with one_blas_thread(), ThreadPoolExecutor(workers) as pool:
         futures = [pool.submit(function, item, check) for item in items]
+        pending = set(futures)
         try:
-            done, _ = wait(futures, return_when=FIRST_EXCEPTION)
-            for future in done:
-                future.result()
-            return [future.result() for future in futures]
-        except BaseException:
+            for future in futures:
+                while future in pending:
+                    done, pending = wait(pending, return_when=FIRST_COMPLETED)
+                    for other in done:
+                        other.result()
+                yield future.result()
+        finally:
             stop.set()
             for future in futures:
                 future.cancel()
-            raise
+
+
+def nobody(*_: Any) -> None:
+    """Hears nothing."""
+
+
+class Threads:
+    """Makes independent runs on this machine's cores."""
+
+    def map(
+        self,
+        function: Callable[[Any, Any, Callable[..., None]], Result],
+        given: Any,
+        items: Sequence[Any],
+        heard: Heard = nobody,
+    ) -> Iterator[Result]:
+        """`function(given, item, tell)` of every item, in their order as they come.
+
+        Args:
+            function: of a module, so that it can be sent elsewhere. It calls `tell(…)` now and then, which raises
+                `Stopped` once the results are not wanted.
+            given: what all runs share.
+            heard: called with the number of an item and what its run tells.
+        """
+
+        def one(numbered: tuple[int, Any], check: Callable[[], None]) -> Result:
+            i, item = numbered
+
+            def tell(*what: Any) -> None:
+                check()
+                heard(i, *what)
+
+            return function(given, item, tell)
+
+        return each(one, list(enumerate(items)))
 
 
 def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
     """`[function(item) for item in items]`, as many at a time as there are cores."""
-    with ThreadPoolExecutor(min(len(items), os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(min(len(items), cores())) as pool:
         return list(pool.map(function, items))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError
-from orthaug._base.parallel import spread
+from orthaug._base.parallel import Threads
 from orthaug._base.warning import Warning
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout
@@ -136,13 +137,19 @@ def _trial(label: str, alone: Pieces, model: Pieces) -> Trial:
 
 
 def cross_validate(
-    record: Record, fits: Sequence[Callable[[Record], Estimate]], *, blocks: int, start: int
+    record: Record,
+    fits: Sequence[Callable[[Record], Estimate]],
+    *,
+    blocks: int,
+    start: int,
+    runner: Any = Threads(),  # noqa: B008  (it holds nothing)
 ) -> list[list[Pieces]]:
     """Squared free-run errors of every way of fitting on every held-out block, in training deviations.
 
     Args:
         fits: each fits a training record; a failed training counts as runs that diverge.
         start: rows at the beginning of an experiment without a prediction.
+        runner: makes the fits of each block; an `Engine`, or `Threads()`.
 
     Returns:
         For every block the errors of every fit.
@@ -153,22 +160,20 @@ def cross_validate(
     folds = blocked(record, blocks, start)
     unit = np.std(np.concatenate([e.outputs for e in record.experiments]), axis=0)
 
-    def one(pair: tuple[Record, Record], check: Callable[[], None]) -> list[Pieces]:
-        training, held = pair
-        errors: list[Pieces] = []
-        for fit in fits:
-            check()
-            try:
-                trained = fit(training)
-            except InputError:  # the block took away what the physics needs
-                errors.append([None] * len(held.experiments))
-                continue
-            usable = trained.status.ok
-            found = squared_errors(trained.model.simulate(held), unit) if usable else [None] * len(held.experiments)
-            errors.append(found)
-        return errors
+    return list(runner.map(_on_block, (tuple(fits), unit), folds))
 
-    return spread(one, folds)
+
+def _on_block(given: Any, pair: tuple[Record, Record], tell: Callable[..., None]) -> list[Pieces]:
+    """Errors on a block of every way of fitting the rest."""
+    (fits, unit), (training, held), errors = given, pair, []
+    for fit in fits:
+        tell()
+        found: Pieces = [None] * len(held.experiments)
+        with suppress(InputError):  # the block took away what the physics needs
+            trained = fit(training)
+            found = squared_errors(trained.model.simulate(held), unit) if trained.status.ok else found
+        errors.append(found)
+    return errors
 
 
 def block_trials(errors: Sequence[Sequence[Pieces]], fit: int) -> list[Trial]:

@@ -21,6 +21,7 @@ from orthaug.commands.program import (
     SpecPath,
     app,
     main,
+    other_writes,
     prepare_jax,
 )
 
@@ -95,6 +96,8 @@ def fit(
     learns, rows = job.spec.declared_learner() is not None, getattr(job.problem, "count", 0)
     with training_bar(job.run_count, job.iterations, learns, rows) as progress:
         fitted = fit_job(job, progress)
+    if other_writes():
+        return
     write_result(fitted, folder, force=force)
     if as_json:
         streams.echo(fitted.result.to_json())
@@ -129,6 +132,8 @@ def compare(
 
     with training_bar(job.run_count * len(job.compared), job.iterations) as progress:
         comparison = comparing.compare(job, model or (), progress)
+    if other_writes():
+        return
     comparing.write(comparison, folder, force=force)
     text = compare_text(comparison.result, comparison.verdicts)
     streams.echo(comparison.result.to_json() if as_json else f"{text}\n\nwritten to {folder}")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 
+from orthaug._base.errors import InputError
 from orthaug._base.memory import available
 from orthaug.commands.sections import Positive, Section
 
@@ -53,8 +54,12 @@ def engine_of(section: EngineSection, kind: str) -> Engine:
 
         return Dask(connected(section.scheduler, section.workers))
     if kind == "devices":
+        from orthaug.models import hosts
         from orthaug.models.devices import Devices
 
+        hosts.join()
+        if hosts.several() and section.devices is not None:
+            raise InputError(f"`engine.devices`: found {section.devices}; over several hosts all devices are used.")
         return Devices(section.devices)
     from orthaug.models.rows import InMemory
     from orthaug.models.streaming import Stream

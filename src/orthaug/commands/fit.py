@@ -89,10 +89,16 @@ def keeping(job: Job, folder: Path, *, resume: bool = False) -> Job:
     """The job with the states of its training kept beside the result folder; with `resume` it goes on from them.
 
     Raises:
-        InputError: states of another fit.
+        InputError: states of another fit; hosts that do not run the same one.
     """
     from orthaug.fitting.checkpoints import Checkpoints
+    from orthaug.models import hosts
 
+    if job.spec.engine.kind == "devices" and hosts.several():
+        hosts.check_alike(job.fingerprint)
+        if resume:
+            raise InputError("--resume: a fit over several hosts keeps no states to go on from; leave it out.")
+        return job
     place = folder.with_name(f"{folder.name}.training")
     kept = Checkpoints(place, job.fingerprint, job.spec.engine.checkpoint)
     return replace(job, checkpoints=kept.opened(resume=resume))
@@ -181,12 +187,10 @@ def cross_validated(job: Job, blocks: int, variants: Sequence[Variant]) -> list[
     """Trials of every variant on every block; none where the record is too short for that."""
     from orthaug.analysis.validation import block_trials, cross_validate
 
-    def fit_of(variant: Variant) -> Any:
-        return lambda fold: job.run(variant.on(fold))
-
-    fits = [fit_of(variant) for variant in (Variant(ALONE), *variants)]
+    fits = [job.fold_fit(variant) for variant in (Variant(ALONE), *variants)]
     try:
-        errors = cross_validate(job.train.record, fits, blocks=blocks, start=job.first_row)
+        options: dict[str, Any] = {"start": job.first_row, "runner": job.runner}
+        errors = cross_validate(job.train.record, fits, blocks=blocks, **options)
     except InputError:
         return [[] for _ in variants]
     return [block_trials(errors, 1 + j) for j in range(len(variants))]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from orthaug import __version__
+from orthaug._base.parallel import Threads
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.warning import Warning
 from orthaug.commands.parts import Part
@@ -95,6 +97,15 @@ class Job(ABC):
     @abstractmethod
     def run(self, variant: Variant = AS_DECLARED, progress: Progress = SILENT) -> Any:
         """Train as the spec says, or a variant of that."""
+
+    def fold_fit(self, variant: Variant) -> Callable[[Record], Any]:
+        """What trains a variant on a fold."""
+        return lambda fold: self.run(variant.on(fold))
+
+    @property
+    def runner(self) -> Any:
+        """Who makes independent runs of this job."""
+        return Threads()
 
     @abstractmethod
     def reach(self, model: Any, record: Record) -> tuple[np.ndarray, Layout]:

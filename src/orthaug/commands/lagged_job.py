@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -92,26 +94,38 @@ class LaggedJob(Job):
         own = record is self.train.record
         return self.problem.rows.x if own else lag_rows(record, self.problem.layout), self.problem.layout
 
-    def posed(self, variant: Variant) -> Problem:
-        """The problem that a variant of the job solves: the job's own, unless its data or lags are others."""
-        if variant.fold is None:
-            return self.problem.physics_alone() if variant.alone else self.problem
-        spec, baseline, weights = self.spec, self.problem.baseline, self.spec.training.output_weights
-        if variant.alone or spec.declared_learner() is None:
-            return pose(variant.fold, baseline, output_weights=weights)
-        return pose(variant.fold, baseline, spec.lag_orders(), spec.learner_inputs(), output_weights=weights)
+    @property
+    def runner(self) -> Engine:
+        from orthaug.models.tasks import runs_on
+
+        return runs_on(self.engine)
+
+    def fold_fit(self, variant: Variant) -> Callable[[Record], Estimate]:
+        """As there; it can be sent to another process. A fold is small: its rows are in memory."""
+        spec, options = self.spec, self.training_options(variant.on(self.train.record))
+        options["structure"] = structure_of(spec, variant.structure_kind)  # predictions score it: no measure tells
+        weights, lags, learner_inputs = spec.training.output_weights, None, None
+        if not variant.alone and spec.declared_learner() is not None:
+            lags, learner_inputs = spec.lag_orders(), spec.learner_inputs()
+        posed = (self.problem.baseline, lags, learner_inputs)
+        return partial(_fitted_to, posed=posed, weights=weights, options=options)
 
     def run(self, variant: Variant = AS_DECLARED, progress: Progress = SILENT) -> Estimate:
         from orthaug.fitting.estimation import fit
 
-        structure = structure_of(self.spec, variant.structure_kind, self.measure)
-        if variant.alone or variant.fold is not None:  # a fold is scored by predictions, which no measure changes
-            structure = structure_of(self.spec, variant.structure_kind)
-        options = self.training_options(variant)
-        options["ensemble"] = self.spec.training.ensemble and variant.fold is None and options["learner"] is not None
-        if variant.fold is None:  # a fold is small
-            options |= {"engine": self.engine, "checkpoints": self.checkpoints}
-        return fit(self.posed(variant), structure=structure, progress=progress, **options)
+        if variant.fold is not None:
+            return self.fold_fit(variant)(variant.fold)
+        structure = structure_of(self.spec, variant.structure_kind, None if variant.alone else self.measure)
+        options = self.training_options(variant) | {"engine": self.engine, "checkpoints": self.checkpoints}
+        options["ensemble"] = self.spec.training.ensemble and options["learner"] is not None
+        problem = self.problem.physics_alone() if variant.alone else self.problem
+        return fit(problem, structure=structure, progress=progress, **options)
+
+
+def _fitted_to(fold: Record, posed: Any, weights: Any, options: dict[str, Any]) -> Estimate:
+    from orthaug.fitting.estimation import fit
+
+    return fit(pose(fold, *posed, output_weights=weights), **options)
 
 
 def open_lagged(path: Path, spec: Spec, *, require_full_rank: bool = True) -> LaggedJob:
@@ -145,7 +159,8 @@ def open_lagged(path: Path, spec: Spec, *, require_full_rank: bool = True) -> La
         options = {"output_weights": spec.training.output_weights, "require_full_rank": require_full_rank}
         kind = spec.engine_kind([path.parent / entry.file for entry in train.files])
         engine = engine_of(spec.engine, kind)
-        if kind in ("memory", "devices") or spec.brought:
+        several = spec.runs(linear=baseline.linear) > 1 and train.source is None  # on a cluster they are its tasks
+        if kind in ("memory", "devices") or spec.brought or (kind == "dask" and several):
             problem = pose(train.record, baseline, lags, learner_inputs, **options)
         else:
             source = train.source or RecordSource(train.record, first, spec.engine.partition_rows)
@@ -155,12 +170,11 @@ def open_lagged(path: Path, spec: Spec, *, require_full_rank: bool = True) -> La
             problem, _, left_out = independent_terms(problem, learner)
         problem.feature_rows()
         _check_scored(spec, problem)
-        _check_cost(spec, problem)
+        _check_cost(spec, problem, engine)
         weighed = weigh_problem(measure_of(spec, problem, path.parent), problem)
         _check_measure(weighed, problem)
         named: dict[str, Any] = {"path": path, "spec": spec, "train": train, "validation": validation, "tests": tests}
         named |= {"problem": problem, "weighed": weighed, "engine": engine}
-        named["engine"] = engine
         job = LaggedJob(**named, physics=physics, left_out=left_out)
         check_suspects(spec.suspects, problem)
         for part in job.parts:
@@ -181,12 +195,12 @@ def _check_scored(spec: Spec, problem: Problem) -> None:
         raise InputError(f"'training.{error.key}'{error.words}.") from None
 
 
-def _check_cost(spec: Spec, problem: Problem) -> None:
+def _check_cost(spec: Spec, problem: Problem, engine: Engine) -> None:
     """`check_cost` before JAX is loaded."""
     sizes = {"rows": problem.count, "features": len(problem.features.entries), "outputs": len(problem.outputs)}
     runs = spec.runs(linear=problem.baseline.linear)
-    held = len(problem.rows)
-    check_cost(spec.declared_learner(), **sizes, held=held, iterations=spec.declared_solver().iterations, runs=runs)
+    options: dict[str, Any] = {"held": len(problem.rows), "iterations": spec.declared_solver().iterations, "runs": runs}
+    check_cost(spec.declared_learner(), **sizes, **options, room=engine.room())
 
 
 def structure_of(spec: Spec, kind: str | None = None, measure: Measure | None = None) -> Structure:

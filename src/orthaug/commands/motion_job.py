@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -148,7 +148,7 @@ def _check_sizes(spec: Spec, problem: MotionProblem) -> None:
     except KeyedError as error:
         raise InputError(f"'{_place(error)}'{error.words}.") from None
     states, outputs = problem.motion.learned
-    sizes = {
+    sizes: dict[str, Any] = {
         "rows": len(problem.record),
         "features": len(problem.features),
         "outputs": max(len(states) + len(outputs), 1),

@@ -146,6 +146,16 @@ def _fail(message: str, code: int) -> None:
     sys.exit(code)
 
 
+def other_writes() -> bool:
+    """Whether this is one of several processes and another one writes, which is said."""
+    from orthaug.models.hosts import waits
+
+    text = waits()
+    if text is not None:
+        streams.echo(text)
+    return text is not None
+
+
 def prepare_jax() -> None:
     """Keep compiled programs for the next command."""
     from orthaug._base.jax import use_compilation_cache

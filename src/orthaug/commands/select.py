@@ -13,6 +13,7 @@ import tomlkit
 
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
+from orthaug.commands.engine_section import EngineSection, engine_of
 from orthaug.commands.folder import not_a_result
 from orthaug.commands.lagged_job import LaggedJob, open_lagged
 from orthaug.commands.spec import LearnerSection, Spec, load_spec
@@ -53,7 +54,10 @@ def open_select(path: Path) -> tuple[LaggedJob, Spec]:
             f"{path}: structure is selected for lagged signals; for a motion declare a learner of terms "
             '(kind = "terms"), or a network, and ask `orthaug explain` what it found.'
         )
-    alone = spec.model_copy(update={"learner": LearnerSection(kind="none"), "lags": None})
+    if spec.engine.kind not in ("auto", "memory", "dask"):
+        raise InputError(f"{path}: `engine.kind`: found {spec.engine.kind}; expected memory, or dask, to select.")
+    parts = {"learner": LearnerSection(kind="none"), "lags": None, "engine": EngineSection(kind="memory")}
+    alone = spec.model_copy(update=parts)
     return open_lagged(path, alone), spec
 
 
@@ -81,6 +85,7 @@ def select_for(job: LaggedJob, spec: Spec, folder: Path, told: Told) -> Selected
     }
     if section.halves and len(job.train.record.experiments) != 1:
         raise InputError(f"{job.path}: 'selection.halves' needs training data of one experiment, to be cut in two.")
+    options["engine"] = engine_of(spec.engine, "dask") if spec.engine.kind == "dask" else None
     try:
         selection = select(job.train.record, job.problem.baseline, **options, progress=told)
     except InputError as error:

@@ -7,7 +7,8 @@ import os
 from typing import Any
 
 from orthaug._base.errors import InputError
-from orthaug._base.memory import check_limit, check_memory
+from orthaug._base.memory import check_limit, check_memory, in_words
+from orthaug.models.rows import Room
 
 LONGEST_FIT = 30 * 86400.0  # s
 _RATE, _STEP = 2e10, 2e-4  # products per second and core; seconds of an iteration at least
@@ -17,7 +18,15 @@ _FEWEST = 50  # iterations that are counted on where more are allowed: most runs
 
 
 def check_cost(
-    learner: Any, *, rows: int, features: int, outputs: int, iterations: int, runs: int, held: int | None = None
+    learner: Any,
+    *,
+    rows: int,
+    features: int,
+    outputs: int,
+    iterations: int,
+    runs: int,
+    held: int | None = None,
+    room: Room | None = None,
 ) -> None:
     """Raise InputError where the normal equations do not fit into memory, or training takes longer than a month.
 
@@ -28,6 +37,7 @@ def check_cost(
         iterations: of a run at most.
         runs: restarts times regularizations.
         held: rows that are in memory; None for all.
+        room: of the workers or devices that add up; None where that is this process.
     """
     held = rows if held is None else held
     check_limit(8.0 * _COPIES * held * (features + outputs), f"a fit of {held} rows")
@@ -38,6 +48,11 @@ def check_cost(
     side_by_side = min(runs, cores)
     what = f"training a learner of {weights} weights" + (f" in {runs} runs" if runs > 1 else "")
     check_memory(8.0 * (3 * side_by_side * weights**2 + runs * weights + held * (features + outputs)), what)
+    if room is not None and (size := 8.0 * room.matrices * weights**2) > room.size:
+        raise InputError(
+            f"{what} takes {in_words(size)} on each worker or device, for {room.matrices} matrices of its weights; "
+            f"{room.place} has {in_words(room.size)}. Take a smaller learner, or larger workers."
+        )
     products = rows * outputs * weights**2 + weights**3 / 3
     seconds = runs * min(iterations, _FEWEST) * max(products / _RATE, _STEP) / cores
     if seconds > LONGEST_FIT:

@@ -29,7 +29,7 @@ from orthaug.fitting.motion_estimation import DEFAULT, fit_motion, pose_for
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.posing import check_record, posed_on
 from orthaug.fitting.reweighting import reweighted
-from orthaug.fitting.rules import check_solver, check_starts, tried
+from orthaug.fitting.rules import check_solver, checked_starts, tried
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Orthogonal, Structure
@@ -38,10 +38,12 @@ from orthaug.inference.measures import Training
 from orthaug.models.learners import MLP, Bound, External, Function, Learner, Scaling
 from orthaug.models.model import Model
 from orthaug.models.rows import Engine, InMemory
+from orthaug.models.tasks import Tasks, runs_on
 from orthaug.models.terms import over_lags, over_states
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.motion import Motion
 from orthaug.physics.problem import Problem, pose
+from orthaug.physics.streamed import StreamedProblem
 
 Regularization = str | float
 
@@ -207,7 +209,8 @@ def fit(
     Args:
         problem: record, physics and learner inputs; the other arguments as of `estimate`.
         learner: None for physics alone, on the rows of the problem.
-        engine: where the rows are, or segments of a free run, and who sums over them.
+        engine: where the rows are, or segments of a free run, and who sums over them. On a cluster several runs over
+            rows that are in memory are tasks, each whole on one worker, and so are their held-out blocks.
         checkpoints: where the states of its runs are kept, to go on from; None to keep none.
 
     Raises:
@@ -219,28 +222,29 @@ def fit(
     conditions = {"linear": problem.baseline.linear, "validated": validation is not None}
     choices = tried(regularization, solver, criterion, structure, learner=learner, **conditions)
     auto = _check_regularizations(regularization, choices, validation is not None or blocks > 0)
-    restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
-    check_starts(restarts if initial is None else 1, seed, ensemble=ensemble)
+    restarts, seed = checked_starts(restarts, seed, warm=initial is not None, ensemble=ensemble)
     check_solver(solver, criterion, () if learner is None else choices)
+    engine = _engine_of(engine, problem, len(choices) * (restarts if initial is None else 1))
+    if initial is None:
+        _check_cost(problem, learner, solver, restarts * len(choices), engine)
     warm, told = None, ()
     if initial is not None:
         task, weights, warm = _warm_start(problem, initial, engine)
         starts = [PlannedRun(0, weights, choice) for choice in choices]
     else:
-        _check_cost(problem, learner, solver, restarts * len(choices))
         problem, learner, told = independent_terms(problem, learner)
         task = OneStepTask.of(problem, learner, engine=engine)
         starts = _starts(task.bound, range(seed, seed + restarts), choices)
-    solved, ensemble = criterion.one_step and problem.baseline.linear, ensemble and task.bound is not None
-    _check_ensemble(ensemble, problem)
+    solved = criterion.one_step and problem.baseline.linear
+    ensemble = _check_ensemble(ensemble and task.bound is not None, problem)
     if task.bound is None and solved:
         estimate = conclude(task, structure, task.physics_learned())
         estimate = replace(estimate, status=replace(estimate.status, start_loss=estimate.status.loss))
     else:
-        task = replace(task, checkpoints=checkpoints)
+        task = _keeping(task, checkpoints)
         trained = task if solved else FreeRunTask.of(task, criterion, warm)
         chosen = Choice(validation, blocks if initial is None else 0, fallback, ensemble, scored=auto and solved)
-        estimate = train(trained, starts, structure, solver, chosen, progress)
+        estimate = train(trained, starts, structure, solver, chosen, progress, runner=engine)
         if _splits(structure) and estimate.status.ok and estimate.model.form.bound is not None:
             estimate = estimate.split(structure.measure)
     estimate = replace(estimate, warnings=(*told, *estimate.warnings))
@@ -256,10 +260,20 @@ def fit(
     return reweighted(estimate, again)
 
 
-def _check_cost(problem: Problem, learner: Learner | None, solver: Solver, runs: int) -> None:
+def _engine_of(engine: Engine, problem: Problem, runs: int) -> Engine:
+    """With a cluster several runs over rows in memory are its tasks."""
+    return runs_on(engine) if runs > 1 and not isinstance(problem, StreamedProblem) else engine
+
+
+def _keeping(task: OneStepTask, checkpoints: Checkpoints | None) -> OneStepTask:
+    """With the states of its runs kept, unless they are a cluster's tasks: a worker may have another disk."""
+    return replace(task, checkpoints=None if isinstance(task.engine, Tasks) else checkpoints)
+
+
+def _check_cost(problem: Problem, learner: Learner | None, solver: Solver, runs: int, engine: Engine) -> None:
     """Raise InputError for what would take more memory or time than there is."""
     sizes = {"rows": problem.count, "features": len(problem.features.entries), "outputs": len(problem.outputs)}
-    check_cost(learner, **sizes, held=len(problem.rows), iterations=solver.iterations, runs=runs)
+    check_cost(learner, **sizes, held=len(problem.rows), iterations=solver.iterations, runs=runs, room=engine.room())
 
 
 def _starts(bound: Bound | None, seeds: range, choices: Sequence[Regularization]) -> list[PlannedRun]:
@@ -282,10 +296,11 @@ def _check_blocks(blocks: int) -> int:
     return blocks
 
 
-def _check_ensemble(ensemble: bool, problem: Problem) -> None:
-    """Raise InputError for a median of outputs that are mixed with each other."""
+def _check_ensemble(ensemble: bool, problem: Problem) -> bool:
+    """Whether there is one; raise InputError for a median of outputs that are mixed with each other."""
     if ensemble and problem.weight.choice == "covariance":
         raise InputError("an ensemble takes the median of each output; use `output_weights` std, none or numbers.")
+    return ensemble
 
 
 def _check_splittable(structure: Structure, baseline: Baseline, learner: Learner | None) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from orthaug._base.checks import check_count
 from orthaug._base.errors import KeyedError, shown
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.kinds import SOLVERS
@@ -12,6 +13,13 @@ from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Structure
 from orthaug.models.learners import Learner
 from orthaug.physics.motion import Motion
+
+
+def checked_starts(restarts: int, seed: int, *, warm: bool, ensemble: bool) -> tuple[int, int]:
+    """How many starts and from which seed, as whole numbers; a `warm` start is one."""
+    restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
+    check_starts(1 if warm else restarts, seed, ensemble=ensemble)
+    return restarts, seed
 
 
 def check_starts(restarts: int, seed: int, *, ensemble: bool) -> None:

@@ -14,7 +14,7 @@ from orthaug._base.checks import finite_or_none
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jax
 from orthaug._base.log import LOG
-from orthaug._base.parallel import one_blas_thread, spread
+from orthaug._base.parallel import Threads, one_blas_thread
 from orthaug._base.progress import Tell
 from orthaug._base.warning import Warning
 from orthaug.data.record import Record
@@ -83,19 +83,21 @@ def train(
     choice: Choice,
     progress: Tell,
     conclude: Concluding = conclude,
+    runner: Any = Threads(),  # noqa: B008  (it holds nothing)
 ) -> Any:
     """Run from every start and conclude with the best.
 
     Args:
+        runner: makes the runs, and those on held-out blocks; an `Engine`, or `Threads()`.
         conclude: makes the estimate of a task, a structure and what a run learned.
     """
     with one_blas_thread():
         task = task.prepared(solver, structure, partial(progress, 0))
     LOG.info("training: %d runs of %s, %s", len(starts), type(solver).__name__, structure.name)
-    starts, runs = _run(task, starts, structure, solver, progress)
+    starts, runs = _run(task, starts, structure, solver, progress, runner)
     losses = [task.loss(run) for run in runs]
     concluded = cache(lambda i: _concluded(conclude, task, structure, task.learned(runs[i])))
-    held_out = _held_out(task, starts, concluded, structure, solver, choice, conclude)
+    held_out = _held_out(task, starts, concluded, structure, solver, choice, conclude, runner)
     errors = [math.nan] * len(runs) if held_out is None else [mean_square(run) for run in held_out.runs]
     ranking = choice.ranking(task, runs, errors)
     usable = np.array([run.ending.usable for run in runs]) & np.isfinite(ranking)
@@ -159,24 +161,14 @@ def _members(starts: Sequence[PlannedRun], ranking: np.ndarray, best: int) -> li
 
 
 def _run(
-    task: Task, starts: Sequence[PlannedRun], structure: Structure, solver: Solver, progress: Tell
+    task: Task, starts: Sequence[PlannedRun], structure: Structure, solver: Solver, progress: Tell, runner: Any
 ) -> tuple[list[PlannedRun], list[Any]]:
     """Every planned run; one that fails is made again from the seeds that follow."""
-
-    def one(numbered: tuple[int, PlannedRun], check: Callable[[], None]) -> Any:
-        i, start = numbered
-
-        def tell(iteration: int, loss: float) -> None:
-            check()
-            progress(i, iteration, loss)
-
-        run = task.run(solver, start.weights, structure, start.regularization, tell)
-        told = (i + 1, start.seed, run.ending.code, run.iterations, task.loss(run), run.seconds)
+    made, given = list(starts), (task, solver, structure)
+    runs = list(runner.map(_one_run, given, made, progress))
+    for i, (start, run) in enumerate(zip(made, runs, strict=True), 1):
+        told = (i, start.seed, run.ending.code, run.iterations, task.loss(run), run.seconds)
         LOG.info("run %d, seed %d: %s after %d iterations, loss %.4g, %.2f s", *told)
-        return run
-
-    made = list(starts)
-    runs = spread(one, list(enumerate(made)))
     failed = [start for start, run in zip(made, runs, strict=True) if not run.ending.usable]
     if task.bound is None or not failed or len(failed) == len(made):  # where all fail the data or the learner are bad
         return made, runs
@@ -187,7 +179,13 @@ def _run(
         start._replace(seed=seed, weights=bound.init(jax.random.key(seed)))
         for seed, start in enumerate(failed, following)
     ]
-    return made + again, runs + spread(one, list(enumerate(again, len(made))))
+    more = runner.map(_one_run, given, again, lambda i, *at: progress(len(made) + i, *at))
+    return made + again, runs + list(more)
+
+
+def _one_run(given: tuple[Task, Solver, Structure], start: PlannedRun, tell: Callable[..., None]) -> Any:
+    task, solver, structure = given
+    return task.run(solver, start.weights, structure, start.regularization, tell)
 
 
 def _replaced(starts: Sequence[PlannedRun], runs: Sequence[Any]) -> list[Warning]:
@@ -206,6 +204,7 @@ def _held_out(
     solver: Solver,
     choice: Choice,
     conclude: Concluding,
+    runner: Any,
 ) -> HeldOut | None:
     """Errors where nothing was fitted: of the runs on the validation record, or of runs on folds on their blocks.
 
@@ -225,25 +224,28 @@ def _held_out(
         LOG.debug("too few rows for %d blocks of cross-validation; the lowest loss chooses", choice.blocks)
         return None
     LOG.info("cross-validation: %d folds of %d runs", len(folds), len(starts))
-    shorter, unit = solver.at_most(FOLD_ITERATIONS), task.problem.deviation
-
-    def one(fold: tuple[Record, Record], check: Callable[[], None]) -> list[Pieces]:
-        training, held = fold
-        failed: Pieces = [None] * len(held.experiments)
-        try:
-            own = task.on(training).prepared(shorter, structure)
-            fits = [_alone(conclude, own, structure)]
-            for start in starts:
-                check()
-                run = own.run(shorter, start.weights, structure, start.regularization)
-                fits.append(_concluded(conclude, own, structure, own.learned(run)))
-        except InputError:  # the block took away what the physics needs
-            return [failed] * (1 + len(starts))
-        return [_errors(fit, held, unit) for fit in fits]
-
-    pieces = [[p for block in column for p in block] for column in zip(*spread(one, folds), strict=True)]
+    given = (task, starts, structure, solver.at_most(FOLD_ITERATIONS), conclude)
+    found = runner.map(_on_fold, given, folds)
+    pieces = [[p for block in column for p in block] for column in zip(*found, strict=True)]
     labels = tuple(f"block {i + 1} of {choice.blocks}" for i, (_, held) in enumerate(folds) for _ in held.experiments)
     return HeldOut(f"blocked cross-validation ({choice.blocks} blocks)", labels, pieces[0], tuple(pieces[1:]))
+
+
+def _on_fold(given: Any, fold: tuple[Record, Record], tell: Callable[..., None]) -> list[Pieces]:
+    """Errors on a block, of physics alone and of a run from every start on the rest."""
+    task, starts, structure, solver, conclude = given
+    training, held = fold
+    failed: Pieces = [None] * len(held.experiments)
+    try:
+        own = task.on(training).prepared(solver, structure)
+        fits = [_alone(conclude, own, structure)]
+        for start in starts:
+            tell()
+            run = own.run(solver, start.weights, structure, start.regularization)
+            fits.append(_concluded(conclude, own, structure, own.learned(run)))
+    except InputError:  # the block took away what the physics needs
+        return [failed] * (1 + len(starts))
+    return [_errors(fit, held, task.problem.deviation) for fit in fits]
 
 
 def _errors(fit: Any, record: Record, unit: Any) -> Pieces:

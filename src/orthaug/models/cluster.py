@@ -6,6 +6,7 @@ of the partitions: whoever computes them, and however often after a worker was l
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -21,8 +22,9 @@ from orthaug import __version__
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jax
+from orthaug._base.parallel import Threads
 from orthaug.data.sources import Source
-from orthaug.models.rows import CHUNK_ROWS, Chunk, chunk_shape, in_chunks
+from orthaug.models.rows import CHUNK_ROWS, Chunk, Room, chunk_shape, in_chunks
 from orthaug.models.streaming import Beside, Laid, apart, chunks_of, folded, summed, together
 
 _SINGLE_THREADED = {
@@ -47,7 +49,7 @@ class Held:
 
 
 @dataclass(frozen=True, eq=False)
-class Dask:
+class Dask(Threads):
     """Rows on the workers of a cluster.
 
     `client` is a `distributed.Client`; `orthaug[dask]` brings it. `limit` is the rows of a chunk.
@@ -66,7 +68,7 @@ class Dask:
         each = -(-len(chunks) // workers)
         with told():
             groups = [chunks[i : i + each] for i in range(0, len(chunks), each)]
-            return [self.client.submit(_kept, group, pure=False) for group in groups]
+            return [self.client.submit(kept, group, pure=False) for group in groups]
 
     def draw(self, source: Source, laying: Callable[[Any], Iterator[Laid]]) -> list[Any]:
         """The partitions of a source, laid out where they will be summed."""
@@ -98,7 +100,7 @@ class Dask:
         ends = np.cumsum(counts).tolist()
         with told():
             groups = [pieces[end - count : end] for end, count in zip(ends, counts, strict=True)]
-            return Held([self.client.submit(_kept, group, pure=False) for group in groups], tuple(counts))
+            return Held([self.client.submit(kept, group, pure=False) for group in groups], tuple(counts))
 
     def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> Held:
         with told():
@@ -133,6 +135,10 @@ class Dask:
         with told():
             return self.client.gather([self._on(function, partition) for partition in partitions])
 
+    def room(self) -> Room:
+        """Of the smallest worker, which may have to add up a whole branch of the tree."""
+        return smallest_worker(self.client, _BRANCHES + 1)
+
     def _on(self, function: Callable[[Any], Any], partition: Any) -> Any:
         """A task; rows that the cluster holds already go to it by their futures."""
         held = getattr(partition, "held", ())
@@ -158,8 +164,9 @@ def _carried(function: Callable[[Any, Any], Any], partition: Any, carry: Any, *h
     return function(partition.on(*held) if held else partition, carry)
 
 
-def _kept(chunks: list[Any]) -> list[Any]:
-    return chunks
+def kept(value: Any) -> Any:
+    """What a worker keeps; made again from what the scheduler knows where that worker is lost."""
+    return value
 
 
 def _beside(parts: Sequence[list[Any]]) -> list[Any]:
@@ -181,6 +188,15 @@ def _added(parts: Sequence[Any]) -> Any:
     for part in parts[1:]:
         total = jax.tree.map(np.add, total, part)
     return total
+
+
+def smallest_worker(client: Any, matrices: int) -> Room:
+    """The worker with the least memory; without a limit it is infinite."""
+    with told():
+        workers = client.scheduler_info(n_workers=-1)["workers"]
+    limits = {address: float(worker["memory_limit"] or math.inf) for address, worker in workers.items()}
+    smallest = min(limits, key=lambda address: limits[address], default="")
+    return Room(limits.get(smallest, math.inf), f"the worker {smallest}", matrices)
 
 
 @contextmanager

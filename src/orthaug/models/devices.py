@@ -7,9 +7,9 @@ shards.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, reduce
+from functools import cache, partial, reduce
 from typing import Any
 
 import numpy as np
@@ -17,15 +17,17 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax
-from orthaug._base.parallel import in_threads
-from orthaug.models.rows import CHUNK_ROWS, Chunk, all_chunks, brought, chunk_shape, in_chunks, row_fold
+from orthaug._base.memory import available
+from orthaug._base.parallel import Heard, Threads, in_threads, nobody
+from orthaug.models.rows import CHUNK_ROWS, Chunk, Room, all_chunks, brought, chunk_shape, in_chunks, row_fold
 
 _ROWS = "rows"
 _ONE_AT_A_TIME = threading.Lock()  # devices that wait for each other in two programs would wait for ever
+_MATRICES = 3  # the sum so far, what a chunk adds, and what all devices have
 
 
 @dataclass(frozen=True)
-class Devices:
+class Devices(Threads):
     """All rows in the memory of the devices, in equal shares; `count` of them, None for all there are."""
 
     count: int | None = None
@@ -80,6 +82,19 @@ class Devices:
     def _run(self, compiled: Callable[..., Any], function: Any, rows: Any, arguments: tuple[Any, ...]) -> Any:
         with _ONE_AT_A_TIME:
             return jax.block_until_ready(compiled(function, self.count, len(arguments))(rows, *arguments))
+
+    def map(self, function: Any, given: Any, items: Sequence[Any], heard: Heard = nobody) -> Iterator[Any]:
+        """One after another: programs that share devices wait for each other, on all hosts in the same order."""
+        for i, item in enumerate(items):
+            yield function(given, item, partial(heard, i))
+
+    def room(self) -> Room:
+        """Of a device: its own memory, or a share of this machine's."""
+        own_process = jax.process_index()
+        devices = [device for device in jax.devices()[: self.count] if device.process_index == own_process]
+        own = [(device.memory_stats() or {}).get("bytes_limit", available() / len(devices)) for device in devices]
+        smallest = min(range(len(devices)), key=lambda i: own[i])
+        return Room(own[smallest], f"the device {devices[smallest]}", _MATRICES)
 
 
 def _even(shape: tuple[int, int], shares: int) -> tuple[int, int]:

@@ -19,7 +19,7 @@ from orthaug.models.dynamics import Dynamics, Numbers, Parts
 from orthaug.models.lagged import Lagged
 from orthaug.models.lagged_filter import LaggedFilter
 from orthaug.models.on_records import OnRecords, trajectory
-from orthaug.models.response import Response
+from orthaug.models.response import Response, Trajectory
 from orthaug.models.statistics import Statistics
 from orthaug.models.stepping import Memory, checked_row, one_experiment, step_lagged
 from orthaug.physics.baseline import Parameter

@@ -7,7 +7,7 @@ know where the rows are.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial, reduce
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import Array, jax, jnp
-from orthaug._base.parallel import in_threads
+from orthaug._base.parallel import Heard, Threads, in_threads, nobody
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
 from orthaug.models.learners import Bound
@@ -45,6 +45,17 @@ class Overlap(NamedTuple):
     """QᵀJ."""
     values: Float[Array | np.ndarray, "nt"]
     """QᵀF."""
+
+
+class Room(NamedTuple):
+    """The smallest of the places that add up apart from this process."""
+
+    size: float
+    """Its memory in bytes."""
+    place: str
+    """What it is called: "the worker tcp://…"."""
+    matrices: int
+    """Gram matrices that it holds at once, where sums are made and added."""
 
 
 @runtime_checkable
@@ -101,9 +112,17 @@ class Engine(Protocol):
         """What was placed or kept, (k, …) each, in NumPy."""
         ...
 
+    def map(self, function: Any, given: Any, items: Sequence[Any], heard: Heard = nobody) -> Iterator[Any]:
+        """Independent runs, `function(given, item, tell)` each; as `Threads.map`."""
+        ...
+
+    def room(self) -> Room | None:
+        """Where memory may be short beside this process; None where all sums are made here."""
+        ...
+
 
 @dataclass(frozen=True)
-class InMemory:
+class InMemory(Threads):
     """All rows on the device, summed by one compiled loop over chunks."""
 
     limit: int = CHUNK_ROWS
@@ -144,6 +163,9 @@ class InMemory:
 
     def fetch(self, rows: Any) -> Any:
         return jax.tree.map(np.asarray, rows)
+
+    def room(self) -> Room | None:
+        return None
 
 
 @partial(jax.jit, static_argnames="function")

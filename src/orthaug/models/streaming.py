@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax
-from orthaug._base.parallel import in_threads
+from orthaug._base.parallel import Threads, in_threads
 from orthaug.data.sources import Source, rows_of
 from orthaug.models.rows import CHUNK_ROWS, Chunk, chunk_shape, in_chunks
 
@@ -40,7 +40,7 @@ class Drawn:
 
 
 @dataclass(frozen=True)
-class Stream:
+class Stream(Threads):
     """Rows stay in their files; memory holds a few chunks of them."""
 
     limit: int = CHUNK_ROWS
@@ -83,6 +83,9 @@ class Stream:
 
     def fetch(self, rows: Iterable[Any]) -> Any:
         return together(list(rows))
+
+    def room(self) -> None:
+        """None: all sums are made here."""
 
 
 @dataclass(frozen=True, eq=False)

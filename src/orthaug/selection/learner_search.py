@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import islice
+from typing import Any
 
 import numpy as np
 
 from orthaug._base.errors import InputError
-from orthaug._base.parallel import spread
-from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.estimation import estimate
@@ -51,6 +52,7 @@ def search_learners(
     criterion: Criterion,
     blocks: int,
     told: Told,
+    runner: Any,
 ) -> LearnerSearch:
     """Judge every width on all lags, and on those whose functions matter by themselves.
 
@@ -65,14 +67,14 @@ def search_learners(
     tried += [replace(learner, hidden=(width,), inputs=inputs) for inputs in seen for width in widths]
     folds = blocked(record, blocks, max(problem.first_row, _largest(lags)))
     names = tuple(channel.name for channel in record.outputs), tuple(channel.name for channel in record.inputs)
-    rungs = []
+    given, rungs = (baseline, lags, criterion, folds), []
+    found = runner.map(_on_fold, given, [(one, i) for one in tried for i in range(len(folds))])
     for one in tried:
-        began = time.monotonic()
-        held = _judge(baseline, lags, one, criterion, folds)
+        held, seconds = zip(*islice(found, len(folds)), strict=True)
         nz = 0 if one is None else len(one.inputs if one.inputs is not None else lags.layout(*names))
         size = 0 if one is None else one.weights(nz, 1)
         words = () if one is None else (f"{one.hidden[0]} neurons of {', '.join(one.inputs or ('all lags',))}",)
-        rungs.append(Rung(Point((), np.zeros(0), np.zeros(0)), words, held, time.monotonic() - began, size))
+        rungs.append(Rung(Point((), np.zeros(0), np.zeros(0)), words, np.array(held), sum(seconds), size))
         try:
             told(rungs[-1])
         except KeyboardInterrupt:
@@ -85,20 +87,15 @@ def _largest(lags: Lags) -> int:
     return int(max(np.max(lags.na, initial=0), np.max(nb + nk - 1, initial=0)))
 
 
-def _judge(
-    baseline: object, lags: Lags, learner: MLP | None, criterion: Criterion, folds: Sequence[tuple[Record, Record]]
-) -> np.ndarray:
-    """Mean squared errors of free runs on each block, of fits without it."""
-
-    def one(fold: tuple[Record, Record], check: Callable[[], None]) -> float:
-        kept, held = fold
-        options = {"solver": LevenbergMarquardt(_ITERATIONS), "blocks": 0, "fallback": False, "criterion": criterion}
-        if learner is not None:
-            options |= {"lags": lags, "regularization": "evidence"}
-        try:
-            fit = estimate(kept, baseline, learner=learner, **options)  # type: ignore[call-overload]
-        except InputError:  # the block took away what the physics needs
-            return np.inf
-        return mean_square(squared_errors(fit.model.simulate(held), 1.0)) if fit.status.ok else np.inf
-
-    return np.array(spread(one, folds))
+def _on_fold(given: Any, item: tuple[MLP | None, int], tell: Callable[..., None]) -> tuple[float, float]:
+    """Mean squared error of free runs on a block of a fit without it, infinite without a model; and seconds."""
+    began, (learner, number), (baseline, lags, criterion, folds) = time.monotonic(), item, given
+    kept, held = folds[number]
+    options = {"solver": LevenbergMarquardt(_ITERATIONS), "blocks": 0, "fallback": False, "criterion": criterion}
+    if learner is not None:
+        options |= {"lags": lags, "regularization": "evidence"}
+    error = np.inf
+    with suppress(InputError):  # the block took away what the physics needs
+        fit = estimate(kept, baseline, learner=learner, **options)
+        error = mean_square(squared_errors(fit.model.simulate(held), 1.0)) if fit.status.ok else np.inf
+    return error, time.monotonic() - began

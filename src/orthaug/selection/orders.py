@@ -6,13 +6,13 @@ with an input, for pole and zero go in pairs where both are superfluous.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from orthaug._base.parallel import one_blas_thread
+from orthaug._base.parallel import Threads, one_blas_thread
 from orthaug.data.record import Record
 from orthaug.data.terms import TermLibrary
 from orthaug.fitting.criteria import Criterion
@@ -90,7 +90,13 @@ class OrderSearch:
 
 
 def search_orders(
-    problem: Problem, criterion: Criterion, largest: Orders, least: Orders, blocks: int, told: Told = lambda rung: None
+    problem: Problem,
+    criterion: Criterion,
+    largest: Orders,
+    least: Orders,
+    blocks: int,
+    told: Told = lambda rung: None,
+    runner: Any = Threads(),  # noqa: B008  (it holds nothing)
 ) -> OrderSearch:
     """Judge orders from `largest` down, never below `least`, what the physics reads already.
 
@@ -108,24 +114,27 @@ def search_orders(
     known = {str(lag) for term in problem.baseline.terms for lag in [term.regressor]}
     found: dict[Orders, Rung] = {}
     with one_blas_thread():
-        folds = Blocks(runs, blocks)
+        folds = Blocks(runs, blocks, runner)
 
-        def judge(orders: Orders) -> None:
-            if orders in found:
-                return
-            began = time.monotonic()
-            chosen = [place[output, i] for i in range(1, orders.na + 1)]
+        def chosen(orders: Orders) -> list[int]:
+            numbers = [place[output, i] for i in range(1, orders.na + 1)]
             for name, nb, nk in zip(inputs, orders.nb, orders.nk, strict=True):
-                chosen += [place[name, i] for i in range(nk, nk + nb)]
-            point = runs.fit(runs.start(), [i for i in chosen if lags[i] not in known])
-            found[orders] = Rung(point, (str(orders),), folds.judge(point), time.monotonic() - began, orders.size)
-            told(found[orders])
+                numbers += [place[name, i] for i in range(nk, nk + nb)]
+            return [i for i in numbers if lags[i] not in known]
+
+        def judge(several: Iterable[Orders]) -> None:
+            new = [orders for orders in dict.fromkeys(several) if orders not in found]
+            for orders, (point, held, seconds) in zip(new, folds.fitted(list(map(chosen, new))), strict=True):
+                found[orders] = Rung(point, (str(orders),), held, seconds, orders.size)
+                told(found[orders])
 
         try:
+            shorter = []
             for na in range(max(least.na, min(1, largest.na)), largest.na + 1):
                 fewer = largest.na - na
                 nb = tuple(max(n - fewer, low, min(n, 1)) for n, low in zip(largest.nb, least.nb, strict=True))
-                judge(Orders(na, nb, largest.nk))
+                shorter.append(Orders(na, nb, largest.nk))
+            judge(shorter)
             _shrink(found, judge, least)
         except KeyboardInterrupt:
             if not found:
@@ -133,13 +142,12 @@ def search_orders(
     return OrderSearch(tuple(found), tuple(found.values()))
 
 
-def _shrink(found: dict[Orders, Rung], judge: Callable[[Orders], None], least: Orders) -> None:
+def _shrink(found: dict[Orders, Rung], judge: Callable[[Iterable[Orders]], None], least: Orders) -> None:
     """From the best on, as long as one lag less is as good as the best."""
     current = min(found, key=lambda orders: found[orders].score)
     while True:
         smaller = list(current.smaller(least))
-        for orders in smaller:
-            judge(orders)
+        judge(smaller)
         within = dict(zip(found, judge_all(tuple(found.values())), strict=True))
         able = [orders for orders in smaller if within[orders].within]
         if not able:

@@ -15,6 +15,8 @@ from orthaug.data.regressors import Lags, in_order
 from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.estimation import estimate
 from orthaug.models.learners import MLP, Learner
+from orthaug.models.rows import Engine, InMemory
+from orthaug.models.tasks import runs_on
 from orthaug.models.terms import Terms
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.problem import Problem, pose, regressor_of
@@ -109,7 +111,7 @@ class Selection:
 
         `stage` is orders, terms or learner; `size` the number of lags, terms or weights; `score` the RMS error of free
         runs on held-out blocks in the output's unit, `standard_error` its own; `within` whether it is as good as the
-        best of its stage; `seconds` what it took.
+        best of its stage; `seconds` what it took (of orders and learners the sum over its fits).
         """
         import pandas as pd
 
@@ -164,6 +166,7 @@ def select(
     blocks: int = 5,
     halves: bool = False,
     progress: Told = _unheard,
+    engine: Engine | None = None,
 ) -> Selection:
     """Choose orders and delay, and terms or a network, by free runs on blocks of the data that are held out.
 
@@ -185,6 +188,7 @@ def select(
         halves: choose on the first half of the record, and keep the other for the fit (`Selection.estimate`), whose
             intervals are then not conditional on the choice.
         progress: called with the stage and each model that was judged.
+        engine: `Dask(client)` has the workers of a cluster judge the models; None for this machine's cores.
 
     Raises:
         InputError: several outputs, too few rows, terms that are none.
@@ -199,9 +203,9 @@ def select(
         raise InputError("structure is chosen beside physics that are terms; of a Python function nothing is known.")
     criterion = Simulation() if criterion is None else criterion
     record, kept = record.split(0.5) if halves else (record, record)
-    problem, heard = pose(record, baseline), _Listener(progress)
+    problem, heard, runner = pose(record, baseline), _Listener(progress), runs_on(engine or InMemory())
     largest, least = _reach(problem, lags)
-    orders = search_orders(problem, criterion, largest, least, blocks, heard.of("orders"))
+    orders = search_orders(problem, criterion, largest, least, blocks, heard.of("orders"), runner)
     names = [channel.name for channel in record.inputs]
     delays = tuple(
         Delay(name, correlated_delay(record, i, largest.nk[i] + largest.nb[i]), orders.chosen.nk[i])
@@ -213,11 +217,13 @@ def select(
     path = found = None
     notes: list[Warning] = []
     if isinstance(learner, Terms) and not heard.stopped:
-        path, notes = _terms(problem, learner, largest, criterion, most, blocks, heard.of("terms"))
+        runs, notes = _terms(problem, learner, largest, criterion)
+        path = climb(runs, blocks, min(most, len(problem.rows) // 10), heard.of("terms"), runner)
         if not path.chosen.point.chosen:
             notes.append(Warning("nothing_helps", "no term lowers the error on the blocks that were held out."))
     elif isinstance(learner, MLP) and not heard.stopped:
-        found = search_learners(problem, chosen, tested, learner, widths, criterion, blocks, heard.of("learner"))
+        told = heard.of("learner")
+        found = search_learners(problem, chosen, tested, learner, widths, criterion, blocks, told, runner)
     if heard.stopped:
         notes.append(Warning("stopped", "the search was stopped; the choice is among the models judged by then."))
     if not halves:
@@ -242,15 +248,8 @@ class _Listener:
         return told
 
 
-def _terms(
-    problem: Problem,
-    learner: Terms,
-    largest: Orders,
-    criterion: Criterion,
-    most: int,
-    blocks: int,
-    told: Callable[[Any], None],
-) -> tuple[TermPath, list[Warning]]:
+def _terms(problem: Problem, learner: Terms, largest: Orders, criterion: Criterion) -> tuple[TermRuns, list[Warning]]:
+    """The library of terms laid out, and what is to be told of it."""
     outputs, inputs = problem.outputs, tuple(channel.name for channel in problem.record.inputs)
     lags = Lags(largest.na, largest.nb, largest.nk).layout(outputs, inputs)
     known = regressor_of(problem.baseline, None, None, outputs, inputs)[0]
@@ -261,8 +260,7 @@ def _terms(
     if len(library) > rows:
         text = f"there are {len(library)} candidate terms and {rows} rows; at most a tenth as many terms are chosen."
         notes.append(Warning("more_terms_than_rows", text))
-    runs = TermRuns.of(problem, able.library, criterion)
-    return climb(runs, blocks, min(most, rows // 10), told), notes
+    return TermRuns.of(problem, able.library, criterion), notes
 
 
 def _reach(problem: Problem, lags: Lags | None) -> tuple[Orders, Orders]:

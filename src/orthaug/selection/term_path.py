@@ -8,14 +8,15 @@ pairs, or worse by less than is worth a term.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
 
 from orthaug._base.checks import Vector
-from orthaug._base.parallel import one_blas_thread, spread
+from orthaug._base.parallel import Threads, one_blas_thread
 from orthaug.fitting.held_out import WORTH, blocked
 from orthaug.fitting.segments import Segments, lay_segments
 from orthaug.selection.forward import Equations, forward
@@ -85,24 +86,48 @@ def judge_all(rungs: Sequence[Rung]) -> tuple[Judged, ...]:
 class Blocks:
     """The folds of blocked cross-validation, laid out once: what is left to fit, and the block's rows to fly over."""
 
-    def __init__(self, runs: TermRuns, blocks: int) -> None:
+    def __init__(self, runs: TermRuns, blocks: int, runner: Any) -> None:
         first = runs.menu.first_row
+        self.runner = runner
         self.folds: list[tuple[TermRuns, Segments]] = []
         held_shape: Segments | None = None
         for kept, held in blocked(runs.problem.record, blocks, first):
             laid = lay_segments(held, runs.menu, 0, runs.flown.washout, held_shape)
             held_shape = laid if held_shape is None else held_shape
             self.folds.append((runs.on(kept), laid))
+        self.given = runs, self.folds
 
-    def judge(self, point: Point) -> Vector:
-        """Mean squared errors of free runs on each block of the same terms, fitted without it."""
+    def judge(self, points: Sequence[Point]) -> Iterator[tuple[Vector, float]]:
+        """Mean squared errors of free runs on each block of the same terms, fitted without it; and what it took [s]."""
+        items = [(point._replace(states=None), i) for point in points for i in range(len(self.folds))]
+        found = self.runner.map(_on_fold, self.given, items)
+        for _ in points:
+            errors, seconds = zip(*islice(found, len(self.folds)), strict=True)
+            yield np.array(errors), sum(seconds)
 
-        def one(fold: tuple[TermRuns, Segments], check: Callable[[], None]) -> float:
-            runs, held = fold
-            own = point._replace(states=None if runs.laid is None else np.asarray(runs.laid.start))
-            return runs.errors(runs.fit(own, point.chosen, _FOLD_ITERATIONS), held)
+    def fitted(self, choices: Sequence[Sequence[int]]) -> Iterator[tuple[Point, Vector, float]]:
+        """Each choice fitted to all of the record and judged; and what it took [s]."""
+        points = list(self.runner.map(_on_all, self.given, choices))
+        judged = self.judge([point for point, _ in points])
+        for (point, fitting), (held, judging) in zip(points, judged, strict=True):
+            yield point, held, fitting + judging
 
-        return np.array(spread(one, self.folds))
+
+_Given = tuple[TermRuns, list[tuple[TermRuns, Segments]]]
+
+
+def _on_all(given: _Given, chosen: Sequence[int], tell: Callable[..., None]) -> tuple[Point, float]:
+    """Chosen terms beside the physics, fitted from physics alone; and what it took [s]."""
+    runs, began = given[0], time.monotonic()
+    return runs.fit(runs.start(), chosen), time.monotonic() - began
+
+
+def _on_fold(given: _Given, item: tuple[Point, int], tell: Callable[..., None]) -> tuple[float, float]:
+    """The mean squared error on a block of a model that is fitted without it; and what it took [s]."""
+    began, (point, number) = time.monotonic(), item
+    runs, held = given[1][number]
+    own = point._replace(states=None if runs.laid is None else np.asarray(runs.laid.start))
+    return runs.errors(runs.fit(own, point.chosen, _FOLD_ITERATIONS), held), time.monotonic() - began
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,17 +164,24 @@ class TermPath:
         return {texts[i]: float(count[i] / _HALVES) for i in rung.point.chosen}
 
 
-def climb(runs: TermRuns, blocks: int, most: int, told: Told = lambda rung: None) -> TermPath:
+def climb(
+    runs: TermRuns,
+    blocks: int,
+    most: int,
+    told: Told = lambda rung: None,
+    runner: Any = Threads(),  # noqa: B008  (it holds nothing)
+) -> TermPath:
     """The path of up to `most` terms forward, and from the best model on backward.
 
     Raises:
         InputError: too few rows for so many blocks.
     """
     with one_blas_thread():
-        folds, rungs = Blocks(runs, blocks), []
+        folds, rungs = Blocks(runs, blocks, runner), []
 
         def judged(point: Point, change: Sequence[str], began: float) -> Rung:
-            rung = Rung(point, tuple(change), folds.judge(point), time.monotonic() - began, len(point.chosen))
+            held, _ = next(folds.judge([point]))
+            rung = Rung(point, tuple(change), held, time.monotonic() - began, len(point.chosen))
             rungs.append(rung)
             told(rung)
             return rung

@@ -24,7 +24,7 @@ from orthaug._base.checks import finite_or_none
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_file
 from orthaug._base.parallel import spread
-from orthaug.models.cluster import told
+from orthaug.models.tasks import ask, places
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -144,15 +144,16 @@ def runs(
     if progress is not None:
         progress(done, len(cases))
 
-    one, wanted = study.one, study.workers if workers is None else workers
-    if client is not None and study.workers != 1:
-        one, wanted = elsewhere(client, study.one)
+    wanted, elsewhere = study.workers if workers is None else workers, client is not None and study.workers != 1
+    if elsewhere:
+        wanted = places(client)
 
     def run_case(i: int, check: Callable[[], None]) -> None:
         nonlocal done
         check()
         began = time.perf_counter()
-        result = _plain(study, one(**cases[i]))
+        made_of = ask(client, check, study.one, **cases[i]) if elsewhere else study.one(**cases[i])
+        result = _plain(study, made_of)
         seconds = round(time.perf_counter() - began, 3)
         made = datetime.now(UTC).isoformat(timespec="seconds")
         run = Run(cases[i], result, made, seconds, stored=False)
@@ -164,17 +165,6 @@ def runs(
 
     spread(run_case, todo, wanted)
     return [run for run in found if run is not None]
-
-
-def elsewhere(client: Any, one: Callable[..., Any]) -> tuple[Callable[..., Any], int]:
-    """A function that has the workers of a cluster compute, and how many of its calls they take at a time."""
-    threads = sum(client.nthreads().values())
-
-    def ask(**case: Any) -> Any:
-        with told():
-            return client.submit(one, **case, pure=False).result()
-
-    return ask, max(threads, 1)
 
 
 def _path(store: Path, study: Study, case: Case) -> Path:

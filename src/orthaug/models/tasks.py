@@ -1,0 +1,166 @@
+"""Independent runs as tasks of a Dask cluster: restarts, held-out blocks, candidates of a selection, cases of a study.
+
+What all runs share is sent once and goes from worker to worker; each run is whole at one place. A task that a lost
+worker had is made again elsewhere, so results do not depend on who made them.
+"""
+
+from __future__ import annotations
+
+import time
+import uuid
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from typing import Any
+
+from orthaug._base.jax import jax
+from orthaug._base.parallel import Heard, Stopped, each, nobody, one_blas_thread, one_core
+from orthaug.models.cluster import Dask, kept, smallest_worker, told
+from orthaug.models.rows import InMemory, Room
+
+_MATRICES = 3  # of a run in memory
+_WAIT = 0.5  # s between two looks at whether a run is still wanted, and two tellings of a run
+_ANY_SIZE = {"distributed.admin.large-graph-warning-threshold": "1 PB"}  # rows are sent on purpose, and once
+
+
+@dataclass(frozen=True)
+class Tasks(InMemory):
+    """Rows in memory, wherever a run is made; independent runs are tasks of a cluster.
+
+    `client` is a `distributed.Client`.
+    """
+
+    client: Any = None
+    _sent: dict[int, Any] = field(default_factory=dict, compare=False, repr=False)
+
+    def __reduce__(self) -> Any:
+        return InMemory, (self.limit,)  # on a worker
+
+    def map(
+        self,
+        function: Callable[[Any, Any, Callable[..., None]], Any],
+        given: Any,
+        items: Sequence[Any],
+        heard: Heard = nobody,
+    ) -> Iterator[Any]:
+        """As `Threads.map`; the function, its arguments and results are pickled, `given` once while it is the same."""
+        shared = self._shared(given)
+        with _heard_on(self.client) as (topic, said):
+
+            def one(numbered: tuple[int, Any], check: Callable[[], None]) -> Any:
+                i, item = numbered
+
+                def look() -> None:
+                    check()
+                    while said[i]:
+                        heard(i, *said[i].popleft())
+
+                return ask(self.client, look, _made, shared, Sealed((function, item)), topic, i)
+
+            yield from each(one, list(enumerate(items)), places(self.client))
+
+    def room(self) -> Room:
+        """Of the smallest worker, which makes whole runs."""
+        return smallest_worker(self.client, _MATRICES)
+
+    def _shared(self, given: Any) -> Any:
+        """What the workers know `given` by."""
+        from dask import config
+
+        if id(given) not in self._sent:
+            self._sent.clear()
+            with told(), config.set(_ANY_SIZE):
+                self._sent[id(given)] = given, self.client.submit(kept, Sealed(given), pure=False)
+        return self._sent[id(given)][1]
+
+
+def runs_on(engine: Any) -> Any:
+    """The engine for several runs over rows in memory: with a cluster they are its tasks."""
+    return Tasks(client=engine.client) if isinstance(engine, Dask) else engine
+
+
+def places(client: Any) -> int:
+    """How many tasks the workers take at a time."""
+    return max(sum(client.nthreads().values()), 1)
+
+
+def ask(client: Any, check: Callable[[], None], function: Callable[..., Any], *args: Any, **named: Any) -> Any:
+    """The result of a function that a worker computes; `check` is called now and then, and may raise to give it up."""
+    from distributed import wait
+
+    with told():
+        future = client.submit(function, *args, pure=False, **named)
+        try:
+            while not future.done():
+                check()
+                with suppress(TimeoutError):
+                    wait(future, timeout=_WAIT)
+            return future.result()
+        except BaseException:
+            future.cancel()
+            raise
+
+
+@contextmanager
+def _heard_on(client: Any) -> Iterator[tuple[str, dict[int, deque[Any]]]]:
+    """A topic on which tasks tell, and what each of them told."""
+    topic, said = f"orthaug-{uuid.uuid4().hex}", defaultdict[int, deque[Any]](deque)
+
+    def hear(event: tuple[Any, Any]) -> None:
+        i, what = event[1]
+        said[i].append(what)
+
+    with told():
+        client.subscribe_topic(topic, hear)
+    try:
+        yield topic, said
+    finally:
+        client.unsubscribe_topic(topic)
+
+
+@dataclass(frozen=True, eq=False)
+class Sealed:
+    """A value that reaches a worker in double precision: JAX would cut its arrays where that is not turned on yet."""
+
+    value: Any
+
+    def __reduce__(self) -> Any:
+        return _sealed, (_Double(), self.value)  # made in this order there
+
+
+class _Double:
+    """Turns on double precision where it arrives."""
+
+    def __reduce__(self) -> Any:
+        return _in_double, ()
+
+
+def _in_double() -> None:
+    _ = jax.config  # what turns it on
+
+
+def _sealed(_: None, value: Any) -> Sealed:
+    return Sealed(value)
+
+
+def _made(shared: Sealed, asked: Sealed, topic: str, number: int) -> Any:
+    """A run on a worker. What it tells goes to the client, from time to time."""
+    from dask.context import thread_state
+    from distributed import get_worker
+
+    worker, key, last = get_worker(), thread_state.key, time.monotonic()
+
+    def tell(*what: Any) -> None:
+        nonlocal last
+        if time.monotonic() - last < _WAIT:
+            return
+        last = time.monotonic()
+        task = worker.state.tasks.get(key)
+        if task is None or task.state == "cancelled":
+            raise Stopped
+        worker.log_event(topic, (number, tuple(float(value) for value in what)))
+
+    with one_blas_thread(), one_core():
+        function, item = asked.value
+        return function(shared.value, item, tell)
