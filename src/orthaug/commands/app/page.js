@@ -1,0 +1,39 @@
+// A file that is dropped goes to the server piece by piece; how far it is, is shown.
+document.addEventListener("change", (event) => {
+  if (event.target.id === "dropped" && event.target.files.length) take(event.target.files[0]);
+});
+for (const name of ["dragover", "dragenter", "dragleave", "drop"]) {
+  document.addEventListener(name, (event) => {
+    if (!event.dataTransfer || ![...event.dataTransfer.types].includes("Files")) return;
+    event.preventDefault();
+    const zone = document.getElementById("drop");
+    if (!zone) return;
+    zone.classList.toggle("over", name === "dragover" || name === "dragenter");
+    if (name === "drop" && event.dataTransfer.files.length) take(event.dataTransfer.files[0]);
+  });
+}
+
+function take(file) {
+  const told = document.getElementById("drop-told"), bar = document.getElementById("drop-bar");
+  const request = new XMLHttpRequest();
+  request.open("PUT", `${location.pathname}/file/${encodeURIComponent(file.name)}`);
+  request.upload.onprogress = (event) => {
+    bar.hidden = false;
+    bar.value = event.total ? event.loaded / event.total : 0;
+    told.textContent = `${file.name}: ${Math.round(100 * bar.value)} %`;
+  };
+  request.onload = () => {
+    bar.hidden = true;
+    let answer = {};
+    try { answer = JSON.parse(request.responseText); } catch { /* told below */ }
+    told.textContent = answer.refused ?? (answer.kept ? `${answer.kept} is here` : "the file could not be taken in");
+    told.classList.toggle("refused", !answer.kept);
+    document.getElementById("dropped").value = "";
+  };
+  request.onerror = () => {
+    bar.hidden = true;
+    told.textContent = "the server does not answer; is orthaug app still running?";
+    told.classList.add("refused");
+  };
+  request.send(file);
+}
