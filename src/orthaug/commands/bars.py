@@ -18,7 +18,7 @@ from orthaug.commands.signals import WATCH
 
 TOLD_AS = "ORTHAUG_PROGRESS"
 """Variable of the environment; where it is `json`, training tells of itself by lines of JSON on standard error."""
-_OFTEN = 0.1  # s between such lines
+_OFTEN = 0.02  # s between such lines
 _MANY = 1_000_000  # rows from which the rate is told
 _LONG = 5.0  # s of a search that are told beforehand
 _SEEN = 3  # models after which the time of the rest is told: the first ones compile

@@ -37,3 +37,19 @@ function take(file) {
   };
   request.send(file);
 }
+
+// Plots take the width that there is, once they have one.
+const widths = new ResizeObserver((entries) => entries.forEach((entry) => fit(entry.target)));
+new MutationObserver(() => {
+  for (const plot of document.querySelectorAll(".plot:not([data-fit])")) {
+    plot.dataset.fit = "";
+    widths.observe(plot);
+  }
+}).observe(document, { childList: true, subtree: true });
+
+async function fit(plot) {
+  const { Plotly } = await import("nicegui-plotly");
+  for (let i = 0; i < 20 && plot.isConnected && !plot._fullLayout; i++) await new Promise((go) => setTimeout(go, 50));
+  const width = plot.isConnected && plot._fullLayout ? plot.offsetWidth : 0;
+  if (width && Math.abs(plot._fullLayout.width - width) > 1) Plotly.relayout(plot, { autosize: true, width });
+}

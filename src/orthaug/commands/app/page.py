@@ -51,7 +51,7 @@ class Page:
         with ui.tabs().props("no-caps align=left active-color=tab indicator-color=tab dense").classes("tabs") as tabs:
             made = {name: ui.tab(name) for name in _PARTS}
         start = "Training" if self.session.commands else "Data"
-        panels = ui.tab_panels(tabs, value=made[start]).props('id=parts keep-alive=""').classes("parts")
+        panels = ui.tab_panels(tabs, value=made[start]).props("id=parts animated=false").classes("parts")
         parts = (self.data, self.model, self.training, self.report, self.export)
         with panels:
             for name, part in zip(_PARTS, parts, strict=True):
@@ -71,8 +71,8 @@ class Page:
         if moved("data"):
             self.data.follow_data()
         if moved("spec"):
-            several = now["spec"] - seen.get("spec", 0) > 1
-            author = "" if several else self.session.author
+            authors = set(self.session.authors[seen.get("spec", 0) :])
+            author = authors.pop() if len(authors) == 1 else ""
             self.data.follow_spec(author)
             self.model.follow_spec(author)
         if moved("check"):

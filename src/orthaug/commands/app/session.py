@@ -34,8 +34,8 @@ class Session:
         self.trouble = ""
         """What is wrong with the data, in words."""
         self.spec = ""
-        self.author = ""
-        """Who changed the spec last: a part of a page, which need not be told."""
+        self.authors: list[str] = []
+        """Who made each change of the spec: a part of a page, which need not be told of its own."""
         self.checked: dict[str, Any] | None = None
         self.refused = ""
         """Why the spec cannot be trained, in words."""
@@ -132,7 +132,8 @@ class Session:
         """Take a spec, and check it when nobody has changed it for a moment."""
         if text == self.spec:
             return
-        self.spec, self.author = text, author
+        self.spec = text
+        self.authors.append(author)
         self.changed("spec")
         if self._check is not None:
             self._check.cancel()

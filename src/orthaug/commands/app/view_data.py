@@ -47,6 +47,7 @@ class DataView:
         self.session = session
         self.uses: dict[str, str] = {}
         self.step = ""
+        self._curves: Any = None
 
     def draw(self) -> None:
         """The places; their content follows."""
@@ -56,7 +57,7 @@ class DataView:
             with ui.element("div").classes("stack"):
                 with card("Data file"):
                     ui.html(_DROP.format(endings=",".join(KNOWN), told=_KNOWN), sanitize=False)
-                    with ui.element("div").classes("line"):
+                    with ui.element("div").classes("fields"):
                         self.path = ui.input("or its path on this machine").props("outlined dense stack-label")
                         self.path.classes("grow").on("keydown.enter", self.name_file)
                         button("Open", self.name_file)
@@ -106,7 +107,7 @@ class DataView:
             self.uses = {h: "input" if h in inputs else "output" if h in outputs else "" for h in self.uses}
         with redrawn(self.column_rows):
             for column in usable[:_LISTED]:
-                with ui.element("div").classes("row"):
+                with ui.element("div").classes("entry"):
                     with ui.element("div").classes("grow"):
                         text(column["header"], "p", "strong")
                         text(column["told"], "p", "hint")
@@ -116,7 +117,7 @@ class DataView:
                 text("Not usable: " + ", ".join(f"{c['header']} ({c['told']})" for c in left[:_LISTED]), "p", "hint")
             if found["open"] and found["spec"] is None:
                 note("The names of the columns do not say which are inputs and outputs: choose them here.", "care")
-            with ui.element("div").classes("line"):
+            with ui.element("div").classes("fields"):
                 step = "" if found["step"] is None else f"{found['step']:g}"
                 own = "" if found["step"] is not None and "column" in found["clock"] else step
                 field("sampling time in s", own, self._set_step, classes="short", hint=step or "1")
@@ -164,10 +165,10 @@ class DataView:
 
     def _draw_step(self, index: int, step: Mapping[str, Any]) -> None:
         kind = str(step.get("step"))
-        with ui.element("div").classes("row"):
+        with ui.element("div").classes("entry"):
             with ui.element("div").classes("grow"):
                 text(f"{index + 1}. {_SUMMARIES.get(kind, kind)}", "p", "strong")
-                with ui.element("div").classes("line"):
+                with ui.element("div").classes("fields"):
                     for own in fields(STEPS[kind]) if kind in STEPS else ():
                         usual = "" if own.default is MISSING else _shown(own.default)
                         field(
@@ -218,6 +219,10 @@ class DataView:
                     unit, name = curve["unit"], channel
             if drawn:
                 rows.append((f"{name} [{unit}]" if unit else name, drawn))
+        state = (rows, cleaned, checked and checked["prepared"], checked and checked["rows"])
+        if state == self._curves:
+            return
+        self._curves = state
         with redrawn(self.curves):
             if not rows:
                 text("The curves of a file are drawn here, once there is one.", "p", "hint")

@@ -72,14 +72,14 @@ class ModelView:
             text(" and ".join(f"{name}[k] = Σ parameter · regressor" for name in outputs), "p", "hint formula")
             for i, term in enumerate(spec_text.rows_of(self.session.spec, _TERMS)):
                 self._draw_term(i, term, several=len(outputs) > 1)
-            with ui.element("div").classes("line"):
+            with ui.element("div").classes("fields"):
                 button("Add a term", self._add)
                 button("Write equations of motion instead", self._to_motion)
 
     def _draw_term(self, index: int, term: Mapping[str, Any], *, several: bool) -> None:
-        keys = ("parameter", "regressor", *(("output",) if several else ()), "initial", "unit", "min", "max")
-        with ui.element("div").classes("row term").props(f'role=group aria-label="term {index + 1}"'):
-            with ui.element("div").classes("line grow"):
+        keys = ("parameter", "regressor", *(("output",) if several else ()), "initial", "unit")
+        with ui.element("div").classes("entry term").props(f'role=group aria-label="term {index + 1}"'):
+            with ui.element("div").classes("fields grow"):
                 for key in keys:
                     wide = "" if key in ("parameter", "regressor") else "short"
                     field(key, term.get(key), self._cell(index, key), classes=f"{wide} {key}")
@@ -120,9 +120,9 @@ class ModelView:
             text(f"d{name}/dt = {equation}{learned}", "p", "formula")
         for name, row in motion.get("parameters", {}).items():
             if isinstance(row, Mapping):
-                with ui.element("div").classes("row term").props(f'role=group aria-label="parameter {name}"'):
+                with ui.element("div").classes("entry term").props(f'role=group aria-label="parameter {name}"'):
                     text(name, "p", "strong")
-                    with ui.element("div").classes("line grow"):
+                    with ui.element("div").classes("fields grow"):
                         for key in ("initial", "unit", "min", "max"):
                             field(key, row.get(key), self._value(("motion", "parameters", name, key)), classes="short")
 
@@ -141,16 +141,16 @@ class ModelView:
                 text("A learner finds what the physics does not say.", "p", "hint")
                 return
             kind = str(learner.get("kind", "mlp"))
-            with ui.element("div").classes("line"):
+            with ui.element("div").classes("fields"):
                 choice("learner", _LEARNERS, kind, self._set_kind)
                 if kind == "mlp":
                     hidden = ", ".join(map(str, learner.get("hidden", [16])))
-                    field("neurons in each layer", hidden, self._set_hidden, classes="short")
+                    field("neurons", hidden, self._set_hidden, classes="short")
                 if kind == "terms":
                     field("highest degree", learner.get("degree"), self._value(("learner", "degree")), classes="short")
                 seen = ", ".join(map(str, learner.get("inputs", ())))
                 field("what it sees", seen, self._set_inputs, hint="all that the physics reads")
-            with ui.element("div").classes("line"):
+            with ui.element("div").classes("fields"):
                 structure = str(content.get("structure", {}).get("kind", "orthogonal"))
                 choice("structure", _STRUCTURES, structure, self._chosen(("structure", "kind")))
                 focus = str(training.get("focus", "simulation" if moves else "prediction"))
@@ -217,7 +217,7 @@ def _findings(told: Mapping[str, Any], bias: Sequence[Mapping[str, Any]]) -> Non
         ("rank on these data", f"{data['rank']} of {data['columns']}, condition {condition}"),
         ("rank on any data", f"{physics['rank']} of {physics['columns']}"),
     ]
-    table(("", "found"), rows)
+    table(("what", "found"), rows)
     for group in physics["inseparable"]:
         note(f"No data can tell apart: {', '.join(group)}.", "care")
     for group in data["collinear"] if physics["identifiable"] else ():
@@ -258,4 +258,4 @@ def _units(units: Sequence[tuple[str, str, str | None]]) -> None:
 
 
 def _percent(value: float | None) -> str:
-    return "–" if value is None else f"{0.0 if abs(value) < 1e-9 else value:+.2g} %"
+    return "–" if value is None else f"{0.0 if abs(value) < 1e-9 else value:+.2g}\u00a0%"

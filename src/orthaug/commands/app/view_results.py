@@ -49,7 +49,7 @@ class ReportView:
                     text("The report of a fit or of a comparison is read here, once there is one.", "p", "hint")
                 return
             self.shown = self.shown if self.shown in there else there[0]
-            with ui.element("div").classes("line report-line"):
+            with ui.element("div").classes("fields report-line"):
                 if len(there) > 1:
                     choice("report", {name: _REPORTS[name] for name in there}, self.shown, self._show, "bare")
                 link("Download the report", f"/work/{session.key}/get/{self.shown}")
@@ -102,7 +102,7 @@ class ExportView:
         if "compare" in session.results:
             files += [("comparison.zip", "All of the comparison", "result folder")]
         for name, label, hint in files:
-            with ui.element("div").classes("row"):
+            with ui.element("div").classes("entry"):
                 with ui.element("div").classes("grow"):
                     text(label, "p", "strong")
                     text(hint, "p", "hint")
@@ -123,7 +123,7 @@ class ExportView:
         field("name in the code", self.name, self._rename, classes="short")
         for target, summary in _TARGETS.items():
             why = session.exports.get(target)
-            with ui.element("div").classes("row"):
+            with ui.element("div").classes("entry"):
                 with ui.element("div").classes("grow"):
                     text(summary, "p", "strong")
                     if why and why != "…":

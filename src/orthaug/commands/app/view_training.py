@@ -12,6 +12,7 @@ from orthaug.commands.app.session import Session
 from orthaug.commands.app.widgets import button, card, loss_figure, note, number, plot, redrawn, table, text
 
 _MOST = 1500  # points of a curve of the loss
+_LEAST = 8  # points that are worth a curve
 _TITLES = {"fit": "Training", "compare": "Comparison"}
 
 
@@ -20,21 +21,20 @@ class TrainingView:
 
     def __init__(self, session: Session) -> None:
         self.session = session
-        self._told = -1  # losses that are drawn
+        self._told = 0  # losses that are drawn
+        self._curve: ui.plotly | None = None
         self._state: Any = None
 
     def draw(self) -> None:
         """The places; their content follows."""
         with card("Train", "Runs orthaug fit on the spec, or orthaug compare: physics alone and every structure."):
-            with ui.element("div").classes("line"):
+            with ui.element("div").classes("fields"):
                 self.begin = button("Train", lambda: self.session.train("fit"), main=True)
                 self.compare = button("Compare structures", lambda: self.session.train("compare"))
                 self.end = button("Stop", self.session.stop, classes="stop")
             self.state = ui.element("div")
             self.bar = ui.element("progress").props('max=1 value=0 aria-label="progress of training"')
             self.losses = ui.element("div")
-            with self.losses:
-                self.curve = plot(loss_figure([]), "Loss of every run over its iterations, on a logarithmic axis.")
         self.fit = ui.element("div")
         self.comparison = ui.element("div")
         self.follow_work()
@@ -57,15 +57,24 @@ class TrainingView:
             else:
                 self._tell(shown)
         self.bar.set_visibility(running is not None)
-        self.losses.set_visibility(shown is not None and bool(shown.losses))
-        if shown is not None and len(shown.losses) != self._told:
-            self._told = len(shown.losses)
-            every = max(1, len(shown.losses) // _MOST)
-            self.curve.update_figure(loss_figure(shown.losses[::every]))
+        self._draw_losses([] if shown is None else shown.losses)
         state = (running is None, *(session.trained.get(kind) for kind in _TITLES), session.spec)
         if state != self._state:
             self._state = state
             self._draw_results()
+
+    def _draw_losses(self, losses: Sequence[tuple[int, int, float]]) -> None:
+        losses = losses if len(losses) >= _LEAST else []
+        if len(losses) == self._told:
+            return
+        figure = loss_figure(losses[:: max(1, len(losses) // _MOST)])
+        if self._curve is None or not losses or not self._told:
+            with redrawn(self.losses):
+                told = "Loss of every run over its iterations, on a logarithmic axis."
+                self._curve = plot(figure, told) if losses else None
+        else:
+            self._curve.update_figure(figure)
+        self._told = len(losses)
 
     def _tell(self, command: Command) -> None:
         told, what = command.progress, _TITLES.get(command.arguments[0], "")
@@ -125,7 +134,7 @@ def _parameters(caption: str, rows: Sequence[Mapping[str, Any]]) -> None:
                 number(row["value"], 6),
                 number(row["std"], 3),
                 f"{number(low)} … {number(high)}",
-                row["unit"],
+                row["unit"] or "–",
             )
         )
     table(("parameter", "value", "standard error", "95 % interval", "unit"), cells, caption)

@@ -9,7 +9,7 @@ from typing import Any
 
 from nicegui import ui
 
-Curves = Mapping[str, Mapping[str, Any]]
+_WIDE = 5  # columns of a table that may be wider than its place
 
 
 def text(what: Any, tag: str = "p", classes: str = "") -> ui.html:
@@ -20,6 +20,8 @@ def text(what: Any, tag: str = "p", classes: str = "") -> ui.html:
 def card(title: str, hint: str = "", classes: str = "") -> ui.element:
     """A section with a heading."""
     section = ui.element("section").classes(f"card {classes}")
+    if "sticky" in classes:  # it scrolls by itself, by keys too
+        section.props(f'tabindex=0 role=region aria-label="{escape(title, True)}"')
     with section:
         text(title, "h2")
         if hint:
@@ -52,7 +54,7 @@ def choice(
     """A list to choose from, as every phone knows it; the label is above."""
     with ui.element("label").classes(f"choice {classes}"):
         text(label, "span")
-        made = ui.element("select")
+        made = ui.element("select").props(f'aria-label="{escape(label, True)}"')
         with made:
             for key, shown in options.items():
                 option = ui.html(escape(shown), sanitize=False, tag="option").props(f'value="{escape(key)}"')
@@ -76,7 +78,9 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "")
             f"<td data-label='{escape(n, True)}'>{escape(str(c))}</td>" for n, c in zip(head[1:], row[1:], strict=True)
         ]
         lines.append(f"<tr><th scope='row'>{escape(str(row[0]))}</th>{''.join(cells)}</tr>")
-    ui.html("".join([*lines, "</tbody></table>"]), sanitize=False).classes("table")
+    made = ui.html("".join([*lines, "</tbody></table>"]), sanitize=False).classes("table")
+    if len(head) >= _WIDE:  # it may scroll, by keys too
+        made.props(f'tabindex=0 role=region aria-label="{escape(caption or head[0], True)}"')
 
 
 def number(value: Any, digits: int = 5) -> str:
@@ -86,7 +90,7 @@ def number(value: Any, digits: int = 5) -> str:
 
 def button(label: str, clicked: Callable[[], Any], *, main: bool = False, classes: str = "") -> ui.button:
     """A button; the main one of its place is filled."""
-    made = ui.button(label, on_click=clicked).props("no-caps unelevated" if main else "no-caps outline")
+    made = ui.button(label, on_click=clicked, color=None).props("no-caps unelevated" if main else "no-caps outline")
     return made.classes(("main " if main else "plain ") + classes)
 
 
@@ -139,8 +143,8 @@ def loss_figure(losses: Sequence[tuple[int, int, float | None]]) -> dict[str, An
     layout = _layout(260)
     layout["xaxis"] |= {"title": {"text": "iteration", "font": {"size": 12}}}
     title = {"text": "loss", "font": {"size": 12}}
-    layout["yaxis"] = {"type": "log", "title": title, "automargin": True, "exponentformat": "power", "nticks": 5}
-    own = {"type": "scatter", "mode": "lines+markers", "marker": {"size": 4}, "showlegend": len(runs) > 1}
+    layout["yaxis"] = {"type": "log", "title": title, "automargin": True, "exponentformat": "e", "nticks": 5}
+    own = {"type": "scatter", "mode": "lines+markers", "marker": {"size": 4}, "showlegend": 1 < len(runs) <= 6}
     traces = [
         {**own, "name": f"run {run}", "x": x, "y": y, "line": {"width": 1.5, "color": _COLORS[i % len(_COLORS)]}}
         for i, (run, (x, y)) in enumerate(runs.items())
@@ -148,7 +152,7 @@ def loss_figure(losses: Sequence[tuple[int, int, float | None]]) -> dict[str, An
     return {"data": traces, "layout": layout, "config": _CONFIG}
 
 
-_CONFIG = {"displayModeBar": False, "responsive": True, "displaylogo": False}
+_CONFIG = {"displayModeBar": False, "responsive": False, "displaylogo": False}
 
 
 def _layout(height: int) -> dict[str, Any]:

@@ -150,7 +150,7 @@ def _units(job: Job) -> list[tuple[str, str, str | None]]:
     first, constants, told = job.train.record.outputs[0].name, job.spec.baseline.constants, {}
     for term in job.spec.baseline.terms:
         expression = parse(str(term.regressor), constants)
-        told[term.parameter] = (term.unit, coefficient_unit(channels[term.output or first], expression, channels))
+        told[term.parameter] = (term.unit or "", coefficient_unit(channels[term.output or first], expression, channels))
     return [(name, *units) for name, units in told.items()]
 
 
