@@ -115,8 +115,9 @@ class DataView:
             left = [c for c in found["columns"] if not c["usable"]]
             if left:
                 text("Not usable: " + ", ".join(f"{c['header']} ({c['told']})" for c in left[:_LISTED]), "p", "hint")
-            if found["open"] and found["spec"] is None:
-                note("The names of the columns do not say which are inputs and outputs: choose them here.", "care")
+            if found["spec"] is None:
+                names = "The names of the columns do not say which are inputs and outputs: choose them here."
+                note(found["open"] or names, "care")
             with ui.element("div").classes("fields"):
                 step = "" if found["step"] is None else f"{found['step']:g}"
                 own = "" if found["step"] is not None and "column" in found["clock"] else step
