@@ -290,7 +290,7 @@ def test_from_a_file_to_code_with_the_numbers_of_the_command_line(server, browse
     page.wait_for_selector(".plot .main-svg")
     page.get_by_label("add a step").select_option("detrend")
     page.wait_for_selector("text=Done: detrend")
-    tab.check("Data", "Model")
+    tab.check("Model")
     assert page.get_by_text("Unit of").count() == 0
     page.get_by_label("unit").first.fill("m")
     page.get_by_label("unit").first.press("Tab")
@@ -322,7 +322,6 @@ def test_from_a_file_to_code_with_the_numbers_of_the_command_line(server, browse
     tab.go("Training")
     page.get_by_role("button", name="Train").click()
     page.wait_for_selector("text=Training is done")
-    tab.check("Training")
     tab.go("Report")
     assert page.frame_locator("iframe").locator("h1").inner_text() == "Model of y from u"
     tab.check("Export")
@@ -373,7 +372,7 @@ def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
     page.wait_for_selector("text=first physics")
     tab.go("Model")
     tab.write(lambda text: text.replace("[learner]", "[learner"))
-    assert "broken TOML" in page.inner_text(".note.bad")
+    assert "Broken TOML" in page.inner_text(".note.bad")
     tab.go("Training")
     assert page.get_by_role("button", name="Train").is_disabled()
     assert tab.fetch("../x") and tab.context.request.get(f"{page.url}/get/result.zip").status == 404
@@ -394,7 +393,7 @@ def test_ctrl_c_leaves_nothing(browser, csv, tmp_path):
     tab.page.wait_for_selector(".note.good")
     tab.go("Training")
     tab.page.get_by_role("button", name="Train").click()
-    tab.page.wait_for_selector("text=iteration")
+    tab.page.wait_for_selector("text=reading and compiling")
     children = server.children()
     assert len(children) >= 2
     told = server.end()

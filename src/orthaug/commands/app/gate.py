@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import hmac
 import secrets
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Mapping
 from http.cookies import CookieError, SimpleCookie
-from typing import Any
+from typing import TYPE_CHECKING
 from urllib.parse import parse_qsl, urlencode
 
-Message = dict[str, Any]
-Scope = Mapping[str, Any]
-Receive = Callable[[], Awaitable[Message]]
-Send = Callable[[Message], Awaitable[None]]
-Application = Callable[[Scope, Receive, Send], Awaitable[None]]
+if TYPE_CHECKING:
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 _NAMES = ("127.0.0.1", "localhost")
 _REFUSED = (
@@ -41,7 +38,7 @@ class Gate:
     requests that a page of another origin makes.
     """
 
-    def __init__(self, app: Application, port: int, token: str | None = None) -> None:
+    def __init__(self, app: ASGIApp, port: int, token: str | None = None) -> None:
         self.app, self.port = app, port
         self.token = secrets.token_urlsafe(32) if token is None else token
         self.cookie = f"orthaug-{port}"  # cookies know no ports

@@ -117,16 +117,16 @@ def _progress(line: str) -> dict[str, Any] | None:
 
 
 class Desk:
-    """Answers questions, each by a process of its own, so that the page neither waits nor holds the data.
+    """Answers questions in processes of their own, so that the page neither waits nor holds the data.
 
     One process waits with its modules imported for the next question.
     """
 
     def __init__(self) -> None:
-        self._spare: asyncio.Task[asyncio.subprocess.Process] | None = None
+        self._idle: list[asyncio.subprocess.Process] = []
+        self._coming: asyncio.Task[asyncio.subprocess.Process] | None = None
         self._busy: set[asyncio.subprocess.Process] = set()
         self._room = asyncio.Semaphore(_AT_ONCE)
-        self.closed = False
 
     async def ask(self, question: str, **given: Any) -> dict[str, Any]:
         """The answer of a worker. A caller that is cancelled ends the worker.
@@ -137,29 +137,37 @@ class Desk:
         async with self._room:
             process = await self._taken()
             self._busy.add(process)
+            answer: dict[str, Any] = {"last": True}
             try:
-                return await _answered(process, {"question": question, **given})
+                answer = await _answered(process, {"question": question, **given})
             finally:
                 self._busy.discard(process)
-                _kill(process)
-                if not self.closed:
+                if answer["last"]:
+                    _kill(process)
                     self.prepare()
+                else:
+                    self._idle.append(process)
+        if "refused" in answer:
+            raise InputError(answer["refused"])
+        return answer
 
     def prepare(self) -> None:
         """Let a process wait for the next question."""
-        if self._spare is None:
-            self._spare = asyncio.ensure_future(_started())
+        if self._coming is None and not self._idle:
+            self._coming = asyncio.ensure_future(_started())
 
     async def _taken(self) -> asyncio.subprocess.Process:
-        spare, self._spare = self._spare or asyncio.ensure_future(_started()), None
-        process = await asyncio.shield(spare)
-        return process if process.returncode is None else await _started()
+        while self._idle:
+            process = self._idle.pop()
+            if process.returncode is None:
+                return process
+        coming, self._coming = self._coming, None
+        return await (_started() if coming is None else asyncio.shield(coming))
 
     async def close(self) -> None:
         """End all of them."""
-        self.closed = True
-        spare = [] if self._spare is None else [await self._spare]
-        for process in (*self._busy, *spare):
+        coming = [] if self._coming is None else [await self._coming]
+        for process in (*self._busy, *self._idle, *coming):
             _kill(process)
             with suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(process.wait(), _GRACE)
@@ -182,12 +190,9 @@ async def _answered(process: asyncio.subprocess.Process, question: dict[str, Any
         process.stdin.write(json.dumps(question, default=_path).encode() + b"\n")
         await process.stdin.drain()
         line = await process.stdout.readline()
-        answer = json.loads(line)
+        return json.loads(line)
     except (OSError, ValueError):
         raise InputError("the data could not be looked at: the process ended early. Is there enough memory?") from None
-    if "refused" in answer:
-        raise InputError(answer["refused"])
-    return answer
 
 
 def _path(value: Any) -> str:

@@ -12,7 +12,19 @@ from nicegui import ui
 from orthaug._base.errors import InputError
 from orthaug.commands.app import spec_text
 from orthaug.commands.app.session import Session
-from orthaug.commands.app.widgets import button, card, choice, curves_figure, field, note, plot, redrawn, table, text
+from orthaug.commands.app.widgets import (
+    button,
+    card,
+    choice,
+    curves_figure,
+    field,
+    named,
+    note,
+    plot,
+    redrawn,
+    table,
+    text,
+)
 from orthaug.data.steps import STEPS
 
 _STEPS = ("data", "prepare")
@@ -179,7 +191,7 @@ class DataView:
                             classes="short",
                             hint=usual,
                         )
-            button("Remove", lambda: self._remove(index)).props(f'aria-label="Remove step {index + 1}"')
+            named(button("Remove", lambda: self._remove(index)), f"Remove step {index + 1}")
 
     def _setting(self, index: int, key: str) -> Any:
         def change(value: str) -> None:

@@ -10,7 +10,7 @@ from nicegui import ui
 from orthaug.commands.app import spec_text
 from orthaug.commands.app.session import Session
 from orthaug.commands.app.view_data import _read
-from orthaug.commands.app.widgets import button, card, choice, field, note, number, redrawn, table, text
+from orthaug.commands.app.widgets import button, card, choice, field, named, note, number, redrawn, table, text
 
 _TERMS = ("baseline", "terms")
 _LEARNERS = {"mlp": "a network", "terms": "a sum of terms", "none": "none: physics alone"}
@@ -78,12 +78,12 @@ class ModelView:
 
     def _draw_term(self, index: int, term: Mapping[str, Any], *, several: bool) -> None:
         keys = ("parameter", "regressor", *(("output",) if several else ()), "initial", "unit")
-        with ui.element("div").classes("entry term").props(f'role=group aria-label="term {index + 1}"'):
+        with named(ui.element("div").classes("entry term").props("role=group"), f"term {index + 1}"):
             with ui.element("div").classes("fields grow"):
                 for key in keys:
                     wide = "" if key in ("parameter", "regressor") else "short"
                     field(key, term.get(key), self._cell(index, key), classes=f"{wide} {key}")
-            button("Remove", lambda: self._remove(index)).props(f'aria-label="Remove term {index + 1}"')
+            named(button("Remove", lambda: self._remove(index)), f"Remove term {index + 1}")
 
     def _cell(self, index: int, key: str) -> Callable[[str], None]:
         def change(value: str) -> None:
@@ -120,7 +120,7 @@ class ModelView:
             text(f"d{name}/dt = {equation}{learned}", "p", "formula")
         for name, row in motion.get("parameters", {}).items():
             if isinstance(row, Mapping):
-                with ui.element("div").classes("entry term").props(f'role=group aria-label="parameter {name}"'):
+                with named(ui.element("div").classes("entry term").props("role=group"), f"parameter {name}"):
                     text(name, "p", "strong")
                     with ui.element("div").classes("fields grow"):
                         for key in ("initial", "unit", "min", "max"):

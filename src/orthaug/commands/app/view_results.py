@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 
 from nicegui import ui
 
 from orthaug.commands.app.session import Session
-from orthaug.commands.app.widgets import button, card, choice, field, link, note, redrawn, text
+from orthaug.commands.app.widgets import button, card, choice, field, link, named, note, redrawn, text
 
 _REPORTS = {"report.html": "of the fit", "comparison.html": "of the comparison"}
 _TARGETS = {
@@ -134,9 +135,9 @@ class ExportView:
                     text("writing …", "p", "note busy").props("role=status")
                 else:
                     made = button("Write", self._exporting(target))
-                    made.props(f'aria-label="Write {target}"')
+                    named(made, f"Write {target}")
 
-    def _exporting(self, target: str) -> object:
+    def _exporting(self, target: str) -> Callable[[], None]:
         return lambda: self.session.export(target, self.name)
 
     def _rename(self, value: str) -> None:

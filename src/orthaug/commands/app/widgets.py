@@ -5,11 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import contextmanager
 from html import escape
-from typing import Any
+from typing import Any, TypeVar
 
 from nicegui import ui
 
+Drawn = TypeVar("Drawn", bound=ui.element)
 _WIDE = 5  # columns of a table that may be wider than its place
+
+
+def named(element: Drawn, label: str) -> Drawn:
+    """With what is read aloud in its place; as it is, never as a piece of markup."""
+    element.props["aria-label"] = label
+    return element
 
 
 def text(what: Any, tag: str = "p", classes: str = "") -> ui.html:
@@ -21,7 +28,7 @@ def card(title: str, hint: str = "", classes: str = "") -> ui.element:
     """A section with a heading."""
     section = ui.element("section").classes(f"card {classes}")
     if "sticky" in classes:  # it scrolls by itself, by keys too
-        section.props(f'tabindex=0 role=region aria-label="{escape(title, True)}"')
+        named(section.props("tabindex=0 role=region"), title)
     with section:
         text(title, "h2")
         if hint:
@@ -43,7 +50,7 @@ def field(label: str, value: Any, changed: Callable[[str], None], *, classes: st
         ui.input(label, value="" if value is None else str(value)).props("outlined dense stack-label").classes(classes)
     )
     if hint:
-        made.props(f'placeholder="{hint}"')
+        made.props["placeholder"] = hint
     made.on("change", lambda: changed(made.value or ""))
     return made
 
@@ -54,10 +61,11 @@ def choice(
     """A list to choose from, as every phone knows it; the label is above."""
     with ui.element("label").classes(f"choice {classes}"):
         text(label, "span")
-        made = ui.element("select").props(f'aria-label="{escape(label, True)}"')
+        made = named(ui.element("select"), label)
         with made:
             for key, shown in options.items():
-                option = ui.html(escape(shown), sanitize=False, tag="option").props(f'value="{escape(key)}"')
+                option = ui.html(escape(shown), sanitize=False, tag="option")
+                option.props["value"] = key
                 if key == value:
                     option.props("selected")
 
@@ -80,7 +88,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "")
         lines.append(f"<tr><th scope='row'>{escape(str(row[0]))}</th>{''.join(cells)}</tr>")
     made = ui.html("".join([*lines, "</tbody></table>"]), sanitize=False).classes("table")
     if len(head) >= _WIDE:  # it may scroll, by keys too
-        made.props(f'tabindex=0 role=region aria-label="{escape(caption or head[0], True)}"')
+        named(made.props("tabindex=0 role=region"), caption or head[0])
 
 
 def number(value: Any, digits: int = 5) -> str:
@@ -97,7 +105,7 @@ def button(label: str, clicked: Callable[[], Any], *, main: bool = False, classe
 def link(label: str, place: str, *, download: bool = True) -> ui.element:
     """A link that looks like a button."""
     made = text(label, "a", "download")
-    made.props(f'href="{place}"')
+    made.props["href"] = place
     return made.props("download") if download else made
 
 
@@ -163,4 +171,4 @@ def _layout(height: int) -> dict[str, Any]:
 
 def plot(figure: dict[str, Any], label: str) -> ui.plotly:
     """A figure, with a sentence that is read aloud in its place."""
-    return ui.plotly(figure).classes("plot").props(f'role=img aria-label="{escape(label, True)}"')
+    return named(ui.plotly(figure).classes("plot").props("role=img"), label)

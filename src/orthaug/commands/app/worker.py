@@ -1,12 +1,14 @@
-"""A process that answers one question of the page: what is in a file, which spec to start with, what a spec is worth.
+"""A process that answers questions of the page: what is in a file, which spec to start with, what a spec is worth.
 
-The question is a line of JSON on standard input, the answer one on standard output: `refused` where there is none.
+A question is a line of JSON on standard input, its answer one on standard output: `refused` where there is none, and
+`last` where the process ends with it.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import queue
 import sys
 import threading
 from collections.abc import Callable, Sequence
@@ -29,35 +31,53 @@ from orthaug.reports.text import check_text
 
 MOST = 3000
 """Points of a curve that are drawn."""
+_KEPT = 600e6  # bytes that a process may have held to go on
 _DRAWN = 12  # columns of a file whose curves are
 
 
 def main() -> None:
-    """Read the question, write the answer, and end; end at once where nobody waits for it any more."""
+    """Answer questions until nobody asks any more; end where a question took much memory, which would be kept."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what a library prints is no answer
-    line = sys.stdin.readline()
-    if not line:
-        return
-    threading.Thread(target=_watch, daemon=True).start()
-    given = json.loads(line)
-    try:
-        answer = QUESTIONS[given.pop("question")](**given)
-    except InputError as error:
-        answer = {"refused": str(error)}
-    except MemoryError:
-        answer = {"refused": "there is not enough memory to look at these data; take fewer rows, or every n-th."}
-    except OSError as error:
-        answer = {"refused": f"{error.filename or 'a file'}: cannot be read ({error.strerror or error})."}
-    except Exception as error:  # a page shows no traceback
-        answer = {"refused": f"this cannot be told: {type(error).__name__}: {' '.join(str(error).split())[:300]}"}
-    answers.write(json.dumps(answer) + "\n")
-    answers.flush()
+    asked: queue.Queue[str] = queue.Queue()
+    threading.Thread(target=_listen, args=(asked,), daemon=True).start()
+    while True:
+        answer = _answer(json.loads(asked.get()))
+        answer["last"] = peak() > _KEPT
+        answers.write(json.dumps(answer) + "\n")
+        answers.flush()
+        if answer["last"]:
+            return
 
 
-def _watch() -> None:
-    sys.stdin.read()
+def _listen(asked: queue.Queue[str]) -> None:
+    """Questions as they come, also while one is answered: where there are no more, nobody waits for that either."""
+    for line in sys.stdin:
+        asked.put(line)
     os._exit(0)
+
+
+def _answer(given: dict[str, Any]) -> dict[str, Any]:
+    try:
+        return QUESTIONS[given.pop("question")](**given)
+    except InputError as error:
+        return {"refused": str(error)}
+    except MemoryError:
+        return {"refused": "there is not enough memory to look at these data; take fewer rows, or every n-th."}
+    except OSError as error:
+        return {"refused": f"{error.filename or 'a file'}: cannot be read ({error.strerror or error})."}
+    except Exception as error:  # a page shows no traceback
+        return {"refused": f"this cannot be told: {type(error).__name__}: {' '.join(str(error).split())[:300]}"}
+
+
+def peak() -> float:
+    """Bytes that this process has held at most; 0 where the system does not say."""
+    try:
+        import resource
+    except ImportError:
+        return 0.0
+    unit = 1 if sys.platform == "darwin" else 1024
+    return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) * unit
 
 
 def look(path: str, out: str, inputs: str | None, outputs: str | None, step: float | None) -> dict[str, Any]:
