@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from fastapi import FastAPI, Request
 from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, RedirectResponse, Response
@@ -15,9 +14,7 @@ from starlette.requests import ClientDisconnect
 
 from orthaug._base.errors import InputError
 from orthaug.commands.app.page import Page
-
-if TYPE_CHECKING:
-    from orthaug.commands.app.server import Sessions
+from orthaug.commands.app.sessions import Sessions
 
 _ICON = (
     "<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'><rect width='32' height='32' rx='7' fill='#0550ae'/>"

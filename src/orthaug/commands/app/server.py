@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-import secrets
 import socket
 import tempfile
 import threading
@@ -18,45 +17,11 @@ from orthaug._base.errors import InputError
 from orthaug._base.partials import PARTIALS
 from orthaug.commands import streams
 from orthaug.commands.app.gate import Gate
-from orthaug.commands.app.processes import Desk
-from orthaug.commands.app.session import Session
+from orthaug.commands.app.sessions import Sessions
 from orthaug.commands.signals import WATCH
 
 _HOST = "127.0.0.1"
 _LOOK = 0.2  # s between looks at whether Ctrl-C came
-_SESSIONS = 50  # that are kept at once
-
-
-class Sessions:
-    """All work that goes on, by keys that cannot be guessed."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.desk = folder, Desk()
-        self._open: dict[str, Session] = {}
-
-    def new(self, spec: Path | None = None) -> Session:
-        """A session in a folder of its own, which nobody else may read.
-
-        Raises:
-            InputError: too many sessions, or a spec that cannot be read.
-        """
-        if len(self._open) >= _SESSIONS:
-            raise InputError(f"{_SESSIONS} pieces of work are open; end orthaug app, and start it again.")
-        key = secrets.token_urlsafe(12)
-        folder = self.folder / f"work-{len(self._open) + 1}"
-        folder.mkdir(mode=0o700)
-        session = self._open[key] = Session(key, folder, self.desk)
-        if spec is not None:
-            session.open_spec(spec)
-        return session
-
-    def find(self, key: str) -> Session | None:
-        """The session of a key."""
-        return self._open.get(key)
-
-    async def close(self) -> None:
-        """End all that runs."""
-        await asyncio.gather(self.desk.close(), *(session.close() for session in self._open.values()))
 
 
 def free_port(wanted: int | None) -> socket.socket:

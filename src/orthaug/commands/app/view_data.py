@@ -105,7 +105,7 @@ class DataView:
                 text(lines[0], "p", "strong")
                 with ui.element("ul").classes("account"):
                     for line in [one for one in lines[1:] if not one.startswith(("input ", "output "))]:
-                        text(line[:1].upper() + line[1:], "li")
+                        text(line, "li")
         self.columns.set_visibility(found is not None)
         if found is not None:
             self._draw_columns(found)
