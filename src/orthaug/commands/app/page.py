@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from html import escape
 from importlib.resources import files
 
 from nicegui import ui
@@ -89,19 +90,11 @@ class Page:
             self._name()
 
     def _name(self) -> None:
-        session = self.session
-        name = session.data.name if session.data else "spec" if session.spec else "from data to a model"
-        self.title.set_content(_escaped(name))
+        self.title.set_content(escape(self.session.title or "from data to a model"))
 
     def _complain(self, error: Exception) -> None:
         told = str(error) if isinstance(error, InputError) else f"this did not work ({type(error).__name__})."
         ui.notify(told[:1].upper() + told[1:], type="negative")
-
-
-def _escaped(what: str) -> str:
-    from html import escape
-
-    return escape(what)
 
 
 def _dress() -> None:

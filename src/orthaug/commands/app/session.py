@@ -28,6 +28,8 @@ class Session:
     def __init__(self, key: str, folder: Path, desk: Desk) -> None:
         self.key, self.folder, self.desk = key, folder, desk
         self.versions: Counter[str] = Counter()
+        self.title = ""
+        """What the work is called: the file that it began with."""
         self.data: Path | None = None
         self.found: dict[str, Any] | None = None
         self.looking = ""
@@ -77,7 +79,7 @@ class Session:
 
     def open_file(self, path: Path) -> None:
         """Look at a data file, and begin a spec for it where its columns tell what they are."""
-        self.data, self.found, self.trouble = path, None, ""
+        self.data, self.found, self.trouble, self.title = path, None, "", path.name
         self._look_again(None, None, None)
 
     def choose(self, inputs: Sequence[str], outputs: Sequence[str], step: float | None) -> None:
@@ -123,6 +125,7 @@ class Session:
             raise InputError(f"{path}: not a text file; expected TOML in UTF-8.") from None
         try:
             self.write(absolute(text, path.absolute().parent), "file")
+            self.title = path.name
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
 

@@ -241,13 +241,12 @@ class DataView:
                 text("The curves of a file are drawn here, once there is one.", "p", "hint")
                 return
             plot(curves_figure(rows), f"Curves of {', '.join(label for label, _ in rows)} over time.")
-            if prepared:
-                told = "after preparation, " if cleaned else ""
-                text(
-                    f"In colour the training data, {told}in grey the whole file. Drag to zoom, double-click for all.",
-                    "p",
-                    "hint",
-                )
+            told = [
+                "In colour the training data",
+                ", after preparation" * cleaned,
+                ", in grey the whole file" * bool(raw),
+            ]
+            text(f"{''.join(told) if prepared else 'The whole file'}. Drag to zoom, double-click for all.", "p", "hint")
             for done in (checked or {}).get("prepared", ()):
                 text(f"Done: {done}", "p", "hint")
             if checked and session.spec:

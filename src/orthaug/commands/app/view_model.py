@@ -16,10 +16,10 @@ _TERMS = ("baseline", "terms")
 _LEARNERS = {"mlp": "a network", "terms": "a sum of terms", "none": "none: physics alone"}
 _FOCUS = {"prediction": "one step ahead", "simulation": "the free run"}
 _STRUCTURES = {
-    "orthogonal": "orthogonal to the physics",
+    "orthogonal": "orthogonal",
     "additive": "additive",
     "orthogonal-penalty": "penalty on the overlap",
-    "baseline-penalty": "penalty on the change of θ",
+    "baseline-penalty": "penalty on θ − θ⁰",
 }
 
 
@@ -121,7 +121,7 @@ class ModelView:
         for name, row in motion.get("parameters", {}).items():
             if isinstance(row, Mapping):
                 with named(ui.element("div").classes("entry term").props("role=group"), f"parameter {name}"):
-                    text(name, "p", "strong")
+                    text(name, "p", "strong name")
                     with ui.element("div").classes("fields grow"):
                         for key in ("initial", "unit", "min", "max"):
                             field(key, row.get(key), self._value(("motion", "parameters", name, key)), classes="short")
@@ -252,7 +252,7 @@ def _units(units: Sequence[tuple[str, str, str | None]]) -> None:
     for name, given, asked in units:
         if asked is not None and given not in (asked, "") and not (asked == "" and given == "1"):
             note(f"Unit of {name}: the spec says {given}, output and regressor ask for {asked or '1'}.", "care")
-    wanted = [f"{name} in {asked or '1'}" for name, given, asked in units if asked is not None and not given]
+    wanted = [f"{name} in {asked or '1'}" for name, given, asked in units if asked and not given]
     if wanted:
         text(f"Units, from those of the channels: {', '.join(wanted)}.", "p", "hint")
 
