@@ -27,6 +27,7 @@ from orthaug.commands.app import spec_text
 from orthaug.commands.app.gate import Gate
 from orthaug.commands.app.processes import Desk
 from orthaug.commands.app.session import Session
+from orthaug.commands.app.sessions import Sessions
 from orthaug.commands.app.worker import thinned
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
@@ -144,6 +145,19 @@ def test_a_session_keeps_to_its_folder(tmp_path):
     for name in ("../x", "spec.toml", "model.zip", "c.zip", "/etc/passwd"):
         with pytest.raises(InputError, match="there is nothing of that name yet"):
             session.download(name)
+
+
+def test_sessions_that_nobody_used_make_room(tmp_path):
+    sessions = Sessions(tmp_path)
+    first, second = sessions.new(), sessions.new()
+    first.data = tmp_path / "run.csv"
+    keys = {sessions.new().key for _ in range(48 + 20)}
+    assert sessions.find(first.key) is first and sessions.find(second.key) is None and len(keys) == 68
+    for key in keys:
+        if (session := sessions.find(key)) is not None:
+            session.data = first.data
+    with pytest.raises(InputError, match="50 pieces of work are open"):
+        sessions.new()
 
 
 def test_what_cannot_be_served_is_said(tmp_path, monkeypatch):

@@ -52,6 +52,11 @@ class Session:
         self._check: asyncio.Task[None] | None = None
         self._look: asyncio.Task[None] | None = None
 
+    @property
+    def untouched(self) -> bool:
+        """Whether nobody has done anything in it yet."""
+        return not self.commands and self.data is None and set(self.authors) <= {"file"}
+
     def changed(self, what: str) -> None:
         """Let every page of the session see it."""
         self.versions[what] += 1

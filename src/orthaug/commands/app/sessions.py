@@ -19,6 +19,7 @@ class Sessions:
     def __init__(self, folder: Path) -> None:
         self.folder, self.desk = folder, Desk()
         self._open: dict[str, Session] = {}
+        self._made = 0
 
     def new(self, spec: Path | None = None) -> Session:
         """A session in a folder of its own, which nobody else may read.
@@ -26,10 +27,14 @@ class Sessions:
         Raises:
             InputError: too many sessions, or a spec that cannot be read.
         """
+        untouched = [session for session in self._open.values() if session.untouched]
+        if len(self._open) >= _SESSIONS and untouched:
+            del self._open[untouched[0].key]
         if len(self._open) >= _SESSIONS:
             raise InputError(f"{_SESSIONS} pieces of work are open; end orthaug app, and start it again.")
         key = secrets.token_urlsafe(12)
-        folder = self.folder / f"work-{len(self._open) + 1}"
+        self._made += 1
+        folder = self.folder / f"work-{self._made}"
         folder.mkdir(mode=0o700)
         session = self._open[key] = Session(key, folder, self.desk)
         if spec is not None:

@@ -200,6 +200,8 @@ class ModelView:
             told = None if session.checked is None else session.checked["check"]
             stale = session.checking or (session.refused and not (session.checked or {}).get("refusal"))
             if told is not None:
+                if stale:
+                    text("As the spec was before:", "p", "hint")
                 with ui.element("div").classes("stale" if stale else ""):
                     _units((session.checked or {})["units"])
                     _findings(told, (session.checked or {})["bias"])

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 from nicegui import ui
 
 Drawn = TypeVar("Drawn", bound=ui.element)
+_SHORT = 12  # letters that stand on one line
 _WIDE = 5  # columns of a table that may be wider than its place
 
 
@@ -82,13 +83,16 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "")
     lines += [f"<th scope='col'>{escape(name)}</th>" for name in head]
     lines.append("</tr></thead><tbody>")
     for row in rows:
-        cells = [
-            f"<td data-label='{escape(n, True)}'>{escape(str(c))}</td>" for n, c in zip(head[1:], row[1:], strict=True)
-        ]
+        cells = [_cell(name, str(value)) for name, value in zip(head[1:], row[1:], strict=True)]
         lines.append(f"<tr><th scope='row'>{escape(str(row[0]))}</th>{''.join(cells)}</tr>")
     made = ui.html("".join([*lines, "</tbody></table>"]), sanitize=False).classes("table")
     if len(head) >= _WIDE:  # it may scroll, by keys too
         named(made.props("tabindex=0 role=region"), caption or head[0])
+
+
+def _cell(head: str, value: str) -> str:
+    short = " class='n'" if len(value) <= _SHORT else ""
+    return f"<td{short} data-label='{escape(head, True)}'>{escape(value)}</td>"
 
 
 def number(value: Any, digits: int = 5) -> str:
