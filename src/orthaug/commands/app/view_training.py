@@ -49,6 +49,7 @@ class TrainingView:
         """How far it is, and what came of it."""
         session, running = self.session, self.session.running
         self.follow_check()
+        self.end.set_visibility(running is not None)
         self.end.set_enabled(running is not None and not running.stopping)
         shown = running or max(session.commands.values(), key=lambda c: c.began, default=None)
         with redrawn(self.state):

@@ -159,7 +159,7 @@ def loss_figure(losses: Sequence[tuple[int, int, float | None]]) -> dict[str, An
     own = {"type": "scatter", "mode": "lines+markers", "marker": {"size": 4}, "showlegend": 1 < len(runs) <= 6}
     traces = [
         {**own, "name": f"run {run}", "x": x, "y": y, "line": {"width": 1.5, "color": _COLORS[i % len(_COLORS)]}}
-        for i, (run, (x, y)) in enumerate(runs.items())
+        for i, (run, (x, y)) in enumerate(sorted(runs.items()))
     ]
     return {"data": traces, "layout": layout, "config": _CONFIG}
 
