@@ -119,6 +119,8 @@ def test_forms_change_a_spec_and_nothing_else(tmp_path):
     data = tomllib.loads(spec_text.absolute(SPEC, tmp_path / "in"))["data"]
     assert data["train"]["files"] == [(tmp_path / "in/run.csv").as_posix(), "/there/b.csv"]
     assert data["tests"]["one"]["files"] == [(tmp_path / "c.csv").as_posix()]
+    tested = spec_text.with_value(spec, ("data", "tests", "new"), {"files": ["d.csv"]})
+    assert tomllib.loads(tested)["data"]["tests"] == {"one": {"files": ["../c.csv"]}, "new": {"files": ["d.csv"]}}
     moving = tomllib.loads(spec_text.as_motion(SPEC))
     assert moving["motion"]["outputs"] == {"y": "x"} and "baseline" not in moving
     with pytest.raises(InputError, match="broken TOML"):
@@ -394,6 +396,14 @@ def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
     assert "Broken TOML" in page.inner_text(".note.bad")
     tab.go("Training")
     assert page.get_by_role("button", name="Train").is_disabled()
+    tab.go("Model")
+    kept = tab.write(lambda text: text.replace("[learner", "[learner]"))
+    tab.go("Data")
+    tab.drop(tmp_path / "own.csv")
+    page.get_by_role("button", name="Take it as a test").click()
+    page.wait_for_selector("text=tests.own")
+    added = tab.fetch("spec.toml").decode()
+    assert tomllib.loads(added)["data"]["tests"].pop("own") == {"files": ["own.csv"]} and kept.splitlines()[0] in added
     assert tab.fetch("../x") and tab.context.request.get(f"{page.url}/get/result.zip").status == 404
     tab.close()
 

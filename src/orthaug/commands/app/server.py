@@ -55,12 +55,13 @@ def check_installed() -> None:
 @contextlib.contextmanager
 def private_folder() -> Iterator[Path]:
     """A folder that only this user may read, gone with the program; what a killed one left goes with the next."""
-    os.umask(0o077)
+    before = os.umask(0o077)
     folder = PARTIALS.folder(Path(tempfile.gettempdir()))
     try:
         yield folder
     finally:
         PARTIALS.discard(folder)
+        os.umask(before)
 
 
 def serve(spec: Path | None, *, port: int | None = None, browser: bool = True) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 from orthaug._base.errors import InputError
 from orthaug.commands.app.processes import Command, Desk
-from orthaug.commands.app.spec_text import absolute, plain
+from orthaug.commands.app.spec_text import absolute, plain, with_value
 from orthaug.data.tables import KNOWN
 
 _PAUSE = 0.6  # s without a change until a spec is checked
@@ -35,6 +35,8 @@ class Session:
         self.looking = ""
         self.trouble = ""
         """What is wrong with the data, in words."""
+        self.kept = False
+        """Whether a file was looked at that the spec, which a person has worked on, was not begun anew for."""
         self.spec = ""
         self.authors: list[str] = []
         """Who made each change of the spec: a part of a page, which need not be told of its own."""
@@ -107,7 +109,8 @@ class Session:
                 self.trouble = found["open"]
             else:
                 self.found = found
-            if found["spec"] is not None:
+            self.kept = inputs is None and self.edited
+            if found["spec"] is not None and not self.kept:
                 own = self.data.parent == self.folder  # a file that was dropped stands beside the spec
                 self.write(found["spec"] if own else absolute(found["spec"], self.folder), "look")
         except InputError as error:
@@ -115,6 +118,20 @@ class Session:
         finally:
             self.looking = ""
             self.changed("data")
+
+    @property
+    def edited(self) -> bool:
+        """Whether there is a spec that somebody has worked on."""
+        return bool(self.spec.strip()) and not set(self.authors) <= {"look"}
+
+    def add_test(self) -> None:
+        """Let the file that was looked at be a test of the spec."""
+        assert self.data is not None
+        file = self.data.name if self.data.parent == self.folder else self.data.as_posix()
+        name = re.sub(r"\W", "_", self.data.stem)
+        self.write(with_value(self.spec, ("data", "tests", name), {"files": [file]}), "test")
+        self.kept = False
+        self.changed("data")
 
     def open_spec(self, path: Path) -> None:
         """Take a spec that stands somewhere; it is read, and never written.

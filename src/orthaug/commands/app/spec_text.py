@@ -71,11 +71,14 @@ def changed(text: str, change: Callable[[Any], None]) -> str:
     """The text after a change of its document.
 
     Raises:
-        InputError: broken TOML.
+        InputError: broken TOML, or TOML in which the change cannot be written.
     """
     document = opened(text)
     change(document)
-    return tomlkit.dumps(document)
+    written = tomlkit.dumps(document)
+    if plain(written) != document.unwrap():
+        raise InputError("a form cannot write this change into the spec as it is laid out; make it in the text.")
+    return written
 
 
 def with_value(text: str, path: Sequence[str], value: Any) -> str:
@@ -87,6 +90,9 @@ def with_value(text: str, path: Sequence[str], value: Any) -> str:
             table = _made(table, key)
         if value is None:
             table.pop(path[-1], None)
+        elif isinstance(value, Mapping):  # inline: a table of its own would land elsewhere beside dotted keys
+            table[path[-1]] = tomlkit.inline_table()
+            table[path[-1]].update(value)
         else:
             table[path[-1]] = value
 

@@ -106,6 +106,9 @@ class DataView:
                 with ui.element("ul").classes("account"):
                     for line in [one for one in lines[1:] if not one.startswith(("input ", "output "))]:
                         text(line, "li")
+                if session.kept:
+                    note("The spec is kept as it is. Take this file as a test of it, or begin anew below.", "care")
+                    button("Take it as a test", session.add_test)
         self.columns.set_visibility(found is not None)
         if found is not None:
             self._draw_columns(found)
@@ -134,7 +137,11 @@ class DataView:
                 step = "" if found["step"] is None else f"{found['step']:g}"
                 own = "" if found["step"] is not None and "column" in found["clock"] else step
                 field("sampling time in s", own, self._set_step, classes="short", hint=step or "1")
-                label = "Begin with these channels" if found["spec"] is None else "Begin anew with these channels"
+                label = (
+                    "Begin with these channels"
+                    if found["spec"] is None and not self.session.spec
+                    else "Begin anew with these channels"
+                )
                 button(label, self.choose, main=found["spec"] is None)
 
     def _choose_use(self, header: str) -> None:
