@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import math
+import os
 import signal
 import sys
 import threading
@@ -11,6 +14,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from orthaug._base.progress import SILENT, Progress
+from orthaug.commands import streams
 from orthaug.commands.signals import WATCH
 from orthaug.commands.streams import say
 
@@ -18,6 +22,9 @@ if TYPE_CHECKING:
     from rich.progress import Progress as Bar
     from rich.progress import ProgressColumn
 
+TOLD_AS = "ORTHAUG_PROGRESS"
+"""Variable of the environment; where it is `json`, training tells of itself by lines of JSON on standard error."""
+_OFTEN = 0.02  # s between such lines
 _MANY = 1_000_000  # rows from which the rate is told
 _LONG = 5.0  # s of a search that are told beforehand
 _SEEN = 3  # models after which the time of the rest is told: the first ones compile
@@ -57,6 +64,7 @@ def training_bar(runs: int, iterations: int, wanted: bool = True, rows: int = 0)
     ):
         task = bar.add_task("compiling", total=runs * iterations)
         done: dict[int, int] = {}
+        line = _lines(runs, iterations)
 
         def tell(run: int, iteration: int, loss: float) -> None:
             nonlocal reached
@@ -66,6 +74,7 @@ def training_bar(runs: int, iterations: int, wanted: bool = True, rows: int = 0)
             rate = rows * passes / max(time.monotonic() - began, 1e-3)
             told = f"{reached}, {rate / 1e6:.3g} million rows/s" if rows >= _MANY else reached
             bar.update(task, completed=passes, description=told)
+            line(run, iteration, loss, passes)
             if interrupted.is_set():
                 raise KeyboardInterrupt(reached)
 
@@ -75,6 +84,23 @@ def training_bar(runs: int, iterations: int, wanted: bool = True, rows: int = 0)
             raise KeyboardInterrupt(reached) from None
         if interrupted.is_set():
             raise KeyboardInterrupt("the scoring of the model")
+
+
+def _lines(runs: int, iterations: int) -> Callable[[int, int, float, int], None]:
+    """What writes a line of JSON now and then, for a program that follows this one; nothing unless it is asked for."""
+    if os.environ.get(TOLD_AS) != "json":
+        return lambda run, iteration, loss, passes: None
+    last = -_OFTEN
+
+    def write(run: int, iteration: int, loss: float, passes: int) -> None:
+        nonlocal last
+        if time.monotonic() - last >= _OFTEN:
+            last = time.monotonic()
+            told = {"run": run + 1, "runs": runs, "iteration": iteration, "iterations": iterations}
+            share = min(1.0, passes / max(runs * iterations, 1))
+            streams.say(json.dumps({**told, "loss": loss if math.isfinite(loss) else None, "done": share}))
+
+    return write
 
 
 @contextmanager

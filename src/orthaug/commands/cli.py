@@ -219,6 +219,20 @@ def init(
     streams.echo(f"{spec.account}\n\nwritten to {out}; next: orthaug fit {out}")
 
 
+@app.command("app")
+def page(
+    spec: Annotated[
+        Path | None, typer.Argument(metavar="[SPEC]", help="Spec to begin with; it is not written.")
+    ] = None,
+    port: Annotated[int | None, typer.Option("--port", metavar="N", help="A free one without it.")] = None,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open it in the browser.")] = True,
+) -> None:
+    """A page on this machine to look at data, write physics, train and export."""
+    from orthaug.commands.app.server import serve
+
+    serve(spec, port=port, browser=browser)
+
+
 @app.command()
 def schema(
     command: Annotated[

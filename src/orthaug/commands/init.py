@@ -177,7 +177,7 @@ def _account(found: Survey, roles: Roles, rows: int, missing: int, cut: int, mod
         step += "; 1 s is written: change it"
     lines = [f"{found.path.name}: {rows} rows, {len(found.columns)} columns", f"sampling time: {step}"]
     for kind, columns in (("input", roles.inputs), ("output", roles.outputs)):
-        lines += [f"{kind:<7}{_seen(column, spikes=kind == 'output')}" for column in columns]
+        lines += [f"{kind:<7}{as_seen(column, spikes=kind == 'output')}" for column in columns]
     used = {id(c) for c in (*roles.inputs, *roles.outputs, found.clock.column)}
     for column in (c for c in found.columns if id(c) not in used):
         why = "no numbers" if not column.numeric else "constant" if column.constant else "not named"
@@ -211,7 +211,7 @@ def _order(order: int) -> str:
     return f"up to order {order}" + (" or more" if order >= PERSISTENCE else ": few lags can be told apart")
 
 
-def _seen(column: Column, *, spikes: bool) -> str:
+def as_seen(column: Column, *, spikes: bool) -> str:
     """A channel in words: range, and what is odd about it."""
     low, high = float(column.finite.min()), float(column.finite.max())
     text = f"{column.name}" + (f" = column '{column.header}'" if column.header != column.name else "")

@@ -1,0 +1,44 @@
+"""The command line as a child of the page: it ends with whoever started it, however that ended.
+
+Whoever started it holds its standard input open. Where that is closed, the child is interrupted as by Ctrl-C, which
+keeps or removes what is partial; that is also how the page stops it.
+"""
+
+from __future__ import annotations
+
+import _thread
+import os
+import signal
+import sys
+import time
+
+_PATIENCE = 5.0  # s for what an interrupt is to remove
+
+
+def main() -> None:
+    """Run the command that the arguments say."""
+    from orthaug.commands.entry import main as program
+
+    watched()
+    program()
+
+
+def watched() -> None:
+    """End this process once its standard input is closed."""
+    _thread.start_new_thread(_wait, ())
+
+
+def _wait() -> None:
+    while os.read(0, 4096):
+        pass
+    if os.name == "posix":
+        os.kill(os.getpid(), signal.SIGINT)
+    else:
+        _thread.interrupt_main()
+    time.sleep(_PATIENCE)
+    os._exit(130)
+
+
+if __name__ == "__main__":
+    sys.argv[0] = "orthaug"
+    main()

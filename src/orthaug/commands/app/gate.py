@@ -1,0 +1,111 @@
+"""Who may use the page: whoever knows the token, from this machine, through a page of this server."""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+from collections.abc import Mapping
+from http.cookies import CookieError, SimpleCookie
+from typing import TYPE_CHECKING
+from urllib.parse import parse_qsl, urlencode
+
+if TYPE_CHECKING:
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+_NAMES = ("127.0.0.1", "localhost")
+_REFUSED = (
+    "<!doctype html><html lang='en'><title>orthaug</title><body style='font:1rem system-ui;margin:3rem'>"
+    "<h1>This page needs its token</h1><p>Open the address that <code>orthaug app</code> printed in the terminal. "
+    "It ends in <code>?token=…</code>.</p></body></html>"
+)
+_HEADERS = {
+    "referrer-policy": "no-referrer",
+    "x-content-type-options": "nosniff",
+    "x-frame-options": "SAMEORIGIN",
+    "cross-origin-resource-policy": "same-origin",
+    "content-security-policy": (
+        "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; frame-ancestors 'self'; form-action 'self'; "
+        "base-uri 'self'; object-src 'none'"
+    ),
+}
+
+
+class Gate:
+    """Stands before an application: requests and websockets without the token never reach it.
+
+    The token comes in the query of the first request, which is sent on without it, and from then on in a cookie. Names
+    of the host other than this machine's are refused, so that no foreign name can be made to lead here, and so are
+    requests that a page of another origin makes.
+    """
+
+    def __init__(self, app: ASGIApp, port: int, token: str | None = None) -> None:
+        self.app, self.port = app, port
+        self.token = secrets.token_urlsafe(32) if token is None else token
+        self.cookie = f"orthaug-{port}"  # cookies know no ports
+
+    @property
+    def url(self) -> str:
+        """Where the page is, with the token."""
+        return f"http://127.0.0.1:{self.port}/?token={self.token}"
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self.app(scope, receive, send)
+            return
+        headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
+        query = parse_qsl(scope.get("query_string", b"").decode("latin-1"), keep_blank_values=True)
+        given = dict(query).get("token")
+        if not self._from_here(headers) or not (self._known(given) or self._known(self._kept(headers))):
+            await _refuse(scope, send)
+        elif scope["type"] == "http" and given is not None and scope["method"] in ("GET", "HEAD"):
+            rest = urlencode([(name, value) for name, value in query if name != "token"])
+            path = "/" + scope["path"].lstrip("/")  # two slashes would be another host
+            await self._sent_on(path + (f"?{rest}" if rest else ""), send)
+        else:
+            await self.app(scope, receive, _with_headers(send) if scope["type"] == "http" else send)
+
+    def _from_here(self, headers: Mapping[str, str]) -> bool:
+        hosts = {f"{name}:{self.port}" for name in _NAMES}
+        origin = headers.get("origin")
+        return headers.get("host", "") in hosts and (origin is None or origin in {f"http://{host}" for host in hosts})
+
+    def _kept(self, headers: Mapping[str, str]) -> str | None:
+        try:
+            morsel = SimpleCookie(headers.get("cookie", "")).get(self.cookie)
+        except CookieError:
+            return None
+        return None if morsel is None else morsel.value
+
+    def _known(self, token: str | None) -> bool:
+        return token is not None and hmac.compare_digest(token.encode(), self.token.encode())
+
+    async def _sent_on(self, place: str, send: Send) -> None:
+        cookie = f"{self.cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+        headers = [(b"location", place.encode("latin-1", "ignore")), (b"set-cookie", cookie.encode())]
+        headers += [(b"cache-control", b"no-store"), (b"referrer-policy", b"no-referrer"), (b"content-length", b"0")]
+        await send({"type": "http.response.start", "status": 303, "headers": headers})
+        await send({"type": "http.response.body", "body": b""})
+
+
+async def _refuse(scope: Scope, send: Send) -> None:
+    if scope["type"] == "websocket":
+        await send({"type": "websocket.close", "code": 1008})
+        return
+    body = _REFUSED.encode()
+    headers = [(b"content-type", b"text/html; charset=utf-8"), (b"content-length", str(len(body)).encode())]
+    await send({"type": "http.response.start", "status": 403, "headers": [*headers, (b"cache-control", b"no-store")]})
+    await send({"type": "http.response.body", "body": body})
+
+
+def _with_headers(send: Send) -> Send:
+    """Every answer says that it is for this page alone; what an answer says itself stands."""
+
+    async def sending(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            own = list(message.get("headers", []))
+            said = {name.lower() for name, _ in own}
+            own += [(k.encode(), v.encode()) for k, v in _HEADERS.items() if k.encode() not in said]
+            message = {**message, "headers": own}
+        await send(message)
+
+    return sending

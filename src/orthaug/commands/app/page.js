@@ -1,0 +1,55 @@
+// A file that is dropped goes to the server piece by piece; how far it is, is shown.
+document.addEventListener("change", (event) => {
+  if (event.target.id === "dropped" && event.target.files.length) take(event.target.files[0]);
+});
+for (const name of ["dragover", "dragenter", "dragleave", "drop"]) {
+  document.addEventListener(name, (event) => {
+    if (!event.dataTransfer || ![...event.dataTransfer.types].includes("Files")) return;
+    event.preventDefault();
+    const zone = document.getElementById("drop");
+    if (!zone) return;
+    zone.classList.toggle("over", name === "dragover" || name === "dragenter");
+    if (name === "drop" && event.dataTransfer.files.length) take(event.dataTransfer.files[0]);
+  });
+}
+
+function take(file) {
+  const told = document.getElementById("drop-told"), bar = document.getElementById("drop-bar");
+  const request = new XMLHttpRequest();
+  request.open("PUT", `${location.pathname}/file/${encodeURIComponent(file.name)}`);
+  request.upload.onprogress = (event) => {
+    bar.hidden = false;
+    bar.value = event.total ? event.loaded / event.total : 0;
+    told.textContent = `${file.name}: ${Math.round(100 * bar.value)} %`;
+  };
+  request.onload = () => {
+    bar.hidden = true;
+    let answer = {};
+    try { answer = JSON.parse(request.responseText); } catch { /* told below */ }
+    told.textContent = answer.refused ?? (answer.kept ? `${answer.kept} is here` : "the file could not be taken in");
+    told.classList.toggle("refused", !answer.kept);
+    document.getElementById("dropped").value = "";
+  };
+  request.onerror = () => {
+    bar.hidden = true;
+    told.textContent = "the server does not answer; is orthaug app still running?";
+    told.classList.add("refused");
+  };
+  request.send(file);
+}
+
+// Plots take the width that there is, once they have one.
+const widths = new ResizeObserver((entries) => entries.forEach((entry) => fit(entry.target)));
+new MutationObserver(() => {
+  for (const plot of document.querySelectorAll(".plot:not([data-fit])")) {
+    plot.dataset.fit = "";
+    widths.observe(plot);
+  }
+}).observe(document, { childList: true, subtree: true });
+
+async function fit(plot) {
+  const { Plotly } = await import("nicegui-plotly");
+  for (let i = 0; i < 20 && plot.isConnected && !plot._fullLayout; i++) await new Promise((go) => setTimeout(go, 50));
+  const width = plot.isConnected && plot._fullLayout ? plot.offsetWidth : 0;
+  if (width && Math.abs(plot._fullLayout.width - width) > 1) Plotly.relayout(plot, { autosize: true, width });
+}

@@ -1,0 +1,103 @@
+"""The page: a heading, five parts behind tabs, and a clock that lets every part follow the session."""
+
+from __future__ import annotations
+
+from html import escape
+from importlib.resources import files
+
+from nicegui import ui
+
+from orthaug._base.errors import InputError
+from orthaug.commands.app.session import Session
+from orthaug.commands.app.view_data import DataView
+from orthaug.commands.app.view_model import ModelView
+from orthaug.commands.app.view_results import ExportView, ReportView
+from orthaug.commands.app.view_training import TrainingView
+from orthaug.commands.app.widgets import text
+
+_OFTEN = 0.25  # s between looks at what has changed
+_PARTS = ("Data", "Model", "Training", "Report", "Export")
+_LOGO = (
+    "<svg viewBox='0 0 32 32' aria-hidden='true'><rect width='32' height='32' rx='7' fill='currentColor'/>"
+    "<path d='M9 7v16h16' class='axes'/><path d='M9 17h6v6' class='angle'/></svg>"
+)
+
+
+class Page:
+    """What one browser tab shows of a session. Several may show the same."""
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self.data, self.model = DataView(session), ModelView(session)
+        self.training, self.report, self.export = TrainingView(session), ReportView(session), ExportView(session)
+        self.seen = dict(session.versions)
+
+    @staticmethod
+    def gone() -> None:
+        """A session that is not open any more."""
+        _dress()
+        text("This work is not open any more", "h1")
+        text("orthaug app was ended since, and what was not taken away went with it.")
+        text("Begin anew", "a").props('href="/"')
+
+    def draw(self) -> None:
+        """All of it."""
+        _dress()
+        ui.context.client.on_exception(self._complain)
+        text("Skip to the content", "a", "skip").props('href="#parts"')
+        with ui.element("div").classes("head"):
+            ui.html(_LOGO, sanitize=False, tag="span").classes("logo")
+            text("orthaug", "h1")
+            self.title = text("", "p", "hint")
+        with ui.tabs().props("no-caps align=left active-color=tab indicator-color=tab dense").classes("tabs") as tabs:
+            made = {name: ui.tab(name) for name in _PARTS}
+        start = "Training" if self.session.commands else "Data"
+        panels = ui.tab_panels(tabs, value=made[start]).props("id=parts animated=false").classes("parts")
+        parts = (self.data, self.model, self.training, self.report, self.export)
+        with panels:
+            for name, part in zip(_PARTS, parts, strict=True):
+                with ui.tab_panel(made[name]):
+                    part.draw()
+        self._name()
+        ui.timer(_OFTEN, self.follow)
+
+    def follow(self) -> None:
+        """Let each part see what has changed since the last look."""
+        now, seen = dict(self.session.versions), self.seen
+        self.seen = now
+
+        def moved(what: str) -> bool:
+            return now.get(what, 0) != seen.get(what, 0)
+
+        if moved("data"):
+            self.data.follow_data()
+        if moved("spec"):
+            authors = set(self.session.authors[seen.get("spec", 0) :])
+            author = authors.pop() if len(authors) == 1 else ""
+            self.data.follow_spec(author)
+            self.model.follow_spec(author)
+        if moved("check"):
+            self.data.follow_check()
+            self.model.follow_check()
+        if moved("work") or moved("spec") or self.session.running is not None:
+            self.training.follow_work()
+        elif moved("check"):
+            self.training.follow_check()
+        if moved("work") or moved("spec"):
+            self.report.follow_work()
+            self.export.follow_work()
+        if now != seen:
+            self._name()
+
+    def _name(self) -> None:
+        self.title.set_content(escape(self.session.title or "from data to a model"))
+
+    def _complain(self, error: Exception) -> None:
+        told = str(error) if isinstance(error, InputError) else f"this did not work ({type(error).__name__})."
+        ui.notify(told[:1].upper() + told[1:], type="negative")
+
+
+def _dress() -> None:
+    place = files("orthaug.commands.app")
+    ui.add_head_html(f"<style>{(place / 'page.css').read_text(encoding='utf-8')}</style>")
+    ui.add_head_html(f"<script>{(place / 'page.js').read_text(encoding='utf-8')}</script>")

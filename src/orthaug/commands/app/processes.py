@@ -1,0 +1,205 @@
+"""Processes of the page: commands with their progress, and questions that are answered by a process of their own."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from orthaug._base.errors import InputError
+from orthaug.commands.bars import TOLD_AS
+
+_LONGEST = 2**26  # bytes of a line of an answer
+_LINES = 400  # of a command that are kept
+_GRACE = 8.0  # s for a process to end by itself
+_AT_ONCE = 2  # questions
+
+
+@dataclass(eq=False)
+class Command:
+    """A command of the program that runs in a child process."""
+
+    arguments: Sequence[str]
+    changed: Callable[[], None]
+    progress: dict[str, Any] = field(default_factory=dict)
+    """The last that was told: `run`, `runs`, `iteration`, `loss`, `done` (share)."""
+    losses: list[tuple[int, int, float]] = field(default_factory=list)
+    """(run, iteration, loss) as told."""
+    output: str = ""
+    lines: list[str] = field(default_factory=list)
+    began: float = 0.0
+    ended: float | None = None
+    code: int | None = None
+    stopping: bool = False
+    process: asyncio.subprocess.Process | None = None
+
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended yet."""
+        return self.code is None
+
+    @property
+    def seconds(self) -> float:
+        """Since it began, or that it took."""
+        return (time.monotonic() if self.ended is None else self.ended) - self.began
+
+    @property
+    def complaint(self) -> str:
+        """What it said last where it failed."""
+        told = [line for line in self.lines if line.strip()]
+        known = [line for line in told if line.startswith(("error:", "training failed:", "interrupted"))]
+        last = (known or ["it ended without a word; is there enough memory?"])[-1]
+        return last.removeprefix("error:").strip()
+
+    async def run(self) -> None:
+        """Start it and follow it to its end."""
+        self.began = time.monotonic()
+        program = [sys.executable, "-m", "orthaug.commands.app.child", *self.arguments]
+        self.process = await asyncio.create_subprocess_exec(
+            *program,
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+            limit=_LONGEST,
+            env={**os.environ, TOLD_AS: "json", "PYTHONIOENCODING": "utf-8", "NO_COLOR": "1"},
+        )
+        assert self.process.stdout is not None
+        if self.stopping:
+            self.stop()
+        output, _ = await asyncio.gather(self.process.stdout.read(), self._told())
+        code = await self.process.wait()
+        self.output, self.ended, self.code = output.decode("utf-8", "replace"), time.monotonic(), code
+        self.changed()
+
+    async def _told(self) -> None:
+        assert self.process is not None and self.process.stderr is not None
+        async for raw in self.process.stderr:
+            line = raw.decode("utf-8", "replace").rstrip()
+            told = _progress(line)
+            if told is None:
+                self.lines = [*self.lines, line][-_LINES:]
+            else:
+                self.progress = told
+                self.losses.append((told["run"], told["iteration"], told["loss"]))
+            self.changed()
+
+    def stop(self) -> None:
+        """Interrupt it: it keeps or removes what is partial, and ends."""
+        self.stopping = True
+        if self.process is not None and self.process.stdin is not None:
+            self.process.stdin.close()
+
+    async def end(self) -> None:
+        """Stop it, and wait until it has ended."""
+        self.stop()
+        if self.process is not None and self.process.returncode is None:
+            try:
+                await asyncio.wait_for(self.process.wait(), _GRACE)
+            except TimeoutError:
+                with suppress(ProcessLookupError):
+                    self.process.kill()
+
+
+def _progress(line: str) -> dict[str, Any] | None:
+    if not line.startswith('{"run"'):
+        return None
+    with suppress(ValueError):
+        told = json.loads(line)
+        return told if isinstance(told, dict) else None
+    return None
+
+
+class Desk:
+    """Answers questions in processes of their own, so that the page neither waits nor holds the data.
+
+    One process waits with its modules imported for the next question.
+    """
+
+    def __init__(self) -> None:
+        self._idle: list[asyncio.subprocess.Process] = []
+        self._coming: asyncio.Task[asyncio.subprocess.Process] | None = None
+        self._busy: set[asyncio.subprocess.Process] = set()
+        self._room = asyncio.Semaphore(_AT_ONCE)
+
+    async def ask(self, question: str, **given: Any) -> dict[str, Any]:
+        """The answer of a worker. A caller that is cancelled ends the worker.
+
+        Raises:
+            InputError: what the question is refused with.
+        """
+        async with self._room:
+            process = await self._taken()
+            self._busy.add(process)
+            answer: dict[str, Any] = {"last": True}
+            try:
+                answer = await _answered(process, {"question": question, **given})
+            finally:
+                self._busy.discard(process)
+                if answer["last"]:
+                    _kill(process)
+                    self.prepare()
+                else:
+                    self._idle.append(process)
+        if "refused" in answer:
+            raise InputError(answer["refused"])
+        return answer
+
+    def prepare(self) -> None:
+        """Let a process wait for the next question."""
+        if self._coming is None and not self._idle:
+            self._coming = asyncio.ensure_future(_started())
+
+    async def _taken(self) -> asyncio.subprocess.Process:
+        while self._idle:
+            process = self._idle.pop()
+            if process.returncode is None:
+                return process
+        coming, self._coming = self._coming, None
+        return await (_started() if coming is None else asyncio.shield(coming))
+
+    async def close(self) -> None:
+        """End all of them."""
+        coming = [] if self._coming is None else [await self._coming]
+        for process in (*self._busy, *self._idle, *coming):
+            _kill(process)
+            with suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(process.wait(), _GRACE)
+
+
+async def _started() -> asyncio.subprocess.Process:
+    return await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "orthaug.commands.app.worker"),
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.DEVNULL,
+        limit=_LONGEST,
+        env={**os.environ, "PYTHONIOENCODING": "utf-8"},
+    )
+
+
+async def _answered(process: asyncio.subprocess.Process, question: dict[str, Any]) -> dict[str, Any]:
+    assert process.stdin is not None and process.stdout is not None
+    try:
+        process.stdin.write(json.dumps(question, default=_path).encode() + b"\n")
+        await process.stdin.drain()
+        line = await process.stdout.readline()
+        return json.loads(line)
+    except (OSError, ValueError):
+        raise InputError("the data could not be looked at: the process ended early. Is there enough memory?") from None
+
+
+def _path(value: Any) -> str:
+    assert isinstance(value, Path)
+    return str(value)
+
+
+def _kill(process: asyncio.subprocess.Process) -> None:
+    with suppress(ProcessLookupError):
+        process.kill()

@@ -1,0 +1,291 @@
+"""One person's work on the page: file, spec, check, training, results. It lives on the server; a page only shows it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+import shutil
+import zipfile
+from collections import Counter
+from collections.abc import Awaitable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from orthaug._base.errors import InputError
+from orthaug.commands.app.processes import Command, Desk
+from orthaug.commands.app.spec_text import absolute, plain, with_value
+from orthaug.data.tables import KNOWN
+
+_PAUSE = 0.6  # s without a change until a spec is checked
+KINDS = ("fit", "compare")
+
+
+class Session:
+    """State and actions. `versions` counts the changes of `data`, `spec`, `check` and `work`, for pages to follow."""
+
+    def __init__(self, key: str, folder: Path, desk: Desk) -> None:
+        self.key, self.folder, self.desk = key, folder, desk
+        self.versions: Counter[str] = Counter()
+        self.title = ""
+        """What the work is called: the file that it began with."""
+        self.data: Path | None = None
+        self.found: dict[str, Any] | None = None
+        self.looking = ""
+        self.trouble = ""
+        """What is wrong with the data, in words."""
+        self.kept = False
+        """Whether a file was looked at that the spec, which a person has worked on, was not begun anew for."""
+        self.spec = ""
+        self.authors: list[str] = []
+        """Who made each change of the spec: a part of a page, which need not be told of its own."""
+        self.checked: dict[str, Any] | None = None
+        self.refused = ""
+        """Why the spec cannot be trained, in words."""
+        self.checking = False
+        self.commands: dict[str, Command] = {}
+        self.trained: dict[str, str] = {}
+        """The spec of each result."""
+        self.results: dict[str, dict[str, Any]] = {}
+        self.exports: dict[str, str] = {}
+        """By target, why there is none; empty where there is."""
+        self._tasks: set[asyncio.Task[Any]] = set()
+        self._check: asyncio.Task[None] | None = None
+        self._look: asyncio.Task[None] | None = None
+
+    @property
+    def untouched(self) -> bool:
+        """Whether nobody has done anything in it yet."""
+        return not self.commands and self.data is None and set(self.authors) <= {"file"}
+
+    def changed(self, what: str) -> None:
+        """Let every page of the session see it."""
+        self.versions[what] += 1
+
+    def start(self, work: Awaitable[Any]) -> asyncio.Task[Any]:
+        """Let something run; it is not lost, and not awaited."""
+        task = asyncio.ensure_future(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
+
+    # Data
+
+    def place_for(self, name: str) -> Path:
+        """Where a file of that name that was dropped is kept.
+
+        Raises:
+            InputError: an ending of no data file.
+        """
+        plain_name = re.sub(r"[^\w. -]", "_", re.split(r"[/\\]", name)[-1]).strip(" .")[-60:]
+        ending = Path(plain_name).suffix.lower()
+        if ending not in KNOWN or not Path(plain_name).stem:
+            raise InputError(f"'{plain_name}': no data file that is known; known are {', '.join(KNOWN)}.")
+        return self.folder / plain_name
+
+    def open_file(self, path: Path) -> None:
+        """Look at a data file, and begin a spec for it where its columns tell what they are."""
+        self.data, self.found, self.trouble, self.title = path, None, "", path.name
+        self._look_again(None, None, None)
+
+    def choose(self, inputs: Sequence[str], outputs: Sequence[str], step: float | None) -> None:
+        """Begin the spec anew with these columns."""
+        self._look_again(",".join(inputs), ",".join(outputs), step)
+
+    def _look_again(self, inputs: str | None, outputs: str | None, step: float | None) -> None:
+        if self._look is not None:
+            self._look.cancel()
+        self._look = self.start(self._looked(inputs, outputs, step))
+
+    async def _looked(self, inputs: str | None, outputs: str | None, step: float | None) -> None:
+        assert self.data is not None
+        self.looking, self.trouble = f"Looking at {self.data.name} …", ""
+        self.changed("data")
+        given: dict[str, Any] = {"path": self.data, "out": self.folder / "spec.toml"}
+        try:
+            found = await self.desk.ask("look", **given, inputs=inputs, outputs=outputs, step=step)
+            if self.found is not None and found["spec"] is None:
+                self.trouble = found["open"]
+            else:
+                self.found = found
+            self.kept = inputs is None and self.edited
+            if found["spec"] is not None and not self.kept:
+                own = self.data.parent == self.folder  # a file that was dropped stands beside the spec
+                self.write(found["spec"] if own else absolute(found["spec"], self.folder), "look")
+        except InputError as error:
+            self.trouble = self.worded(error)
+        finally:
+            self.looking = ""
+            self.changed("data")
+
+    @property
+    def edited(self) -> bool:
+        """Whether there is a spec that somebody has worked on."""
+        return bool(self.spec.strip()) and not set(self.authors) <= {"look"}
+
+    def add_test(self) -> None:
+        """Let the file that was looked at be a test of the spec."""
+        assert self.data is not None
+        file = self.data.name if self.data.parent == self.folder else self.data.as_posix()
+        name = re.sub(r"\W", "_", self.data.stem)
+        self.write(with_value(self.spec, ("data", "tests", name), {"files": [file]}), "test")
+        self.kept = False
+        self.changed("data")
+
+    def open_spec(self, path: Path) -> None:
+        """Take a spec that stands somewhere; it is read, and never written.
+
+        Raises:
+            InputError: a file that cannot be read, or broken TOML.
+        """
+        try:
+            text = path.read_text(encoding="utf-8-sig")
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+        except UnicodeDecodeError:
+            raise InputError(f"{path}: not a text file; expected TOML in UTF-8.") from None
+        try:
+            self.write(absolute(text, path.absolute().parent), "file")
+            self.title = path.name
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+
+    # Spec
+
+    def write(self, text: str, author: str) -> None:
+        """Take a spec, and check it when nobody has changed it for a moment."""
+        if text == self.spec:
+            return
+        self.spec = text
+        self.authors.append(author)
+        self.changed("spec")
+        if self._check is not None:
+            self._check.cancel()
+        self.checking = bool(text.strip())
+        self.changed("check")
+        self._check = self.start(self._checked())
+
+    async def _checked(self) -> None:
+        await asyncio.sleep(_PAUSE)
+        if not self.spec.strip():
+            self.checked, self.refused = None, ""
+            self.changed("check")
+            return
+        place = self.folder / "check.toml"
+        place.write_text(self.spec, encoding="utf-8")
+        try:
+            self.checked = await self.desk.ask("examine", path=place, whole=False)
+            if self.checked["check"] is None:
+                self.refused = ""
+                self.changed("check")
+                self.checked = await self.desk.ask("examine", path=place, whole=True)
+            self.refused = self.worded(self.checked["refusal"] or "")
+        except InputError as error:
+            self.refused = self.worded(error)
+        self.checking = False
+        self.changed("check")
+
+    def content(self) -> dict[str, Any]:
+        """The spec as dictionaries; empty while its TOML is broken."""
+        try:
+            return plain(self.spec)
+        except InputError:
+            return {}
+
+    def worded(self, text: Any) -> str:
+        """A message without the session's own folder and file names."""
+        text = str(text).removeprefix(f"{self.folder / 'check.toml'}: ").removeprefix(f"{self.folder / 'spec.toml'}: ")
+        return text.replace(f"{self.folder}/", "").replace(f"{self.folder}\\", "")
+
+    # Training
+
+    @property
+    def running(self) -> Command | None:
+        """The training that goes on."""
+        return next((command for kind in KINDS if (command := self.commands.get(kind)) and command.running), None)
+
+    def train(self, kind: str) -> None:
+        """Run `orthaug fit` or `orthaug compare` on the spec."""
+        if self.running is not None or not self.spec.strip():
+            return
+        place = self.folder / "spec.toml"
+        place.write_text(self.spec, encoding="utf-8")
+        shutil.rmtree(self.folder / f"{kind}.training", ignore_errors=True)
+        self.exports.clear()
+        arguments = (kind, str(place), "--out", str(self.folder / kind), "--force")
+        command = self.commands[kind] = Command(arguments, lambda: self.changed("work"))
+        self.changed("work")
+        self.start(self._followed(kind, command, self.spec))
+
+    async def _followed(self, kind: str, command: Command, spec: str) -> None:
+        try:
+            await command.run()
+        except OSError as error:
+            command.lines, command.code = [f"error: training cannot start ({error.strerror})."], 2
+        if command.code == 0:
+            self.trained[kind] = spec
+            with suppress(OSError, ValueError):
+                text = (self.folder / kind / "result.json").read_text(encoding="utf-8")
+                self.results[kind] = json.loads(text)
+        self.changed("work")
+
+    def stop(self) -> None:
+        """Interrupt the training that goes on."""
+        if self.running is not None:
+            self.running.stop()
+            self.changed("work")
+
+    # What can be taken away
+
+    def export(self, target: str, name: str) -> None:
+        """Run `orthaug export` on the model."""
+        self.start(self._exported(target, name))
+
+    async def _exported(self, target: str, name: str) -> None:
+        arguments = ("export", str(self.folder / "fit"), "--to", target, "--out", str(self.folder / "export" / target))
+        (self.folder / "export").mkdir(exist_ok=True)
+        command = Command((*arguments, "--name", name, "--force"), lambda: None)
+        self.exports[target] = "…"
+        self.changed("work")
+        await command.run()
+        self.exports[target] = "" if command.code == 0 else self.worded(command.complaint)
+        self.changed("work")
+
+    def download(self, what: str) -> Path:
+        """The file that is handed out under a name: from a list, never a path.
+
+        Raises:
+            InputError: nothing there.
+        """
+        if what == "spec.toml" and self.spec:
+            place = self.folder / "download.toml"
+            place.write_text(self.spec, encoding="utf-8")
+            return place
+        files = {
+            "report.html": "fit/report.html",
+            "result.json": "fit/result.json",
+            "comparison.html": "compare/report.html",
+        }
+        folders = {"model.zip": "fit/model", "result.zip": "fit", "comparison.zip": "compare"}
+        folders |= {f"{target}.zip": f"export/{target}" for target, why in self.exports.items() if not why}
+        if what in files and (self.folder / files[what]).is_file():
+            return self.folder / files[what]
+        if what in folders and (self.folder / folders[what]).is_dir():
+            return _zipped(self.folder / folders[what], self.folder / f"download-{what}")
+        raise InputError("there is nothing of that name yet.")
+
+    async def close(self) -> None:
+        """End all that runs."""
+        for task in list(self._tasks):
+            if task is self._check or task is self._look:
+                task.cancel()
+        await asyncio.gather(*(command.end() for command in self.commands.values()))
+
+
+def _zipped(folder: Path, place: Path) -> Path:
+    with zipfile.ZipFile(place, "w", zipfile.ZIP_DEFLATED) as archive:
+        for file in sorted(folder.rglob("*")):
+            if file.is_file():
+                archive.write(file, file.relative_to(folder.parent).as_posix())
+    return place

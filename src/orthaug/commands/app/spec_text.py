@@ -1,0 +1,188 @@
+"""A spec as text that forms change: one key or table at a time, comments and order kept."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+from tomlkit.exceptions import TOMLKitError
+from tomlkit.items import AoT
+
+from orthaug._base.errors import InputError
+
+
+def opened(text: str) -> tomlkit.TOMLDocument:
+    """The document.
+
+    Raises:
+        InputError: broken TOML.
+    """
+    try:
+        return tomlkit.parse(text)
+    except (TOMLKitError, RecursionError) as error:
+        raise InputError(f"broken TOML: {' '.join(str(error).split())}.") from None
+
+
+def absolute(text: str, folder: Path) -> str:
+    """The same spec with whole paths for files that it names from `folder` on, so that it may stand anywhere."""
+    document = opened(text)
+    for entry in _with_files(document):
+        entry["files"] = [_whole(folder, file) for file in entry["files"]]
+    return tomlkit.dumps(document)
+
+
+def _whole(folder: Path, file: Any) -> Any:
+    """Not resolved: links and patterns stay what they are."""
+    return Path(os.path.abspath(folder / file)).as_posix() if isinstance(file, str) else file
+
+
+def _with_files(document: Mapping[str, Any]) -> Iterator[Any]:
+    data = _table(document, "data")
+    parts = [data.get("train"), data.get("validation"), *_table(data, "tests").values()]
+    for entry in (*parts, _table(document, "structure").get("measure")):
+        if isinstance(entry, Mapping) and isinstance(entry.get("files"), list):
+            yield entry
+
+
+def _table(document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    found = document.get(key)
+    return found if isinstance(found, Mapping) else {}
+
+
+def _made(document: Any, key: str) -> Any:
+    if not isinstance(document.get(key), Mapping):
+        document[key] = tomlkit.table()
+    return document[key]
+
+
+def plain(text: str) -> dict[str, Any]:
+    """The content in plain dictionaries and lists.
+
+    Raises:
+        InputError: broken TOML.
+    """
+    return opened(text).unwrap()
+
+
+def changed(text: str, change: Callable[[Any], None]) -> str:
+    """The text after a change of its document.
+
+    Raises:
+        InputError: broken TOML, or TOML in which the change cannot be written.
+    """
+    document = opened(text)
+    change(document)
+    written = tomlkit.dumps(document)
+    if plain(written) != document.unwrap():
+        raise InputError("a form cannot write this change into the spec as it is laid out; make it in the text.")
+    return written
+
+
+def with_value(text: str, path: Sequence[str], value: Any) -> str:
+    """With a key of a table set, or without it where the value is None; tables on the way are made."""
+
+    def change(document: Any) -> None:
+        table = document
+        for key in path[:-1]:
+            table = _made(table, key)
+        if value is None:
+            table.pop(path[-1], None)
+        elif isinstance(value, Mapping):  # inline: a table of its own would land elsewhere beside dotted keys
+            table[path[-1]] = tomlkit.inline_table()
+            table[path[-1]].update(value)
+        else:
+            table[path[-1]] = value
+
+    return changed(text, change)
+
+
+def rows_of(text: str, path: Sequence[str]) -> list[dict[str, Any]]:
+    """The tables of a list of tables, such as `data.prepare`; none where there is no such list."""
+    content: Any = plain(text)
+    for key in path[:-1]:
+        content = _table(content, key)
+    found = content.get(path[-1])
+    return [dict(row) for row in found if isinstance(row, Mapping)] if isinstance(found, list) else []
+
+
+def with_row(text: str, path: Sequence[str], row: Mapping[str, Any]) -> str:
+    """With a table more at the end of a list of tables."""
+
+    def change(document: Any) -> None:
+        table = document
+        for key in path[:-1]:
+            table = _made(table, key)
+        rows = table.get(path[-1])
+        if not isinstance(rows, list) or (not rows and not isinstance(rows, AoT)):
+            table[path[-1]] = tomlkit.aot()
+            rows = table[path[-1]]
+        new = tomlkit.table() if isinstance(rows, AoT) else tomlkit.inline_table()
+        new.update(row)
+        rows.append(new)
+
+    return changed(text, change)
+
+
+def with_cell(text: str, path: Sequence[str], index: int, key: str, value: Any) -> str:
+    """With a key of one table of a list set, or without it where the value is None."""
+
+    def change(document: Any) -> None:
+        row = _list(document, path)[index]
+        if value is None:
+            row.pop(key, None)
+        else:
+            row[key] = value
+
+    return changed(text, change)
+
+
+def without_row(text: str, path: Sequence[str], index: int) -> str:
+    """Without one table of a list."""
+
+    def change(document: Any) -> None:
+        rows = _list(document, path)
+        del rows[index]
+        if not rows:
+            table = document
+            for key in path[:-1]:
+                table = table[key]
+            del table[path[-1]]
+
+    return changed(text, change)
+
+
+def _list(document: Any, path: Sequence[str]) -> Any:
+    for key in path:
+        document = document[key]
+    return document
+
+
+MOTION = """
+[motion]
+[motion.states]
+x = {{ derivative = "v", start = "{output}" }}
+v = {{ derivative = "({force} - c*v - k*x)/m", start = "derivative of {output}", learned = true }}
+[motion.outputs]
+{output} = "x"
+[motion.parameters]
+m = {{ initial = 1.0, min = 0 }}
+c = {{ initial = 1.0, min = 0 }}
+k = {{ initial = 1.0, min = 0 }}
+"""
+
+
+def as_motion(text: str) -> str:
+    """With the equations of a mass, a spring and a damper in place of the baseline, for a person to change."""
+    data = _table(plain(text), "data")
+    inputs, outputs = data.get("inputs") or ["0"], data.get("outputs") or ["y"]
+
+    def change(document: Any) -> None:
+        for key in ("baseline", "lags", "physics", "motion", "suspects"):
+            document.pop(key, None)
+        document["motion"] = tomlkit.parse(MOTION.format(output=outputs[0], force=inputs[0]))["motion"]
+        _made(document, "learner")["inputs"] = ["v"]
+
+    return changed(text, change)

@@ -1,0 +1,281 @@
+"""The part of the page for data: a file, its columns, its curves, and the steps that clean it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any
+
+from nicegui import ui
+
+from orthaug._base.errors import InputError
+from orthaug.commands.app import spec_text
+from orthaug.commands.app.session import Session
+from orthaug.commands.app.widgets import (
+    button,
+    card,
+    choice,
+    curves_figure,
+    field,
+    named,
+    note,
+    plot,
+    redrawn,
+    table,
+    text,
+)
+from orthaug.data.steps import STEPS
+
+_STEPS = ("data", "prepare")
+_LISTED = 40  # columns
+_USES = {"": "leave out", "input": "input", "output": "output"}
+_SUMMARIES = {
+    "detrend": "take out mean or trend",
+    "lowpass": "low-pass filter",
+    "highpass": "high-pass filter",
+    "decimate": "keep each n-th row, filtered",
+    "resample": "put onto an even grid",
+    "outliers": "mark outliers (Hampel)",
+    "fill": "fill short gaps",
+    "shift": "shift an input in time",
+}
+_FIRST = {"cutoff": 1.0, "factor": 2, "samples": 1}  # what a step begins with where it has no default
+_KNOWN = "CSV, TSV, Parquet, Excel, MATLAB, NumPy or HDF5; it stays on this machine"
+_DROP = """
+<label class="drop" id="drop">
+  <input type="file" id="dropped" class="unseen" accept="{endings}">
+  <span class="drop-title">Drop a data file here, or choose one</span>
+  <span class="hint" id="drop-told" role="status">{told}</span>
+  <progress id="drop-bar" max="1" value="0" hidden aria-label="file taken in"></progress>
+</label>
+"""
+
+
+class DataView:
+    """Draws the data of a session, and follows them."""
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self.uses: dict[str, str] = {}
+        self.step = ""
+        self._curves: Any = None
+
+    def draw(self) -> None:
+        """The places; their content follows."""
+        from orthaug.data.tables import KNOWN
+
+        with ui.element("div").classes("columns wide-right"):
+            with ui.element("div").classes("stack"):
+                with card("Data file"):
+                    ui.html(_DROP.format(endings=",".join(KNOWN), told=_KNOWN), sanitize=False)
+                    with ui.element("div").classes("fields"):
+                        self.path = ui.input("or its path on this machine").props("outlined dense stack-label")
+                        self.path.classes("grow").on("keydown.enter", self.name_file)
+                        button("Open", self.name_file)
+                    self.status = ui.element("div")
+                self.columns = card("Channels", "Say what each column is; the spec begins with that.")
+                self.cleaning = card("Preparation", "Every part of the data goes through these steps, in this order.")
+                with self.columns:
+                    self.column_rows = ui.element("div")
+                with self.cleaning:
+                    self.step_rows = ui.element("div")
+            with card("Curves", classes="sticky"):
+                self.curves = ui.element("div")
+        self.follow_data()
+        self.follow_spec("")
+
+    def name_file(self) -> None:
+        """Open a file that stands on this machine."""
+        given = (self.path.value or "").strip().strip("\"'")
+        if given:
+            self.session.open_file(Path(given).expanduser().absolute())
+
+    def follow_data(self) -> None:
+        """What was seen in the file."""
+        session, found = self.session, self.session.found
+        with redrawn(self.status):
+            if session.looking:
+                with ui.element("p").classes("note busy").props("role=status"):
+                    text(session.looking, "span")
+            elif session.trouble:
+                note(session.trouble, "bad")
+            elif found is not None and session.data is not None:
+                lines = found["account"].splitlines() or [f"{session.data.name}: {found['rows']} rows"]
+                text(lines[0], "p", "strong")
+                with ui.element("ul").classes("account"):
+                    for line in [one for one in lines[1:] if not one.startswith(("input ", "output "))]:
+                        text(line, "li")
+                if session.kept:
+                    note("The spec is kept as it is. Take this file as a test of it, or begin anew below.", "care")
+                    button("Take it as a test", session.add_test)
+        self.columns.set_visibility(found is not None)
+        if found is not None:
+            self._draw_columns(found)
+        self.follow_check()
+
+    def _draw_columns(self, found: Mapping[str, Any]) -> None:
+        usable = [column for column in found["columns"] if column["usable"]]
+        inputs, outputs = found.get("inputs"), found.get("outputs")
+        self.uses = {column["header"]: column["kind"] for column in usable}
+        if inputs is not None and outputs is not None:
+            self.uses = {h: "input" if h in inputs else "output" if h in outputs else "" for h in self.uses}
+        with redrawn(self.column_rows):
+            for column in usable[:_LISTED]:
+                with ui.element("div").classes("entry"):
+                    with ui.element("div").classes("grow"):
+                        text(column["header"], "p", "strong")
+                        text(column["told"], "p", "hint")
+                    self._choose_use(column["header"])
+            left = [c for c in found["columns"] if not c["usable"]]
+            if left:
+                text("Not usable: " + ", ".join(f"{c['header']} ({c['told']})" for c in left[:_LISTED]), "p", "hint")
+            if found["spec"] is None:
+                names = "The names of the columns do not say which are inputs and outputs: choose them here."
+                note(found["open"] or names, "care")
+            with ui.element("div").classes("fields"):
+                step = "" if found["step"] is None else f"{found['step']:g}"
+                own = "" if found["step"] is not None and "column" in found["clock"] else step
+                field("sampling time in s", own, self._set_step, classes="short", hint=step or "1")
+                label = (
+                    "Begin with these channels"
+                    if found["spec"] is None and not self.session.spec
+                    else "Begin anew with these channels"
+                )
+                button(label, self.choose, main=found["spec"] is None)
+
+    def _choose_use(self, header: str) -> None:
+        def use(value: str) -> None:
+            self.uses[header] = value
+
+        choice(f"use of {header}", _USES, self.uses[header], use, "bare")
+
+    def _set_step(self, value: str) -> None:
+        self.step = value
+
+    def choose(self) -> None:
+        """Begin the spec with the columns as they are chosen."""
+        chosen = {kind: [h for h, use in self.uses.items() if use == kind] for kind in ("input", "output")}
+        try:
+            step = float(self.step) if self.step.strip() else None
+        except ValueError:
+            ui.notify("The sampling time must be a number of seconds, such as 0.01.", type="warning")
+            return
+        if not chosen["output"]:
+            ui.notify("Choose at least one output.", type="warning")
+            return
+        self.session.choose(chosen["input"], chosen["output"], step)
+
+    def follow_spec(self, author: str) -> None:
+        """The steps of preparation, as the spec has them."""
+        if author == "steps":
+            return
+        self.cleaning.set_visibility(bool(self.session.spec.strip()))
+        try:
+            steps = spec_text.rows_of(self.session.spec, _STEPS)
+        except InputError:
+            return
+        with redrawn(self.step_rows):
+            for i, step in enumerate(steps):
+                self._draw_step(i, step)
+            if not steps:
+                text("None yet.", "p", "hint")
+            options = {"": "add a step …"} | {kind: f"{kind}: {_SUMMARIES.get(kind, kind)}" for kind in STEPS}
+            choice("add a step", options, "", self._add, "bare")
+
+    def _draw_step(self, index: int, step: Mapping[str, Any]) -> None:
+        kind = str(step.get("step"))
+        with ui.element("div").classes("entry"):
+            with ui.element("div").classes("grow"):
+                text(f"{index + 1}. {_SUMMARIES.get(kind, kind)}", "p", "strong")
+                with ui.element("div").classes("fields"):
+                    for own in fields(STEPS[kind]) if kind in STEPS else ():
+                        usual = "" if own.default is MISSING else _shown(own.default)
+                        field(
+                            own.name,
+                            _shown(step.get(own.name)),
+                            self._setting(index, own.name),
+                            classes="short",
+                            hint=usual,
+                        )
+            named(button("Remove", lambda: self._remove(index)), f"Remove step {index + 1}")
+
+    def _setting(self, index: int, key: str) -> Any:
+        def change(value: str) -> None:
+            self._write(spec_text.with_cell(self.session.spec, _STEPS, index, key, _read(key, value)), "steps")
+
+        return change
+
+    def _add(self, kind: str) -> None:
+        if kind not in STEPS:
+            return
+        needed = [own.name for own in fields(STEPS[kind]) if own.default is MISSING]
+        first = {name: _FIRST[name] for name in needed if name in _FIRST}
+        if "channel" in needed:
+            first["channel"] = (self.session.content().get("data", {}).get("inputs") or [""])[0]
+        self._write(spec_text.with_row(self.session.spec, _STEPS, {"step": kind, **first}), "more steps")
+
+    def _remove(self, index: int) -> None:
+        self._write(spec_text.without_row(self.session.spec, _STEPS, index), "more steps")
+
+    def _write(self, spec: str, author: str) -> None:
+        self.session.write(spec, author)
+
+    def follow_check(self) -> None:
+        """Curves of the file, and of the training data after preparation."""
+        found, checked, session = self.session.found, self.session.checked, self.session
+        prepared = {} if checked is None else checked["curves"]
+        raw = {} if found is None else found["curves"]
+        cleaned = bool(checked and checked["prepared"])
+        rows = []
+        shown = [curve["column"] for curve in prepared.values()] or list(raw)
+        for name in shown:
+            drawn = [{**raw[name], "name": "as measured", "raw": bool(prepared)}] if name in raw else []
+            unit = ""
+            for channel, curve in prepared.items():
+                if curve["column"] == name:
+                    told = "prepared, training" if cleaned else "training"
+                    drawn.append({**curve, "name": told})
+                    unit, name = curve["unit"], channel
+            if drawn:
+                rows.append((f"{name} [{unit}]" if unit else name, drawn))
+        state = (rows, cleaned, checked and checked["prepared"], checked and checked["rows"])
+        if state == self._curves:
+            return
+        self._curves = state
+        with redrawn(self.curves):
+            if not rows:
+                text("The curves of a file are drawn here, once there is one.", "p", "hint")
+                return
+            plot(curves_figure(rows), f"Curves of {', '.join(label for label, _ in rows)} over time.")
+            told = [
+                "In colour the training data",
+                ", after preparation" * cleaned,
+                ", in grey the whole file" * bool(raw),
+            ]
+            text(f"{''.join(told) if prepared else 'The whole file'}. Drag to zoom, double-click for all.", "p", "hint")
+            for done in (checked or {}).get("prepared", ()):
+                text(f"Done: {done}", "p", "hint")
+            if checked and session.spec:
+                table(
+                    ("part", "rows"), [(part, count) for part, count in checked["rows"].items()], "Rows that are used"
+                )
+
+
+def _shown(value: Any) -> str:
+    return "" if value is None else ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+
+
+def _read(key: str, value: str) -> Any:
+    """What a field says: a number, names, or text; None for nothing. The spec's own check says what is wrong."""
+    value = value.strip()
+    if not value:
+        return None
+    if key == "channels":
+        return [name.strip() for name in value.split(",") if name.strip()]
+    for kind in (int, float):
+        try:
+            return kind(value)
+        except ValueError:
+            continue
+    return value

@@ -1,0 +1,263 @@
+"""The part of the page for the model: forms for physics, learner and training, the spec, and what checking says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from nicegui import ui
+
+from orthaug.commands.app import spec_text
+from orthaug.commands.app.session import Session
+from orthaug.commands.app.view_data import _read
+from orthaug.commands.app.widgets import button, card, choice, field, named, note, number, redrawn, table, text
+
+_TERMS = ("baseline", "terms")
+_LEARNERS = {"mlp": "a network", "terms": "a sum of terms", "none": "none: physics alone"}
+_FOCUS = {"prediction": "one step ahead", "simulation": "the free run"}
+_STRUCTURES = {
+    "orthogonal": "orthogonal",
+    "additive": "additive",
+    "orthogonal-penalty": "penalty on the overlap",
+    "baseline-penalty": "penalty on θ − θ⁰",
+}
+
+
+class ModelView:
+    """Draws the spec of a session as forms and as text, and follows it."""
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+
+    def draw(self) -> None:
+        """The places; their content follows."""
+        with ui.element("div").classes("columns"):
+            with ui.element("div").classes("stack"):
+                with card("Physics"):
+                    self.physics = ui.element("div")
+                with card("Learner and training"):
+                    self.learner = ui.element("div")
+                hint = "What the forms write. Every key is in docs/spec.md; forms and text change each other."
+                with card("Spec", hint):
+                    self.editor = ui.textarea("spec in TOML", value=self.session.spec).classes("editor")
+                    self.editor.props("outlined stack-label spellcheck=false autocapitalize=off autogrow debounce=250")
+                    self.editor.on_value_change(lambda event: self.session.write(event.value or "", "editor"))
+            with card("Check", classes="sticky"):
+                self.check = ui.element("div")
+        self.follow_spec("")
+        self.follow_check()
+
+    def follow_spec(self, author: str) -> None:
+        """Forms after a change of the text, the text after a change in a form."""
+        if author != "editor" and self.editor.value != self.session.spec:
+            self.editor.set_value(self.session.spec)
+        if author != "form":
+            content = self.session.content()
+            if content or not self.session.spec.strip():
+                self._draw_physics(content)
+                self._draw_learner(content)
+
+    def _write(self, spec: str, author: str = "form") -> None:
+        self.session.write(spec, author)
+
+    def _draw_physics(self, content: Mapping[str, Any]) -> None:
+        with redrawn(self.physics):
+            if not content:
+                text("It begins with a data file, or with a spec in the field below.", "p", "hint")
+                return
+            if "motion" in content:
+                self._draw_motion(content)
+                return
+            outputs = content.get("data", {}).get("outputs") or []
+            text(" and ".join(f"{name}[k] = Σ parameter · regressor" for name in outputs), "p", "hint formula")
+            for i, term in enumerate(spec_text.rows_of(self.session.spec, _TERMS)):
+                self._draw_term(i, term, several=len(outputs) > 1)
+            with ui.element("div").classes("fields"):
+                button("Add a term", self._add)
+                button("Write equations of motion instead", self._to_motion)
+
+    def _draw_term(self, index: int, term: Mapping[str, Any], *, several: bool) -> None:
+        keys = ("parameter", "regressor", *(("output",) if several else ()), "initial", "unit")
+        with named(ui.element("div").classes("entry term").props("role=group"), f"term {index + 1}"):
+            with ui.element("div").classes("fields grow"):
+                for key in keys:
+                    wide = "" if key in ("parameter", "regressor") else "short"
+                    field(key, term.get(key), self._cell(index, key), classes=f"{wide} {key}")
+            named(button("Remove", lambda: self._remove(index)), f"Remove term {index + 1}")
+
+    def _cell(self, index: int, key: str) -> Callable[[str], None]:
+        def change(value: str) -> None:
+            read = value.strip() or None if key in ("parameter", "regressor", "output", "unit") else _read(key, value)
+            self._write(spec_text.with_cell(self.session.spec, _TERMS, index, key, read))
+
+        return change
+
+    def _add(self) -> None:
+        taken = {str(term.get("parameter")) for term in spec_text.rows_of(self.session.spec, _TERMS)}
+        name = next(name for i in range(1, 1000) if (name := f"p{i}") not in taken)
+        data = self.session.content().get("data", {})
+        row = {
+            "parameter": name,
+            "regressor": f"{([*data.get('inputs', ()), *data.get('outputs', ())] or ['u'])[0]}[k-1]**2",
+        }
+        outputs = data.get("outputs") or []
+        row |= {"output": outputs[0]} if len(outputs) > 1 else {}
+        self._write(spec_text.with_row(self.session.spec, _TERMS, row), "more terms")
+
+    def _remove(self, index: int) -> None:
+        self._write(spec_text.without_row(self.session.spec, _TERMS, index), "more terms")
+
+    def _to_motion(self) -> None:
+        self._write(spec_text.as_motion(self.session.spec), "motion")
+        ui.notify("A mass, a spring and a damper: change the equations in the spec below.")
+
+    def _draw_motion(self, content: Mapping[str, Any]) -> None:
+        motion = content["motion"]
+        text("Equations of motion. States and outputs are written in the spec below.", "p", "hint")
+        for name, state in motion.get("states", {}).items():
+            equation = state.get("derivative") if isinstance(state, Mapping) else None
+            learned = " + learned" if isinstance(state, Mapping) and state.get("learned") else ""
+            text(f"d{name}/dt = {equation}{learned}", "p", "formula")
+        for name, row in motion.get("parameters", {}).items():
+            if isinstance(row, Mapping):
+                with named(ui.element("div").classes("entry term").props("role=group"), f"parameter {name}"):
+                    text(name, "p", "strong name")
+                    with ui.element("div").classes("fields grow"):
+                        for key in ("initial", "unit", "min", "max"):
+                            field(key, row.get(key), self._value(("motion", "parameters", name, key)), classes="short")
+
+    def _value(self, path: tuple[str, ...]) -> Callable[[str], None]:
+        def change(value: str) -> None:
+            read = value.strip() or None if path[-1] == "unit" else _read(path[-1], value)
+            self._write(spec_text.with_value(self.session.spec, path, read))
+
+        return change
+
+    def _draw_learner(self, content: Mapping[str, Any]) -> None:
+        learner, training = content.get("learner", {}), content.get("training", {})
+        moves = "motion" in content
+        with redrawn(self.learner):
+            if not content:
+                text("A learner finds what the physics does not say.", "p", "hint")
+                return
+            kind = str(learner.get("kind", "mlp"))
+            with ui.element("div").classes("fields"):
+                choice("learner", _LEARNERS, kind, self._set_kind)
+                if kind == "mlp":
+                    hidden = ", ".join(map(str, learner.get("hidden", [16])))
+                    field("neurons", hidden, self._set_hidden, classes="short")
+                if kind == "terms":
+                    field("highest degree", learner.get("degree"), self._value(("learner", "degree")), classes="short")
+                seen = ", ".join(map(str, learner.get("inputs", ())))
+                field("what it sees", seen, self._set_inputs, hint="all that the physics reads")
+            with ui.element("div").classes("fields"):
+                structure = str(content.get("structure", {}).get("kind", "orthogonal"))
+                choice("structure", _STRUCTURES, structure, self._chosen(("structure", "kind")))
+                focus = str(training.get("focus", "simulation" if moves else "prediction"))
+                choice("trained on", _FOCUS, focus, self._chosen(("training", "focus")))
+                field(
+                    "starts", training.get("restarts"), self._value(("training", "restarts")), classes="short", hint="1"
+                )
+                field(
+                    "iterations", training.get("iterations"), self._value(("training", "iterations")), classes="short"
+                )
+
+    def _chosen(self, path: tuple[str, ...]) -> Callable[[str], None]:
+        return lambda value: self._write(spec_text.with_value(self.session.spec, path, value))
+
+    def _set_kind(self, kind: str) -> None:
+        spec = spec_text.with_value(self.session.spec, ("learner", "kind"), kind)
+        learner = self.session.content().get("learner", {})
+        if kind == "terms" and not {"terms", "degree"} & set(learner):
+            spec = spec_text.with_value(spec, ("learner", "degree"), 2)
+        self._write(spec, "learner")
+
+    def _set_hidden(self, value: str) -> None:
+        try:
+            hidden = [int(part) for part in value.replace(";", ",").split(",") if part.strip()]
+        except ValueError:
+            ui.notify("Neurons are whole numbers, such as 16, or 8, 8 for two layers.", type="warning")
+            return
+        self._write(spec_text.with_value(self.session.spec, ("learner", "hidden"), hidden or None))
+
+    def _set_inputs(self, value: str) -> None:
+        names = [name.strip() for name in value.split(",") if name.strip()]
+        self._write(spec_text.with_value(self.session.spec, ("learner", "inputs"), names or None))
+
+    def follow_check(self) -> None:
+        """What checking says of the spec as it is."""
+        session = self.session
+        with redrawn(self.check):
+            if not session.spec.strip():
+                text("Rank, units, what the learner could take from the physics, and what would bias it.", "p", "hint")
+                return
+            if session.checking:
+                note("Checking …", "busy")
+            elif session.refused:
+                note(session.refused[:1].upper() + session.refused[1:], "bad")
+            else:
+                note("This spec can be trained.", "good")
+            told = None if session.checked is None else session.checked["check"]
+            stale = session.checking or (session.refused and not (session.checked or {}).get("refusal"))
+            if told is not None:
+                if stale:
+                    text("As the spec was before:", "p", "hint")
+                with ui.element("div").classes("stale" if stale else ""):
+                    _units((session.checked or {})["units"])
+                    _findings(told, (session.checked or {})["bias"])
+            elif session.checking and session.checked is not None:
+                text("The equations are run to see what they determine; that takes a while.", "p", "hint")
+
+
+def _findings(told: Mapping[str, Any], bias: Sequence[Mapping[str, Any]]) -> None:
+    """The account of `orthaug check`."""
+    data, physics = told["excitation"], told["identifiability"]
+    condition = "infinite" if data["condition"] is None else number(data["condition"], 3)
+    rows = [
+        ("parameters", ", ".join(told["parameters"]) or "none"),
+        ("usable rows", told["rows"]),
+        ("rank on these data", f"{data['rank']} of {data['columns']}, condition {condition}"),
+        ("rank on any data", f"{physics['rank']} of {physics['columns']}"),
+    ]
+    table(("what", "found"), rows)
+    for group in physics["inseparable"]:
+        note(f"No data can tell apart: {', '.join(group)}.", "care")
+    for group in data["collinear"] if physics["identifiable"] else ():
+        note(f"These data do not excite separately: {', '.join(group)}.", "care")
+    if told.get("motion"):
+        text(told["motion"]["text"], "p", "small")
+    if told["shared"]:
+        text("Shared with the learner", "h3")
+        text(told["shared"]["text"], "p", "small")
+        rows = [
+            (", ".join(o["inputs"]), o["shared"], ", ".join(o["determined"]) or "–")
+            for o in told["shared"]["alternatives"] or ()
+        ]
+        if rows:
+            table(("if it sees only", "shared", "determined"), rows)
+    if bias:
+        text("What would bias the parameters", "h3")
+        text(
+            "If such a term is missing from the physics; its size 1 % of the output's, or as the spec says.",
+            "p",
+            "hint",
+        )
+        names = list(bias[0]["percent"])
+        rows = [(b["name"], *(_percent(b["percent"].get(n)) for n in names), b["removed_by"] or "–") for b in bias]
+        table(("missing term", *names, "removed by"), rows)
+    for warning in told["warnings"]:
+        note(warning["text"], "care")
+
+
+def _units(units: Sequence[tuple[str, str, str | None]]) -> None:
+    """What the spec says of units, where it is not what the regressors ask for; both are written in one way here."""
+    for name, given, asked in units:
+        if asked is not None and given not in (asked, "") and not (asked == "" and given == "1"):
+            note(f"Unit of {name}: the spec says {given}, output and regressor ask for {asked or '1'}.", "care")
+    wanted = [f"{name} in {asked or '1'}" for name, given, asked in units if asked and not given]
+    if wanted:
+        text(f"Units, from those of the channels: {', '.join(wanted)}.", "p", "hint")
+
+
+def _percent(value: float | None) -> str:
+    return "–" if value is None else f"{0.0 if abs(value) < 1e-9 else value:+.2g}\u00a0%"

@@ -1,0 +1,149 @@
+"""The parts of the page to read the report, and to take away spec, model and code."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+from nicegui import ui
+
+from orthaug.commands.app.session import Session
+from orthaug.commands.app.widgets import button, card, choice, field, link, named, note, redrawn, text
+
+_REPORTS = {"report.html": "of the fit", "comparison.html": "of the comparison"}
+_TARGETS = {
+    "c": "C99 without libraries",
+    "casadi": "CasADi, for optimisation and MPC",
+    "numpy": "Python with NumPy alone",
+    "control": "python-control",
+    "onnx": "ONNX",
+    "fmu": "FMU, for simulators",
+    "latex": "LaTeX",
+}
+
+
+class ReportView:
+    """Shows report.html as it is."""
+
+    def __init__(self, session: Session) -> None:
+        self.session, self.shown = session, "report.html"
+        self._state: object = None
+
+    def draw(self) -> None:
+        """The place; its content follows."""
+        self.place = ui.element("div")
+        self.follow_work()
+
+    def follow_work(self) -> None:
+        """The report of the last result."""
+        session = self.session
+        there = [
+            name for kind, name in (("fit", "report.html"), ("compare", "comparison.html")) if kind in session.results
+        ]
+        marks = [session.commands[kind].began for kind in ("fit", "compare") if kind in session.results]
+        if (there, marks) == self._state:
+            return
+        self._state = (there, marks)
+        with redrawn(self.place):
+            if not there:
+                with card("Report"):
+                    text("The report of a fit or of a comparison is read here, once there is one.", "p", "hint")
+                return
+            self.shown = self.shown if self.shown in there else there[0]
+            with ui.element("div").classes("fields report-line"):
+                if len(there) > 1:
+                    choice("report", {name: _REPORTS[name] for name in there}, self.shown, self._show, "bare")
+                link("Download the report", f"/work/{session.key}/get/{self.shown}")
+            frame = ui.element("iframe").classes("report").props('sandbox="allow-scripts" title="report"')
+            frame.props(f'src="/work/{session.key}/get/{self.shown}?show=true&n={session.versions["work"]}"')
+
+    def _show(self, name: str) -> None:
+        self.shown, self._state = name, None
+        self.follow_work()
+
+
+class ExportView:
+    """Hands out files, and lets the model be written as code."""
+
+    def __init__(self, session: Session) -> None:
+        self.session, self.name = session, "model"
+        self._state: object = None
+
+    def draw(self) -> None:
+        """The places; their content follows."""
+        with ui.element("div").classes("columns even"):
+            with card("Files"):
+                self.files = ui.element("div")
+            with card("Model as code", "Needs no orthaug; each folder has a README and test vectors."):
+                self.code = ui.element("div")
+        self.follow_work()
+
+    def follow_work(self) -> None:
+        """What there is to take."""
+        session = self.session
+        state = (bool(session.spec), tuple(session.results), tuple(session.exports.items()))
+        if state == self._state:
+            return
+        self._state = state
+        with redrawn(self.files):
+            self._draw_files()
+        with redrawn(self.code):
+            self._draw_code()
+
+    def _draw_files(self) -> None:
+        session = self.session
+        files = [("spec.toml", "Spec", "the command line runs it to the same numbers")] if session.spec else []
+        if "fit" in session.results:
+            files += [("model.zip", "Model", "for orthaug simulate, predict, linearize, track")]
+            files += [
+                ("report.html", "Report", "one file, needs no network"),
+                ("result.json", "Numbers", "result.json"),
+            ]
+            files += [("result.zip", "All of the fit", "result folder")]
+        if "compare" in session.results:
+            files += [("comparison.zip", "All of the comparison", "result folder")]
+        for name, label, hint in files:
+            with ui.element("div").classes("entry"):
+                with ui.element("div").classes("grow"):
+                    text(label, "p", "strong")
+                    text(hint, "p", "hint")
+                link(name, f"/work/{session.key}/get/{name}")
+        if not files:
+            text("There is nothing to take yet.", "p", "hint")
+            return
+        text("The same on the command line:", "p", "small")
+        text("orthaug fit spec.toml --out result", "pre")
+        if session.data is not None and session.data.parent == session.folder:
+            text(f"The spec names {session.data.name}: let the two stand in one folder.", "p", "hint")
+
+    def _draw_code(self) -> None:
+        session = self.session
+        if "fit" not in session.results:
+            text("Train a model first.", "p", "hint")
+            return
+        field("name in the code", self.name, self._rename, classes="short")
+        for target, summary in _TARGETS.items():
+            why = session.exports.get(target)
+            with ui.element("div").classes("entry"):
+                with ui.element("div").classes("grow"):
+                    text(summary, "p", "strong")
+                    if why and why != "…":
+                        note(why, "bad")
+                if why == "":
+                    link(f"{target}.zip", f"/work/{session.key}/get/{target}.zip")
+                elif why == "…":
+                    text("writing …", "p", "note busy").props("role=status")
+                else:
+                    made = button("Write", self._exporting(target))
+                    named(made, f"Write {target}")
+
+    def _exporting(self, target: str) -> Callable[[], None]:
+        return lambda: self.session.export(target, self.name)
+
+    def _rename(self, value: str) -> None:
+        if re.fullmatch(r"[A-Za-z]\w{0,39}", value.strip(), re.ASCII):
+            self.name = value.strip()
+            self.session.exports.clear()
+            self.session.changed("work")
+        else:
+            ui.notify("A name has letters, digits and underscores, and begins with a letter.", type="warning")

@@ -1,0 +1,172 @@
+"""The part of the page for training: begin, follow and stop it, and its results as tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from nicegui import ui
+
+from orthaug.commands.app.processes import Command
+from orthaug.commands.app.session import Session
+from orthaug.commands.app.widgets import button, card, loss_figure, note, number, plot, redrawn, table, text
+
+_MOST = 1500  # points of a curve of the loss
+_LEAST = 8  # points that are worth a curve
+_TITLES = {"fit": "Training", "compare": "Comparison"}
+
+
+class TrainingView:
+    """Draws what runs and what came of it, and follows both."""
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self._told = 0  # losses that are drawn
+        self._curve: ui.plotly | None = None
+        self._state: Any = None
+
+    def draw(self) -> None:
+        """The places; their content follows."""
+        with card("Train", "Runs orthaug fit on the spec, or orthaug compare: physics alone and every structure."):
+            with ui.element("div").classes("fields"):
+                self.begin = button("Train", lambda: self.session.train("fit"), main=True)
+                self.compare = button("Compare structures", lambda: self.session.train("compare"))
+                self.end = button("Stop", self.session.stop, classes="stop")
+            self.state = ui.element("div")
+            self.bar = ui.element("progress").props('max=1 value=0 aria-label="progress of training"')
+            self.losses = ui.element("div")
+        self.fit = ui.element("div")
+        self.comparison = ui.element("div")
+        self.follow_work()
+
+    def follow_check(self) -> None:
+        """Whether there is something to train."""
+        able = bool(self.session.spec.strip()) and self.session.running is None and not self.session.refused
+        for made in (self.begin, self.compare):
+            made.set_enabled(able)
+
+    def follow_work(self) -> None:
+        """How far it is, and what came of it."""
+        session, running = self.session, self.session.running
+        self.follow_check()
+        self.end.set_visibility(running is not None)
+        self.end.set_enabled(running is not None and not running.stopping)
+        shown = running or max(session.commands.values(), key=lambda c: c.began, default=None)
+        with redrawn(self.state):
+            if shown is None:
+                text("Nothing has been trained yet." if session.spec else "It begins with a data file.", "p", "hint")
+            else:
+                self._tell(shown)
+        self.bar.set_visibility(running is not None)
+        self._draw_losses([] if shown is None else shown.losses)
+        state = (running is None, *(session.trained.get(kind) for kind in _TITLES), session.spec)
+        if state != self._state:
+            self._state = state
+            self._draw_results()
+
+    def _draw_losses(self, losses: Sequence[tuple[int, int, float]]) -> None:
+        losses = losses if len(losses) >= _LEAST else []
+        if len(losses) == self._told:
+            return
+        figure = loss_figure(losses[:: max(1, len(losses) // _MOST)])
+        if self._curve is None or not losses or not self._told:
+            with redrawn(self.losses):
+                told = "Loss of every run over its iterations, on a logarithmic axis."
+                self._curve = plot(figure, told) if losses else None
+        else:
+            self._curve.update_figure(figure)
+        self._told = len(losses)
+
+    def _tell(self, command: Command) -> None:
+        told, what = command.progress, _TITLES.get(command.arguments[0], "")
+        if command.running:
+            done = (
+                f"run {told['run']} of {told['runs']}, iteration {told['iteration']}"
+                if told
+                else "reading and compiling"
+            )
+            loss = f", loss {number(told['loss'], 4)}" if told else ""
+            ending = "stopping …" if command.stopping else f"{done}{loss}"
+            text(f"{what}: {ending} · {command.seconds:.0f} s", "p", "note busy").props("role=status")
+            self.bar.props(f"value={told.get('done', 0) if told else 0}")
+        elif command.stopping and command.code != 0:
+            note(f"{what} was stopped after {command.seconds:.0f} s; nothing was kept of it.", "care")
+        elif command.code == 0:
+            note(f"{what} is done, in {command.seconds:.1f} s.", "good")
+        else:
+            note(f"{what} failed: {self.session.worded(command.complaint)}", "bad")
+
+    def _draw_results(self) -> None:
+        session = self.session
+        with redrawn(self.fit):
+            if (result := session.results.get("fit")) is not None:
+                with card("Result"):
+                    if session.trained["fit"] != session.spec:
+                        note("The spec has changed since this was trained.", "care")
+                    _fit(result)
+        with redrawn(self.comparison):
+            if (result := session.results.get("compare")) is not None:
+                with card("Comparison"):
+                    if session.trained["compare"] != session.spec:
+                        note("The spec has changed since this was compared.", "care")
+                    _compare(result)
+
+
+def _fit(result: Mapping[str, Any]) -> None:
+    if result["validation"]:
+        text(result["validation"]["text"], "p", "strong")
+    _parameters("Parameters", result["parameters"])
+    if result["physical_parameters"]:
+        _parameters("Physical parameters", result["physical_parameters"])
+    _scores([("", result["scores"])])
+    if result["residuals"]:
+        text(result["residuals"]["text"], "p", "small")
+    for warning in result["warnings"]:
+        note(warning["text"], "care")
+
+
+def _parameters(caption: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    cells = []
+    for row in rows:
+        low, high = row["ci95"] or (None, None)
+        cells.append(
+            (
+                row["name"],
+                number(row["value"], 6),
+                number(row["std"], 3),
+                f"{number(low)} … {number(high)}",
+                row["unit"] or "–",
+            )
+        )
+    table(("parameter", "value", "standard error", "95 % interval", "unit"), cells, caption)
+
+
+def _scores(models: Sequence[tuple[str, Mapping[str, Any]]]) -> None:
+    rows = []
+    for name, scores in models:
+        for part, kinds in scores.items():
+            one, free = kinds["prediction"], kinds["simulation"]
+            own = [_numbers(one["nrmse"]), _numbers(free["nrmse"]), _numbers(free["rmse"]), _numbers(free["fit"], 4)]
+            rows.append((name or part, *([part] if name else []), *own))
+    head = (*(("model", "part") if models and models[0][0] else ("part",)), "NRMSE, one step")
+    table((*head, "NRMSE, free run", "RMSE, free run", "FIT %, free run"), rows, "Scores")
+
+
+def _numbers(values: Sequence[float | None] | None, digits: int = 4) -> str:
+    return "–" if values is None else ", ".join(number(value, digits) for value in values)
+
+
+def _compare(result: Mapping[str, Any]) -> None:
+    if result["chosen"]:
+        text(f"Chosen on the validation part: {result['chosen']}.", "p", "strong")
+    _scores([(row["name"], row["scores"]) for row in result["comparison"]])
+    rows = [
+        (row["name"], ", ".join(f"{p['name']} = {number(p['value'])}" for p in row["parameters"]), row["weights"])
+        for row in result["comparison"]
+    ]
+    table(("model", "parameters", "weights"), rows, "Parameters")
+    for row in result["comparison"]:
+        if row["validation"]:
+            text(f"{row['name']}: {row['validation']['text']}", "p", "small")
+    for warning in result["warnings"]:
+        note(warning["text"], "care")

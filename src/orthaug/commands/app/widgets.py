@@ -1,0 +1,178 @@
+"""Building blocks of the page: headings, fields, tables, curves; plain HTML where that is all it takes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import contextmanager
+from html import escape
+from typing import Any, TypeVar
+
+from nicegui import ui
+
+Drawn = TypeVar("Drawn", bound=ui.element)
+_SHORT = 12  # letters that stand on one line
+_WIDE = 5  # columns of a table that may be wider than its place
+
+
+def named(element: Drawn, label: str) -> Drawn:
+    """With what is read aloud in its place; as it is, never as a piece of markup."""
+    element.props["aria-label"] = label
+    return element
+
+
+def text(what: Any, tag: str = "p", classes: str = "") -> ui.html:
+    """Text in an element; never read as HTML."""
+    return ui.html(escape(str(what)), sanitize=False, tag=tag).classes(classes)
+
+
+def card(title: str, hint: str = "", classes: str = "") -> ui.element:
+    """A section with a heading."""
+    section = ui.element("section").classes(f"card {classes}")
+    if "sticky" in classes:  # it scrolls by itself, by keys too
+        named(section.props("tabindex=0 role=region"), title)
+    with section:
+        text(title, "h2")
+        if hint:
+            text(hint, "p", "hint")
+    return section
+
+
+@contextmanager
+def redrawn(place: ui.element) -> Any:
+    """Draw the content of an element anew."""
+    place.clear()
+    with place:
+        yield
+
+
+def field(label: str, value: Any, changed: Callable[[str], None], *, classes: str = "", hint: str = "") -> ui.input:
+    """A line of text; told when it is left, or by Enter."""
+    made = (
+        ui.input(label, value="" if value is None else str(value)).props("outlined dense stack-label").classes(classes)
+    )
+    if hint:
+        made.props["placeholder"] = hint
+    made.on("change", lambda: changed(made.value or ""))
+    return made
+
+
+def choice(
+    label: str, options: Mapping[str, str], value: str, changed: Callable[[str], None], classes: str = ""
+) -> ui.element:
+    """A list to choose from, as every phone knows it; the label is above."""
+    with ui.element("label").classes(f"choice {classes}"):
+        text(label, "span")
+        made = named(ui.element("select"), label)
+        with made:
+            for key, shown in options.items():
+                option = ui.html(escape(shown), sanitize=False, tag="option")
+                option.props["value"] = key
+                if key == value:
+                    option.props("selected")
+
+        def told(event: Any) -> None:
+            changed(str(event.args))
+
+        made.on("change", told, js_handler="(event) => emit(event.target.value)")
+    return made
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "") -> None:
+    """A table; on a phone each row is a block with the heads beside its cells."""
+    lines = ["<table>", f"<caption>{escape(caption)}</caption>" if caption else "", "<thead><tr>"]
+    lines += [f"<th scope='col'>{escape(name)}</th>" for name in head]
+    lines.append("</tr></thead><tbody>")
+    for row in rows:
+        cells = [_cell(name, str(value)) for name, value in zip(head[1:], row[1:], strict=True)]
+        lines.append(f"<tr><th scope='row'>{escape(str(row[0]))}</th>{''.join(cells)}</tr>")
+    made = ui.html("".join([*lines, "</tbody></table>"]), sanitize=False).classes("table")
+    if len(head) >= _WIDE:  # it may scroll, by keys too
+        named(made.props("tabindex=0 role=region"), caption or head[0])
+
+
+def _cell(head: str, value: str) -> str:
+    short = " class='n'" if len(value) <= _SHORT else ""
+    return f"<td{short} data-label='{escape(head, True)}'>{escape(value)}</td>"
+
+
+def number(value: Any, digits: int = 5) -> str:
+    """A number as it is read; a dash where there is none."""
+    return "–" if value is None else f"{value:.{digits}g}"
+
+
+def button(label: str, clicked: Callable[[], Any], *, main: bool = False, classes: str = "") -> ui.button:
+    """A button; the main one of its place is filled."""
+    made = ui.button(label, on_click=clicked, color=None).props("no-caps unelevated" if main else "no-caps outline")
+    return made.classes(("main " if main else "plain ") + classes)
+
+
+def link(label: str, place: str, *, download: bool = True) -> ui.element:
+    """A link that looks like a button."""
+    made = text(label, "a", "download")
+    made.props["href"] = place
+    return made.props("download") if download else made
+
+
+def note(what: str, kind: str = "") -> ui.html:
+    """A sentence that must be seen: `bad`, `care` or `good`."""
+    return text(what, "p", f"note {kind}").props("role=alert" if kind == "bad" else "role=status")
+
+
+_COLORS = ("#3b82d0", "#d9730d", "#159a7c", "#9a5fd6", "#c2498a", "#8a7a12")
+
+
+def curves_figure(rows: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], unit: str = "time in s") -> dict[str, Any]:
+    """Curves below one another on one axis of time: of each row a label, and traces `x`, `y`, `name`, `raw`."""
+    traces: list[dict[str, Any]] = []
+    layout = _layout(70 + 130 * len(rows))
+    layout["xaxis"] |= {
+        "title": {"text": unit, "font": {"size": 12}},
+        "anchor": f"y{len(rows)}" if len(rows) > 1 else "y",
+    }
+    gap = 0.12 / max(len(rows), 1)
+    for i, (label, drawn) in enumerate(rows):
+        axis, top = (f"y{i + 1}" if i else "y"), 1 - i / len(rows)
+        title = {"text": label, "font": {"size": 12}}
+        layout[f"yaxis{i + 1 if i else ''}"] = {
+            **{"domain": [max(0.0, top - 1 / len(rows) + gap), top - gap / 2], "zeroline": False, "automargin": True},
+            **{"title": title, "nticks": 5, "anchor": "x"},
+        }
+        for curve in drawn:
+            raw = curve.get("raw", False)
+            line = {"width": 1.2, "color": "#8b949e" if raw else _COLORS[i % len(_COLORS)]}
+            own = {"name": curve["name"], "x": curve["x"], "y": curve["y"], "line": line, "opacity": 0.6 if raw else 1}
+            traces.append({**own, "type": "scatter", "mode": "lines", "xaxis": "x", "yaxis": axis, "showlegend": False})
+    return {"data": traces, "layout": layout, "config": _CONFIG}
+
+
+def loss_figure(losses: Sequence[tuple[int, int, float | None]]) -> dict[str, Any]:
+    """The loss of every run over its iterations."""
+    runs: dict[int, tuple[list[int], list[float | None]]] = {}
+    for run, iteration, loss in losses:
+        x, y = runs.setdefault(run, ([], []))
+        x.append(iteration)
+        y.append(loss)
+    layout = _layout(260)
+    layout["xaxis"] |= {"title": {"text": "iteration", "font": {"size": 12}}}
+    title = {"text": "loss", "font": {"size": 12}}
+    layout["yaxis"] = {"type": "log", "title": title, "automargin": True, "exponentformat": "e", "nticks": 5}
+    own = {"type": "scatter", "mode": "lines+markers", "marker": {"size": 4}, "showlegend": 1 < len(runs) <= 6}
+    traces = [
+        {**own, "name": f"run {run}", "x": x, "y": y, "line": {"width": 1.5, "color": _COLORS[i % len(_COLORS)]}}
+        for i, (run, (x, y)) in enumerate(sorted(runs.items()))
+    ]
+    return {"data": traces, "layout": layout, "config": _CONFIG}
+
+
+_CONFIG = {"displayModeBar": False, "responsive": False, "displaylogo": False}
+
+
+def _layout(height: int) -> dict[str, Any]:
+    plain: dict[str, Any] = {"paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)", "height": height}
+    plain |= {"margin": {"l": 56, "r": 12, "t": 8, "b": 40}, "font": {"size": 12}, "hovermode": "x unified"}
+    return plain | {"xaxis": {"zeroline": False, "automargin": True}, "legend": {"orientation": "h", "y": 1.12}}
+
+
+def plot(figure: dict[str, Any], label: str) -> ui.plotly:
+    """A figure, with a sentence that is read aloud in its place."""
+    return named(ui.plotly(figure).classes("plot").props("role=img"), label)

@@ -1,0 +1,220 @@
+"""A process that answers questions of the page: what is in a file, which spec to start with, what a spec is worth.
+
+A question is a line of JSON on standard input, its answer one on standard output: `refused` where there is none, and
+`last` where the process ends with it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import Vector
+from orthaug._base.errors import InputError
+from orthaug.commands import check as checking
+from orthaug.commands import init as starting
+from orthaug.commands.job import Job
+from orthaug.commands.opening import open_job
+from orthaug.data.expressions import parse
+from orthaug.data.record import Channel, check_step
+from orthaug.data.survey import Column, Survey
+from orthaug.data.writing import coefficient_unit
+from orthaug.reports.text import check_text
+
+MOST = 3000
+"""Points of a curve that are drawn."""
+_KEPT = 600e6  # bytes that a process may have held to go on
+_DRAWN = 12  # columns of a file whose curves are
+
+
+def main() -> None:
+    """Answer questions until nobody asks any more; end where a question took much memory, which would be kept."""
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # what a library prints is no answer
+    asked: queue.Queue[str] = queue.Queue()
+    threading.Thread(target=_listen, args=(asked,), daemon=True).start()
+    while True:
+        answer = _answer(json.loads(asked.get()))
+        answer["last"] = peak() > _KEPT
+        answers.write(json.dumps(answer) + "\n")
+        answers.flush()
+        if answer["last"]:
+            return
+
+
+def _listen(asked: queue.Queue[str]) -> None:
+    """Questions as they come, also while one is answered: where there are no more, nobody waits for that either."""
+    for line in sys.stdin:
+        asked.put(line)
+    os._exit(0)
+
+
+def _answer(given: dict[str, Any]) -> dict[str, Any]:
+    try:
+        return QUESTIONS[given.pop("question")](**given)
+    except InputError as error:
+        return {"refused": str(error)}
+    except MemoryError:
+        return {"refused": "there is not enough memory to look at these data; take fewer rows, or every n-th."}
+    except OSError as error:
+        return {"refused": f"{error.filename or 'a file'}: cannot be read ({error.strerror or error})."}
+    except Exception as error:  # a page shows no traceback
+        return {"refused": f"this cannot be told: {type(error).__name__}: {' '.join(str(error).split())[:300]}"}
+
+
+def peak() -> float:
+    """Bytes that this process has held at most; 0 where the system does not say."""
+    try:
+        import resource
+    except ImportError:
+        return 0.0
+    unit = 1 if sys.platform == "darwin" else 1024
+    return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) * unit
+
+
+def look(path: str, out: str, inputs: str | None, outputs: str | None, step: float | None) -> dict[str, Any]:
+    """The columns of a file, their curves, and the first spec for it where its channels are known.
+
+    Args:
+        out: where the spec will stand.
+        inputs: columns of the inputs, separated by commas; None for what their names say.
+        outputs: the same of the outputs.
+        step: sampling time in s where a person said it.
+    """
+    found = starting.look(Path(path))
+    answer: dict[str, Any] = {
+        "columns": [_column(found, column) for column in found.columns],
+        "rows": max(column.filled for column in found.columns),
+        "clock": str(found.clock),
+        "step": found.clock.step,
+        "spec": None,
+        "account": "",
+        "open": "",
+    }
+    try:
+        roles = starting.assign(found, inputs, outputs, None if step is None else check_step(step))
+        if roles is not None:
+            draft = starting.draft(found, roles, Path(out))
+            names = {"inputs": [c.header for c in roles.inputs], "outputs": [c.header for c in roles.outputs]}
+            answer |= {"spec": draft.spec, "account": draft.account, **names}
+    except InputError as error:
+        answer["open"] = str(error).removeprefix(f"{path}: ")
+    return answer | {"curves": _curves(found)}
+
+
+def _column(found: Survey, column: Column) -> dict[str, Any]:
+    usable = column in found.signals
+    why = "time" if column is found.clock.column else "no numbers" if not column.numeric else "constant"
+    told = starting.as_seen(column, spikes=column.kind != "input") if usable else why
+    own = {"header": column.header, "name": column.name, "unit": column.unit, "kind": column.kind}
+    head = f"{column.name}" + (f" = column '{column.header}'" if column.header != column.name else "")
+    return own | {"usable": usable, "told": told.removeprefix(f"{head}: ")}
+
+
+def _curves(found: Survey) -> dict[str, Any]:
+    step = found.clock.step or 1.0
+    curves = {}
+    for column in found.signals[:_DRAWN]:
+        values = column.values[: column.filled]
+        clock = found.clock.column
+        time = clock.values[: len(values)] if clock is not None and found.clock.instants else None
+        if time is None or len(time) < len(values) or not np.isfinite(time).all():
+            time = step * np.arange(len(values))
+        curves[column.header] = thinned(time, values)
+    return curves
+
+
+def examine(path: str, whole: bool) -> dict[str, Any]:
+    """What `orthaug check` tells of a spec, and its training data as they are after preparation.
+
+    Args:
+        whole: run equations of motion too; without, `check` is None for them, since that takes its time.
+    """
+    job = open_job(Path(path), require_full_rank=False)
+    moves = job.spec.motion is not None
+    told: dict[str, Any] = {"check": None, "text": "", "refusal": None, "bias": []}
+    if whole or not moves:
+        if moves:
+            from orthaug._base.jax import use_compilation_cache
+
+            use_compilation_cache()
+        result = checking.check_job(job)
+        refused = checking.refusal(job, result)
+        told = {"check": json.loads(result.to_json()), "text": check_text(result)}
+        told |= {"refusal": None if refused is None else str(refused)}
+        told["bias"] = [
+            {"name": one.name, "removed_by": one.removed_by, "percent": one.percent} for one in result.bias or ()
+        ]
+    return told | {
+        "rows": {part.name: len(part.record) for part in job.parts},
+        "step": job.train.record.sampling_time,
+        "units": _units(job),
+        "prepared": [done.text for done in job.train.record.prepared],
+        "curves": _prepared_curves(job),
+    }
+
+
+def _units(job: Job) -> list[tuple[str, str, str | None]]:
+    """Of each parameter of a baseline: its name, the unit that the spec gives, and what its regressor asks for."""
+    if job.spec.baseline is None:
+        return []
+    channels = {channel.name: channel.unit for channel in (*job.train.record.inputs, *job.train.record.outputs)}
+    first, constants, told = job.train.record.outputs[0].name, job.spec.baseline.constants, {}
+    for term in job.spec.baseline.terms:
+        expression = parse(str(term.regressor), constants)
+        told[term.parameter] = (term.unit or "", coefficient_unit(channels[term.output or first], expression, channels))
+    return [(name, *units) for name, units in told.items()]
+
+
+def _prepared_curves(job: Job) -> dict[str, Any]:
+    """By channel, of the training data; experiments are apart."""
+    record = job.train.record
+    channels: Sequence[Channel] = (*record.inputs, *record.outputs)
+    curves = {}
+    for j, channel in enumerate(channels):
+        x: list[float | None] = []
+        y: list[float | None] = []
+        for e in record.experiments:
+            values = np.hstack([e.inputs, e.outputs])[:, j]
+            share = max(8, MOST * len(e) // max(len(record), 1))
+            curve = thinned(e.start_time + record.sampling_time * np.arange(len(e)), values, share)
+            x, y = [*x, *curve["x"], None], [*y, *curve["y"], None]
+        curves[channel.name] = {"x": x[:-1], "y": y[:-1], "unit": channel.unit, "column": channel.file_column}
+    return curves
+
+
+def thinned(time: Vector, values: Vector, most: int = MOST) -> dict[str, list[float | None]]:
+    """A curve of at most about `most` points: of each stretch the least and the largest value, in their order.
+
+    Examples:
+        >>> thinned(np.arange(6.0), np.array([0.0, 5.0, 1.0, 2.0, -1.0, 0.0]), 4)
+        {'x': [0.0, 1.0, 3.0, 4.0], 'y': [0.0, 5.0, 2.0, -1.0]}
+    """
+    if len(values) > most:
+        edges = np.linspace(0, len(values), most // 2 + 1).astype(int)
+        there = np.where(np.isfinite(values), values, np.nan)
+        kept = []
+        for a, b in zip(edges[:-1], edges[1:], strict=True):
+            piece = there[a:b]
+            known = np.isfinite(piece).any()
+            kept += sorted({a + int(np.nanargmin(piece)), a + int(np.nanargmax(piece))}) if known else [a]
+        time, values = time[kept], values[kept]
+    return {"x": _plain(time), "y": _plain(values)}
+
+
+def _plain(values: Vector) -> list[float | None]:
+    return [float(f"{v:.7g}") if np.isfinite(v) else None for v in values]
+
+
+QUESTIONS: dict[str, Callable[..., dict[str, Any]]] = {"look": look, "examine": examine}
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,432 @@
+"""The page of `orthaug app`: who may use it, and the whole path from a data file to a model in a real browser."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.util
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tomllib
+import urllib.error
+import urllib.request
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_cli import run, signals, write_csv
+
+from orthaug._base.errors import InputError
+from orthaug.commands.app import spec_text
+from orthaug.commands.app.gate import Gate
+from orthaug.commands.app.processes import Desk
+from orthaug.commands.app.session import Session
+from orthaug.commands.app.sessions import Sessions
+from orthaug.commands.app.worker import thinned
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+CHROMIUM = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
+HAS_PAGE = importlib.util.find_spec("nicegui") is not None
+HAS_BROWSER = importlib.util.find_spec("playwright") is not None and CHROMIUM is not None
+served = pytest.mark.skipif(not HAS_PAGE or os.name != "posix", reason="no NiceGUI, or no SIGINT")
+browsed = pytest.mark.skipif(
+    not (HAS_PAGE and HAS_BROWSER) or os.name != "posix", reason="no NiceGUI, Playwright or Chromium, or no SIGINT"
+)
+MAIN = "from orthaug.commands.entry import main; main()"
+LATE = 30_000  # ms
+SPEC = """# kept
+[data]
+inputs = ["u"]
+outputs = ["y"]
+train = { files = ["run.csv", "/there/b.csv"] } # kept too
+tests.one = { files = ["../c.csv"] }
+[[baseline.terms]]
+parameter = "a"
+regressor = "y[k-1]"
+[learner]
+kind = "none"
+"""
+
+
+def answer(gate: Gate, kind: str = "http", **given: Any) -> tuple[int, dict[str, str], bool]:
+    """Status or closing code, headers, and whether the application behind the gate was reached."""
+    sent: list[dict[str, Any]] = []
+    reached: list[str] = []
+
+    async def behind(scope, receive, send):
+        reached.append(scope["path"])
+        if scope["type"] == "http":
+            await send({"type": "http.response.start", "status": 200, "headers": []})
+            await send({"type": "http.response.body", "body": b""})
+
+    async def send(message):
+        sent.append(message)
+
+    gate.app = behind
+    headers = {"host": f"127.0.0.1:{gate.port}", **given.get("headers", {})}
+    scope = {"type": kind, "path": given.get("path", "/"), "query_string": given.get("query", "").encode()}
+    scope |= {"headers": [(k.encode(), v.encode()) for k, v in headers.items()], "method": given.get("method", "GET")}
+    asyncio.run(gate(scope, None, send))  # type: ignore[arg-type]
+    first = sent[0] if sent else {}
+    told = {k.decode(): v.decode() for k, v in first.get("headers", [])}
+    return first.get("status", first.get("code", 0)), told, bool(reached)
+
+
+def test_only_the_token_opens_the_gate():
+    gate = Gate(None, 8123, token="sesame")  # type: ignore[arg-type]
+    kept = {"cookie": "a=b; orthaug-8123=sesame"}
+    assert gate.url == "http://127.0.0.1:8123/?token=sesame"
+    for kind, refusal in (("http", 403), ("websocket", 1008)):
+        for query, cookie in (
+            ("", ""),
+            ("token=", ""),
+            ("token=sesam", ""),
+            ("", "orthaug-8123=x"),
+            ("", "orthaug-1=sesame"),
+        ):
+            assert answer(gate, kind, query=query, headers={"cookie": cookie})[::2] == (refusal, False)
+        assert answer(gate, kind, headers=kept)[2]
+        for header in ({"host": "evil.example:8123"}, {"host": "127.0.0.1:1"}, {"origin": "http://evil.example"}):
+            assert answer(gate, kind, headers=kept | header)[::2] == (refusal, False)
+        assert answer(gate, kind, headers=kept | {"host": "localhost:8123", "origin": "http://localhost:8123"})[2]
+    code, told, reached = answer(gate, query="token=sesame&show=true", path="//evil.example/x")
+    assert (code, told["location"], reached) == (303, "/evil.example/x?show=true", False)
+    assert "HttpOnly" in told["set-cookie"] and "SameSite=Strict" in told["set-cookie"]
+    assert "frame-ancestors 'self'" in answer(gate, headers=kept)[1]["content-security-policy"]
+    assert len(Gate(None, 1).token) > 40 and Gate(None, 1).token != Gate(None, 1).token  # type: ignore[arg-type]
+
+
+def test_forms_change_a_spec_and_nothing_else(tmp_path):
+    steps = ("data", "prepare")
+    spec = spec_text.with_row(SPEC, steps, {"step": "detrend"})
+    spec = spec_text.with_row(spec, steps, {"step": "lowpass", "cutoff": 2.0})
+    spec = spec_text.with_cell(spec, steps, 1, "order", 2)
+    assert spec_text.rows_of(spec, steps) == [{"step": "detrend"}, {"step": "lowpass", "cutoff": 2.0, "order": 2}]
+    spec = spec_text.without_row(spec_text.without_row(spec, steps, 0), steps, 0)
+    assert tomllib.loads(spec) == tomllib.loads(SPEC) and "# kept too" in spec
+    spec = spec_text.with_value(spec, ("training", "restarts"), 3)
+    assert tomllib.loads(spec)["training"] == {"restarts": 3}
+    inline = spec_text.with_row(
+        '[baseline]\nterms = [{ parameter = "a", regressor = "1" }]', ("baseline", "terms"), {"x": 1}
+    )
+    assert spec_text.rows_of(inline, ("baseline", "terms"))[1] == {"x": 1}
+    data = tomllib.loads(spec_text.absolute(SPEC, tmp_path / "in"))["data"]
+    assert data["train"]["files"] == [(tmp_path / "in/run.csv").as_posix(), "/there/b.csv"]
+    assert data["tests"]["one"]["files"] == [(tmp_path / "c.csv").as_posix()]
+    tested = spec_text.with_value(spec, ("data", "tests", "new"), {"files": ["d.csv"]})
+    assert tomllib.loads(tested)["data"]["tests"] == {"one": {"files": ["../c.csv"]}, "new": {"files": ["d.csv"]}}
+    moving = tomllib.loads(spec_text.as_motion(SPEC))
+    assert moving["motion"]["outputs"] == {"y": "x"} and "baseline" not in moving
+    with pytest.raises(InputError, match="broken TOML"):
+        spec_text.plain("[data\n")
+
+
+def test_a_curve_is_thinned_to_what_is_seen():
+    x = np.arange(100_000.0)
+    y = np.sin(x / 1e4)
+    y[31_234], y[77:90] = 5.0, np.nan
+    drawn = thinned(x, y)
+    assert len(drawn["x"]) <= 3000 and max(v for v in drawn["y"] if v is not None) == 5.0
+    assert drawn["x"] == sorted(drawn["x"])  # type: ignore[type-var]
+    assert thinned(x[77:200], y[77:200])["y"][:13] == [None] * 13
+
+
+def test_a_session_keeps_to_its_folder(tmp_path):
+    session = Session("key", tmp_path, Desk())
+    assert session.place_for("../../etc/run one.csv") == tmp_path / "run one.csv"
+    assert session.place_for("C:\\data\\<b>.CSV").parent == tmp_path
+    for name in ("run.exe", ".csv", "", "spec.toml"):
+        with pytest.raises(InputError, match="no data file that is known"):
+            session.place_for(name)
+    for name in ("../x", "spec.toml", "model.zip", "c.zip", "/etc/passwd"):
+        with pytest.raises(InputError, match="there is nothing of that name yet"):
+            session.download(name)
+
+
+def test_sessions_that_nobody_used_make_room(tmp_path):
+    sessions = Sessions(tmp_path)
+    first, second = sessions.new(), sessions.new()
+    first.data = tmp_path / "run.csv"
+    keys = {sessions.new().key for _ in range(48 + 20)}
+    assert sessions.find(first.key) is first and sessions.find(second.key) is None and len(keys) == 68
+    for key in keys:
+        if (session := sessions.find(key)) is not None:
+            session.data = first.data
+    with pytest.raises(InputError, match="50 pieces of work are open"):
+        sessions.new()
+
+
+def test_what_cannot_be_served_is_said(tmp_path, monkeypatch):
+    (tmp_path / "bad.toml").write_text("[data\n")
+    for arguments, told in (
+        (["absent.toml"], "absent.toml: no such file"),
+        ([str(tmp_path / "bad.toml")], "bad.toml: broken TOML"),
+        (["--port", "70000"], "--port: cannot listen on port 70000"),
+    ):
+        done = run("app", "--no-browser", *arguments)
+        assert (done.code, done.out) == (2, "") and told in done.err, done
+    monkeypatch.setitem(sys.modules, "nicegui", None)
+    assert "pip install 'orthaug[app]'" in run("app", "--no-browser").err
+
+
+class Server:
+    """`orthaug app` in a process of its own."""
+
+    def __init__(self, folder: Path, *arguments: object) -> None:
+        setting = {k: v for k, v in os.environ.items() if k != "PYTEST_CURRENT_TEST"} | {"TMPDIR": str(folder)}
+        program = [sys.executable, "-c", MAIN, "app", "--no-browser", *map(str, arguments)]
+        pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        self.process = subprocess.Popen(program, cwd=folder, env=setting, **pipes)
+        assert self.process.stdout is not None
+        self.url = self.process.stdout.readline().strip()
+        self.base = self.url.partition("?")[0]
+
+    def children(self) -> list[int]:
+        """All processes below it."""
+        found, parents = [], [self.process.pid]
+        while parents:
+            for task in Path(f"/proc/{parents.pop()}/task").glob("*/children"):
+                below = [int(number) for number in task.read_text().split()]
+                found, parents = found + below, parents + below
+        return found
+
+    def end(self) -> str:
+        """What it said on standard error, after Ctrl-C."""
+        self.process.send_signal(signal.SIGINT)
+        _, told = self.process.communicate(timeout=20)
+        return told
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory) -> Iterator[Server]:
+    started = Server(tmp_path_factory.mktemp("app"))
+    yield started
+    if started.process.poll() is None:
+        started.end()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def csv(tmp_path_factory) -> Path:
+    u, y = signals(400, 3)
+    path = tmp_path_factory.mktemp("data") / "plant.csv"
+    write_csv(path, u=u, y=y)
+    return path
+
+
+class Tab:
+    """A tab of a browser of its own, with what it complained of and asked for."""
+
+    def __init__(self, browser, server: Server, width: int = 1280, scheme: str = "light") -> None:
+        self.context = browser.new_context(viewport={"width": width, "height": 844}, color_scheme=scheme)
+        self.page, self.told, self.server = self.context.new_page(), [], server
+        self.page.set_default_timeout(LATE)
+        self.asked: set[str] = set()
+        self.page.on("console", lambda m: self.told.append(m.text) if m.type in ("error", "warning") else None)
+        self.page.on("pageerror", lambda error: self.told.append(str(error)))
+        self.page.on("request", lambda r: self.asked.add(r.url))
+        self.page.on("websocket", lambda w: self.asked.add(w.url.replace("ws://", "http://")))
+        self.page.goto(server.url)
+        self.page.wait_for_selector("#drop")
+
+    def go(self, name: str) -> None:
+        self.page.get_by_role("tab", name=name).click()
+
+    def drop(self, file: Path) -> None:
+        self.page.set_input_files("#dropped", file)
+        self.page.wait_for_selector(f"text={file.name}: ")
+
+    def write(self, change) -> str:
+        """Change the spec in the editor, and wait until it was checked."""
+        editor = self.page.get_by_label("spec in TOML")
+        spec = change(editor.input_value())
+        editor.fill(spec)
+        self.page.wait_for_selector("text=Checking …")
+        self.page.wait_for_selector(".note.good, .note.bad")
+        return spec
+
+    def fetch(self, name: str) -> bytes:
+        return self.context.request.get(f"{self.page.url}/get/{name}").body()
+
+    def check(self, *names: str) -> None:
+        """axe finds nothing, and nothing is wider than the page."""
+        from axe_playwright_python.sync_playwright import Axe
+
+        for name in names:
+            self.go(name)
+            self.page.wait_for_timeout(250)
+            found = Axe().run(self.page)
+            assert found.violations_count == 0, found.generate_report()
+            width = self.page.viewport_size["width"]
+            assert self.page.evaluate("document.documentElement.scrollWidth") <= width, name
+
+    def close(self) -> None:
+        self.context.close()
+        assert self.told == []
+        assert {url for url in self.asked if not url.startswith((self.server.base, "data:", "blob:"))} == set()
+
+
+@served
+def test_the_server_listens_on_this_machine_alone_and_asks_for_the_token(server):
+    def status(url: str, **headers: str) -> int:
+        try:
+            with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=10) as told:
+                return told.status
+        except urllib.error.HTTPError as error:
+            return error.code
+
+    assert server.base.startswith("http://127.0.0.1:")
+    places = ("", "work/x", "work/x/get/spec.toml", "_nicegui_ws/socket.io/?EIO=4&transport=polling")
+    assert [status(server.base + place) for place in places] == [403] * 4
+    assert status(server.url + "x") == 403 and status(server.url, Host="evil.example") == 403
+    port = server.base.rstrip("/").rpartition(":")[2]
+    listening = Path("/proc/net/tcp").read_text().splitlines() if os.path.exists("/proc/net/tcp") else []
+    own = [line.split()[1] for line in listening if line.split()[1].endswith(f":{int(port):04X}") and " 0A " in line]
+    assert set(own) <= {f"0100007F:{int(port):04X}"}
+
+
+@browsed
+def test_from_a_file_to_code_with_the_numbers_of_the_command_line(server, browser, csv, tmp_path, without_figures):
+    tab, other = Tab(browser, server), Tab(browser, server, 390, "dark")
+    page = tab.page
+    tab.drop(csv)
+    page.wait_for_selector(".plot .main-svg")
+    page.get_by_role("tab", name="Data").focus()
+    page.keyboard.press("ArrowRight")
+    assert page.evaluate("document.activeElement.innerText.trim()") == "Model"
+    page.get_by_label("add a step").select_option("detrend")
+    page.wait_for_selector("text=Done: detrend")
+    tab.check("Model")
+    assert page.get_by_text("Unit of").count() == 0
+    page.get_by_label("unit").first.fill("m")
+    page.get_by_label("unit").first.press("Tab")
+    page.wait_for_function("document.querySelector('.editor textarea').value.includes('unit = \"m\"')")
+    spec = tab.write(
+        lambda text: text.replace("restarts = 3", "restarts = 200\niterations = 4000\nregularization = 0.0")
+    )
+    assert 'unit = "m"' in spec and '[[data.prepare]]\nstep = "detrend"' in spec
+
+    # while it trains another one works on another file, and sees nothing of it
+    tab.go("Training")
+    page.get_by_role("button", name="Train").click()
+    second = csv.with_name("second.csv")
+    write_csv(second, left=np.arange(40.0) % 7, right=np.arange(40.0) % 5)
+    other.page.set_input_files("#dropped", second)
+    other.page.wait_for_selector("text=The names of the columns do not say")
+    assert other.page.url != page.url and "plant.csv" not in other.page.inner_text("body")
+
+    # a reload in the middle finds it again, and it can be stopped
+    page.wait_for_selector("text=iteration")
+    page.reload()
+    page.wait_for_selector("text=iteration")
+    assert page.get_by_role("tab", name="Training").get_attribute("aria-selected") == "true"
+    page.get_by_role("button", name="Stop").click()
+    page.wait_for_selector("text=Training was stopped")
+
+    tab.go("Model")
+    tab.write(lambda text: text.replace("restarts = 200\niterations = 4000", "restarts = 1\niterations = 20"))
+    tab.go("Training")
+    page.get_by_role("button", name="Train").click()
+    page.wait_for_selector("text=Training is done")
+    tab.go("Report")
+    assert page.frame_locator("iframe").locator("h1").inner_text() == "Model of y from u"
+    tab.check("Export")
+    page.get_by_role("button", name="Write numpy").click()
+    page.wait_for_selector("text=numpy.zip")
+
+    (tmp_path / "spec.toml").write_bytes(tab.fetch("spec.toml"))
+    shutil.copy(csv, tmp_path)
+    assert run("fit", tmp_path / "spec.toml", "--out", tmp_path / "result").code == 0
+    own = json.loads((tmp_path / "result" / "result.json").read_text())
+    shown = json.loads(tab.fetch("result.json"))
+    for told in (own, shown):
+        for restart in told["restarts"]:
+            restart.pop("seconds", None)
+    assert [p["value"] for p in shown["parameters"]] == [p["value"] for p in own["parameters"]]
+    assert shown["scores"] == own["scores"] and shown["restarts"] == own["restarts"]
+    for name, file in (("model.zip", "model/arrays.safetensors"), ("numpy.zip", "numpy/model.py")):
+        (tmp_path / name).write_bytes(tab.fetch(name))
+        assert file in zipfile.ZipFile(tmp_path / name).namelist()
+    arrays = zipfile.ZipFile(tmp_path / "model.zip").read("model/arrays.safetensors")
+    assert arrays == (tmp_path / "result" / "model" / "arrays.safetensors").read_bytes()
+
+    phone = other.page
+    phone.goto(page.url)
+    phone.wait_for_selector("[role=tab]")
+    other.check("Data", "Model", "Training", "Report", "Export")
+    other.close()
+    tab.close()
+
+
+@browsed
+def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
+    tab = Tab(browser, server)
+    page = tab.page
+    page.get_by_label("or its path").fill(str(tmp_path / "absent.csv"))
+    page.get_by_role("button", name="Open").click()
+    page.wait_for_selector("text=no such file")
+    (tmp_path / "run.txt").write_text("no data")
+    page.set_input_files("#dropped", tmp_path / "run.txt")
+    page.wait_for_selector("text=no data file that is known")
+    tab.told.clear()  # the browser tells of the 422
+    (tmp_path / "own.csv").write_text(csv.read_text().replace("u,y", "force,<i>way</i>"))
+    page.get_by_label("or its path").fill(str(tmp_path / "own.csv"))
+    page.get_by_label("or its path").press("Enter")
+    page.get_by_label("use of force").select_option("input")
+    page.get_by_label("use of <i>way</i>").select_option("output")
+    page.get_by_role("button", name="Begin with these").click()
+    page.wait_for_selector("text=first physics")
+    tab.go("Model")
+    tab.write(lambda text: text.replace("[learner]", "[learner"))
+    assert "Broken TOML" in page.inner_text(".note.bad")
+    tab.go("Training")
+    assert page.get_by_role("button", name="Train").is_disabled()
+    tab.go("Model")
+    kept = tab.write(lambda text: text.replace("[learner", "[learner]"))
+    tab.go("Data")
+    tab.drop(tmp_path / "own.csv")
+    page.get_by_role("button", name="Take it as a test").click()
+    page.wait_for_selector("text=tests.own")
+    added = tab.fetch("spec.toml").decode()
+    assert tomllib.loads(added)["data"]["tests"].pop("own") == {"files": ["own.csv"]} and kept.splitlines()[0] in added
+    assert tab.fetch("../x") and tab.context.request.get(f"{page.url}/get/result.zip").status == 404
+    tab.close()
+
+
+@browsed
+@pytest.mark.skipif(not os.path.exists("/proc/self/task"), reason="children are read from /proc")
+def test_ctrl_c_leaves_nothing(browser, csv, tmp_path):
+    (tmp_path / "plant.toml").write_text(
+        f'[data]\ninputs = ["u"]\noutputs = ["y"]\ntrain = {{ files = ["{csv.as_posix()}"] }}\n'
+        '[[baseline.terms]]\nparameter = "a"\nregressor = "y[k-1]"\n[learner]\nhidden = [8]\n'
+        "[training]\nrestarts = 200\niterations = 4000\nregularization = 0.0\n"
+    )
+    server = Server(tmp_path, tmp_path / "plant.toml")
+    tab = Tab(browser, server)
+    tab.go("Model")
+    tab.page.wait_for_selector(".note.good")
+    tab.go("Training")
+    tab.page.get_by_role("button", name="Train").click()
+    tab.page.wait_for_selector("text=reading and compiling")
+    children = server.children()
+    assert len(children) >= 2
+    told = server.end()
+    assert (server.process.returncode, told) == (0, "ended\n")
+    assert [number for number in children if Path(f"/proc/{number}").exists()] == []
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["plant.toml"]
+    tab.context.close()
