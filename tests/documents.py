@@ -4,7 +4,7 @@
 
 - `python` blocks of a page share their names; `sh` blocks run line by line, `orthaug` by its entry in this process, all
   else by a shell; `toml` blocks with a title are written to the file of that name, others are parts of a spec, which
-  replace those of the page's `spec.toml` and are opened with its data.
+  replace those of the page's `spec.toml`; that is then opened with its data.
 - A `text` block right below is what the block prints: words as they stand, whole numbers too, other numbers to 2 % or
   a unit and a half of their last digit. `...` stands for anything.
 - Comments before a block: `<!-- given: run1.csv, record -->` is what the reader has already, made by `GIVEN`;
@@ -152,16 +152,15 @@ def shell(line: str) -> tuple[int, str]:
 
 
 def opened(text: str) -> None:
-    """A part of a spec stands in the page's spec in the place of what it replaces, and that opens with its data."""
+    """Puts a part of a spec into the page's spec, in the place of what it replaces, and opens that with its data."""
     part = tomllib.loads(text)
     whole = tomllib.loads(Path("spec.toml").read_text(encoding="utf-8"))
     data = {**whole.get("data", {}), **part.pop("data", {})}
     for name in ("baseline", "lags", "physics") if "motion" in part else ():
         whole.pop(name, None)
-    path = Path("part-of-a-spec.toml")
+    path = Path("spec.toml")
     path.write_text(tomlkit.dumps({**whole, **part, "data": data}), encoding="utf-8")
     open_job(path)
-    path.unlink()
 
 
 class Page:

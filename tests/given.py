@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
+from test_cli import run
 
 import orthaug as oa
 
@@ -13,7 +16,7 @@ import orthaug as oa
 def measured(rows: int = 300, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Force and position of a mass-spring-damper that hardens; noise in the equation."""
     rng = np.random.default_rng(seed)
-    u, y = rng.normal(size=rows), np.zeros(rows)
+    u, y = np.repeat(rng.normal(size=rows // 4), 4), np.zeros(rows)
     for k in range(2, rows):
         y[k] = 1.5 * y[k - 1] - 0.7 * y[k - 2] + 0.1 * u[k - 1] - 0.1 * y[k - 1] ** 3 + 0.001 * rng.normal()
     return u, y
@@ -34,6 +37,7 @@ def baseline() -> oa.Baseline:
     return oa.Baseline.from_terms([oa.Term(*term) for term in terms.items()])
 
 
+@cache
 def fit() -> oa.Estimate:
     return oa.estimate(record(), baseline(), learner=oa.MLP(hidden=(4,)))
 
@@ -44,7 +48,51 @@ def elsewhere(x: np.ndarray) -> np.ndarray:
 
 
 FILES = ("run1.csv", "run2.csv", "steps.csv", "new.csv")
+def result(name: str) -> None:
+    """A fitted spec, as a folder."""
+    give(["run1.csv", "spec.toml"], {})
+    assert run("fit", "spec.toml", "--out", name).code == 0
+
+
+def runs(name: str) -> None:
+    """Parquet files of two experiments."""
+    Path(name).mkdir()
+    for i in range(2):
+        frame().assign(run=i).to_parquet(f"{name}/{i}.parquet")
+
+
+def frame() -> pd.DataFrame:
+    return pd.DataFrame(dict(zip(("force", "position"), measured(), strict=True)))
+
+
+def dask_frame() -> object:
+    from dask.dataframe import from_pandas
+    from distributed import Client
+
+    Client(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None)
+    return from_pandas(frame(), npartitions=2)
+
+
+def physics() -> oa.PhysicsMap:
+    values = {"p1": "theta1", "p2": "theta2", "p3": "theta3"}
+    parameters = [oa.PhysicalParameter(name, 0.5) for name in values]
+    return oa.PhysicsMap.of(parameters, {theta: name for name, theta in values.items()})
+
+
+def samples() -> list[tuple[np.ndarray, np.ndarray]]:
+    u, y = measured(20)
+    return [(u[k : k + 1], y[k : k + 1]) for k in range(len(u))]
+
+
+FOLDERS = {"result": result, "runs": runs}
 NAMES: dict[str, Callable[[], object]] = {
+    "files": lambda: sorted(str(path) for path in Path("runs").glob("*.parquet")),
+    "dask_frame": dask_frame,
+    "physics": physics,
+    "model": lambda: fit().model,
+    "samples": samples,
+    "measured": samples,
+    "measured_inputs": lambda: [inputs for inputs, _ in samples()],
     "oa": lambda: oa,
     "np": lambda: np,
     "record": record,
@@ -59,6 +107,8 @@ def give(wanted: Sequence[str], names: dict) -> None:
     for one in wanted:
         if one in FILES:
             file(one, FILES.index(one))
+        elif one in FOLDERS:
+            FOLDERS[one](one)
         elif one == "spec.toml":
             Path(one).write_text(SPEC, encoding="utf-8")
         else:
