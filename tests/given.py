@@ -47,7 +47,11 @@ def elsewhere(x: np.ndarray) -> np.ndarray:
     return (1.5 * x[:, 0] - 0.7 * x[:, 1] + 0.1 * x[:, 2] - 0.1 * x[:, 0] ** 3)[:, None]
 
 
+OPEN: list = []
+"""What has to be closed after a page."""
 FILES = ("run1.csv", "run2.csv", "steps.csv", "new.csv")
+
+
 def result(name: str) -> None:
     """A fitted spec, as a folder."""
     give(["run1.csv", "spec.toml"], {})
@@ -69,7 +73,7 @@ def dask_frame() -> object:
     from dask.dataframe import from_pandas
     from distributed import Client
 
-    Client(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None)
+    OPEN.append(Client(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None))
     return from_pandas(frame(), npartitions=2)
 
 

@@ -6,6 +6,7 @@ repository and every link leads somewhere when the site is opened from disk.
 
 from __future__ import annotations
 
+import logging
 import os
 import posixpath
 import re
@@ -15,6 +16,7 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parents[2]
 LINK = re.compile(r"(\]\()([^)#\s]+)([^)]*\))")
+LOADED = re.compile(r"<(?:script|link|img|iframe)\b[^>]*\b(?:src|href)=[\"']?(?:https?:)?//[^>]*>")
 PLACE = "repository"
 ALWAYS = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "examples/README.md", "benchmarks/README.md")
 
@@ -64,3 +66,10 @@ def on_page_markdown(markdown: str, page, config, files: Files) -> str:
         return match[0] if path is None else match[1] + posixpath.relpath(place(path), here or ".") + match[3]
 
     return LINK.sub(bent, markdown)
+
+
+def on_post_page(output: str, page, config) -> str:
+    """Under `strict` a page that would load something from a network is refused."""
+    for tag in LOADED.findall(output):
+        logging.getLogger("mkdocs.hooks").warning("%s loads from a network: %s", page.file.src_uri, tag)
+    return output
