@@ -25,7 +25,7 @@ OPTIONAL = ("casadi", "control", "dask", "distributed", "pyarrow", "sklearn")
 
 @pytest.fixture
 def fresh(tmp_path, monkeypatch) -> Iterator[None]:
-    """A fresh folder to work in; what a page leaves in the process goes with it. Figures of fits are drawn elsewhere."""
+    """A fresh folder to work in; what a page leaves in the process goes with it. Other tests draw figures."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("orthaug.commands.fit._draw", lambda *_: None)
     matplotlib.use("agg")
@@ -116,10 +116,10 @@ def test_output_is_compared(expected, printed, same):
 
 def test_blocks_of_a_page():
     text = (
-        "<!-- given: run1.csv, record -->\n```python\nx = 1\n```\n\n```text\n1\n```\n<!-- not run: no such machine -->\n"
+        "<!-- given: run1.csv, record -->\n```python\nx = 1\n```\n\n```text\n1\n```\n<!-- not run: no device -->\n"
         '```sh\nfail\n```\nwords\n```text\nno output\n```\n<!-- exit 2 -->\n```toml title="a.toml"\n```\n'
     )
     one, two, three = blocks(text)
     assert (one.given, one.prints, one.line) == (["run1.csv", "record"], "1\n", 2)
-    assert (two.not_run, two.prints) == ("no such machine", None)
+    assert (two.not_run, two.prints) == ("no device", None)
     assert (three.title, three.exits) == ("a.toml", 2)
