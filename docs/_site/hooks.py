@@ -17,6 +17,7 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).resolve().parents[2]
 LINK = re.compile(r"(\]\()([^)#\s]+)([^)]*\))")
 LOADED = re.compile(r"<(?:script|link|img|iframe)\b[^>]*\b(?:src|href)=[\"']?(?:https?:)?//[^>]*>")
+NOT_RUN = re.compile(r"^<!-- not run: (.+?) -->$", re.MULTILINE)
 PLACE = "repository"
 ALWAYS = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "examples/README.md", "benchmarks/README.md")
 
@@ -57,7 +58,7 @@ def on_files(files: Files, config) -> Files:
 
 
 def on_page_markdown(markdown: str, page, config, files: Files) -> str:
-    """Bends the links of a page to where their targets are in the site."""
+    """Bends the links of a page to where their targets are in the site, and shows why a block is not run."""
     here = posixpath.dirname(page.file.src_uri)
     found = targets(markdown, origin(page.file.src_uri))
 
@@ -65,11 +66,13 @@ def on_page_markdown(markdown: str, page, config, files: Files) -> str:
         path = found.get(match[2])
         return match[0] if path is None else match[1] + posixpath.relpath(place(path), here or ".") + match[3]
 
-    return LINK.sub(bent, markdown)
+    return NOT_RUN.sub(r"*The tests do not run this block: \1.*\n", LINK.sub(bent, markdown))
 
 
 def on_post_page(output: str, page, config) -> str:
-    """Under `strict` a page that would load something from a network is refused."""
+    """Under `strict` refuses a page that would load something from a network; names the search for screen readers."""
     for tag in LOADED.findall(output):
         logging.getLogger("mkdocs.hooks").warning("%s loads from a network: %s", page.file.src_uri, tag)
-    return output
+    return output.replace(
+        'data-md-component="search" role="dialog"', 'data-md-component="search" role="dialog" aria-label="Search"'
+    )
