@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import re
 import sys
 from collections.abc import Iterator
@@ -123,3 +124,21 @@ def test_blocks_of_a_page():
     assert (one.given, one.prints, one.line) == (["run1.csv", "record"], "1\n", 2)
     assert (two.not_run, two.prints) == ("no device", None)
     assert (three.title, three.exits) == ("a.toml", 2)
+
+
+def test_a_page_of_the_site_that_loads_from_a_network_is_found(monkeypatch):
+    pytest.importorskip("mkdocs")
+    monkeypatch.syspath_prepend(ROOT / "docs" / "_site")
+    hooks = importlib.import_module("hooks")
+    for tag in (
+        '<script src="https://x.y/z.js">',
+        "<link rel=stylesheet href=//x.y/z.css>",
+        '<img src="http://x.y/z.png">',
+    ):
+        assert hooks.LOADED.search(tag)
+    assert not hooks.LOADED.search('<a href="https://x.y"><img src="figures/a.png"><script src="../assets/a.js">')
+    linked = hooks.targets(
+        "[a](../examples/mpc.py) [b](https://x.y) [c](spec.md#data) [d](absent.md)", "docs/export.md"
+    )
+    assert linked == {"../examples/mpc.py": "examples/mpc.py", "spec.md": "docs/spec.md"}
+    assert hooks.place("examples/mpc.py") == "repository/examples/mpc.py" and hooks.place("docs/spec.md") == "spec.md"
