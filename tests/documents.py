@@ -3,11 +3,11 @@
     python tests/documents.py docs/tutorials/measure.md      prints what every block prints, and how long it takes
 
 - `python` blocks of a page share their names; `sh` blocks run line by line, `orthaug` by its entry in this process, all
-  else by a shell; `toml` blocks with a title are written to the file of that name, others are parts of a spec, which
+  else by a shell; `toml` blocks with a title are written to that file and opened, others are parts of a spec, which
   replace those of the page's `spec.toml`; that is then opened with its data.
 - A `text` block right below is what the block prints: words as they stand, whole numbers too, other numbers to 2 % or
   a unit and a half of their last digit. `...` stands for anything.
-- Comments before a block: `<!-- given: run1.csv, record -->` is what the reader has already, made by `GIVEN`;
+- Comments before a block: `<!-- given: run1.csv, record -->` is what the reader has already, made by `given.py`;
   `<!-- exit 2 -->` is how the last command ends; `<!-- not run: why -->` leaves the block out.
 """
 
@@ -176,6 +176,7 @@ class Page:
         given.give(block.given, self.names)
         if block.language == "toml" and block.title:
             Path(block.title).write_text(block.text, encoding="utf-8")
+            open_job(Path(block.title))
         elif block.language == "toml":
             opened(block.text)
         elif block.language == "python" and block.title:
