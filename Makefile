@@ -2,7 +2,7 @@
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test check wheel smoke bench claims clean
+.PHONY: help setup demo test check docs wheel smoke bench claims clean
 
 BIN := .venv/bin
 STAMP := .venv/ready
@@ -20,11 +20,14 @@ demo: $(STAMP)  ## fit the built-in mass-spring-damper example
 test: $(STAMP)  ## run the whole test suite, a file at a time on every core
 	@$(BIN)/python -m pytest -q -n auto --dist loadfile
 
-check: $(STAMP)  ## ruff, pyright and the architecture test
+check: $(STAMP) docs  ## ruff, pyright, the architecture test and the site of the documents
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/pyright
 	@$(BIN)/python -m pytest -q tests/test_architecture.py
+
+docs: $(STAMP)  ## build the documents as a site in build/site, to open from disk
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
 
 wheel: $(STAMP)  ## build sdist and wheel into dist
 	@rm -rf dist && $(BIN)/python -m build --outdir dist . >$(LOG) 2>&1 || { tail -n 20 $(LOG) | sed 's|[a-z+]*://[^ ]*|...|g' >&2; exit 1; }

@@ -28,7 +28,7 @@ STORE = ROOT / "orthaug-out" / "claims.json"
 def pages() -> list[Path]:
     """The documents whose numbers are looked after."""
     named = ("README.md", "benchmarks/README.md", "examples/README.md")
-    return [*(ROOT / name for name in named), *sorted((ROOT / "docs").glob("*.md"))]
+    return [*(ROOT / name for name in named), *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def all_blocks() -> list[Block]:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import pickle
-import re
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -25,7 +23,6 @@ from sklearn.pipeline import make_pipeline  # noqa: E402
 from sklearn.preprocessing import StandardScaler  # noqa: E402
 from sklearn.utils.estimator_checks import check_estimator  # noqa: E402
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "sklearn.md"
 SMALL = oa.MLP(hidden=(3,))
 NARX_CANNOT = {  # by what it is: predict(X, y) looks back from each row at measured outputs
     "check_estimators_unfitted", "check_n_features_in_after_fitting", "check_estimators_dtypes", "check_dtype_object",
@@ -304,13 +301,3 @@ def test_what_a_narx_refuses_and_how(narx, records):
             call()
     with pytest.raises(ValueError, match="X has 2 features, but AugmentedNARX is expecting 1"):
         narx.predict(np.column_stack([X, X]), y)
-
-
-def test_the_page_runs_as_it_stands(capsys):
-    names: dict = {}
-    for block in re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE):
-        exec(compile(block, str(PAGE), "exec"), names)
-    out = capsys.readouterr().out
-    assert "drag" in out and "95 % interval" in out and "1 rows at the start" in out
-    low, high = names["model"].theta_interval_[0]
-    assert 0.39 < low < 0.4 < high < 0.41 and names["search"].best_params_["learner"] is not None

@@ -1,0 +1,144 @@
+"""Every block of code of README and docs runs as it is written, in a fresh folder, and prints what stands below it."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+import sys
+from collections.abc import Iterator
+
+import given
+import matplotlib
+import pytest
+from documents import ROOT, Page, blocks, differences, pages
+
+from orthaug.export.kinds import TARGETS
+
+SOURCE = ROOT / "src" / "orthaug"
+
+PAGES = {page.relative_to(ROOT).as_posix(): page for page in pages()}
+BLOCKS = {name: list(blocks(page.read_text(encoding="utf-8"))) for name, page in PAGES.items()}
+RUNNING = [name for name, found in BLOCKS.items() if any(block.not_run is None for block in found)]
+NOT_RUN = 8
+OPTIONAL = ("casadi", "control", "dask", "distributed", "pyarrow", "sklearn")
+
+
+@pytest.fixture
+def fresh(tmp_path, monkeypatch) -> Iterator[None]:
+    """A fresh folder to work in; what a page leaves in the process goes with it. Other tests draw figures."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("orthaug.commands.fit._draw", lambda *_: None)
+    matplotlib.use("agg")
+    path, targets, modules = list(sys.path), dict(TARGETS), set(sys.modules)
+    yield
+    sys.path[:] = path
+    TARGETS.clear()
+    TARGETS.update(targets)
+    for name in set(sys.modules) - modules:
+        if str(getattr(sys.modules[name], "__file__", None) or "").startswith((str(tmp_path), "mpc")):
+            del sys.modules[name]
+    while given.OPEN:
+        given.OPEN.pop().close()
+
+
+@pytest.mark.parametrize("name", RUNNING)
+@pytest.mark.usefixtures("fresh")
+def test_the_page_runs(name):
+    page = Page(PAGES[name])
+    for block in page.blocks:
+        if block.not_run is None:
+            try:
+                printed = page.printed(block)
+            except ModuleNotFoundError as error:
+                if error.name not in OPTIONAL:
+                    raise
+                pytest.skip(f"no {error.name}")
+            assert block.prints is None or differences(block.prints, printed) == [], f"{name}:{block.line}"
+
+
+def test_few_blocks_are_not_run_and_each_says_why():
+    left_out = [
+        f"{name}:{block.line} {block.language}: {block.not_run}"
+        for name, found in BLOCKS.items()
+        for block in found
+        if block.not_run is not None
+    ]
+    print("\n".join(left_out))
+    assert len(left_out) <= NOT_RUN
+    assert all(len(reason.rpartition(": ")[2].split()) >= 2 for reason in left_out)
+
+
+def test_every_public_name_is_in_the_reference():
+    public = re.findall(r"^from \.[\w.]+ import (\w+) as \1$", (SOURCE / "__init__.pyi").read_text(), re.MULTILINE)
+    told = [
+        name
+        for page in sorted((ROOT / "docs" / "reference").glob("*.md"))
+        for name in re.findall(r"^::: orthaug\.(\w+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    ]
+    assert sorted(told) == sorted(public) and len(public) > 80
+
+
+def test_every_page_is_in_the_navigation():
+    nav = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:")[2]
+    told = set(re.findall(r"[\w/]+\.md\b", nav))
+    assert {name.removeprefix("docs/") for name in PAGES if name != "README.md"} <= told
+
+
+def test_every_warning_has_a_row_with_a_remedy():
+    calls = [
+        node
+        for file in SOURCE.rglob("*.py")
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("Warning", "WarningResult")
+    ]
+    first = [call.args[0] if call.args else call.keywords[0].value for call in calls]
+    codes = {node.value for node in first if isinstance(node, ast.Constant)}
+    rows = re.findall(r"^\| (`.+`) \| .+ \| .+ \|$", (ROOT / "docs/guide/trouble.md").read_text(), re.MULTILINE)
+    assert len(codes) > 50 and codes - set(re.findall(r"`(\w+)`", " ".join(rows))) == set()
+
+
+@pytest.mark.parametrize(
+    ("expected", "printed", "same"),
+    [
+        ("RMSE 0.0251 m", "RMSE   0.02512 m\n", True),
+        ("RMSE 0.0251 m", "RMSE 0.0271 m", False),
+        ("rank 3 of 3", "rank 2 of 3", False),
+        ("took ... s\nloss 1.2e-3", "took 5 s of 8 s\n\nloss 1.21e-03\n", True),
+        ("loss 1.2e-3", "loss 1.4e-03", False),
+        ("y[k-1]  -0.5", "y[k-2] -0.5", False),
+        ("value -0.5", "value 0.5", False),
+        ("a b", "a c", False),
+    ],
+)
+def test_output_is_compared(expected, printed, same):
+    assert (differences(expected, printed) == []) is same
+
+
+def test_blocks_of_a_page():
+    text = (
+        "<!-- given: run1.csv, record -->\n```python\nx = 1\n```\n\n```text\n1\n```\n<!-- not run: no device -->\n"
+        '```sh\nfail\n```\nwords\n```text\nno output\n```\n<!-- exit 2 -->\n```toml title="a.toml"\n```\n'
+    )
+    one, two, three = blocks(text)
+    assert (one.given, one.prints, one.line) == (["run1.csv", "record"], "1\n", 2)
+    assert (two.not_run, two.prints) == ("no device", None)
+    assert (three.title, three.exits) == ("a.toml", 2)
+
+
+def test_a_page_of_the_site_that_loads_from_a_network_is_found(monkeypatch):
+    pytest.importorskip("mkdocs")
+    monkeypatch.syspath_prepend(ROOT / "docs" / "_site")
+    hooks = importlib.import_module("hooks")
+    for tag in (
+        '<script src="https://x.y/z.js">',
+        "<link rel=stylesheet href=//x.y/z.css>",
+        '<img src="http://x.y/z.png">',
+    ):
+        assert hooks.LOADED.search(tag)
+    assert not hooks.LOADED.search('<a href="https://x.y"><img src="figures/a.png"><script src="../assets/a.js">')
+    linked = hooks.targets(
+        "[a](../examples/mpc.py) [b](https://x.y) [c](spec.md#data) [d](absent.md)", "docs/export.md"
+    )
+    assert linked == {"../examples/mpc.py": "examples/mpc.py", "spec.md": "docs/spec.md"}
+    assert hooks.place("examples/mpc.py") == "repository/examples/mpc.py" and hooks.place("docs/spec.md") == "spec.md"
