@@ -10,7 +10,8 @@ from orthaug._base.errors import InputError, RankError
 from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Channel, Record
 from orthaug.data.regressors import Lags
-from orthaug.fitting.estimation import estimate, orthogonalize
+from orthaug.fitting.elsewhere import orthogonalize
+from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive, Orthogonal
 from orthaug.models.learners import MLP, Function

@@ -13,7 +13,7 @@ ONLY_POSIX = {
     "os": ("fork", "forkpty", "killpg", "setsid", "getuid", "geteuid", "mkfifo", "getpgid", "wait3", "uname", "nice"),
     "signal": ("SIGKILL", "SIGPIPE", "SIGHUP", "SIGUSR1", "SIGUSR2", "SIGALRM", "alarm", "setitimer", "pause"),
 }
-ASKED_FIRST = {"_base.memory": {"resource"}}  # imported in a `try`, and done without
+ASKED_FIRST = dict.fromkeys(("_base.memory", "commands.app.worker"), {"resource"})  # in a `try`, and done without
 TEXT = {"read_text": 0, "write_text": 1}  # and how many arguments stand before the encoding
 
 

@@ -12,7 +12,8 @@ from orthaug._base.errors import InputError, RankError
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
 from orthaug.fitting.criteria import Simulation
-from orthaug.fitting.estimation import estimate, orthogonalize
+from orthaug.fitting.elsewhere import orthogonalize
+from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive, Orthogonal
 from orthaug.inference.measures import Samples, Symmetrized, Training, Uniform, Weighted

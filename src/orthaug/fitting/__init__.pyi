@@ -1,8 +1,8 @@
 from .criteria import Prediction as Prediction
 from .criteria import Simulation as Simulation
+from .elsewhere import orthogonalize as orthogonalize
 from .estimates import Estimate as Estimate
 from .estimation import estimate as estimate
-from .estimation import orthogonalize as orthogonalize
 from .motion_estimates import MotionEstimate as MotionEstimate
 from .narx import AugmentedNARX as AugmentedNARX
 from .recursive import Recursive as Recursive

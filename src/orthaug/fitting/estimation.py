@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, TypedDict, Unpack, overload
 
@@ -23,7 +23,6 @@ from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.free_run import FreeRunTask
 from orthaug.fitting.independent_terms import independent_terms
-from orthaug.fitting.learned import Learned
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_estimation import DEFAULT, fit_motion, pose_for
 from orthaug.fitting.one_step import OneStepTask
@@ -35,14 +34,14 @@ from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.fitting.training import Choice, PlannedRun, train
 from orthaug.inference.measures import Training
-from orthaug.models.learners import MLP, Bound, External, Function, Learner, Scaling
+from orthaug.models.learners import MLP, Bound, Learner, Scaling
 from orthaug.models.model import Model
 from orthaug.models.rows import Engine, InMemory
 from orthaug.models.tasks import Tasks, runs_on
 from orthaug.models.terms import over_lags, over_states
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.motion import Motion
-from orthaug.physics.problem import Problem, pose
+from orthaug.physics.problem import Problem
 from orthaug.physics.streamed import StreamedProblem
 
 Regularization = str | float
@@ -318,39 +317,6 @@ def _check_splittable(structure: Structure, baseline: Baseline, learner: Learner
 def _splits(structure: Structure) -> bool:
     """Whether θ is split off under another measure than that of training."""
     return structure.measure != Training()
-
-
-def orthogonalize(
-    record: Record, baseline: Baseline, function: Callable[[Any], Any], lags: Lags | None = None
-) -> Estimate:
-    """Split a model trained elsewhere into physics and an orthogonal rest (F2).
-
-    Args:
-        record: the rows over which the rest is made orthogonal, usually the training data.
-        baseline: the physics.
-        function: `g(x)` on NumPy regressors (N, nx) in `Lags` order, giving (N, ny); from any toolbox.
-        lags: the regressor that `function` expects; None for the raw lags of the baseline.
-
-    Returns:
-        An estimate whose model predicts what `function` does, with `θ = Φ⁺G` and the learner `g − φθ`.
-        There are no standard errors: they belong to how `function` was trained.
-    """
-    problem = pose(record, baseline, lags)
-    ny, nz = len(problem.outputs), len(problem.features.entries)
-    external = External(function, ny=ny)
-    values = external.values(problem.feature_rows())  # once; the sums below read what it gave
-    scaling, unit = Scaling(np.zeros(nz), np.ones(nz)), np.ones(ny)
-    task = OneStepTask.of(problem, None)
-    gain = np.broadcast_to(problem.weight.matrix / task.rms, (*values.shape, ny))
-    rows = task.engine.lay(values, problem.projection.q, problem.unexplained / task.rms, gain)
-    task = replace(task, rows=rows, unit=unit, bound=Bound(_GIVEN, ny, ny))
-    concluded = conclude(task, Orthogonal(), Learned(task.bound, np.zeros(0), scaling, unit, elsewhere=True))
-    form = replace(concluded.model.form, bound=Bound(external, nz, ny))
-    return replace(concluded, model=replace(concluded.model, form=form))
-
-
-_GIVEN = Function(lambda w, z: z, lambda key: ())
-"""The learner whose values are its features."""
 
 
 def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStepTask, Vector, Vector]:

@@ -21,6 +21,7 @@ from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.fitting.training import Choice, PlannedRun, train
 from orthaug.models.learners import Learner
 from orthaug.models.rows import Engine, InMemory
+from orthaug.models.tasks import Tasks, runs_on
 from orthaug.physics.motion import Motion
 from orthaug.physics.motion_problem import MotionProblem, pose_motion
 
@@ -67,16 +68,17 @@ def fit_motion(
     validated = validation is not None
     conditions = {"linear": False, "validated": validated, "motion": True}
     choices = tried(regularization, solver, criterion, structure, learner=learner, **conditions)
-    restarts, seed = check_count(restarts, "restarts"), check_count(seed, "seed", least=0)
-    check_starts(restarts, seed, ensemble=False)
+    restarts, seed = checked_starts(restarts, seed, warm=False, ensemble=False)
     check_solver(solver, criterion, () if learner is None else choices)
-    task = MotionTask.of(problem, learner, criterion, engine).keeping(checkpoints)
+    engine = runs_on(engine) if restarts * len(choices) > 1 else engine
+    kept = None if isinstance(engine, Tasks) else checkpoints
+    task = MotionTask.of(problem, learner, criterion, engine).keeping(kept)
     starts = [PlannedRun(seed, (), "none")]
     if task.bound is not None:
         keyed = {s: task.bound.init(jax.random.key(s)) for s in range(seed, seed + restarts)}
         starts = [PlannedRun(s, w, choice) for choice in choices for s, w in keyed.items()]
     chosen = Choice(validation, blocks, fallback)
-    return train(task, starts, structure, solver, chosen, progress, conclude_motion)
+    return train(task, starts, structure, solver, chosen, progress, conclude_motion, runner=engine)
 
 
 def without_learner(problem: MotionProblem) -> MotionProblem:
