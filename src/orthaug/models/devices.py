@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, partial, reduce
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -18,8 +18,8 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax
 from orthaug._base.memory import available
-from orthaug._base.parallel import Heard, Threads, in_threads, nobody
-from orthaug.models.rows import CHUNK_ROWS, Chunk, Room, all_chunks, brought, chunk_shape, in_chunks, row_fold
+from orthaug._base.parallel import Heard, nobody
+from orthaug.models.rows import CHUNK_ROWS, Chunk, Here, Room, all_chunks, brought, chunk_shape, in_chunks, row_fold
 
 _ROWS = "rows"
 _ONE_AT_A_TIME = threading.Lock()  # devices that wait for each other in two programs would wait for ever
@@ -27,7 +27,7 @@ _MATRICES = 3  # the sum so far, what a chunk adds, and what all devices have
 
 
 @dataclass(frozen=True)
-class Devices(Threads):
+class Devices(Here):
     """All rows in the memory of the devices, in equal shares; `count` of them, None for all there are."""
 
     count: int | None = None
@@ -41,9 +41,6 @@ class Devices(Threads):
 
     def draw(self, source: Any, laying: Callable[[Any], Any]) -> Chunk:
         return self.lay(*brought(source, laying))
-
-    def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
-        return in_threads(function, partitions)
 
     def sum(self, function: Callable[..., Any], rows: Chunk, *arguments: Any) -> Any:
         return self._run(_total, function, rows, arguments)
@@ -67,17 +64,8 @@ class Devices(Threads):
 
         return self.place(jax.tree.map(even, all_chunks(function, partitions)))
 
-    def along(self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any) -> Any:
-        return reduce(lambda carry, partition: function(partition, carry), partitions, carry)
-
-    def beside(self, *rows: Any) -> Any:
-        return rows
-
     def keep(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> tuple[Any, Any]:
         return self._run(_both, function, rows, arguments)
-
-    def fetch(self, rows: Any) -> Any:
-        return jax.tree.map(np.asarray, rows)
 
     def _run(self, compiled: Callable[..., Any], function: Any, rows: Any, arguments: tuple[Any, ...]) -> Any:
         with _ONE_AT_A_TIME:

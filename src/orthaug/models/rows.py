@@ -121,8 +121,24 @@ class Engine(Protocol):
         ...
 
 
+class Here(Threads):
+    """What engines share that read partitions in this process, and keep the chunks of rows in one array."""
+
+    def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
+        return in_threads(function, partitions)
+
+    def along(self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any) -> Any:
+        return reduce(lambda carry, partition: function(partition, carry), partitions, carry)
+
+    def beside(self, *rows: Any) -> Any:
+        return rows
+
+    def fetch(self, rows: Any) -> Any:
+        return jax.tree.map(np.asarray, rows)
+
+
 @dataclass(frozen=True)
-class InMemory(Threads):
+class InMemory(Here):
     """All rows on the device, summed by one compiled loop over chunks."""
 
     limit: int = CHUNK_ROWS
@@ -135,9 +151,6 @@ class InMemory(Threads):
 
     def draw(self, source: Any, laying: Callable[[Any], Any]) -> Chunk:
         return self.lay(*brought(source, laying))
-
-    def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
-        return in_threads(function, partitions)
 
     def sum(self, function: Callable[..., Any], rows: Chunk, *arguments: Any) -> Any:
         return _compiled_sum(function, rows, arguments)
@@ -152,17 +165,8 @@ class InMemory(Threads):
     def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> Any:
         return self.place(all_chunks(function, partitions))
 
-    def along(self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any) -> Any:
-        return reduce(lambda carry, partition: function(partition, carry), partitions, carry)
-
-    def beside(self, *rows: Any) -> Any:
-        return rows
-
     def keep(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> tuple[Any, Any]:
         return _compiled_fold(function, rows, arguments)
-
-    def fetch(self, rows: Any) -> Any:
-        return jax.tree.map(np.asarray, rows)
 
     def room(self) -> Room | None:
         return None

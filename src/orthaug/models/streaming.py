@@ -9,7 +9,7 @@ import queue
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, reduce
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -17,9 +17,8 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax
-from orthaug._base.parallel import Threads, in_threads
 from orthaug.data.sources import Source, rows_of
-from orthaug.models.rows import CHUNK_ROWS, Chunk, chunk_shape, in_chunks
+from orthaug.models.rows import CHUNK_ROWS, Chunk, Here, chunk_shape, in_chunks
 
 _AHEAD = 3  # chunks that wait to be summed
 
@@ -40,7 +39,7 @@ class Drawn:
 
 
 @dataclass(frozen=True)
-class Stream(Threads):
+class Stream(Here):
     """Rows stay in their files; memory holds a few chunks of them."""
 
     limit: int = CHUNK_ROWS
@@ -58,10 +57,6 @@ class Stream(Threads):
     def sum(self, function: Callable[..., Any], rows: Iterable[Chunk], *arguments: Any) -> Any:
         return summed(function, rows, arguments)
 
-    def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
-        """A function of every partition, as many at a time as there are cores."""
-        return in_threads(function, partitions)
-
     @property
     def shares(self) -> int:
         return 1
@@ -71,9 +66,6 @@ class Stream(Threads):
 
     def read(self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]) -> Read:
         return Read(function, partitions)
-
-    def along(self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any) -> Any:
-        return reduce(lambda carry, partition: function(partition, carry), partitions, carry)
 
     def beside(self, *rows: Iterable[Any]) -> Beside:
         return Beside(rows)
