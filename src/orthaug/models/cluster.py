@@ -25,7 +25,7 @@ from orthaug._base.jax import jax
 from orthaug._base.parallel import Threads
 from orthaug.data.sources import Source
 from orthaug.models.rows import CHUNK_ROWS, Chunk, Room, chunk_shape, in_chunks
-from orthaug.models.streaming import Beside, Laid, apart, chunks_of, folded, summed, together
+from orthaug.models.streaming import Laid, apart, chunks_of, folded, summed, together
 
 _SINGLE_THREADED = {
     "OMP_NUM_THREADS": "1",
@@ -39,7 +39,7 @@ _PATIENCE = "20 s"  # to reach a scheduler
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """Futures of groups of chunks, and how many chunks each has."""
+    """Futures of groups of chunks, or tuples of those whose chunks stand beside each other; how many each group has."""
 
     futures: list[Any]
     counts: tuple[int, ...]
@@ -115,9 +115,7 @@ class Dask(Threads):
             return self.client.gather(carry)
 
     def beside(self, *rows: Held) -> Held:
-        with told():
-            return Held([self.client.submit(_beside, parts, pure=False) for parts in zip(*rows, strict=True)],
-                        rows[0].counts)  # fmt: skip
+        return Held(list(zip(*rows, strict=True)), rows[0].counts)
 
     def keep(self, function: Callable[..., Any], rows: Held, *arguments: Any) -> tuple[Held, Any]:
         given = jax.tree.map(np.asarray, arguments)
@@ -169,18 +167,19 @@ def kept(value: Any) -> Any:
     return value
 
 
-def _beside(parts: Sequence[list[Any]]) -> list[Any]:
-    return list(Beside(tuple(parts)))
+def _paired(groups: Any) -> list[Any]:
+    """The chunks of a group; of a tuple of groups, tuples of their chunks."""
+    return list(zip(*map(_paired, groups), strict=True)) if isinstance(groups, tuple) else groups
 
 
 def _folded(function: Callable[..., Any], chunks: Sequence[Any], arguments: tuple[Any, ...]) -> tuple[list[Any], Any]:
     """What one partition keeps, and its share of a sum."""
-    return folded(function, chunks, arguments)
+    return folded(function, _paired(chunks), arguments)
 
 
 def _partial_sum(function: Callable[..., Any], chunks: Sequence[Chunk], arguments: tuple[Any, ...]) -> Any:
     """One partition's share of a sum, as NumPy arrays."""
-    return jax.tree.map(np.asarray, summed(function, chunks, arguments))
+    return jax.tree.map(np.asarray, summed(function, _paired(chunks), arguments))
 
 
 def _added(parts: Sequence[Any]) -> Any:
