@@ -31,7 +31,8 @@ class FreeRunScores:
     """A trained free run, whose scores of p = (c, w) can be summed over blocks.
 
     `slope` and `pull` are how the best states follow p and the measured states; None where the states are no unknowns.
-    `unit` scales the information of p to the Gram matrix that the model keeps.
+    `unit` scales the information of p to the Gram matrix that the model keeps. `share` is how many times more was
+    trained on than these segments, which are then a witness of it.
     """
 
     dynamics: Dynamics
@@ -42,6 +43,7 @@ class FreeRunScores:
     unit: float
     slope: Float[np.ndarray, "k m n0 n"] | None = None
     pull: Float[np.ndarray, "k m n0"] | None = None
+    share: float = 1.0
 
     @property
     def longest(self) -> int:
@@ -90,6 +92,6 @@ class FreeRunScores:
             used: parameters of the fit, by which its errors are too small.
         """
         scores = self.blocks(steps)
-        blocks, rows = len(scores), self.segments.count * len(self.weight)
+        blocks, rows = len(scores), self.share * self.segments.count * len(self.weight)
         correction = blocks / max(blocks - 1, 1) * rows / max(rows - used, 1.0)
-        return correction * self.unit**2 * scores.T @ scores, blocks
+        return self.share * correction * self.unit**2 * scores.T @ scores, blocks

@@ -26,13 +26,14 @@ from orthaug.inference.intervals import joint_covariance, robust_covariance, rob
 from orthaug.inference.learned_terms import equation, learned_terms, term_frame, term_lines
 from orthaug.inference.measures import Measure, Points, Support, Training
 from orthaug.inference.physical import PhysicalEstimate, profile, solve
-from orthaug.inference.splitting import MeasureSplit, learner_slope, split_under
+from orthaug.inference.splitting import MeasureSplit, learner_slope, split_under, streamed_slope
 from orthaug.models.model import Model
 from orthaug.models.statistics import Statistics
 from orthaug.physics.baseline import check_sampling_constant
 from orthaug.physics.excitation import Excitation
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import Problem
+from orthaug.physics.streamed import StreamedProblem
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -252,6 +253,8 @@ class Estimate(ShownFit):
         problem = self.problem
         if self.model.form.bound is None:
             return np.zeros((len(self.theta), 0))
+        if isinstance(problem, StreamedProblem):
+            return streamed_slope(self.model, problem)
         points = Points(problem.rows.x, np.ones(len(problem.rows)))
         unit = np.broadcast_to(problem.weight.matrix, (len(points.x), *problem.weight.matrix.shape))
         return learner_slope(self.model, points, problem.projection, unit)

@@ -224,6 +224,7 @@ class FlightTask(ABC):
             unit=objective.rms**2,
             slope=slope,
             pull=missed @ (rows.T @ rows) if objective.initial.free else None,
+            share=self.plan.segments.count / objective.segments.count,
         )
 
     def _covariance(

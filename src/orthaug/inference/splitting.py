@@ -13,14 +13,18 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug._base.warning import Warning
+from orthaug.data.sources import Partition
 from orthaug.inference.measures import Measure, Points, Support
 from orthaug.inference.weighed import weigh
+from orthaug.models.learners import Bound
 from orthaug.models.model import Model
-from orthaug.models.rows import InMemory, Overlaps, learner_rows
+from orthaug.models.rows import InMemory, Overlaps, chunk_shape, learner_rows
 from orthaug.models.statistics import JointCovariance
+from orthaug.models.streaming import chunks_of, summed
 from orthaug.physics.excitation import require_rank
 from orthaug.physics.output_weights import times
 from orthaug.physics.projection import Projection
+from orthaug.physics.streamed import Laying, StreamedProblem
 
 SUPPORTED = 0.9  # share of a measure within reach of the data, below which it is warned of
 
@@ -92,6 +96,33 @@ def split_under(measure: Measure, model: Model, support: Support, joint: JointCo
     condition = weighed.excitation.condition
     told_of = (share, len(points.x), condition, warnings)
     return MeasureSplit(measure.name, theta, aux, covariance, defect, *told_of, slope=slope, measure=measure)
+
+
+@dataclass(frozen=True, eq=False)
+class _Overlapping:
+    """QᵀJ over the rows of a partition; picklable if the learner is."""
+
+    laying: Laying
+    bound: Bound
+    weights: Vector
+
+    def __call__(self, partition: Partition) -> Matrix | None:
+        chunks = chunks_of(self.laying(partition), chunk_shape(partition.rows)[1])
+        found = summed(Overlaps(self.bound), chunks, (self.weights,))
+        return None if found is None else np.asarray(found.jacobian)
+
+
+def streamed_slope(model: Model, problem: StreamedProblem) -> Matrix:
+    """∂θ_aux/∂w under the training measure, in one pass over all rows of a source."""
+    bound, numbers = model.form.bound, model.numbers
+    nt = len(model.theta)
+    if bound is None or not bound.size:
+        return np.zeros((nt, 0))
+    gain = problem.weight.matrix * np.asarray(numbers.gain)
+    laying = problem.laying(np.asarray(numbers.centre), np.asarray(numbers.halfwidth), 1.0, gain)
+    parts = problem.passes(_Overlapping(laying, bound, np.asarray(numbers.weights)), problem.source.partitions)
+    overlap = sum(part for part in parts if part is not None)
+    return problem.projection.from_coordinates(problem.projection.along(model.shared) @ overlap)
 
 
 def learner_slope(model: Model, points: Points, projection: Projection, unit: np.ndarray) -> Matrix:
