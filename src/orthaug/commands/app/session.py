@@ -43,6 +43,8 @@ class Session:
         self.checked: dict[str, Any] | None = None
         self.refused = ""
         """Why the spec cannot be trained, in words."""
+        self.stale = False
+        """Whether `checked` is of an earlier spec: this one could not be opened."""
         self.checking = False
         self.commands: dict[str, Command] = {}
         self.trained: dict[str, str] = {}
@@ -169,7 +171,7 @@ class Session:
     async def _checked(self) -> None:
         await asyncio.sleep(_PAUSE)
         if not self.spec.strip():
-            self.checked, self.refused = None, ""
+            self.checked, self.refused, self.stale = None, "", False
             self.changed("check")
             return
         place = self.folder / "check.toml"
@@ -177,12 +179,12 @@ class Session:
         try:
             self.checked = await self.desk.ask("examine", path=place, whole=False)
             if self.checked["check"] is None:
-                self.refused = ""
+                self.refused, self.stale = "", False
                 self.changed("check")
                 self.checked = await self.desk.ask("examine", path=place, whole=True)
-            self.refused = self.worded(self.checked["refusal"] or "")
+            self.refused, self.stale = self.worded(self.checked["refusal"] or ""), False
         except InputError as error:
-            self.refused = self.worded(error)
+            self.refused, self.stale = self.worded(error), True
         self.checking = False
         self.changed("check")
 
