@@ -97,6 +97,8 @@ def test_only_the_token_opens_the_gate():
         assert answer(gate, kind, headers=kept | {"host": "localhost:8123", "origin": "http://localhost:8123"})[2]
     code, told, reached = answer(gate, query="token=sesame&show=true", path="//evil.example/x")
     assert (code, told["location"], reached) == (303, "/evil.example/x?show=true", False)
+    _, told, _ = answer(gate, query="token=sesame", path="/\\evil.example/\r\nx: y")
+    assert told["location"] == "/%5Cevil.example/%0D%0Ax%3A%20y"
     assert "HttpOnly" in told["set-cookie"] and "SameSite=Strict" in told["set-cookie"]
     assert "frame-ancestors 'self'" in answer(gate, headers=kept)[1]["content-security-policy"]
     assert len(Gate(None, 1).token) > 40 and Gate(None, 1).token != Gate(None, 1).token  # type: ignore[arg-type]
@@ -398,12 +400,29 @@ def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
     assert page.get_by_role("button", name="Train").is_disabled()
     tab.go("Model")
     kept = tab.write(lambda text: text.replace("[learner", "[learner]"))
+    for broken in (
+        "learner = 3\nbaseline = 4\n[data]\ninputs = 1\noutputs = [2]\n",
+        "data = 3\n[motion]\nstates = 4\n",
+    ):
+        tab.write(lambda _, broken=broken: broken)
+        assert page.locator(".note.bad").count() and not page.locator(".q-notification").count()
+    tab.write(lambda _: kept)
     tab.go("Data")
+    page.get_by_label("add a step").select_option("lowpass")
+    page.wait_for_selector("text=Done: lowpass (cutoff 0.1")
+    page.get_by_label("cutoff").fill("2")
+    page.get_by_label("cutoff").press("Enter")
+    page.wait_for_selector("text=2 Hz is not below")
+    page.get_by_role("button", name="Remove step 1").click()
     tab.drop(tmp_path / "own.csv")
     page.get_by_role("button", name="Take it as a test").click()
     page.wait_for_selector("text=tests.own")
     added = tab.fetch("spec.toml").decode()
     assert tomllib.loads(added)["data"]["tests"].pop("own") == {"files": ["own.csv"]} and kept.splitlines()[0] in added
+    assert (
+        tab.context.request.get(f"{page.url}/get/spec.toml?show=true").headers["content-disposition"][:10]
+        == "attachment"
+    )
     assert tab.fetch("../x") and tab.context.request.get(f"{page.url}/get/result.zip").status == 404
     tab.close()
 
