@@ -29,6 +29,7 @@ from orthaug.commands.app.processes import Desk
 from orthaug.commands.app.session import Session
 from orthaug.commands.app.sessions import Sessions
 from orthaug.commands.app.worker import thinned
+from orthaug.commands.parts import expanded
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 CHROMIUM = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
@@ -127,6 +128,11 @@ def test_forms_change_a_spec_and_nothing_else(tmp_path):
     assert moving["motion"]["outputs"] == {"y": "x"} and "baseline" not in moving
     with pytest.raises(InputError, match="broken TOML"):
         spec_text.plain("[data\n")
+
+
+def test_a_file_whose_name_looks_like_a_pattern_is_found(tmp_path):
+    (tmp_path / "run [1].csv").touch()
+    assert expanded(tmp_path / "spec.toml", ["run [1].csv"], "train") == ["run [1].csv"]
 
 
 def test_a_curve_is_thinned_to_what_is_seen():

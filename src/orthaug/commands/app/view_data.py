@@ -134,6 +134,9 @@ class DataView:
             left = [c for c in found["columns"] if not c["usable"]]
             if left:
                 text("Not usable: " + ", ".join(f"{c['header']} ({c['told']})" for c in left[:_LISTED]), "p", "hint")
+            if not usable:
+                note("No column of this file is a signal that changes: there is nothing to fit.", "bad")
+                return
             if found["spec"] is None:
                 names = "The names of the columns do not say which are inputs and outputs: choose them here."
                 note(found["open"] or names, "care")
