@@ -25,7 +25,7 @@ from test_cli import run, signals, write_csv
 from orthaug._base.errors import InputError
 from orthaug.commands.app import spec_text
 from orthaug.commands.app.gate import Gate
-from orthaug.commands.app.processes import Desk
+from orthaug.commands.app.processes import Command, Desk
 from orthaug.commands.app.session import Session
 from orthaug.commands.app.sessions import Sessions
 from orthaug.commands.app.worker import thinned
@@ -155,6 +155,13 @@ def test_a_session_keeps_to_its_folder(tmp_path):
     for name in ("../x", "spec.toml", "model.zip", "c.zip", "/etc/passwd"):
         with pytest.raises(InputError, match="there is nothing of that name yet"):
             session.download(name)
+
+
+def test_a_command_that_cannot_start_has_failed(monkeypatch):
+    monkeypatch.setattr(sys, "executable", "/absent")
+    command = Command(["fit"], lambda: None)
+    asyncio.run(command.run())
+    assert (command.running, command.complaint) == (False, "the command cannot start (No such file or directory).")
 
 
 def test_sessions_that_nobody_used_make_room(tmp_path):

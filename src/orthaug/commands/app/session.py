@@ -221,10 +221,7 @@ class Session:
         self.start(self._followed(kind, command, self.spec))
 
     async def _followed(self, kind: str, command: Command, spec: str) -> None:
-        try:
-            await command.run()
-        except OSError as error:
-            command.lines, command.code = [f"error: training cannot start ({error.strerror})."], 2
+        await command.run()
         if command.code == 0:
             self.trained[kind] = spec
             with suppress(OSError, ValueError):
@@ -251,8 +248,9 @@ class Session:
         self.exports[target] = "…"
         self.changed("work")
         await command.run()
-        self.exports[target] = "" if command.code == 0 else self.worded(command.complaint)
-        self.changed("work")
+        if target in self.exports:  # else another model or another name came in between
+            self.exports[target] = "" if command.code == 0 else self.worded(command.complaint)
+            self.changed("work")
 
     def download(self, what: str) -> Path:
         """The file that is handed out under a name: from a list, never a path.
