@@ -26,8 +26,8 @@ def text(what: Any, tag: str = "p", classes: str = "") -> ui.html:
 
 
 def sentence(told: str) -> str:
-    """A message as it begins on a page."""
-    return told[:1].upper() + told[1:]
+    """A message as it begins on a page; the name of a file stays as it is."""
+    return told if "." in told.partition(" ")[0] else told[:1].upper() + told[1:]
 
 
 def card(title: str, hint: str = "", classes: str = "") -> ui.element:
