@@ -25,10 +25,11 @@ from test_cli import run, signals, write_csv
 from orthaug._base.errors import InputError
 from orthaug.commands.app import spec_text
 from orthaug.commands.app.gate import Gate
-from orthaug.commands.app.processes import Desk
+from orthaug.commands.app.processes import Command, Desk
 from orthaug.commands.app.session import Session
 from orthaug.commands.app.sessions import Sessions
 from orthaug.commands.app.worker import thinned
+from orthaug.commands.parts import expanded
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 CHROMIUM = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
@@ -97,6 +98,8 @@ def test_only_the_token_opens_the_gate():
         assert answer(gate, kind, headers=kept | {"host": "localhost:8123", "origin": "http://localhost:8123"})[2]
     code, told, reached = answer(gate, query="token=sesame&show=true", path="//evil.example/x")
     assert (code, told["location"], reached) == (303, "/evil.example/x?show=true", False)
+    _, told, _ = answer(gate, query="token=sesame", path="/\\evil.example/\r\nx: y")
+    assert told["location"] == "/%5Cevil.example/%0D%0Ax%3A%20y"
     assert "HttpOnly" in told["set-cookie"] and "SameSite=Strict" in told["set-cookie"]
     assert "frame-ancestors 'self'" in answer(gate, headers=kept)[1]["content-security-policy"]
     assert len(Gate(None, 1).token) > 40 and Gate(None, 1).token != Gate(None, 1).token  # type: ignore[arg-type]
@@ -127,6 +130,11 @@ def test_forms_change_a_spec_and_nothing_else(tmp_path):
         spec_text.plain("[data\n")
 
 
+def test_a_file_whose_name_looks_like_a_pattern_is_found(tmp_path):
+    (tmp_path / "run [1].csv").touch()
+    assert expanded(tmp_path / "spec.toml", ["run [1].csv"], "train") == ["run [1].csv"]
+
+
 def test_a_curve_is_thinned_to_what_is_seen():
     x = np.arange(100_000.0)
     y = np.sin(x / 1e4)
@@ -147,6 +155,13 @@ def test_a_session_keeps_to_its_folder(tmp_path):
     for name in ("../x", "spec.toml", "model.zip", "c.zip", "/etc/passwd"):
         with pytest.raises(InputError, match="there is nothing of that name yet"):
             session.download(name)
+
+
+def test_a_command_that_cannot_start_has_failed(monkeypatch):
+    monkeypatch.setattr(sys, "executable", "/absent")
+    command = Command(["fit"], lambda: None)
+    asyncio.run(command.run())
+    assert (command.running, command.complaint) == (False, "the command cannot start (No such file or directory).")
 
 
 def test_sessions_that_nobody_used_make_room(tmp_path):
@@ -394,16 +409,29 @@ def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
     tab.go("Model")
     tab.write(lambda text: text.replace("[learner]", "[learner"))
     assert "Broken TOML" in page.inner_text(".note.bad")
+    broken = page.get_by_label("spec in TOML").input_value()
+    tab.write(lambda _: "learner = 3\nbaseline = 4\n[data]\ninputs = 1\noutputs = [2]\n[motion]\nstates = 5\n")
+    assert page.locator(".q-notification").count() == 0  # forms read what they can
     tab.go("Training")
     assert page.get_by_role("button", name="Train").is_disabled()
     tab.go("Model")
-    kept = tab.write(lambda text: text.replace("[learner", "[learner]"))
+    kept = tab.write(lambda _: broken.replace("[learner", "[learner]"))
     tab.go("Data")
+    page.get_by_label("add a step").select_option("lowpass")
+    page.wait_for_selector("text=Done: lowpass (cutoff 0.1")
+    page.get_by_label("cutoff").fill("2")
+    page.get_by_label("cutoff").press("Enter")
+    page.wait_for_selector("text=2 Hz is not below")
+    page.get_by_role("button", name="Remove step 1").click()
     tab.drop(tmp_path / "own.csv")
     page.get_by_role("button", name="Take it as a test").click()
     page.wait_for_selector("text=tests.own")
     added = tab.fetch("spec.toml").decode()
     assert tomllib.loads(added)["data"]["tests"].pop("own") == {"files": ["own.csv"]} and kept.splitlines()[0] in added
+    assert (
+        tab.context.request.get(f"{page.url}/get/spec.toml?show=true").headers["content-disposition"][:10]
+        == "attachment"
+    )
     assert tab.fetch("../x") and tab.context.request.get(f"{page.url}/get/result.zip").status == 404
     tab.close()
 

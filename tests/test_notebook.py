@@ -91,7 +91,7 @@ def test_records_are_shown_and_escaped(record):
 
 
 def test_physics_are_shown(baseline, motion):
-    assert {"x[k-1]", "m/N", "[0, –]"} <= set(Checked(baseline._repr_html_()).cells)
+    assert {"x[k-1]", "m/N", "≥ 0"} <= set(Checked(baseline._repr_html_()).cells)
     assert {"d/dt v", "(u - c*v)/m", "kg", "2"} <= set(Checked(motion._repr_html_()).cells)
     function = oa.Baseline.from_function(lambda x: x[None, :], ["a"])
     assert "a function of the regressor" in function._repr_html_()

@@ -129,7 +129,7 @@ def expanded(path: Path, entries: Sequence[str], name: str) -> list[str]:
         if (path.parent / entry).is_dir():
             files = [f"{entry.rstrip('/')}/{file.name}" for file in (path.parent / entry).iterdir()]
             files = [file for file in files if Path(file).suffix.lower() in KNOWN]
-        elif any(mark in entry for mark in "*?["):
+        elif any(mark in entry for mark in "*?[") and not (path.parent / entry).is_file():
             files = glob.glob(entry, root_dir=path.parent, recursive=True)
         else:
             found.append(entry)

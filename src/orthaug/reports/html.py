@@ -105,11 +105,12 @@ def _baseline(baseline: Baseline) -> Card:
     facts = {"constants": ", ".join(f"{k} = {v:g}" for k, v in dict(baseline.constants).items())}
     if baseline.function is not None:
         facts["terms"] = "a function of the regressor"
-    terms = Table(
-        ["output", "parameter", "regressor"],
-        [[t.output or "–", f"{t.parameter} (fixed)" if t.fixed else t.parameter, t.regressor] for t in baseline.terms],
-    )
-    return Card("Baseline", _told(facts), [terms, _declared(baseline.parameters)])
+    rows = [[f"{t.parameter} (fixed)" if t.fixed else t.parameter, t.regressor] for t in baseline.terms]
+    columns = ["parameter", "regressor"]
+    if any(t.output for t in baseline.terms):  # else there is only one
+        columns = ["output", *columns]
+        rows = [[t.output or "–", *row] for t, row in zip(baseline.terms, rows, strict=True)]
+    return Card("Baseline", _told(facts), [Table(columns, rows), _declared(baseline.parameters)])
 
 
 @card_of.register
@@ -143,7 +144,7 @@ def _fit(fit: Estimate | MotionEstimate) -> Card:
         [
             name,
             _number(row["value"]),
-            _number(row["std"]),
+            _number(row["std"], 3),
             _interval(row["ci95_low"], row["ci95_high"]),
             row["unit"] or "–",
         ]
@@ -173,9 +174,7 @@ def _declared(parameters: Sequence[Any]) -> Table:
     """Parameters as they were declared."""
     rows = []
     for p in parameters:
-        low, high = getattr(p, "min", None), getattr(p, "max", None)
-        bounded = any(end is not None and np.isfinite(end) for end in (low, high))
-        rows.append([p.name, _number(p.initial), p.unit or "–", _interval(low, high) if bounded else "–"])
+        rows.append([p.name, _number(p.initial), p.unit or "–", _bounds(p.min, p.max)])
     return Table(["parameter", "initial", "unit", "bounds"], rows)
 
 
@@ -191,8 +190,14 @@ def _told(facts: Mapping[str, str]) -> dict[str, str]:
     return told
 
 
-def _number(value: Any) -> str:
-    return "–" if value is None or not np.isfinite(value) else f"{value:.6g}"
+def _number(value: Any, digits: int = 6) -> str:
+    return "–" if value is None or not np.isfinite(value) else f"{value:.{digits}g}"
+
+
+def _bounds(low: float, high: float) -> str:
+    if np.isfinite(low) and np.isfinite(high):
+        return _interval(low, high)
+    return f"≥ {low:g}" if np.isfinite(low) else f"≤ {high:g}" if np.isfinite(high) else "–"
 
 
 def _interval(low: Any, high: Any) -> str:

@@ -7,7 +7,7 @@ import secrets
 from collections.abc import Mapping
 from http.cookies import CookieError, SimpleCookie
 from typing import TYPE_CHECKING
-from urllib.parse import parse_qsl, urlencode
+from urllib.parse import parse_qsl, quote, urlencode
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -59,7 +59,7 @@ class Gate:
             await _refuse(scope, send)
         elif scope["type"] == "http" and given is not None and scope["method"] in ("GET", "HEAD"):
             rest = urlencode([(name, value) for name, value in query if name != "token"])
-            path = "/" + scope["path"].lstrip("/")  # two slashes would be another host
+            path = "/" + quote(scope["path"].lstrip("/"))  # two slashes would be another host
             await self._sent_on(path + (f"?{rest}" if rest else ""), send)
         else:
             await self.app(scope, receive, _with_headers(send) if scope["type"] == "http" else send)
@@ -81,7 +81,7 @@ class Gate:
 
     async def _sent_on(self, place: str, send: Send) -> None:
         cookie = f"{self.cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
-        headers = [(b"location", place.encode("latin-1", "ignore")), (b"set-cookie", cookie.encode())]
+        headers = [(b"location", place.encode()), (b"set-cookie", cookie.encode())]
         headers += [(b"cache-control", b"no-store"), (b"referrer-policy", b"no-referrer"), (b"content-length", b"0")]
         await send({"type": "http.response.start", "status": 303, "headers": headers})
         await send({"type": "http.response.body", "body": b""})

@@ -13,7 +13,7 @@ from orthaug.commands.app.view_data import DataView
 from orthaug.commands.app.view_model import ModelView
 from orthaug.commands.app.view_results import ExportView, ReportView
 from orthaug.commands.app.view_training import TrainingView
-from orthaug.commands.app.widgets import text
+from orthaug.commands.app.widgets import sentence, text
 
 _OFTEN = 0.25  # s between looks at what has changed
 _PARTS = ("Data", "Model", "Training", "Report", "Export")
@@ -94,7 +94,7 @@ class Page:
 
     def _complain(self, error: Exception) -> None:
         told = str(error) if isinstance(error, InputError) else f"this did not work ({type(error).__name__})."
-        ui.notify(told[:1].upper() + told[1:], type="negative")
+        ui.notify(sentence(told), type="negative")
 
 
 def _dress() -> None:

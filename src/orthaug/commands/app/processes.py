@@ -59,8 +59,17 @@ class Command:
         return last.removeprefix("error:").strip()
 
     async def run(self) -> None:
-        """Start it and follow it to its end."""
+        """Start it and follow it to its end; one that cannot start has failed."""
         self.began = time.monotonic()
+        try:
+            self.output, self.code = await self._followed()
+        except OSError as error:
+            self.lines, self.code = [f"error: the command cannot start ({error.strerror})."], 2
+        self.ended = time.monotonic()
+        self.changed()
+
+    async def _followed(self) -> tuple[str, int]:
+        """What it wrote to standard output, and the code that it ended with."""
         program = [sys.executable, "-m", "orthaug.commands.app.child", *self.arguments]
         self.process = await asyncio.create_subprocess_exec(
             *program,
@@ -74,9 +83,7 @@ class Command:
         if self.stopping:
             self.stop()
         output, _ = await asyncio.gather(self.process.stdout.read(), self._told())
-        code = await self.process.wait()
-        self.output, self.ended, self.code = output.decode("utf-8", "replace"), time.monotonic(), code
-        self.changed()
+        return output.decode("utf-8", "replace"), await self.process.wait()
 
     async def _told(self) -> None:
         assert self.process is not None and self.process.stderr is not None

@@ -48,7 +48,7 @@ def application(sessions: Sessions, spec: Path | None) -> FastAPI:
             file = session.download(what)
         except InputError as error:
             return _told(str(error), 404)
-        if show:
+        if show and file.suffix == ".html":  # else a spec could be read as a page of this origin
             return FileResponse(file, headers={"cache-control": "no-store"}, media_type="text/html")
         return FileResponse(file, filename=what, headers={"cache-control": "no-store"})
 

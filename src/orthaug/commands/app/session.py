@@ -43,6 +43,8 @@ class Session:
         self.checked: dict[str, Any] | None = None
         self.refused = ""
         """Why the spec cannot be trained, in words."""
+        self.stale = False
+        """Whether `checked` is of an earlier spec: this one could not be opened."""
         self.checking = False
         self.commands: dict[str, Command] = {}
         self.trained: dict[str, str] = {}
@@ -169,7 +171,7 @@ class Session:
     async def _checked(self) -> None:
         await asyncio.sleep(_PAUSE)
         if not self.spec.strip():
-            self.checked, self.refused = None, ""
+            self.checked, self.refused, self.stale = None, "", False
             self.changed("check")
             return
         place = self.folder / "check.toml"
@@ -177,12 +179,12 @@ class Session:
         try:
             self.checked = await self.desk.ask("examine", path=place, whole=False)
             if self.checked["check"] is None:
-                self.refused = ""
+                self.refused, self.stale = "", False
                 self.changed("check")
                 self.checked = await self.desk.ask("examine", path=place, whole=True)
-            self.refused = self.worded(self.checked["refusal"] or "")
+            self.refused, self.stale = self.worded(self.checked["refusal"] or ""), False
         except InputError as error:
-            self.refused = self.worded(error)
+            self.refused, self.stale = self.worded(error), True
         self.checking = False
         self.changed("check")
 
@@ -219,10 +221,7 @@ class Session:
         self.start(self._followed(kind, command, self.spec))
 
     async def _followed(self, kind: str, command: Command, spec: str) -> None:
-        try:
-            await command.run()
-        except OSError as error:
-            command.lines, command.code = [f"error: training cannot start ({error.strerror})."], 2
+        await command.run()
         if command.code == 0:
             self.trained[kind] = spec
             with suppress(OSError, ValueError):
@@ -249,8 +248,9 @@ class Session:
         self.exports[target] = "…"
         self.changed("work")
         await command.run()
-        self.exports[target] = "" if command.code == 0 else self.worded(command.complaint)
-        self.changed("work")
+        if target in self.exports:  # else another model or another name came in between
+            self.exports[target] = "" if command.code == 0 else self.worded(command.complaint)
+            self.changed("work")
 
     def download(self, what: str) -> Path:
         """The file that is handed out under a name: from a list, never a path.

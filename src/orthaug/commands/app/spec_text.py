@@ -13,6 +13,8 @@ from tomlkit.items import AoT
 
 from orthaug._base.errors import InputError
 
+_WORDS = ("parameter", "regressor", "output", "unit", "channel")  # keys whose values are text, digits or not
+
 
 def opened(text: str) -> tomlkit.TOMLDocument:
     """The document.
@@ -40,16 +42,45 @@ def _whole(folder: Path, file: Any) -> Any:
 
 
 def _with_files(document: Mapping[str, Any]) -> Iterator[Any]:
-    data = _table(document, "data")
-    parts = [data.get("train"), data.get("validation"), *_table(data, "tests").values()]
-    for entry in (*parts, _table(document, "structure").get("measure")):
+    data = section(document, "data")
+    parts = [data.get("train"), data.get("validation"), *section(data, "tests").values()]
+    for entry in (*parts, section(document, "structure").get("measure")):
         if isinstance(entry, Mapping) and isinstance(entry.get("files"), list):
             yield entry
 
 
-def _table(document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    found = document.get(key)
-    return found if isinstance(found, Mapping) else {}
+def section(content: Mapping[str, Any], *path: str) -> Mapping[str, Any]:
+    """The table at the end of the path; an empty one where there is none, or something else in its place."""
+    for key in path:
+        found = content.get(key)
+        content = found if isinstance(found, Mapping) else {}
+    return content
+
+
+def names(table: Mapping[str, Any], key: str) -> list[str]:
+    """The strings of a list, such as `outputs`; none where there is no such list."""
+    found = table.get(key)
+    return [name for name in found if isinstance(name, str)] if isinstance(found, list) else []
+
+
+def shown(value: Any) -> str:
+    """A value as a field shows it."""
+    return "" if value is None else ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+
+
+def read(key: str, value: str) -> Any:
+    """What a field says: a number, names, or text; None for nothing. The spec's own check says what is wrong."""
+    value = value.strip()
+    if not value:
+        return None
+    if key == "channels":
+        return [name.strip() for name in value.split(",") if name.strip()]
+    for kind in (int, float) if key not in _WORDS else ():
+        try:
+            return kind(value)
+        except ValueError:
+            continue
+    return value
 
 
 def _made(document: Any, key: str) -> Any:
@@ -101,10 +132,7 @@ def with_value(text: str, path: Sequence[str], value: Any) -> str:
 
 def rows_of(text: str, path: Sequence[str]) -> list[dict[str, Any]]:
     """The tables of a list of tables, such as `data.prepare`; none where there is no such list."""
-    content: Any = plain(text)
-    for key in path[:-1]:
-        content = _table(content, key)
-    found = content.get(path[-1])
+    found = section(plain(text), *path[:-1]).get(path[-1])
     return [dict(row) for row in found if isinstance(row, Mapping)] if isinstance(found, list) else []
 
 
@@ -121,6 +149,8 @@ def with_row(text: str, path: Sequence[str], row: Mapping[str, Any]) -> str:
             rows = table[path[-1]]
         new = tomlkit.table() if isinstance(rows, AoT) else tomlkit.inline_table()
         new.update(row)
+        if isinstance(rows, AoT):
+            new.add(tomlkit.nl())  # before what follows
         rows.append(new)
 
     return changed(text, change)
@@ -176,8 +206,8 @@ k = {{ initial = 1.0, min = 0 }}
 
 def as_motion(text: str) -> str:
     """With the equations of a mass, a spring and a damper in place of the baseline, for a person to change."""
-    data = _table(plain(text), "data")
-    inputs, outputs = data.get("inputs") or ["0"], data.get("outputs") or ["y"]
+    data = section(plain(text), "data")
+    inputs, outputs = names(data, "inputs") or ["0"], names(data, "outputs") or ["y"]
 
     def change(document: Any) -> None:
         for key in ("baseline", "lags", "physics", "motion", "suspects"):

@@ -22,6 +22,7 @@ from orthaug.commands.app.widgets import (
     note,
     plot,
     redrawn,
+    sentence,
     table,
     text,
 )
@@ -40,7 +41,9 @@ _SUMMARIES = {
     "fill": "fill short gaps",
     "shift": "shift an input in time",
 }
-_FIRST = {"cutoff": 1.0, "factor": 2, "samples": 1}  # what a step begins with where it has no default
+_FIRST = {"factor": 2, "samples": 1}  # what a step begins with where it has no default
+_LABELS = {"cutoff": "cutoff in Hz", "sampling_time": "step in s", "most": "rows at most", "window": "rows each side"}
+_CUTOFF = 0.1  # the first cutoff, as a share of the sampling frequency
 _KNOWN = "CSV, TSV, Parquet, Excel, MATLAB, NumPy or HDF5; it stays on this machine"
 _DROP = """
 <label class="drop" id="drop">
@@ -80,6 +83,7 @@ class DataView:
                     self.column_rows = ui.element("div")
                 with self.cleaning:
                     self.step_rows = ui.element("div")
+                    self.refusal = ui.element("div")
             with card("Curves", classes="sticky"):
                 self.curves = ui.element("div")
         self.follow_data()
@@ -130,13 +134,16 @@ class DataView:
             left = [c for c in found["columns"] if not c["usable"]]
             if left:
                 text("Not usable: " + ", ".join(f"{c['header']} ({c['told']})" for c in left[:_LISTED]), "p", "hint")
+            if not usable:
+                note("No column of this file is a signal that changes: there is nothing to fit.", "bad")
+                return
             if found["spec"] is None:
                 names = "The names of the columns do not say which are inputs and outputs: choose them here."
                 note(found["open"] or names, "care")
             with ui.element("div").classes("fields"):
                 step = "" if found["step"] is None else f"{found['step']:g}"
                 own = "" if found["step"] is not None and "column" in found["clock"] else step
-                field("sampling time in s", own, self._set_step, classes="short", hint=step or "1")
+                field("sampling time in s", own, self._set_step, classes="medium", hint=step or "1")
                 label = (
                     "Begin with these channels"
                     if found["spec"] is None and not self.session.spec
@@ -185,24 +192,24 @@ class DataView:
 
     def _draw_step(self, index: int, step: Mapping[str, Any]) -> None:
         kind = str(step.get("step"))
-        with ui.element("div").classes("entry"):
+        with ui.element("div").classes("entry step"):
             with ui.element("div").classes("grow"):
                 text(f"{index + 1}. {_SUMMARIES.get(kind, kind)}", "p", "strong")
                 with ui.element("div").classes("fields"):
                     for own in fields(STEPS[kind]) if kind in STEPS else ():
-                        usual = "" if own.default is MISSING else _shown(own.default)
+                        usual = "all" if own.name == "channels" else spec_text.shown(own.default)
                         field(
-                            own.name,
-                            _shown(step.get(own.name)),
+                            _LABELS.get(own.name, own.name),
+                            spec_text.shown(step.get(own.name)),
                             self._setting(index, own.name),
                             classes="short",
-                            hint=usual,
+                            hint="" if own.default is MISSING else usual,
                         )
             named(button("Remove", lambda: self._remove(index)), f"Remove step {index + 1}")
 
     def _setting(self, index: int, key: str) -> Any:
         def change(value: str) -> None:
-            self._write(spec_text.with_cell(self.session.spec, _STEPS, index, key, _read(key, value)), "steps")
+            self._write(spec_text.with_cell(self.session.spec, _STEPS, index, key, spec_text.read(key, value)), "steps")
 
         return change
 
@@ -210,9 +217,13 @@ class DataView:
         if kind not in STEPS:
             return
         needed = [own.name for own in fields(STEPS[kind]) if own.default is MISSING]
-        first = {name: _FIRST[name] for name in needed if name in _FIRST}
+        first: dict[str, Any] = {name: _FIRST[name] for name in needed if name in _FIRST}
+        if "cutoff" in needed:
+            step = (self.session.checked or self.session.found or {}).get("step") or 1.0
+            first["cutoff"] = float(f"{_CUTOFF / step:.2g}")
         if "channel" in needed:
-            first["channel"] = (self.session.content().get("data", {}).get("inputs") or [""])[0]
+            data = spec_text.section(self.session.content(), "data")
+            first["channel"] = next(iter(spec_text.names(data, "inputs")), "")
         self._write(spec_text.with_row(self.session.spec, _STEPS, {"step": kind, **first}), "more steps")
 
     def _remove(self, index: int) -> None:
@@ -222,7 +233,10 @@ class DataView:
         self.session.write(spec, author)
 
     def follow_check(self) -> None:
-        """Curves of the file, and of the training data after preparation."""
+        """Curves of the file, and of the training data after preparation; why they cannot be drawn."""
+        with redrawn(self.refusal):
+            if self.session.stale:
+                note(sentence(self.session.refused), "bad")
         found, checked, session = self.session.found, self.session.checked, self.session
         prepared = {} if checked is None else checked["curves"]
         raw = {} if found is None else found["curves"]
@@ -260,22 +274,3 @@ class DataView:
                 table(
                     ("part", "rows"), [(part, count) for part, count in checked["rows"].items()], "Rows that are used"
                 )
-
-
-def _shown(value: Any) -> str:
-    return "" if value is None else ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
-
-
-def _read(key: str, value: str) -> Any:
-    """What a field says: a number, names, or text; None for nothing. The spec's own check says what is wrong."""
-    value = value.strip()
-    if not value:
-        return None
-    if key == "channels":
-        return [name.strip() for name in value.split(",") if name.strip()]
-    for kind in (int, float):
-        try:
-            return kind(value)
-        except ValueError:
-            continue
-    return value

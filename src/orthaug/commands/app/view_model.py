@@ -9,8 +9,19 @@ from nicegui import ui
 
 from orthaug.commands.app import spec_text
 from orthaug.commands.app.session import Session
-from orthaug.commands.app.view_data import _read
-from orthaug.commands.app.widgets import button, card, choice, field, named, note, number, redrawn, table, text
+from orthaug.commands.app.widgets import (
+    button,
+    card,
+    choice,
+    field,
+    named,
+    note,
+    number,
+    redrawn,
+    sentence,
+    table,
+    text,
+)
 
 _TERMS = ("baseline", "terms")
 _LEARNERS = {"mlp": "a network", "terms": "a sum of terms", "none": "none: physics alone"}
@@ -68,7 +79,7 @@ class ModelView:
             if "motion" in content:
                 self._draw_motion(content)
                 return
-            outputs = content.get("data", {}).get("outputs") or []
+            outputs = spec_text.names(spec_text.section(content, "data"), "outputs")
             text(" and ".join(f"{name}[k] = Σ parameter · regressor" for name in outputs), "p", "hint formula")
             for i, term in enumerate(spec_text.rows_of(self.session.spec, _TERMS)):
                 self._draw_term(i, term, several=len(outputs) > 1)
@@ -87,20 +98,16 @@ class ModelView:
 
     def _cell(self, index: int, key: str) -> Callable[[str], None]:
         def change(value: str) -> None:
-            read = value.strip() or None if key in ("parameter", "regressor", "output", "unit") else _read(key, value)
-            self._write(spec_text.with_cell(self.session.spec, _TERMS, index, key, read))
+            self._write(spec_text.with_cell(self.session.spec, _TERMS, index, key, spec_text.read(key, value)))
 
         return change
 
     def _add(self) -> None:
         taken = {str(term.get("parameter")) for term in spec_text.rows_of(self.session.spec, _TERMS)}
         name = next(name for i in range(1, 1000) if (name := f"p{i}") not in taken)
-        data = self.session.content().get("data", {})
-        row = {
-            "parameter": name,
-            "regressor": f"{([*data.get('inputs', ()), *data.get('outputs', ())] or ['u'])[0]}[k-1]**2",
-        }
-        outputs = data.get("outputs") or []
+        data = spec_text.section(self.session.content(), "data")
+        inputs, outputs = spec_text.names(data, "inputs"), spec_text.names(data, "outputs")
+        row = {"parameter": name, "regressor": f"{[*inputs, *outputs, 'u'][0]}[k-1]**2"}
         row |= {"output": outputs[0]} if len(outputs) > 1 else {}
         self._write(spec_text.with_row(self.session.spec, _TERMS, row), "more terms")
 
@@ -112,13 +119,13 @@ class ModelView:
         ui.notify("A mass, a spring and a damper: change the equations in the spec below.")
 
     def _draw_motion(self, content: Mapping[str, Any]) -> None:
-        motion = content["motion"]
+        motion = spec_text.section(content, "motion")
         text("Equations of motion. States and outputs are written in the spec below.", "p", "hint")
-        for name, state in motion.get("states", {}).items():
+        for name, state in spec_text.section(motion, "states").items():
             equation = state.get("derivative") if isinstance(state, Mapping) else None
             learned = " + learned" if isinstance(state, Mapping) and state.get("learned") else ""
             text(f"d{name}/dt = {equation}{learned}", "p", "formula")
-        for name, row in motion.get("parameters", {}).items():
+        for name, row in spec_text.section(motion, "parameters").items():
             if isinstance(row, Mapping):
                 with named(ui.element("div").classes("entry term").props("role=group"), f"parameter {name}"):
                     text(name, "p", "strong name")
@@ -128,13 +135,12 @@ class ModelView:
 
     def _value(self, path: tuple[str, ...]) -> Callable[[str], None]:
         def change(value: str) -> None:
-            read = value.strip() or None if path[-1] == "unit" else _read(path[-1], value)
-            self._write(spec_text.with_value(self.session.spec, path, read))
+            self._write(spec_text.with_value(self.session.spec, path, spec_text.read(path[-1], value)))
 
         return change
 
     def _draw_learner(self, content: Mapping[str, Any]) -> None:
-        learner, training = content.get("learner", {}), content.get("training", {})
+        learner, training = spec_text.section(content, "learner"), spec_text.section(content, "training")
         moves = "motion" in content
         with redrawn(self.learner):
             if not content:
@@ -144,14 +150,14 @@ class ModelView:
             with ui.element("div").classes("fields"):
                 choice("learner", _LEARNERS, kind, self._set_kind)
                 if kind == "mlp":
-                    hidden = ", ".join(map(str, learner.get("hidden", [16])))
-                    field("neurons", hidden, self._set_hidden, classes="short")
+                    hidden = learner.get("hidden", [16])
+                    field("neurons", spec_text.shown(hidden), self._set_hidden, classes="short")
                 if kind == "terms":
                     field("highest degree", learner.get("degree"), self._value(("learner", "degree")), classes="short")
-                seen = ", ".join(map(str, learner.get("inputs", ())))
-                field("what it sees", seen, self._set_inputs, hint="all that the physics reads")
+                seen = learner.get("inputs")
+                field("what it sees", spec_text.shown(seen), self._set_inputs, hint="all that the physics reads")
             with ui.element("div").classes("fields"):
-                structure = str(content.get("structure", {}).get("kind", "orthogonal"))
+                structure = str(spec_text.section(content, "structure").get("kind", "orthogonal"))
                 choice("structure", _STRUCTURES, structure, self._chosen(("structure", "kind")))
                 focus = str(training.get("focus", "simulation" if moves else "prediction"))
                 choice("trained on", _FOCUS, focus, self._chosen(("training", "focus")))
@@ -167,7 +173,7 @@ class ModelView:
 
     def _set_kind(self, kind: str) -> None:
         spec = spec_text.with_value(self.session.spec, ("learner", "kind"), kind)
-        learner = self.session.content().get("learner", {})
+        learner = spec_text.section(self.session.content(), "learner")
         if kind == "terms" and not {"terms", "degree"} & set(learner):
             spec = spec_text.with_value(spec, ("learner", "degree"), 2)
         self._write(spec, "learner")
@@ -194,11 +200,11 @@ class ModelView:
             if session.checking:
                 note("Checking …", "busy")
             elif session.refused:
-                note(session.refused[:1].upper() + session.refused[1:], "bad")
+                note(sentence(session.refused), "bad")
             else:
                 note("This spec can be trained.", "good")
             told = None if session.checked is None else session.checked["check"]
-            stale = session.checking or (session.refused and not (session.checked or {}).get("refusal"))
+            stale = session.checking or session.stale
             if told is not None:
                 if stale:
                     text("As the spec was before:", "p", "hint")

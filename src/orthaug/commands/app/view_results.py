@@ -121,7 +121,8 @@ class ExportView:
         if "fit" not in session.results:
             text("Train a model first.", "p", "hint")
             return
-        field("name in the code", self.name, self._rename, classes="short")
+        with ui.element("div").classes("fields"):
+            field("name in the code", self.name, self._rename, classes="medium")
         for target, summary in _TARGETS.items():
             why = session.exports.get(target)
             with ui.element("div").classes("entry"):

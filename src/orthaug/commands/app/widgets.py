@@ -25,6 +25,11 @@ def text(what: Any, tag: str = "p", classes: str = "") -> ui.html:
     return ui.html(escape(str(what)), sanitize=False, tag=tag).classes(classes)
 
 
+def sentence(told: str) -> str:
+    """A message as it begins on a page; the name of a file stays as it is."""
+    return told if "." in told.partition(" ")[0] else told[:1].upper() + told[1:]
+
+
 def card(title: str, hint: str = "", classes: str = "") -> ui.element:
     """A section with a heading."""
     section = ui.element("section").classes(f"card {classes}")
