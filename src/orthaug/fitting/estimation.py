@@ -224,13 +224,12 @@ def fit(
     restarts, seed = checked_starts(restarts, seed, warm=initial is not None, ensemble=ensemble)
     check_solver(solver, criterion, () if learner is None else choices)
     engine = _engine_of(engine, problem, len(choices) * (restarts if initial is None else 1))
-    if initial is None:
-        _check_cost(problem, learner, solver, restarts * len(choices), engine)
     warm, told = None, ()
     if initial is not None:
         task, weights, warm = _warm_start(problem, initial, engine)
         starts = [PlannedRun(0, weights, choice) for choice in choices]
     else:
+        _check_cost(problem, learner, solver, restarts * len(choices), engine)
         problem, learner, told = independent_terms(problem, learner)
         task = OneStepTask.of(problem, learner, engine=engine)
         starts = _starts(task.bound, range(seed, seed + restarts), choices)
