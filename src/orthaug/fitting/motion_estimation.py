@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from orthaug._base.checks import check_count, check_type
+from orthaug._base.checks import check_type
 from orthaug._base.jax import jax
 from orthaug._base.progress import SILENT, Tell
 from orthaug.data.record import Record
@@ -14,7 +14,7 @@ from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.motion_conclusion import conclude_motion
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_task import MotionTask
-from orthaug.fitting.rules import check_motion_choices, check_solver, check_starts, tried
+from orthaug.fitting.rules import check_motion_choices, check_solver, checked_starts, tried
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Orthogonal, Structure
