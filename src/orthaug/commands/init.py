@@ -164,7 +164,7 @@ def _steps(found: Survey, roles: Roles) -> list[tuple[str, dict[str, Any]]]:
     steps: list[tuple[str, dict[str, Any]]] = []
     if any(column.spikes for column in roles.outputs):
         threshold = min(column.threshold for column in roles.outputs)
-        steps += [("outliers", {"threshold": threshold}), ("fill", {"most": FILLED})]
+        steps += [("outliers", {"threshold": threshold}), ("fill", {"most": FILLED, "method": "pchip"})]
     if _time(found, roles) and not found.clock.even:
         steps.append(("resample", {"sampling_time": found.clock.step}))
     return steps
