@@ -13,6 +13,7 @@ import scipy.io
 import scipy.signal
 from test_cli import run
 
+from orthaug.commands import opening
 from orthaug.data.survey import channel_name, split_header, survey
 from orthaug.data.tables import column_names
 
@@ -144,6 +145,29 @@ def test_names_that_say_it_are_enough_and_few_rows_are_refused(tmp_path):
     assert done.code == 2 and "3 usable rows are too few" in done.err and not (tmp_path / "b.toml").exists()
 
 
+def test_one_wrong_sample_of_a_signal_that_moves_fast_is_seen_and_replaced(tmp_path):
+    u, y = np.random.default_rng(2).normal(size=600), np.sin(np.arange(600) / 1.5)
+    pd.DataFrame({"u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
+    assert survey(tmp_path / "a.csv").find("y").spikes == 0
+    y[350] += 2.5 * np.ptp(y)
+    pd.DataFrame({"u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
+    done = run("init", tmp_path / "a.csv", "--sampling-time", "0.1", "--out", tmp_path / "spec.toml")
+    assert done.code == 0 and "; 1 sample far from all neighbours, which the spec replaces" in done.out
+    job = opening.open_job(tmp_path / "spec.toml")
+    assert job.train.record.prepared[0].samples == 1
+
+
+@pytest.mark.parametrize("held", [1, 20])
+def test_a_delay_is_seen_where_the_response_sets_in_slowly(tmp_path, held):
+    """An inertia, sampled often: the response grows from nothing at lag 4; the cross-correlation sees it far later."""
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.normal(size=2000 // held), held)
+    y = scipy.signal.lfilter([0, 0, 0, 0, 0.002], [1, -1.98, 0.985], u) + 1e-4 * rng.normal(size=2000)
+    pd.DataFrame({"u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
+    done = run("init", tmp_path / "a.csv", "--sampling-time", "0.01", "--out", tmp_path / "spec.toml")
+    assert "it is first significant at lag 4" in done.out and ", nk 4;" in done.out
+
+
 def test_what_is_seen_of_a_column(tmp_path):
     rng = np.random.default_rng(0)
     square, coarse = np.sign(rng.normal(size=400)), np.round(rng.normal(size=400), 1)
@@ -168,4 +192,4 @@ def test_uneven_instants_are_resampled(tmp_path):
     assert done.code == 0 and "but the steps are uneven" in done.out, done.err
     data = tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
     assert [step["step"] for step in data["prepare"]] == ["outliers", "fill", "resample"] and data["time"] == "t"
-    assert data["prepare"][-1]["sampling_time"] == 0.1 and "1 samples far from all their neighbours" in done.out
+    assert data["prepare"][-1]["sampling_time"] == 0.1 and "1 sample far from all neighbours" in done.out

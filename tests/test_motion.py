@@ -54,6 +54,10 @@ def test_positive_parameters_are_estimated_as_logarithms() -> None:
     ("changed", "message"),
     [
         ({"states": [oa.State("x", "w")]}, "the equation of 'x' = w: unknown name 'w'"),
+        (
+            {"states": [oa.State("x", "sin(pi*x)")]},
+            "the equation of 'x' = sin(pi*x): unknown name 'pi'; write 3.141592653589793",
+        ),
         ({"states": [oa.State("x")]}, "the state 'x' has no `derivative`"),
         ({"states": []}, "the motion has no states"),
         ({"outputs": []}, "the motion has no outputs"),

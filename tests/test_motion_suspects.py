@@ -65,6 +65,14 @@ def test_the_bias_is_that_of_data_with_the_term(clean: oa.MotionEstimate) -> Non
     assert hardening.expected == pytest.approx(0.2 * hardening.per_unit)
 
 
+def test_a_fit_of_difference_equations_is_refused() -> None:
+    rng = np.random.default_rng(0)
+    record = oa.Record.from_arrays(rng.normal(size=40), rng.normal(size=40), sampling_time=0.1)
+    fit = oa.estimate(record, oa.Baseline.from_terms([oa.Term("a", "y[k-1]")]), learner=None)
+    with pytest.raises(oa.InputError, match="must be a fit of equations of motion .*`bias_budget`"):
+        oa.suspected_bias(fit, SUSPECTS)  # type: ignore[arg-type]
+
+
 def test_a_term_that_the_learner_sees_moves_what_it_could_imitate_alone(learned: oa.MotionEstimate) -> None:
     friction, hardening = oa.suspected_bias(learned, SUSPECTS)
     assert friction.seen and friction.moved[[0, 2]] == pytest.approx([0, 0], abs=1e-12)

@@ -203,6 +203,8 @@ def test_a_spec_prepares_every_part_and_the_result_tells(tmp_path, monkeypatch):
     assert [w["code"] for w in result["warnings"]].count("filtered_noise") == 1
     told = run("simulate", "result", "run.csv", "--out", "free.csv")
     assert told.code == 0 and "fitted to prepared data: detrend (degree 0), lowpass (cutoff 0.4" in told.err
+    told = run("export", "result", "--to", "numpy", "--out", "code")
+    assert told.code == 0 and "The code stands for data after these steps" in told.err and "detrend" in told.err
     for wrong, message in (
         ('step = "lowpas"\n', "'lowpass'"),
         ('step = "lowpass"\n', "cutoff"),

@@ -12,7 +12,7 @@ import pytest
 
 from orthaug._base.errors import InputError
 from orthaug.data import tables
-from orthaug.data.tables import check_readable, has_column, read_table
+from orthaug.data.tables import check_readable, column_names, has_column, read_table
 
 
 def put(folder: Path, name: str, content: str | bytes) -> Path:
@@ -47,6 +47,7 @@ AS_FOUND = {
     "lines of separators at the end": "u,y\n1,2\n3,4\n,\n,\n",
     "blank lines before the header": "\n\nu,y\n1,2\n3,4\n",
     "blank CRLF lines before the header": "\r\n  \r\nu,y\r\n1,2\r\n3,4\r\n",
+    "remarks before the header": "# bench 3, 4 May\n% of u, y\n\nu,y\n1,2\n3,4\n",
     "a longer unused column": "u,y,other\n1,2,9\n3,4,9\n,,9\n,,9\n",
     "a shorter unused column": "u,y,other\n1,2,9\n3,4,\n",
     "text in an unused column": "u,note,y\n1,warm,2\n3,,4\n",
@@ -61,6 +62,15 @@ AS_FOUND = {
 @pytest.mark.parametrize("content", AS_FOUND.values(), ids=AS_FOUND.keys())
 def test_csv_as_it_is_found(tmp_path, content):
     assert values(put(tmp_path, "run.csv", content), "u", "y") == [[1.0, 3.0], [2.0, 4.0]]
+
+
+@pytest.mark.parametrize(
+    ("content", "names"),
+    [("# u,y\n1,2\n", ["# u", "y"]), ("# a run\n# u,y\n", ["# u", "y"]), ("#\nu;y\n1,5;2\n", ["u", "y"])],
+)
+def test_names_may_stand_behind_the_sign_of_a_remark(tmp_path, content, names):
+    """As NumPy writes them: the last line before the numbers is the header."""
+    assert column_names(put(tmp_path, "run.csv", content)) == names
 
 
 def test_numpy_and_pandas_read_the_same_numbers(tmp_path, monkeypatch):

@@ -12,6 +12,11 @@ _LATEST = 64  # column at which the last cell of a row may begin for it to be fo
 _GAP = "  "
 
 
+def counted(number: int, thing: str) -> str:
+    """`1 sample`, `2 samples`."""
+    return f"{number} {thing}" + ("" if number == 1 else "s")
+
+
 def table(rows: Sequence[Sequence[str]], width: int = WIDTH) -> list[str]:
     """Rows of cells as lines, the first row the head. Rows may be of different lengths.
 

@@ -18,6 +18,7 @@ from orthaug.analysis.missing_terms import MissingTest
 from orthaug.analysis.predictability import Predictable, predictable
 from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, rms_errors
 from orthaug.analysis.verdict_text import SHARE, Finding, words
+from orthaug.analysis.wild_rows import wild_rows
 from orthaug.data.regressors import Lags
 from orthaug.fitting.criteria import Simulation
 from orthaug.fitting.estimates import Estimate
@@ -121,6 +122,7 @@ def _concluded(seen: Finding, free_tests: tuple[ResidualTest, ...] | None) -> Di
     if verdict == "equation_noise" and seen.fit.criterion.simulates and seen.white:
         seen = replace(seen, changes=_toward_prediction(seen))
     text, warnings = words(verdict, seen)
+    warnings = (*wild_rows(seen.one_step, seen.fit.problem.record.experiments), *warnings)
     return Diagnosis(
         verdict, text, seen.tests, free_tests, seen.ratio, seen.noise, warnings, seen.predictable, seen.changes
     )

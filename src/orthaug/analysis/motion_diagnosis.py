@@ -120,7 +120,7 @@ def _words(
     learner = "let the learner see more" if fit.model.form.bound is not None else "add a learner where it acts"
     return (
         f"What the free run leaves ({sizes}) holds more than noise: {'; '.join(what)}. Physics is missing; {learner}, "
-        "or try another hold of the inputs."
+        'try another hold of the inputs, or delay one (step = "shift" of data.prepare).'
     )
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from orthaug._base.checks import check_type
 from orthaug.analysis.motion_bias import MotionGround, TermBias
 from orthaug.analysis.motion_response import Place
 from orthaug.analysis.motion_suspects import MotionSuspect, check_motion_suspects
@@ -23,8 +24,11 @@ def suspected_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> li
     """What terms that the equations of a fitted motion may lack do to its parameters, and what tells of them.
 
     Raises:
-        InputError: suspects that the motion cannot have.
+        InputError: suspects that the motion cannot have, or a fit of difference equations.
     """
+    check_type(
+        fit, MotionEstimate, "fit", "a fit of equations of motion (of difference equations `bias_budget` tells it)"
+    )
     check_motion_suspects(suspects, fit.problem)
     ground = ground_after(fit)
     if ground is None or not suspects:

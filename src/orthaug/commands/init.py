@@ -13,12 +13,15 @@ import tomlkit
 
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_file
+from orthaug._base.lines import counted
 from orthaug.data.readers import read_record
 from orthaug.data.record import Channel, Record
 from orthaug.data.steps import STEPS
-from orthaug.data.survey import SPIKE, Column, Survey, survey
+from orthaug.data.survey import Column, Survey, survey
 from orthaug.selection.first_orders import FirstModel, first_model
 
+FILLED = 3
+"""Rows of a gap that the spec's step `fill` reconstructs at most."""
 TRAINED = 0.75  # share of the rows; the rest is a test
 _TESTED = 30  # rows of a test at least
 _LISTED = 12  # columns in a message
@@ -160,7 +163,8 @@ def _steps(found: Survey, roles: Roles) -> list[tuple[str, dict[str, Any]]]:
     """Preparation that the data need: spikes of outputs replaced, uneven instants put onto a grid."""
     steps: list[tuple[str, dict[str, Any]]] = []
     if any(column.spikes for column in roles.outputs):
-        steps += [("outliers", {"threshold": SPIKE}), ("fill", {"most": 3})]
+        threshold = min(column.threshold for column in roles.outputs)
+        steps += [("outliers", {"threshold": threshold}), ("fill", {"most": FILLED, "method": "pchip"})]
     if _time(found, roles) and not found.clock.even:
         steps.append(("resample", {"sampling_time": found.clock.step}))
     return steps
@@ -185,10 +189,13 @@ def _account(found: Survey, roles: Roles, rows: int, missing: int, cut: int, mod
     for column, delay, order in zip(roles.inputs, model.delays, model.persistence, strict=True):
         lines.append(f"{column.name} excites {_order(order)}; {_delay(delay)}")
     if missing:
-        lines.append(f"{missing} rows lack a value and will be left out, with all windows that touch them")
+        filled = any(kind == "fill" for kind, _ in _steps(found, roles))
+        lines.append(f"{_lacking(missing)} and will be left out, with all windows that touch them")
+        if filled:
+            lines[-1] = f"{_lacking(missing)}: gaps of up to {FILLED} rows are filled, longer ones left out"
     for name, late, seen in zip(_channel_names(roles.inputs), model.orders.nk, model.delays, strict=True):
         if seen is not None and seen != late:
-            lines.append(f"{name} is taken from lag {late} on, which runs as well or better with as few lags")
+            lines.append(f"the spec takes {name} from lag {late} on, which runs as well or better with as few lags")
     size, errors = model.orders, ", ".join(f"{100 * error:.3g} %" for error in model.free_run)
     told = "one step ahead" if not roles.inputs else "in free run"
     lines.append(f"first physics: linear, {size}{', with a constant' if model.offset else ''}; {told} its error")
@@ -197,12 +204,14 @@ def _account(found: Survey, roles: Roles, rows: int, missing: int, cut: int, mod
     return "\n".join(lines)
 
 
+def _lacking(rows: int) -> str:
+    return f"{counted(rows, 'row')} lack{'s' if rows == 1 else ''} a value"
+
+
 def _delay(delay: int | None) -> str:
-    return (
-        "its cross-correlation with the output is nowhere significant"
-        if delay is None
-        else f"its cross-correlation with the output is first significant at lag {delay}"
-    )
+    if delay is None:
+        return "no lag of it is significant"
+    return f"beside the outputs' past it is first significant at lag {delay}"
 
 
 def _order(order: int) -> str:
@@ -217,11 +226,11 @@ def as_seen(column: Column, *, spikes: bool) -> str:
     text = f"{column.name}" + (f" = column '{column.header}'" if column.header != column.name else "")
     text += f": {low:.4g} to {high:.4g} {column.unit}".rstrip()
     if column.missing:
-        text += f"; {column.missing} cells missing"
+        text += f"; {counted(column.missing, 'cell')} missing"
     if spikes and column.spikes:
-        text += f"; {column.spikes} samples far from all their neighbours, which the spec replaces"
+        text += f"; {counted(column.spikes, 'sample')} far from all neighbours, which the spec replaces"
     for value, count in column.limits:
-        text += f"; {count} rows at {value:.4g}, perhaps a limit of sensor or actuator"
+        text += f"; {counted(count, 'row')} at {value:.4g}, perhaps a limit of sensor or actuator"
     if column.quantum is not None:
         text += f"; in steps of {column.quantum:.3g}"
     return text
@@ -243,7 +252,11 @@ def _spec(
     document.add(tomlkit.comment("Every key: docs/spec.md. What is written here is a start, not a verdict."))
     document.add("data", _data(found, roles, out, rows, cut, missing, named))
     document.add(tomlkit.nl())
-    document.add(tomlkit.comment("The physics: linear difference equations, to be replaced by what you know."))
+    document.add(
+        tomlkit.comment(
+            "The physics: linear difference equations, to be replaced by what you know ([motion]: equations of motion)."
+        )
+    )
     document.add("baseline", _baseline(named, model))
     learner = tomlkit.table()
     learner.add("kind", "mlp")
@@ -277,7 +290,7 @@ def _data(
     uneven = time is not None and not clock.even
     if missing or uneven:
         data.add("missing", "skip")
-        data["missing"].comment(f"{missing} rows lack a value" if missing else "nothing is interpolated across gaps")
+        data["missing"].comment(_lacking(missing) if missing else "nothing is interpolated across gaps")
     for name, part in (("train", [0, cut]), ("tests", [cut, rows])):
         if part[0] == part[1]:
             continue

@@ -150,10 +150,14 @@ def export(
 ) -> None:
     """A saved model as code that needs no orthaug."""
     from orthaug.commands import export as exporting
+    from orthaug.commands.run import prepared_notes
 
     exporting.check(model, to, out, name, force=force)
     prepare_jax()
     exporting.run(model, to, out, name, force=force)
+    what = "The code stands for data after these steps: a delay by `shift`, say, is not in it."
+    for line in prepared_notes(model, what, apart=("outliers", "fill")):
+        streams.say(line)
     streams.echo(f"written to {out}")
 
 

@@ -123,15 +123,19 @@ def held_outputs(model: Model | MotionModel, data: Path, reading: Reading) -> li
     return [c for c in model.outputs if has_column(data, reading.columns.get(c.name, c.file_column))]
 
 
-def prepared_notes(model: Path) -> tuple[str, ...]:
+def prepared_notes(
+    model: Path, what: str = "The rows of this file are taken as they are.", apart: Sequence[str] = ()
+) -> tuple[str, ...]:
     """What the result that a model lies in tells of the preparation of its data."""
     for folder in (model, model.parent):
         try:
             steps = json.loads((folder / "result.json").read_text(encoding="utf-8"))["data"]["prepare"]
-            names = ", ".join(f"{step['text']}" for step in steps)
+            names = ", ".join(f"{step['text']}" for step in steps if step["step"] not in apart)
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
             continue
-        return (f"note: the model was fitted to prepared data: {names}. The rows of this file are taken as they are.",)
+        if not names:
+            break
+        return (f"note: the model was fitted to prepared data: {names}. {what}",)
     return ()
 
 

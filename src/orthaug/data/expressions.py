@@ -201,6 +201,8 @@ def parse_named(
     for word in re.findall(r"\b[^\W\d]\w*", unicodedata.normalize("NFKC", text)):
         if word not in known and word not in FUNCTIONS and not keyword.iskeyword(word):
             hint = nearest(word, known) or f"; known are {', '.join(known)}"
+            if word == "pi":
+                hint = "; write 3.141592653589793, or give a channel in degrees a `scale`"
             raise InputError(f"{where} = {text}: unknown name '{word}'{(hints or {}).get(word, hint)}.")
     try:
         return parse(text, known)

@@ -7,6 +7,7 @@ import re
 import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,8 @@ _LEVELS = 20  # of a signal at least, for one with fewer stands at its extremes 
 _COARSE = 0.02  # steps of a signal over its standard deviation that are told
 SPIKE = 15.0
 """Deviations from its neighbours that a sample is a spike from on."""
+_LOWER = (SPIKE, 10.0, 7.0, 5.0, 4.0)  # tried where a sample stands far outside the range of all others
+_BEYOND = 0.5  # of that range
 _OUTSIDE = 2.5  # interquartile ranges from the middle
 _FEW = 0.01  # share of samples that spikes are at most
 _SAME = 1e-6  # relative
@@ -87,12 +90,29 @@ class Column:
     @property
     def spikes(self) -> int:
         """Samples far from all their neighbours and from what the signal usually is, where they are few."""
+        return self._spiky[1]
+
+    @property
+    def threshold(self) -> float:
+        """The step `outliers` takes the spikes away with it: `SPIKE`, lower where they need it."""
+        return self._spiky[0]
+
+    @cached_property
+    def _spiky(self) -> tuple[float, int]:
         x = self.values[: self.filled]
         run = Run(x[:, None], np.arange(float(len(x))), (self.name,), 0, 1.0)
-        wild = np.isfinite(x) & ~np.isfinite(Outliers(threshold=SPIKE).apply(run).values[:, 0])
         usual = np.quantile(self.finite, [0.25, 0.75])
-        count = int((wild & (np.abs(x - usual.mean()) > _OUTSIDE * np.ptp(usual))).sum())
-        return count if count <= max(1.0, _FEW * len(x)) else 0
+        far = np.abs(x - usual.mean()) > _OUTSIDE * np.ptp(usual)
+        wild = {}
+        for threshold in _LOWER:
+            marked = np.isfinite(x) & ~np.isfinite(Outliers(threshold=threshold).apply(run).values[:, 0])
+            wild[threshold] = marked & far
+        rest = x[np.isfinite(x) & ~wild[_LOWER[-1]]]
+        beyond = _BEYOND * np.ptp(rest)
+        alone = wild[_LOWER[-1]] & ((x > rest.max() + beyond) | (x < rest.min() - beyond))
+        threshold = next(threshold for threshold in _LOWER if not (alone & ~wild[threshold]).any())
+        count = int(wild[threshold].sum())
+        return (threshold, count) if count <= max(1.0, _FEW * len(x)) else (SPIKE, 0)
 
     @property
     def quantum(self) -> float | None:

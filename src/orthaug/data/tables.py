@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -21,6 +21,8 @@ from orthaug.data.variables import ENDINGS, foreign, read_variables, short, vari
 
 _SMALL = 4_000_000  # bytes of a text file that NumPy reads sooner than pandas is imported
 _NAMED = 30  # columns that a message lists
+_REMARK = ("#", "%")  # lines above the header that begin so
+_NUMBER = re.compile(r'[\s"]*[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?[\s"]*')
 _DECIMAL_COMMA = re.compile(r'(?:^|;)[ \t]*"?[ \t]*[+-]?(?:\d[\d.]*)?,\d+', re.MULTILINE)
 
 
@@ -222,19 +224,31 @@ def _text_header(path: Path) -> tuple[list[str], int, str]:
 
 
 def _header(path: Path) -> tuple[list[str], int, str]:
-    """Column names, the number of lines up to and with the header, and the separator."""
+    """Column names, the number of lines up to and with the header, and the separator; remarks above it are skipped."""
     with path.open(encoding="utf-8-sig", newline="") as file:
-        line, number = "", 0
-        while not line.strip():
-            line, number = file.readline(), number + 1
-            if not line:
-                raise InputError(f"{path}: the file holds only blank lines.")
+        line, number = _next_line(file, 0)
+        if not line:
+            raise InputError(f"{path}: the file holds only blank lines.")
+        while line.lstrip().startswith(_REMARK):
+            after, further = _next_line(file, number)
+            if not after or any(map(_NUMBER.fullmatch, re.split(r"[,;\t]", after))):
+                break  # the names themselves stand behind the sign, right above the numbers
+            line, number = after, further
     if "\0" in line:
         raise csv.Error("NUL byte")
     tab = path.suffix.lower() == ".tsv"
     bare = re.sub(r'"[^"]*"', "", line)  # separators inside quotes do not count
     separator = "\t" if tab else ";" if ";" in bare and "," not in bare else ","
     return [name.strip() for name in next(csv.reader([line], delimiter=separator))], number, separator
+
+
+def _next_line(file: TextIO, number: int) -> tuple[str, int]:
+    """The next line that is not blank, empty at the end of the file, and its number, after line `number`."""
+    for line in iter(file.readline, ""):
+        number += 1
+        if line.strip():
+            return line, number
+    return "", number
 
 
 def _up_to_last(held: np.ndarray) -> int:

@@ -115,7 +115,7 @@ A step of a fitted model, {target.summary}. Written by orthaug {__version__}.
 
 Model sha256: `{program.digest}` (`checksum` in `model.json`)
 
-Sampling time: {program.sampling_time!r} s. A step takes the inputs of one sample and gives the outputs of that sample.
+Sampling time: {program.sampling_time:.9g} s. A step takes the inputs of one sample and gives its outputs.
 
 {_listed("Inputs, in order:", program.inputs)}
 {_listed("Outputs:", program.outputs)}

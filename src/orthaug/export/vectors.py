@@ -15,6 +15,7 @@ from orthaug.export.program import Program
 from orthaug.models.model import Model
 
 _ROWS, _SEED = 64, 0
+_HELD = 8  # rows of each level: under a new one in every row an inertia hardly moves
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,13 +28,13 @@ class Vectors:
 
     @classmethod
     def of(cls, model: Any, program: Program) -> Vectors:
-        """A free run under random inputs, in the range that the model was trained on where that is known.
+        """A free run under random levels of the inputs, in the range that the model was trained on where that is known.
 
         It starts from zero, or from one where zero has no output.
         """
         rng = np.random.default_rng(_SEED)
         middle, reach = _range(model, program)
-        drawn = middle + reach * rng.uniform(-1, 1, (_ROWS, program.held))
+        drawn = middle + reach * np.repeat(rng.uniform(-1, 1, (_ROWS // _HELD, program.held)), _HELD, axis=0)
         inputs = drawn if program.ends == 1 else np.concatenate([drawn, np.roll(drawn, -1, axis=0)], axis=1)
 
         def run(state: Any, rows: Any) -> Any:

@@ -74,8 +74,8 @@ def check_text(result: CheckResult) -> str:
     if result.bias:
         lines += [
             "",
-            "Bias of each parameter if a term is missing from the physics. Size: its share of the output's deviation,",
-            "1 % where no coefficient is given. Removed by: a measure, if some weighting of these points leaves none;",
+            "Bias of each parameter if a term is missing from the physics. Size: its share of the output's deviation, "
+            "1 % where no coefficient is given. Removed by: a measure, if some weighting of these points leaves none; "
             "the learner, if it sees the term, from what it could not imitate.",
             *_suspect_lines(result.bias),
         ]

@@ -19,6 +19,7 @@ _RANK = 1e-9  # singular value over the largest
 PERSISTENCE = 20  # the highest order of excitation that is looked for
 _EXCITED = 1e-6  # singular value over the largest
 _DELAY = 20  # the largest delay that is looked for
+_SURE = 3.1  # standard errors: 5 % for 21 lags together
 _LEVEL = 0.1  # mean over standard deviation, from which on a constant is part of the physics
 
 
@@ -30,7 +31,7 @@ class FirstModel:
     offset: bool
     """Whether the signals have a level, so that the physics needs a constant."""
     delays: tuple[int | None, ...]
-    """Of each input by its cross-correlation; None where it is not seen."""
+    """First lag of each input that is significant beside the output's own past; None where none is."""
     persistence: tuple[int, ...]
     """Up to which order each input excites; `PERSISTENCE` stands for that or more."""
     free_run: tuple[float, ...]
@@ -49,9 +50,7 @@ def first_model(record: Record) -> FirstModel | None:
     excited = tuple(_persistence(record, i) for i in range(len(record.inputs)))
     usual = [tuple(late if delay is None else delay for delay in delays) for late in (1, 0)]
     best: list[tuple[float, int, Orders, tuple[float, ...]]] = []
-    for nk in dict.fromkeys(
-        [*usual, *((late,) * len(delays) for late in (1, 0))]
-    ):  # a correlation may miss the first lags
+    for nk in dict.fromkeys([*usual, *((late,) * len(delays) for late in (1, 0))]):  # a test may miss the first lags
         for na, n in product(range(_MOST + 1), range(1, _MOST + 1) if record.inputs else [0]):
             orders = Orders(na, tuple(max(1, min(n, order)) for order in excited), nk)
             errors = _errors(record, orders, offset)
@@ -75,15 +74,36 @@ def _first_rows(experiments: tuple[Experiment, ...], most: int) -> tuple[Experim
 
 
 def _delay(record: Record, number: int) -> int | None:
-    """The shortest delay with which an input acts on any output."""
-    long = tuple(e for e in record.experiments if len(e) > 2 * _DELAY)
+    """The first lag at which an input acts on any output, beside the output's past and all other lags of the inputs.
+
+    Where rows or excitation do not allow that, by the cross-correlation with the input made white.
+    """
     found = []
-    for j, output in enumerate(record.outputs):
-        own = tuple(replace(e, outputs=e.outputs[:, [j]]) for e in long)
-        if own:
-            found.append(correlated_delay(replace(record, outputs=(output,), experiments=own), number, _DELAY))
+    long = tuple(e for e in record.experiments if len(e) > 2 * _DELAY)
+    for j, output in enumerate(record.outputs if long else ()):
+        one = tuple(replace(e, outputs=e.outputs[:, [j]]) for e in long)
+        own = replace(record, outputs=(output,), experiments=one)
+        tested = _tested_delay(own, number)
+        found.append(correlated_delay(own, number, _DELAY) if tested is None else tested)
     seen = [lag for lag in found if lag is not None]
     return min(seen) if seen else None
+
+
+def _tested_delay(record: Record, number: int) -> int | None:
+    """By t-tests, at 5 % for all lags together; None where none is significant or the lags cannot be told apart."""
+    orders = Orders(_MOST, (_DELAY + 1,) * len(record.inputs), (0,) * len(record.inputs))
+    phi = np.concatenate([_rows(e, 0, orders, _DELAY, True) for e in record.experiments])
+    y = np.concatenate([e.outputs[_DELAY:, 0] for e in record.experiments])
+    q, r = np.linalg.qr(phi / np.maximum(np.linalg.norm(phi, axis=0), 1e-300))
+    if len(y) < 2 * orders.size or np.linalg.cond(r) > 1 / _RANK:
+        return None
+    theta = np.linalg.solve(r, q.T @ y)
+    noise = float(np.linalg.norm(y - q @ (r @ theta))) / np.sqrt(len(y) - len(theta))
+    std = noise * np.linalg.norm(np.linalg.inv(r), axis=1)
+    begin = _MOST + number * (_DELAY + 1)
+    lags = slice(begin, begin + _DELAY + 1)
+    over = np.flatnonzero(np.abs(theta[lags]) > _SURE * np.maximum(std[lags], 1e-300))
+    return int(over[0]) if len(over) else None
 
 
 def _persistence(record: Record, number: int) -> int:
