@@ -30,7 +30,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 
 # Tracing makes millions of objects that stay: Python's collector walks them less often.
-gc.set_threshold(200_000, 20, 100)
+gc.set_threshold(100_000, 10, 10)
 
 settings.register_profile(
     "orthaug",
