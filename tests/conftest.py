@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from collections.abc import Iterator
@@ -15,10 +16,21 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1]
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
-# Most of a test's time is XLA compiling small programs. These two leave out what only makes large ones faster: it
-# takes half of the time then. Unset, it passes as well. The workers share the cores; BLAS needs no threads of its own.
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0")
+# Most of a test's time is XLA compiling small programs. The first two leave out what only makes large ones faster: it
+# takes half of the time then. The third compiles a program in one piece: pieces are for idle cores, and there are none.
+# Unset, it passes as well. The workers share the cores; BLAS needs no threads of its own.
+_FLAGS = (
+    "xla_cpu_use_fusion_emitters=false",
+    "xla_backend_optimization_level=0",
+    "xla_cpu_parallel_codegen_split_count=1",
+)
+os.environ.setdefault("XLA_FLAGS", " ".join(f"--{flag}" for flag in _FLAGS))
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Where in the source each operation was written is not looked up for the compiler.
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
+
+# Tracing makes millions of objects that stay: Python's collector walks them less often.
+gc.set_threshold(100_000, 10, 10)
 
 settings.register_profile(
     "orthaug",
@@ -31,7 +43,7 @@ settings.register_profile(
 settings.load_profile("orthaug")
 
 
-_MOST_MAPS = 25_000  # of memory, of 65,530 that Linux gives a process: each compiled program takes about three
+_MOST_MAPS = 35_000  # of memory, of 65,530 that Linux gives a process: each compiled program takes one or more
 
 
 @pytest.fixture(autouse=True, scope="module")

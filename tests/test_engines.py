@@ -332,7 +332,8 @@ assert len(jax.devices()) == 4
 def test_devices_give_the_result_of_rows_in_memory(folder, in_memory):
     """Two of four, and all four."""
     script = DEVICES.format(tests=os.path.dirname(__file__), folder=str(folder))
-    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=4"
+    environment = os.environ | {"XLA_FLAGS": flags}
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=environment, check=False)
     assert run.returncode == 0, run.stderr
     expected, *found = (json.loads((folder / f"{kind}.json").read_text()) for kind in ("memory", "devices2", "devices"))

@@ -309,9 +309,8 @@ def _free_names(node: ast.AST) -> Iterator[ast.Name]:
 
 def _lag(node: ast.Subscript, text: str) -> Lag:
     """The raw lag that `name[k]` or `name[k-3]` stands for."""
-    piece = ast.unparse(node)
     if not isinstance(node.value, ast.Name):
-        raise InputError(f"'{text}': '{piece}' is not a channel at a lag such as y[k-1].")
+        raise InputError(f"'{text}': '{ast.unparse(node)}' is not a channel at a lag such as y[k-1].")
     name, index = node.value.id, node.slice
     if isinstance(index, ast.Name) and index.id == "k":
         return Lag(name, 0)
@@ -324,11 +323,15 @@ def _lag(node: ast.Subscript, text: str) -> Lag:
         and type(index.right.value) is int
     ):
         if isinstance(index.op, ast.Add) and index.right.value > 0:
-            raise InputError(f"'{text}': '{piece}' looks ahead; a regressor uses {name}[k] or earlier samples.")
+            raise InputError(
+                f"'{text}': '{ast.unparse(node)}' looks ahead; a regressor uses {name}[k] or earlier samples."
+            )
         if index.right.value > LARGEST_LAG:
-            raise InputError(f"'{text}': '{piece}' reaches too far back; lags up to {LARGEST_LAG} are read.")
+            raise InputError(
+                f"'{text}': '{ast.unparse(node)}' reaches too far back; lags up to {LARGEST_LAG} are read."
+            )
         return Lag(name, index.right.value)
-    raise InputError(f"'{text}': the index of '{piece}' must be k or k-1, k-2, … with a whole number.")
+    raise InputError(f"'{text}': the index of '{ast.unparse(node)}' must be k or k-1, k-2, … with a whole number.")
 
 
 def _evaluate(node: ast.expr, columns: Mapping[Lag, Any], constants: Mapping[str, float], xp: Any, text: str) -> Any:

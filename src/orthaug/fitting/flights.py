@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -46,6 +46,9 @@ def _learned(flight: Flight, first_loss: float) -> bool:
     return bool(flight.end.flown.loss < LEARNED * first_loss)
 
 
+Task = TypeVar("Task", bound="FlightTask")  # Self is nothing that run-time checks of annotations can read
+
+
 @dataclass(frozen=True, eq=False)
 class FlightTask(ABC):
     """A course, and what physics alone does on it: None before `prepared`, and where physics alone cannot fly."""
@@ -69,7 +72,7 @@ class FlightTask(ABC):
     ) -> list[Place]:
         """Where a run from the weights w may start; arguments as in `estimate`."""
 
-    def keeping(self, checkpoints: Checkpoints | None) -> Self:
+    def keeping(self: Task, checkpoints: Checkpoints | None) -> Task:
         """The same with the states of its descents kept."""
         return replace(self, plan=replace(self.plan, checkpoints=checkpoints))
 
