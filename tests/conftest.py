@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import sys
 from collections.abc import Iterator
@@ -29,9 +28,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Where in the source each operation was written is not looked up for the compiler.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 
-# Tracing makes millions of objects that stay: Python's collector walks them less often.
-gc.set_threshold(100_000, 10, 10)
-
 settings.register_profile(
     "orthaug",
     derandomize=True,
@@ -43,7 +39,12 @@ settings.register_profile(
 settings.load_profile("orthaug")
 
 
-_MOST_MAPS = 35_000  # of memory, of 65,530 that Linux gives a process: each compiled program takes one or more
+_MOST_MAPS = 15_000  # of memory, of 65,530 that Linux gives a process: each compiled program takes one or more
+
+
+def pytest_xdist_auto_num_workers() -> int:
+    """One more than cores: many tests wait for a process that they have started."""
+    return (os.cpu_count() or 1) + 1
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -14,6 +14,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import os
 import re
@@ -183,6 +184,7 @@ class Page:
             Path(block.title).write_text(block.text, encoding="utf-8")
         elif block.language == "python":
             code = "\n" * block.line + block.text
+            importlib.invalidate_caches()  # a block before may have written a module in the same instant
             with contextlib.redirect_stdout(io.StringIO()) as out:
                 exec(compile(code, str(self.path), "exec", dont_inherit=True), self.names)
             return out.getvalue()

@@ -69,3 +69,8 @@ def linear_columns(given: Problem) -> np.ndarray:
     for _ in range(2):
         columns = columns - q @ (q.T @ columns)
     return columns
+
+
+def unfolded(text: str) -> str:
+    """Printed text on one line."""
+    return " ".join(text.split())

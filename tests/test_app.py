@@ -39,7 +39,12 @@ served = pytest.mark.skipif(not HAS_PAGE or os.name != "posix", reason="no NiceG
 browsed = pytest.mark.skipif(
     not (HAS_PAGE and HAS_BROWSER) or os.name != "posix", reason="no NiceGUI, Playwright or Chromium, or no SIGINT"
 )
-MAIN = "from orthaug.commands.entry import main; main()"
+MAIN = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a process in the background may have inherited none
+from orthaug.commands.entry import main
+main()
+"""
 LATE = 30_000  # ms
 SPEC = """# kept
 [data]

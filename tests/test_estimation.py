@@ -5,6 +5,7 @@ from __future__ import annotations
 import naive
 import numpy as np
 import pytest
+from helpers import unfolded
 
 from orthaug._base.errors import InputError, RankError
 from orthaug._base.jax import jax, jnp
@@ -335,10 +336,6 @@ def test_progress_is_told(record):
 
 
 # how it ends
-
-
-def unfolded(text):
-    return " ".join(text.split())
 
 
 def test_iteration_limit(short):

@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.signal
+from helpers import unfolded
 
 import orthaug as oa
 from orthaug._base.errors import InputError
@@ -179,7 +180,7 @@ def test_the_folder_has_figures_and_a_page(folder, printed, result):
     assert (part["equation"], part["unit"]) == ("dv/dt", "m/s²") and 0.01 < part["share"] < 0.2
     assert part["share"] == pytest.approx(part["learner"] / part["physics"], rel=0.2)
     assert set(result["motion"]["substep_bias"]) == set("mck")
-    assert result["shared"]["text"] in printed
+    assert result["shared"]["text"] in unfolded(printed)
 
 
 def test_a_saved_motion_is_the_fitted_one(folder, model, result):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +23,28 @@ from orthaug.models.learners import Bound
 from orthaug.physics.problem import Problem
 
 
+def lagged(task: OneStepTask) -> Lagged:
+    """The dynamics of a problem and its learner."""
+    problem = task.problem
+    return Lagged(problem.baseline, problem.features, problem.layout, problem.outputs, task.bound)
+
+
+def declared(task: OneStepTask, criterion: Criterion) -> dict[str, Any]:
+    """What a plan has of its task and its criterion, wherever the segments are."""
+    problem = task.problem
+    return {
+        "record": problem.record,
+        "criterion": criterion,
+        "flown": criterion.flown,
+        "rms": task.rms,
+        "deviation": problem.deviation,
+        "output_weights": problem.weight.choice,
+        "scaling": task.scaling,
+        "unit": task.unit,
+        "task": task,
+    }
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FlightPlan(Course):
     """A problem laid out in segments, beside its rows laid out for one step."""
@@ -36,23 +59,9 @@ class FlightPlan(Course):
         Raises:
             InputError: nothing would be scored.
         """
-        problem, flown, sums = task.problem, criterion.flown, SegmentSums.of(task.engine)
-        assert flown is not None, "one step ahead is `OneStepTask`'s"
-        dynamics = Lagged(problem.baseline, problem.features, problem.layout, problem.outputs, task.bound)
-        return cls(
-            record=problem.record,
-            dynamics=dynamics,
-            **Layout.of(problem.record, dynamics, criterion, shares=task.engine.shares)._asdict(),
-            criterion=criterion,
-            flown=flown,
-            rms=task.rms,
-            deviation=problem.deviation,
-            output_weights=problem.weight.choice,
-            scaling=task.scaling,
-            unit=task.unit,
-            sums=sums,
-            task=task,
-        )
+        dynamics, record, sums = lagged(task), task.problem.record, SegmentSums.of(task.engine)
+        laid = Layout.of(record, dynamics, criterion, shares=task.engine.shares)
+        return cls(**laid._asdict(), **declared(task, criterion), dynamics=dynamics, sums=sums)
 
     @property
     def problem(self) -> Problem:

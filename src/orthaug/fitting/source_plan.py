@@ -13,7 +13,7 @@ from orthaug.data.record import Record
 from orthaug.data.sources import Source
 from orthaug.fitting.course import COLOUR_ROWS, COLOURED_STEPS, Looked
 from orthaug.fitting.criteria import Criterion
-from orthaug.fitting.flight_plan import FlightPlan
+from orthaug.fitting.flight_plan import FlightPlan, declared, lagged
 from orthaug.fitting.initial_states import InitialStates, Start
 from orthaug.fitting.objective import RUNAWAY, FreeRunObjective
 from orthaug.fitting.one_step import OneStepTask
@@ -23,7 +23,6 @@ from orthaug.fitting.segments import lay_segments
 from orthaug.fitting.solvers.descent import Descent
 from orthaug.fitting.source_runs import WholeRuns
 from orthaug.fitting.source_segments import Found, SourceSegments, look
-from orthaug.models.lagged import Lagged
 from orthaug.physics.streamed import StreamedProblem
 
 _SETTLING = 4  # Gauss-Newton steps of a witness's states
@@ -51,7 +50,7 @@ class SourcePlan(FlightPlan):
                 "`segment` is 0, whole experiments, which need their rows in memory; give a number of steps, such as "
                 "512, or a Record."
             )
-        dynamics = Lagged(problem.baseline, problem.features, problem.layout, problem.outputs, task.bound)
+        dynamics = lagged(task)
         empty, source, washout = problem.basis.form.empty, problem.source, flown.washout
         found = Found.of(task.engine.passes(look, source.partitions))
         longest = max(found.rows) - dynamics.first_row
@@ -65,25 +64,9 @@ class SourcePlan(FlightPlan):
             whole = WholeRuns(task.engine, source.partitions, empty, min(washout, longest - 1), count)
             if segments.steps < COLOURED_STEPS <= longest:
                 colour = SourceSegments.cut(*made, 0, washout, COLOUR_ROWS)
-        return cls(
-            record=problem.record,
-            dynamics=dynamics,
-            segments=segments,
-            whole=whole,
-            colour=colour,
-            criterion=criterion,
-            flown=flown,
-            rms=task.rms,
-            deviation=problem.deviation,
-            output_weights=problem.weight.choice,
-            scaling=task.scaling,
-            unit=task.unit,
-            sums=sums,
-            task=task,
-            source=source,
-            found=found,
-            empty=empty,
-        )
+        laid: dict[str, Any] = {"segments": segments, "whole": whole, "colour": colour}
+        cut = {"source": source, "found": found, "empty": empty}
+        return cls(**laid, **cut, **declared(task, criterion), dynamics=dynamics, sums=sums)
 
     @property
     def lengthens(self) -> bool:
