@@ -311,7 +311,7 @@ def test_the_server_listens_on_this_machine_alone_and_asks_for_the_token(server)
             return error.code
 
     assert server.base.startswith("http://127.0.0.1:")
-    places = ("", "work/x", "work/x/get/spec.toml", "_nicegui_ws/socket.io/?EIO=4&transport=polling")
+    places = ("", "session/x", "session/x/get/spec.toml", "_nicegui_ws/socket.io/?EIO=4&transport=polling")
     assert [status(server.base + place) for place in places] == [403] * 4
     assert status(server.url + "x") == 403 and status(server.url, Host="evil.example") == 403
     port = server.base.rstrip("/").rpartition(":")[2]

@@ -15,7 +15,8 @@ from orthaug._base.folders import whole_file
 from orthaug._base.warning import Warning
 from orthaug.commands.run import Reading, held_outputs
 from orthaug.data.parquet_source import open_parquet
-from orthaug.data.sources import Source, rows_of
+from orthaug.data.sources import Source
+from orthaug.data.tables import parquet_file
 
 if TYPE_CHECKING:
     from orthaug.models.model import Model
@@ -42,6 +43,9 @@ def long_run(model: Path, data: Path, reading: Reading, *, free: bool) -> LongRu
     """
     if data.suffix.lower() != ".parquet" or reading != Reading(columns=reading.columns) or not data.is_file():
         return None
+    with parquet_file(data) as file:
+        if file.metadata.num_rows <= LONG:
+            return None
     from orthaug.models.model import Model
     from orthaug.models.storage import load
 
@@ -56,7 +60,7 @@ def long_run(model: Path, data: Path, reading: Reading, *, free: bool) -> LongRu
         time=loaded.time_column,
         columns=reading.columns,
     )
-    return LongRun(loaded, source, free) if rows_of(source) > LONG else None
+    return LongRun(loaded, source, free)
 
 
 def write(run: LongRun, out: Path | None, *, force: bool = False) -> tuple[Scores | None, list[Warning]]:

@@ -90,7 +90,7 @@ class Dask(Threads):
 
     @property
     def shares(self) -> int:
-        return max(len(self.client.scheduler_info()["workers"]), 1)
+        return max(len(self.client.nthreads()), 1)
 
     def place(self, chunks: Any, like: Sequence[Any] | None = None) -> Held:
         pieces = apart(chunks)

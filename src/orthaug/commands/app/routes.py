@@ -33,13 +33,13 @@ def application(sessions: Sessions, spec: Path | None) -> FastAPI:
             session = sessions.new(spec)
         except InputError as error:
             return _told(str(error), 503)
-        return RedirectResponse(f"/work/{session.key}", 303)
+        return RedirectResponse(f"/session/{session.key}", 303)
 
-    @app.put("/work/{key}/file/{name}")
+    @app.put("/session/{key}/file/{name}")
     async def drop(key: str, name: str, request: Request) -> Response:
         return await _kept(sessions, key, name, request)
 
-    @app.get("/work/{key}/get/{what}")
+    @app.get("/session/{key}/get/{what}")
     def get(key: str, what: str, show: bool = False) -> Response:
         session = sessions.find(key)
         try:
@@ -52,7 +52,7 @@ def application(sessions: Sessions, spec: Path | None) -> FastAPI:
             return FileResponse(file, headers={"cache-control": "no-store"}, media_type="text/html")
         return FileResponse(file, filename=what, headers={"cache-control": "no-store"})
 
-    @ui.page("/work/{key}", title="orthaug", response_timeout=20)
+    @ui.page("/session/{key}", title="orthaug", response_timeout=20)
     def work(key: str) -> None:
         session = sessions.find(key)
         Page(session).draw() if session is not None else Page.gone()

@@ -53,9 +53,9 @@ class ReportView:
             with ui.element("div").classes("fields report-line"):
                 if len(there) > 1:
                     choice("report", {name: _REPORTS[name] for name in there}, self.shown, self._show, "bare")
-                link("Download the report", f"/work/{session.key}/get/{self.shown}")
+                link("Download the report", f"/session/{session.key}/get/{self.shown}")
             frame = ui.element("iframe").classes("report").props('sandbox="allow-scripts" title="report"')
-            frame.props(f'src="/work/{session.key}/get/{self.shown}?show=true&n={session.versions["work"]}"')
+            frame.props(f'src="/session/{session.key}/get/{self.shown}?show=true&n={session.versions["work"]}"')
 
     def _show(self, name: str) -> None:
         self.shown, self._state = name, None
@@ -107,7 +107,7 @@ class ExportView:
                 with ui.element("div").classes("grow"):
                     text(label, "p", "strong")
                     text(hint, "p", "hint")
-                link(name, f"/work/{session.key}/get/{name}")
+                link(name, f"/session/{session.key}/get/{name}")
         if not files:
             text("There is nothing to take yet.", "p", "hint")
             return
@@ -131,7 +131,7 @@ class ExportView:
                     if why and why != "…":
                         note(why, "bad")
                 if why == "":
-                    link(f"{target}.zip", f"/work/{session.key}/get/{target}.zip")
+                    link(f"{target}.zip", f"/session/{session.key}/get/{target}.zip")
                 elif why == "…":
                     text("writing …", "p", "note busy").props("role=status")
                 else:
