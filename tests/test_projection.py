@@ -267,6 +267,11 @@ def test_least_squares_through_blocks_has_the_digits_of_qr(name, sizes):
 
 @pytest.mark.parametrize("name", NIST)
 def test_nist_digits_through_blocks(data_folder, name):
+    """On the average of ten orders of the rows: what one order gives is luck, and differs between kinds of BLAS."""
     phi, y, certified = nist(data_folder, name)
-    found = digits(through_blocks(phi, y, [5, 3]), certified["beta"])
-    assert found >= digits(scaled_qr(phi[:, 0], y[:, 0]), certified["beta"]) - 1.0
+    rng, found, reference = np.random.default_rng(3), [], []
+    for _ in range(10):
+        order = rng.permutation(len(y))
+        found.append(digits(through_blocks(phi[order], y[order], [5, 3]), certified["beta"]))
+        reference.append(digits(scaled_qr(phi[order, 0], y[order, 0]), certified["beta"]))
+    assert np.mean(found) >= np.mean(reference) - 1.0
