@@ -11,7 +11,8 @@ from test_cli import make_project, run
 
 import orthaug as oa
 from orthaug._base.errors import InputError
-from orthaug.data.preparation import warnings_of
+from orthaug.data.preparation import steps_again, warnings_of
+from orthaug.data.record import Prepared
 
 T = 0.01
 TIME = T * np.arange(1000)
@@ -214,6 +215,85 @@ def test_a_spec_prepares_every_part_and_the_result_tells(tmp_path, monkeypatch):
         spec.write_text(f"{text}[[data.prepare]]\n{wrong}")
         done = run("check", spec)
         assert done.code == 2 and message in done.err, done.err
+
+
+STEPS = (
+    ('step = "detrend"\n', oa.Detrend()),
+    ('step = "outliers"\nchannels = ["y"]\n', oa.Outliers(channels=("y",))),
+    ('step = "fill"\nmost = 4\n', oa.Fill(most=4)),
+    ('step = "decimate"\nfactor = 2\n', oa.Decimate(factor=2)),
+    ('step = "shift"\nchannel = "u"\nsamples = 1\n', oa.Shift("u", 1)),
+)
+
+
+@pytest.fixture(scope="module")
+def decimated(tmp_path_factory):
+    """A result of data that went through many steps, with files as they were measured beside it."""
+    folder = tmp_path_factory.mktemp("decimated")
+    spec = make_project(folder)
+    sections = "".join(f"[[data.prepare]]\n{text}" for text, _ in STEPS)
+    spec.write_text(f"{spec.read_text()}{sections}")
+    rows = pd.read_csv(folder / "run.csv")
+    rows.loc[[60, 61, 90], "y"] = [np.nan, np.nan, 50.0]
+    rows.to_csv(folder / "run.csv", index=False)
+    rows.drop(columns="y").to_csv(folder / "inputs.csv", index=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        done = run("fit", spec, "--out", "result")
+        assert done.code == 0, done.err
+    return folder
+
+
+def test_a_saved_model_knows_how_its_data_were_prepared(decimated, monkeypatch):
+    monkeypatch.chdir(decimated)
+    model = oa.load("result")
+    assert model.preparation == tuple(step for _, step in STEPS) and model.prepared[1].samples == 1
+    oa.save(model, "again", force=True)
+    assert oa.load("again").prepared == model.prepared
+    raw = {"inputs": ["u"], "outputs": ["y"], "sampling_time": model.sampling_time / 2}
+    record = oa.read_record("run.csv", **raw, prepare=model.preparation)
+    done = run("simulate", "again", "run.csv", "--prepare", "--out", "free.csv", "--force")
+    assert done.code == 0 and "The same was done to the rows of this file." in done.err.replace("\n  ", " "), done.err
+    free = pd.read_csv("free.csv")
+    (expected,) = model.simulate(record).trajectories
+    np.testing.assert_allclose(free["y_model"], expected.model[:, 0], rtol=1e-12)
+    np.testing.assert_allclose(np.diff(free["time"]), model.sampling_time)
+    done = run("predict", "result", "run.csv", "--horizon", "3", "--prepare", "--out", "ahead.csv", "--force")
+    assert done.code == 0 and len(pd.read_csv("ahead.csv")) == len(free)
+
+
+def test_outputs_that_a_file_lacks_are_not_prepared(decimated, monkeypatch):
+    monkeypatch.chdir(decimated)
+    done = run("simulate", "result", "inputs.csv", "--prepare", "--out", "driven.csv", "--force")
+    assert done.code == 0, done.err
+    record = oa.read_record(
+        "run.csv",
+        inputs=["u"],
+        sampling_time=oa.load("result").sampling_time / 2,
+        prepare=[STEPS[0][1], STEPS[3][1], STEPS[4][1]],
+    )
+    (expected,) = oa.load("result").simulate(record, initial="zero").trajectories
+    np.testing.assert_allclose(pd.read_csv("driven.csv")["y_model"], expected.model[:, 0], rtol=1e-12)
+
+
+def test_training_files_are_prepared_again_for_a_split_and_for_tracking(decimated, monkeypatch):
+    """Under the measure of the training data a split of an orthogonal fit changes nothing."""
+    monkeypatch.chdir(decimated)
+    fitted = json.loads((decimated / "result" / "result.json").read_text())["parameters"]
+    done = run("split", "result", "run.csv", "--json")
+    assert done.code == 0, done.err
+    found = json.loads(done.out)["parameters"]
+    np.testing.assert_allclose([p["value"] for p in found], [p["value"] for p in fitted], rtol=1e-9)
+    done = run("track", "result", "--data", "run.csv", "--training", "run.csv", "--out", "tracked")
+    assert done.code == 0, done.err
+    done = run("explain", "result", "run.csv")
+    assert "prepared data: detrend" in done.err and "1 sample marked as missing" in done.err, done.err
+
+
+def test_instants_are_resampled_as_those_of_the_training_data():
+    resampled = Prepared("resample", {"method": "linear"})
+    steps, step = steps_again([resampled, Prepared("decimate", {"factor": 5, "phase": "zero"})], ["u"], 0.1)
+    assert steps == (oa.Resample(sampling_time=0.02), oa.Decimate(factor=5)) and step == 0.02
 
 
 def test_rows_that_stay_in_their_files_are_not_prepared(tmp_path, monkeypatch):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from orthaug._base.errors import InputError
+from orthaug.commands.run import prepared_notes
 from orthaug.export import exporting
 
 
@@ -19,8 +20,8 @@ def check(model: Path, to: str, out: Path, name: str, *, force: bool = False) ->
         raise InputError(f"{out}: holds the model {model}, which is exported; give another folder.")
 
 
-def run(model: Path, to: str, out: Path, name: str, *, force: bool = False) -> None:
-    """Load the model and write the folder.
+def run(model: Path, to: str, out: Path, name: str, *, force: bool = False) -> tuple[str, ...]:
+    """Load the model and write the folder; what to know of the code.
 
     Raises:
         InputError: no model there, or one that has no code.
@@ -33,3 +34,5 @@ def run(model: Path, to: str, out: Path, name: str, *, force: bool = False) -> N
     except InputError as error:
         own = str(error).startswith(str(out))
         raise InputError(str(error) if own else f"{model}: {error}") from None
+    what = "The code stands for data after these steps: a delay by `shift`, say, is not in it."
+    return prepared_notes(loaded, what, apart=("outliers", "fill"))

@@ -20,6 +20,7 @@ from orthaug.commands.program import (
     ModelPath,
     OutFile,
     OutFolder,
+    Prepare,
     Rows,
     app,
     prepare_jax,
@@ -40,13 +41,14 @@ def simulate(
     rows: Rows = None,
     every: Every = 1,
     column: Columns = None,
+    prepare: Prepare = False,
     force: Force = False,
 ) -> None:
     """Free run of a saved model on a data file."""
     from orthaug.commands import run
     from orthaug.commands.folder import check_file
 
-    reading = run.Reading.of(missing, rows, every, column or ())
+    reading = run.Reading.of(missing, rows, every, column or (), prepare)
     if initial is None and _written_long(model, data, reading, out, force, free=True):
         return
     opened = run.open_run(model, data, reading=reading)
@@ -71,13 +73,14 @@ def predict(
     rows: Rows = None,
     every: Every = 1,
     column: Columns = None,
+    prepare: Prepare = False,
     force: Force = False,
 ) -> None:
     """H-step-ahead prediction of a saved model."""
     from orthaug.commands import run
     from orthaug.commands.folder import check_file
 
-    reading = run.Reading.of(missing, rows, every, column or ())
+    reading = run.Reading.of(missing, rows, every, column or (), prepare)
     plain = horizon == 1 and initial is None and not observer
     if plain and _written_long(model, data, reading, out, force, free=False):
         return
@@ -131,11 +134,13 @@ def explain(
 ) -> None:
     """Which terms the learner of a saved model has found, and what to write into the physics."""
     from orthaug.commands.explain import explain_model
-    from orthaug.commands.run import open_run
+    from orthaug.commands.run import Reading, open_run
     from orthaug.reports.explanation_text import explain_text
 
-    opened = open_run(model, data)
+    opened = open_run(model, data, reading=Reading(prepare=True))
     prepare_jax()
+    for line in opened.notes:
+        streams.say(line)
     result = explain_model(opened, degree=degree, functions=functions or (), most=most)
     streams.echo(result.to_json() if as_json else explain_text(result))
 
@@ -150,13 +155,10 @@ def export(
 ) -> None:
     """A saved model as code that needs no orthaug."""
     from orthaug.commands import export as exporting
-    from orthaug.commands.run import prepared_notes
 
     exporting.check(model, to, out, name, force=force)
     prepare_jax()
-    exporting.run(model, to, out, name, force=force)
-    what = "The code stands for data after these steps: a delay by `shift`, say, is not in it."
-    for line in prepared_notes(model, what, apart=("outliers", "fill")):
+    for line in exporting.run(model, to, out, name, force=force):
         streams.say(line)
     streams.echo(f"written to {out}")
 
@@ -249,7 +251,7 @@ def _written_long(model: Path, data: Path, reading: Reading, out: Path | None, f
     check_file(out, model, data, force=force)
     prepare_jax()
     scored, warnings = long_run.write(run, out, force=force)
-    for line in (*prepared_notes(model), *(f"warning: {warning.text}" for warning in warnings)):
+    for line in (*prepared_notes(run.model), *(f"warning: {warning.text}" for warning in warnings)):
         streams.say(line)
     say = streams.say if out is None else streams.echo
     if scored is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -16,6 +15,7 @@ from orthaug._base.errors import InputError, MissingSampleError
 from orthaug._base.folders import whole_file
 from orthaug._base.warning import Warning
 from orthaug.commands.parts import long_stretches
+from orthaug.data.preparation import steps_again
 from orthaug.data.readers import read_record
 from orthaug.data.record import Channel, Record
 from orthaug.data.tables import check_readable, has_column
@@ -34,9 +34,11 @@ class Reading:
     rows: tuple[int, int] | None = None
     every: int = 1
     columns: Mapping[str, str] = field(default_factory=dict)
+    prepare: bool = False
+    """Whether the rows go through the steps that the model's training data went through."""
 
     @classmethod
-    def of(cls, missing: str, rows: str | None, every: int, columns: Sequence[str]) -> Reading:
+    def of(cls, missing: str, rows: str | None, every: int, columns: Sequence[str], prepare: bool = False) -> Reading:
         """Of the options of a command.
 
         Raises:
@@ -51,7 +53,7 @@ class Reading:
             if not (name and equal and column):
                 raise InputError(f"--column: found '{text}'; expected NAME=COLUMN, such as position=yVal.")
             named[name] = column
-        return cls(missing, read_rows(rows), every, named)
+        return cls(missing, read_rows(rows), every, named, prepare)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,14 +104,12 @@ def open_run(
     elif held:
         missing = [c.name for c in loaded.outputs if c not in held]
         raise InputError(f"{data}: has some of the model's outputs but not {', '.join(missing)}; give all or none.")
-    step = None if loaded.time_column else loaded.sampling_time / reading.every
-    options = {"rows": reading.rows, "every": reading.every, "columns": reading.columns, "missing": reading.missing}
-    channels = {"inputs": loaded.inputs, "outputs": held}
     try:
-        record = read_record(data, **channels, sampling_time=step, time=loaded.time_column, **options)
+        record = record_for(loaded, data, held, reading)
     except MissingSampleError as error:
         raise InputError(f"{error} --missing skip leaves such rows out.") from None
-    rows, told = len(record) + record.missing, prepared_notes(model)
+    what = _DONE if reading.prepare else _RAW
+    rows, told = len(record) + record.missing, prepared_notes(loaded, what)
     if record.missing:
         estimated = need_outputs and loaded.form.states and not loaded.form.memory  # a state to predict from
         first = loaded.form.first_row + ahead + bool(estimated)
@@ -118,25 +118,47 @@ def open_run(
     return ModelOnData(loaded, record, data, rows, told)
 
 
+def record_for(model: Model | MotionModel, data: Path, outputs: Sequence[Channel], reading: Reading) -> Record:
+    """A model's inputs, and some outputs, from a file.
+
+    Raises:
+        InputError: as `read_record`.
+    """
+    steps, step = (), model.sampling_time
+    if reading.prepare:
+        steps, step = steps_again(model.prepared, [c.name for c in (*model.inputs, *outputs)], step)
+    return read_record(
+        data,
+        inputs=model.inputs,
+        outputs=outputs,
+        sampling_time=None if model.time_column else step / reading.every,
+        time=model.time_column,
+        rows=reading.rows,
+        every=reading.every,
+        columns=reading.columns,
+        missing=reading.missing,
+        prepare=steps,
+    )
+
+
 def held_outputs(model: Model | MotionModel, data: Path, reading: Reading) -> list[Channel]:
     """The outputs that a file has columns of."""
     return [c for c in model.outputs if has_column(data, reading.columns.get(c.name, c.file_column))]
 
 
-def prepared_notes(
-    model: Path, what: str = "The rows of this file are taken as they are.", apart: Sequence[str] = ()
-) -> tuple[str, ...]:
-    """What the result that a model lies in tells of the preparation of its data."""
-    for folder in (model, model.parent):
-        try:
-            steps = json.loads((folder / "result.json").read_text(encoding="utf-8"))["data"]["prepare"]
-            names = ", ".join(f"{step['text']}" for step in steps if step["step"] not in apart)
-        except (OSError, ValueError, KeyError, TypeError, RecursionError):
-            continue
-        if not names:
-            break
-        return (f"note: the model was fitted to prepared data: {names}. {what}",)
-    return ()
+_RAW = "The rows of this file are taken as they are; --prepare does the same to them."
+_DONE = "The same was done to the rows of this file."
+
+
+def prepared_notes(model: Model | MotionModel, what: str = _RAW, apart: Sequence[str] = ()) -> tuple[str, ...]:
+    """What to know of a model whose training data were prepared.
+
+    Args:
+        what: stands behind the steps.
+        apart: kinds of steps that are not told.
+    """
+    told = [done.text for done in model.prepared if done.step not in apart]
+    return (f"note: the model was fitted to prepared data: {', '.join(told)}. {what}",) if told else ()
 
 
 def read_initial(initial: str | None, opened: ModelOnData) -> str | Any:

@@ -10,8 +10,7 @@ import numpy as np
 
 from orthaug._base.errors import InputError
 from orthaug._base.warning import Warning
-from orthaug.commands.run import ModelOnData
-from orthaug.data.readers import read_record
+from orthaug.commands.run import ModelOnData, Reading, record_for
 from orthaug.data.record import Record
 from orthaug.data.tables import check_readable
 from orthaug.inference.measures import Measure, Support
@@ -27,11 +26,8 @@ def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | Non
     for path in data:
         check_readable(path)
     loaded = load(model)
-    step = None if loaded.time_column else loaded.sampling_time
-    inputs, outputs, time = loaded.inputs, loaded.outputs, loaded.time_column
-    records = [
-        read_record(path, inputs=inputs, outputs=outputs, sampling_time=step, time=time, rows=rows) for path in data
-    ]
+    reading = Reading("skip", rows, prepare=True)  # of rows with missing cells none were trained on
+    records = [record_for(loaded, path, loaded.outputs, reading) for path in data]
     return ModelOnData(loaded, Record.join(records), data[0])
 
 

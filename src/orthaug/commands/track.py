@@ -16,8 +16,8 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
 from orthaug._base.warning import Warning
 from orthaug.commands.folder import not_a_result
+from orthaug.commands.run import Reading, record_for
 from orthaug.commands.split import open_training
-from orthaug.data.readers import read_record
 from orthaug.data.record import Record
 from orthaug.data.tables import check_readable
 from orthaug.physics.parameters import PhysicsMap
@@ -76,19 +76,9 @@ def open_track(
         from orthaug.fitting.recursive_start import MOTION
 
         raise InputError(f"{model}: {MOTION}")
-    step = None if loaded.time_column else loaded.sampling_time
     records, files = [], []
     for path in data:
-        records.append(
-            read_record(
-                path,
-                inputs=loaded.inputs,
-                outputs=loaded.outputs,
-                sampling_time=step,
-                time=loaded.time_column,
-                missing="skip",
-            )
-        )
+        records.append(record_for(loaded, path, loaded.outputs, Reading("skip", prepare=True)))
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
         files.append(FileResult(file=str(path), sha256=digest, rows=len(records[-1])))
     given = open_training(model, training, rows).record if training else None

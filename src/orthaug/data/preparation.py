@@ -124,6 +124,29 @@ def _pieces(run: Run, place: Experiment, keep: bool) -> list[Experiment]:
     return pieces
 
 
+def steps_again(
+    prepared: Sequence[Prepared], names: Sequence[str], sampling_time: float
+) -> tuple[tuple[Step, ...], float]:
+    """The steps that prepare a new record as another one was, and its sampling time [s] before them.
+
+    Args:
+        names: channels that the new record has; the steps leave out others.
+        sampling_time: of the prepared record [s], also where a step took the usual one.
+    """
+    steps: list[Step] = []
+    for done in reversed(prepared):
+        options = {name: tuple(value) if isinstance(value, list) else value for name, value in done.options.items()}
+        if done.step == "resample":
+            options["sampling_time"] = sampling_time
+        if done.step == "decimate":
+            sampling_time /= done.options["factor"]
+        if "channels" in options:
+            options["channels"] = tuple(name for name in options["channels"] if name in names)
+        if options.get("channels") != () and options.get("channel") in (None, *names):
+            steps.insert(0, STEPS[done.step](**options))
+    return tuple(steps), sampling_time
+
+
 def warnings_of(prepared: Sequence[Prepared], names: Sequence[str]) -> tuple[Warning, ...]:
     """What must be known of a fit to data that were prepared so."""
     found = []

@@ -153,7 +153,8 @@ class Prepared:
         values = {name: " ".join(v) if isinstance(v, list) else v for name, v in self.options.items()}
         text = f"{self.step} ({', '.join(f'{name} {value}' for name, value in values.items())})"
         done = {"outliers": "marked as missing", "fill": "reconstructed"}.get(self.step)
-        return f"{text}: {self.samples} samples {done}" if done else text
+        samples = "1 sample" if self.samples == 1 else f"{self.samples} samples"
+        return f"{text}: {samples} {done}" if done else text
 
     def with_samples(self, samples: int) -> Prepared:
         """The same step of more samples."""

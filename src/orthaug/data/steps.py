@@ -45,7 +45,7 @@ class Run:
     def columns(self, channels: Channels, usual: range | None = None) -> list[int]:
         """Indices of channels; without names the usual ones, which are all unless given."""
         if channels is None:
-            return list(usual or range(len(self.names)))
+            return list(range(len(self.names)) if usual is None else usual)
         check_type(channels, tuple | list, "channels", "a list of channel names")
         for name in channels:
             if name not in self.names:
@@ -254,8 +254,10 @@ class Outliers:
 
     def apply(self, run: Run) -> Run:
         columns = run.columns(self.channels, range(run.inputs, len(run.names)))
-        marked = [np.where(self._wild(run.values[:, j]), np.nan, run.values[:, j]) for j in columns]
-        return run.holding(columns, np.column_stack(marked))
+        values = run.values[:, columns].copy()
+        for x in values.T:
+            x[self._wild(x)] = np.nan
+        return run.holding(columns, values)
 
     def _wild(self, x: Vector) -> np.ndarray:
         if len(x) < 2:

@@ -85,6 +85,7 @@ def _model(
         inputs=record.inputs,
         sampling_time=record.sampling_time,
         time_column=record.time_column,
+        prepared=record.prepared,
         structure=structure.name,
         largest_output=problem.largest_output,
         deviation=problem.deviation,

@@ -74,6 +74,7 @@ def _model(plan: MotionCourse, structure: Structure, learned: Learned) -> Motion
         loose=plan.loose,
         window=_WINDOWS[0] * (plan.dynamics.states + 1),
         time_column=record.time_column,
+        prepared=record.prepared,
         statistics=Statistics(learned.gram, middle, noise, learned.ridge, learned.errors.freedom, flown=True),
     )
     return replace(model, window=_best_window(model, record)) if learned.ending.usable else model

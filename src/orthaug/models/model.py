@@ -14,7 +14,7 @@ from orthaug._base.checks import Matrix, Vector, as_signal, check_count
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, jnp, padded_length
 from orthaug._base.views import Shown
-from orthaug.data.record import Channel, Experiment, Record
+from orthaug.data.record import Channel, Experiment, Prepared, Record
 from orthaug.models.dynamics import Dynamics, Numbers, Parts
 from orthaug.models.lagged import Lagged
 from orthaug.models.lagged_filter import LaggedFilter
@@ -78,6 +78,8 @@ class Model(OnRecords, Shown):
     """Directions of θ (nθ, s) along which a split makes the learner orthogonal; None for all."""
     time_column: str | None = None
     statistics: Statistics = Statistics()  # noqa: RUF009  (frozen)
+    prepared: tuple[Prepared, ...] = field(default=(), kw_only=True, repr=False)
+    """What the training data went through before."""
 
     def __repr__(self) -> str:
         learner = self.form.bound.learner if self.form.bound else "none"

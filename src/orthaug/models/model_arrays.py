@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from orthaug.data.record import Channel
+from orthaug.data.record import Channel, Prepared
 from orthaug.models.dynamics import Numbers
 from orthaug.models.statistics import Statistics
 
@@ -18,14 +18,17 @@ def said_of(model: Any) -> dict[str, Any]:
     """What a file says of every model, whatever its physics."""
     channels = {kind: [asdict(channel) for channel in getattr(model, kind)] for kind in ("outputs", "inputs")}
     kept = model.statistics
-    return {name: getattr(model, name) for name in _SAID} | channels | {"flown": kept.flown, "verdict": kept.verdict}
+    said = {name: getattr(model, name) for name in _SAID} | channels | {"flown": kept.flown, "verdict": kept.verdict}
+    return said | ({"prepared": [asdict(step) for step in model.prepared]} if model.prepared else {})
 
 
 def fields_from(declared: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict[str, Any]:
     """The fields that every model has, from its file."""
     channels = {kind: tuple(Channel(**c) for c in declared[kind]) for kind in ("outputs", "inputs")}
     numbers = {"numbers": numbers_from(arrays), "statistics": statistics_from(arrays, declared)}
-    return {name: declared[name] for name in _SAID} | channels | numbers | {"largest_output": arrays["largest_output"]}
+    fields = {name: declared[name] for name in _SAID} | channels | numbers
+    prepared = tuple(Prepared(**step) for step in declared.get("prepared", ()))
+    return fields | {"largest_output": arrays["largest_output"], "prepared": prepared}
 
 
 def arrays_of(model: Any) -> dict[str, np.ndarray]:

@@ -18,7 +18,7 @@ from orthaug._base.checks import Matrix, Vector, as_signal, check_count
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, padded_length
 from orthaug._base.views import Shown
-from orthaug.data.record import Channel, Experiment, Record
+from orthaug.data.record import Channel, Experiment, Prepared, Record
 from orthaug.models.dynamics import Numbers, Parts
 from orthaug.models.motion_filter import MotionFilter
 from orthaug.models.motion_parts import parts_at
@@ -106,6 +106,8 @@ class MotionModel(OnRecords, Shown):
     time_column: str | None = None
     trained: Trained | None = field(default=None, repr=False)
     statistics: Statistics = Statistics()  # noqa: RUF009  (frozen)
+    prepared: tuple[Prepared, ...] = field(default=(), kw_only=True, repr=False)
+    """What the training data went through before."""
 
     def __repr__(self) -> str:
         learner = self.form.bound.learner if self.form.bound else "none"

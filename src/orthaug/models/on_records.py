@@ -9,7 +9,8 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError, shown
-from orthaug.data.record import Channel, Experiment, Record, same_step
+from orthaug.data.preparation import steps_again
+from orthaug.data.record import Channel, Experiment, Prepared, Record, same_step
 from orthaug.models.dynamics import Dynamics, Parts
 from orthaug.models.response import Trajectory
 
@@ -24,6 +25,12 @@ class OnRecords:
     inputs: tuple[Channel, ...]
     sampling_time: float
     largest_output: Vector
+    prepared: tuple[Prepared, ...]
+
+    @property
+    def preparation(self) -> tuple[Any, ...]:
+        """The steps that the training data went through, for `prepare` and `read_record` of other data."""
+        return steps_again(self.prepared, [c.name for c in (*self.inputs, *self.outputs)], self.sampling_time)[0]
 
     def bounded(self, parts: Parts, experiment: Experiment, measured: Matrix | None) -> Trajectory:
         """A free run cut where it left all bounds."""
