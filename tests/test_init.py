@@ -106,7 +106,7 @@ REFUSED = [
     (("--inputs", "force"), "Say both"),
     (("--inputs", "force", "--outputs", "speed"), "no column 'speed'; the file has time [ms], force [N]"),
     (("--inputs", "gain", "--outputs", "position"), "column 'gain' is 2 in every row; leave it out"),
-    (("--inputs", "note", "--outputs", "position"), "column 'note' holds no numbers"),
+    (("--inputs", "note", "--outputs", "position"), "column 'note' cannot be a channel: no numbers"),
     (("--inputs", "force", "--outputs", "force_,force"), "no column 'force_'"),
     (("--inputs", "force", "--outputs", "force [N]"), "'force [N]' is named twice"),
     (("--inputs", "time [ms]", "--outputs", "position"), "is the time; it is no channel"),
@@ -193,3 +193,10 @@ def test_uneven_instants_are_resampled(tmp_path):
     data = tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
     assert [step["step"] for step in data["prepare"]] == ["outliers", "fill", "resample"] and data["time"] == "t"
     assert data["prepare"][-1]["sampling_time"] == 0.1 and "1 sample far from all neighbours" in done.out
+
+
+def test_a_name_that_stands_twice_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    (tmp_path / "a.csv").write_text("u,u,y\n" + "".join(f"{k % 7},{k},{k % 5}\n" for k in range(40)))
+    done = run("init", tmp_path / "a.csv", "--inputs", "u", "--outputs", "y", "--out", tmp_path / "spec.toml")
+    assert done.code == 2 and "column 'u' cannot be a channel: its name stands twice" in done.err

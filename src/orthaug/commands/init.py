@@ -184,7 +184,7 @@ def _account(found: Survey, roles: Roles, rows: int, missing: int, cut: int, mod
         lines += [f"{kind:<7}{as_seen(column, spikes=kind == 'output')}" for column in columns]
     used = {id(c) for c in (*roles.inputs, *roles.outputs, found.clock.column)}
     for column in (c for c in found.columns if id(c) not in used):
-        why = "no numbers" if not column.numeric else "constant" if column.constant else "not named"
+        why = column.unusable or ("constant" if column.constant else "not named")
         lines.append(f"left out: {column.header} ({why})")
     for column, delay, order in zip(roles.inputs, model.delays, model.persistence, strict=True):
         lines.append(f"{column.name} excites {_order(order)}; {_delay(delay)}")

@@ -51,7 +51,8 @@ class Column:
     name: str
     unit: str
     values: Vector
-    numeric: bool = True
+    unusable: str = ""
+    """Why it can be no channel, in words."""
 
     @property
     def finite(self) -> Vector:
@@ -162,7 +163,7 @@ class Survey:
     @property
     def signals(self) -> tuple[Column, ...]:
         """Columns that could be channels: numbers that vary and are not time."""
-        found = [c for c in self.columns if c.numeric and len(c.finite) and not c.constant]
+        found = [c for c in self.columns if not c.unusable and not c.constant]
         return tuple(c for c in found if c is not self.clock.column)
 
     def find(self, name: str) -> Column:
@@ -176,8 +177,8 @@ class Survey:
             known = ", ".join(c.header for c in self.columns)
             raise InputError(f"{self.path}: no column '{name}'; the file has {known}.")
         column = named[0]
-        if not column.numeric or not len(column.finite):
-            raise InputError(f"{self.path}: column '{name}' holds no numbers; it cannot be a channel.")
+        if column.unusable:
+            raise InputError(f"{self.path}: column '{name}' cannot be a channel: {column.unusable}.")
         if column.constant:
             raise InputError(f"{self.path}: column '{name}' is {column.finite[0]:g} in every row; leave it out.")
         return column
@@ -198,7 +199,8 @@ def survey(path: Path) -> Survey:
         InputError: no such file, an unknown ending, a file that cannot be read or has no column of numbers.
     """
     columns: list[Column] = []
-    headers = list(dict.fromkeys(column_names(path)))
+    every = list(column_names(path))
+    headers = list(dict.fromkeys(every))
     try:
         table = read_table(path, headers).columns
     except InputError:  # one of them cannot be read: each by itself
@@ -207,12 +209,12 @@ def survey(path: Path) -> Survey:
         base, unit = split_header(header)
         try:
             values = table[header] if table else read_table(path, [header]).columns[header]
-            numeric = True
-        except InputError:  # text, complex numbers, a name that stands twice: no channel
-            values, numeric = np.empty(0), False
+            unusable = "" if np.isfinite(values).any() else "no numbers"
+        except InputError:  # text, complex numbers, or not known which
+            values, unusable = np.empty(0), "no numbers" if every.count(header) == 1 else "its name stands twice"
         name = channel_name(base, [c.name for c in columns])
-        columns.append(Column(header, name, unit, values, numeric and bool(np.isfinite(values).any())))
-    if not any(c.numeric for c in columns):
+        columns.append(Column(header, name, unit, values, unusable))
+    if all(c.unusable for c in columns):
         raise InputError(f"{path}: no column holds numbers; expected one for each signal, under a header.")
     return Survey(path, tuple(columns), _clock(columns))
 
@@ -245,7 +247,7 @@ def _clock(columns: Sequence[Column]) -> Clock:
     for column in columns:
         base = split_header(column.header)[0]
         values, scale = column.finite, _SECONDS.get(column.unit.lower())
-        if not column.numeric or scale is None:
+        if column.unusable or scale is None:
             continue
         if _TIME.match(base) and len(values) > 1 and column.filled == rows and (np.diff(values) > 0).all():
             steps = np.diff(values)

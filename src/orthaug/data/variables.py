@@ -176,6 +176,8 @@ ENDINGS = tuple(_FORMATS)
 
 def short(error: Exception) -> str:
     """What a library says, on one line."""
+    if isinstance(error, LookupError) or any(isinstance(part, bytes) for part in error.args):
+        return "unknown bytes"
     return " ".join(str(error).split())[:120] or type(error).__name__
 
 

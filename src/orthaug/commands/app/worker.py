@@ -112,7 +112,7 @@ def look(path: str, out: str, inputs: str | None, outputs: str | None, step: flo
 
 def _column(found: Survey, column: Column) -> dict[str, Any]:
     usable = column in found.signals
-    why = "time" if column is found.clock.column else "no numbers" if not column.numeric else "constant"
+    why = "time" if column is found.clock.column else column.unusable or "constant"
     told = starting.as_seen(column, spikes=column.kind != "input") if usable else why
     own = {"header": column.header, "name": column.name, "unit": column.unit, "kind": column.kind}
     head = f"{column.name}" + (f" = column '{column.header}'" if column.header != column.name else "")
