@@ -6,6 +6,7 @@ of the partitions: whoever computes them, and however often after a worker was l
 
 from __future__ import annotations
 
+import atexit
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -232,7 +233,9 @@ def connected(scheduler: str | None, workers: int | None) -> Any:
         count = workers or os.cpu_count() or 1
         with config.set({"distributed.nanny.pre-spawn-environ": _SINGLE_THREADED}):
             options: dict[str, Any] = {"n_workers": count, "threads_per_worker": 1, "dashboard_address": ":0"}
-            client = Client(LocalCluster(**options))
+            cluster = LocalCluster(**options)
+            client = Client(cluster)
+            atexit.register(_closed, client, cluster)  # before distributed's own, which tells of tasks it cancels
     else:
         try:
             client = Client(scheduler, timeout=_PATIENCE)
@@ -240,6 +243,11 @@ def connected(scheduler: str | None, workers: int | None) -> Any:
             raise InputError(f"no Dask scheduler answers at {scheduler} ({type(error).__name__}).") from None
     check_versions(client)
     return client
+
+
+def _closed(*parts: Any) -> None:
+    for part in parts:
+        part.close()
 
 
 def check_versions(client: Any) -> None:
