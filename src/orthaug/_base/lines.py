@@ -17,6 +17,20 @@ def counted(number: int, thing: str) -> str:
     return f"{number} {thing}" + ("" if number == 1 else "s")
 
 
+def percent(share: float, digits: int = 2, *, sign: str = "") -> str:
+    """A share in per cent with so many digits, and without an exponent unless it is tiny or huge.
+
+    Examples:
+        >>> [percent(share) for share in (0.0123, 0.999, 26.04)]
+        ['1.2 %', '100 %', '2600 %']
+        >>> percent(0.25, sign="+")
+        '+25 %'
+    """
+    text = f"{100 * share:{sign}.{digits}g}"
+    value = float(text)
+    return f"{value:{sign}.0f} %" if 100 <= abs(value) < 1e7 else f"{text} %"
+
+
 def table(rows: Sequence[Sequence[str]], width: int = WIDTH) -> list[str]:
     """Rows of cells as lines, the first row the head. Rows may be of different lengths.
 

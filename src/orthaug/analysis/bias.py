@@ -19,6 +19,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector, check_unique
 from orthaug._base.errors import InputError
+from orthaug._base.lines import percent
 from orthaug.analysis.absorbed import Absorbed
 from orthaug.analysis.suspects import Suspect
 from orthaug.physics.excitation import excitation, require_rank
@@ -124,7 +125,7 @@ class SuspectedBias:
         ]
         return (
             f"{self.suspect.name}: no weighting of these points leaves θ unbiased if it counts any of the "
-            f"{100 * certificate.positive:.3g} % where (φᵀa)δ is positive, for it is nowhere negative; "
+            f"{percent(certificate.positive, 3)} where (φᵀa)δ is positive, for it is nowhere negative; "
             f"a = {' '.join(terms)} (columns scaled to root mean square 1). Only the least bias can be asked for."
         )
 

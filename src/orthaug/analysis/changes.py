@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.lines import percent
 from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.local_dynamics import transitions
 from orthaug.analysis.predictability import BlockSums, Share
@@ -64,7 +65,7 @@ class Change:
 
     def __str__(self) -> str:
         error = "its error one step ahead" if self.of == "prediction" else "the error of its free run"
-        return f"{self.advice}: {error} is predicted to fall by {100 * self.fall:.2g} %"
+        return f"{self.advice}: {error} is predicted to fall by {percent(self.fall)}"
 
 
 def fall_of(share: float) -> float:

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from orthaug._base.checks import Matrix
+from orthaug._base.lines import percent
 from orthaug._base.warning import Warning
 from orthaug.analysis.boundedness import divergence_scaling
 from orthaug.analysis.contraction import Contraction, contraction
@@ -79,7 +80,7 @@ def _sentences(checks: Stability) -> Iterator[tuple[str, str]]:
     if run.diverged:
         yield f"The free run diverges ({'; '.join(run.diverged)}); it is looked at up to there.", "free_run_diverges"
     if run.share_above_one is not None:
-        above = f"above 1 at {100 * run.share_above_one:.3g} % of {len(run.radius)} steps of the free run"
+        above = f"above 1 at {percent(run.share_above_one, 3)} of {len(run.radius)} steps of the free run"
         peak = f"median {run.median:.4g}, largest {run.largest:.4g} at {run.worst}"
         warns = "spectral_radius_above_one" if run.share_above_one > 0.01 else ""
         yield f"The local spectral radius is {above}; {peak}.", warns
@@ -93,7 +94,7 @@ def _sentences(checks: Stability) -> Iterator[tuple[str, str]]:
         how = f"contracts in one metric (rate {contracts.rate:.4g}): evidence, not proof, that it forgets its start"
         yield f"On all {contracts.samples} sampled points the free run {how}.", ""
     else:
-        share = f"{100 * (1 - contracts.share):.3g} % of the {contracts.samples} sampled points"
+        share = f"{percent(1 - contracts.share, 3)} of the {contracts.samples} sampled points"
         worst = f"worst at {contracts.worst}, rate {contracts.rate:.4g}"
         yield f"At {share} the free run does not contract in the best metric that was found, {worst}.", ""
     stays, times = ("stays within", checks.searched) if factor is None else ("leaves", factor)

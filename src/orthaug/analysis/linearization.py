@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Vector, check_choice, check_type
 from orthaug._base.errors import InputError
+from orthaug._base.lines import percent
 from orthaug._base.warning import Warning
 from orthaug.analysis.continuous_time import METHODS, Continuous, converted
 from orthaug.analysis.linear_steps import (
@@ -288,5 +289,5 @@ def _rough(bode: Any) -> list[Warning]:
     share = float(np.mean(wide))
     if share < 0.05:
         return []
-    text = f"at {100 * share:.2g} % of the frequencies the band is so wide that the delta method is rough there."
+    text = f"at {percent(share)} of the frequencies the band is so wide that the delta method is rough there."
     return [Warning("wide_band", text)]

@@ -15,6 +15,7 @@ import scipy.special
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.lines import percent
 from orthaug._base.warning import Warning
 from orthaug.analysis.absorbed import Smoother
 from orthaug.fitting.estimates import Estimate
@@ -63,7 +64,7 @@ class MissingLags:
         others = f" (after it {', '.join(test.lag for test in self.missing[1:])})" if len(self.missing) > 1 else ""
         return (
             "What the physics lacks is no function of what the learner sees: the residual also depends on "
-            f"{first.lag}{others}, by {100 * first.share:.2g} % of its variance, so that θ beside the learner is "
+            f"{first.lag}{others}, by {percent(first.share)} of its variance, so that θ beside the learner is "
             "biased; add that lag to learner.inputs."
         )
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from orthaug._base.errors import InputError
+from orthaug._base.lines import percent
 from orthaug._base.parallel import one_blas_thread
 from orthaug._base.warning import Warning
 from orthaug.analysis.diagnosis import Diagnosis
@@ -127,7 +128,7 @@ def _words(
 def _named(lacks: MissingTest, fit: MotionEstimate) -> str:
     """What is most likely missing, and where to put it."""
     best, *others = lacks.terms
-    text = f"Most likely {best} would explain {100 * best.share:.2g} % of its square"
+    text = f"Most likely {best} would explain {percent(best.share)} of its square"
     if others:
         text += f", as would {' or '.join(f'{term.expression} in that of {term.equation}' for term in others[:2])}"
     learned = {fit.problem.motion.names_of_states[i] for i in fit.problem.motion.learned[0]}

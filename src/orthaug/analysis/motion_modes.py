@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import Array, jax
+from orthaug._base.lines import percent
 from orthaug._base.warning import Warning
 from orthaug.analysis.boundedness import divergence_scaling
 from orthaug.data.record import Record
@@ -88,7 +89,7 @@ def _of_modes(model: MotionModel, x: Matrix, u: Matrix) -> MotionStability:
         return MotionStability(found, (), told)
     where = ", ".join(f"{name} = {value:.4g}" for name, value in found.worst.items())
     told += (
-        f"At {100 * found.growing:.3g} % of its points one grows, by up to {found.rightmost:.4g} 1/s ({where}); median "
+        f"At {percent(found.growing, 3)} of its points one grows, by up to {found.rightmost:.4g} 1/s ({where}); median "
         f"of the largest real part {found.median:.4g} 1/s."
     )
     warnings = (Warning("growing_mode", told),) if found.growing > _OFTEN else ()

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthaug._base.checks import Vector
+from orthaug._base.lines import percent
 from orthaug._base.warning import Warning
 from orthaug.analysis.motion_response import LOOSER, solved
 from orthaug.fitting.initial_states import InitialStates
@@ -71,7 +72,7 @@ def _warnings(found: SubstepBias, fit: MotionEstimate) -> tuple[Warning, ...]:
     """One sentence on the parameters that finer steps would move."""
     told = []
     for name, moved, errors, value in zip(found.names, found.value, found.errors, fit.values, strict=True):
-        share = f", {100 * moved / value:+.2g} %" if value else ""
+        share = f", {percent(moved / value, sign='+')}" if value else ""
         if np.isfinite(errors) and errors > _LARGE:
             told.append(f"{name} by {moved:+.2g} ({errors:.2g} standard errors{share})")
         elif np.isnan(errors) and name not in fit.unidentified and abs(moved) > _LARGE_SHARE * abs(value):

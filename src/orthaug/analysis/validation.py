@@ -12,6 +12,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError
+from orthaug._base.lines import percent
 from orthaug._base.parallel import Threads
 from orthaug._base.warning import Warning
 from orthaug.data.record import Record
@@ -53,7 +54,7 @@ class Extrapolation:
         low, high = self.training
         return (
             f"In {self.lag}, {self.part} leaves the training range of {low:.4g} to {high:.4g}: it goes from "
-            f"{self.reach[0]:.4g} to {self.reach[1]:.4g}, outside on {100 * self.share:.2g} % of its rows"
+            f"{self.reach[0]:.4g} to {self.reach[1]:.4g}, outside on {percent(self.share)} of its rows"
         )
 
 

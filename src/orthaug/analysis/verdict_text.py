@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from orthaug._base.lines import percent
 from orthaug._base.warning import Warning
 from orthaug.analysis.changes import WORTH, Change, fall_of
 from orthaug.analysis.predictability import Predictable
@@ -100,7 +101,7 @@ def _sensor_noise(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
         return f"{text}, which the simulation criterion suits.{more}", ()
     text += '. One-step estimates of θ are then inconsistent: train with focus = "simulation"'
     if seen.changes and seen.changes[0].kind == "criterion":
-        text += f"; the error of the free run is predicted to fall by {100 * seen.changes[0].fall:.2g} %"
+        text += f"; the error of the free run is predicted to fall by {percent(seen.changes[0].fall)}"
     if seen.noise is not None and seen.noise > _TOO_FAST:
         text += (
             f". The noise is {100 * seen.noise:.0f} % of what tells the lagged outputs apart: the sampling is too fast "
@@ -128,7 +129,7 @@ def _small(seen: Finding) -> str:
 
 def _size(seen: Finding) -> str:
     share = max((t.rms or 0.0) / d for t, d in zip(seen.own, seen.fit.problem.deviation, strict=True))
-    return f"{100 * share:.2g} % of the output's deviation"
+    return f"{percent(share)} of the output's deviation"
 
 
 def _shares(seen: Finding) -> str:
@@ -139,7 +140,7 @@ def _shares(seen: Finding) -> str:
     of = f" of {one.name}" if len(seen.predictable) > 1 else ""
     unit = next((c.unit for c in seen.fit.problem.record.outputs if c.name == one.name), "")
     size = float(np.sqrt(one.largest())) * one.rms
-    past, driven, curved = (f"{100 * share:.2g} %" for share in (one.own_past, one.inputs, one.functions))
+    past, driven, curved = (percent(share) for share in (one.own_past, one.inputs, one.functions))
     return (
         f"Of its variance{of} {past} could be predicted from its own past, {driven} from the inputs, {curved} from "
         f"functions of the regressors: {size:.2g}{f' {unit}' if unit else ''} at most."
@@ -153,7 +154,7 @@ def _advice(seen: Finding, otherwise: str) -> str:
     if not seen.predictable:
         return "Try more lags, other learner inputs or neurons."
     limit = 100 * fall_of(WORTH)
-    return f"No further lag, offset or learner is predicted to lower it by {limit:.2g} %: {otherwise}."
+    return f"No further lag, offset or learner is predicted to lower it by {percent(limit / 100)}: {otherwise}."
 
 
 def _sentence(change: Change) -> str:

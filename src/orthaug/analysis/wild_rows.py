@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from orthaug._base.lines import counted
+from orthaug._base.lines import counted, percent
 from orthaug._base.warning import Warning
 from orthaug.analysis.residuals import errors_of
 from orthaug.data.record import Experiment
@@ -35,7 +35,7 @@ def wild_rows(response: Response, experiments: Sequence[Experiment]) -> tuple[Wa
         named = [experiments[rows[k][0]].where(rows[k][1]) for k in wild[:_NAMED]]
         more = f" and {len(wild) - _NAMED} more" if len(wild) > _NAMED else ""
         text = (
-            f"{100 * held:.3g} % of the squares of the one-step residual of {output.name} stand in "
+            f"{percent(held, 3)} of the squares of the one-step residual of {output.name} stand in "
             f"{counted(len(wild), 'row')} of {len(error)}: {'; '.join(named)}{more}. If samples are wrong there, so is "
             'θ: mark them (step = "outliers" of data.prepare), or leave them out.'
         )

@@ -13,7 +13,7 @@ import tomlkit
 
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_file
-from orthaug._base.lines import counted
+from orthaug._base.lines import counted, percent
 from orthaug.data.readers import read_record
 from orthaug.data.record import Channel, Record
 from orthaug.data.steps import STEPS
@@ -196,7 +196,7 @@ def _account(found: Survey, roles: Roles, rows: int, missing: int, cut: int, mod
     for name, late, seen in zip(_channel_names(roles.inputs), model.orders.nk, model.delays, strict=True):
         if seen is not None and seen != late:
             lines.append(f"the spec takes {name} from lag {late} on, which runs as well or better with as few lags")
-    size, errors = model.orders, ", ".join(f"{100 * error:.3g} %" for error in model.free_run)
+    size, errors = model.orders, ", ".join(percent(error, 3) for error in model.free_run)
     told = "one step ahead" if not roles.inputs else "in free run"
     lines.append(f"first physics: linear, {size}{', with a constant' if model.offset else ''}; {told} its error")
     lines[-1] += f" on rows held out is {errors} of the output's standard deviation"

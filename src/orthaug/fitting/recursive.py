@@ -18,6 +18,7 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector, check_choice, check_count, check_number, check_type, is_number
 from orthaug._base.errors import InputError, shown
 from orthaug._base.jax import jax
+from orthaug._base.lines import percent
 from orthaug.data.record import Record
 from orthaug.fitting import recursive_start, recursive_storage
 from orthaug.fitting.estimates import Estimate, order_of
@@ -360,7 +361,7 @@ class Recursive:
 
 def outside_text(outside: int, rows: int) -> str:
     """How many rows the learner extrapolates on."""
-    share = f"{100 * outside / rows:.2g} % of the rows"
+    share = f"{percent(outside / rows)} of the rows"
     return f"the learner's inputs leave those of training on {share}: it extrapolates there, which raises no alarm"
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from orthaug._base.lines import fold, table
+from orthaug._base.lines import fold, percent, table
 from orthaug.reports.explanation import ExplainResult
 
 
@@ -10,7 +10,7 @@ def explain_text(result: ExplainResult) -> str:
     """What the learner has found, the terms alone, θ with them in the physics, and what to write into the spec."""
     blocks = [[_capital(result.text)]]
     if result.noise is not None:
-        blocks[0] += [f"Of what it adds, {100 * result.noise:.2g} % are its own errors, as far as training tells."]
+        blocks[0] += [f"Of what it adds, {percent(result.noise)} are its own errors, as far as training tells."]
     if result.terms:
         blocks += [_term_lines(result), _parameter_lines(result)]
     if result.singles:
@@ -46,7 +46,7 @@ def _parameter_lines(result: ExplainResult) -> list[str]:
 
 
 def _percent(share: float | None) -> str:
-    return "–" if share is None else f"{100 * share:.3g} %"
+    return "–" if share is None else percent(share, 3)
 
 
 def _capital(text: str) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from orthaug._base.lines import percent
 from orthaug.models.response import Response
 from orthaug.reports.drawing import (
     BLACK,
@@ -127,7 +128,7 @@ def residual_analysis_figure(tests: Sequence[ResidualTestResult], title: str) ->
             centres, means, errors = (_floats(values) for values in (curve.centres, curve.means, curve.errors))
             row[2].errorbar(centres, means, 2.576 * errors, fmt="o", color=GREEN, markersize=3)
             row[2].axhline(0.0, color=BLACK, linewidth=0.6)
-            label(row[2], x=name, title=f"mean over {name}, {100 * share:.2g} % explained")
+            label(row[2], x=name, title=f"mean over {name}, {percent(share)} explained")
     return figure
 
 

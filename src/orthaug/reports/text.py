@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from orthaug._base.lines import fold, table
+from orthaug._base.lines import fold, percent, table
 from orthaug.reports.fields import WarningResult
 from orthaug.reports.findings import SharedResult, SuspectResult
 from orthaug.reports.result import (
@@ -171,8 +171,10 @@ def _suspect_lines(suspects: Sequence[SuspectResult]) -> list[str]:
     for suspect in suspects:
         guess = suspect.coefficient
         cosine = "–" if suspect.cosine is None else f"{suspect.cosine:.3f}"
-        size = "1 %" if guess is None else "–" if suspect.size is None else f"{100 * abs(guess) * suspect.size:.2g} %"
-        biases = ("–" if share is None else f"{_rounded(share):+.2g} %" for share in suspect.percent.values())
+        size = "1 %" if guess is None else "–" if suspect.size is None else percent(abs(guess) * suspect.size)
+        biases = (
+            "–" if share is None else percent(_rounded(share) / 100, sign="+") for share in suspect.percent.values()
+        )
         rows.append([suspect.name, size, *biases, cosine, suspect.removed_by or "–"])
     return table(rows)
 
@@ -191,7 +193,7 @@ def _bias_lines(result: FitResult) -> list[str]:
         bias = None if bias is None else _rounded(bias / (row.value or 1.0)) * (row.value or 1.0)
         if bias is not None and row.value is not None:
             errors = f"{abs(bias) / row.std:7.2g}" if row.std else f"{'–':>7}"
-            part = f"{_rounded(100 * bias / row.value):+7.2g} %" if row.value else f"{'–':>9}"
+            part = f"{percent(_rounded(bias / row.value), sign='+') if row.value else '–':>9}"
             reach = row.ci95_with_bias
             limits = f"[{_limit(reach[0])}, {_limit(reach[1])}]" if reach else f"{'–':^29}"
             lines.append(f"{row.name:<{width}}  {bias:+11.3g}  {errors}  {part}  {limits}".rstrip())

@@ -10,6 +10,7 @@ import numpy as np
 
 from orthaug._base.checks import check_count, check_type, is_number
 from orthaug._base.errors import InputError, shown
+from orthaug._base.lines import percent
 from orthaug._base.warning import Warning
 from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.analysis.suspects import Suspect
@@ -212,7 +213,7 @@ def _told(space: Space, chosen: list[Candidate], fitted: Fit, dropped: bool) -> 
         named = " and ".join(", ".join(term.expression for term in terms).rsplit(", ", 1)) if len(terms) < 3 else ""
         what = named or f"{len(terms)} terms"
         verb = "explains" if len(terms) == 1 else "explain"
-        text = f"{what} {verb} {100 * share:.3g} % of what the learner adds beside the physics."
+        text = f"{what} {verb} {percent(share, 3)} of what the learner adds beside the physics."
     told = []
     if ground.outside > _OUTSIDE:
         reach = f"{100 * ground.outside:.0f} % of the rows lie beyond what the learner saw in training"
@@ -230,7 +231,7 @@ def _why_nothing(space: Space, real: bool, dropped: bool, share: float, singles:
         return "nothing explains the learner: the physics expresses all candidate terms already."
     if not real:
         return "what the learner adds does not stand out from its own errors; there is nothing to explain."
-    best = f"the best single term, {singles[0].expression}, explains {100 * singles[0].share:.2g} % of it"
+    best = f"the best single term, {singles[0].expression}, explains {percent(singles[0].share)} of it"
     if dropped and share < _HALF:
         return f"no term stands out from the learner's own errors; {best}. Keep the learner."
     return f"no few terms explain half of what the learner adds; {best}. Keep the learner, or try other suspects."

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from orthaug._base.lines import percent
 from orthaug.fitting.estimation import estimate
 from orthaug.studies.common import (
     LARGEST_TRAINED,
@@ -124,7 +125,7 @@ def findings(table: pd.DataFrame) -> list[Finding]:
     last = _means(table, 3, "orthogonal").iloc[-1]
     quantity = f"set 3, 30 dB, orthogonal: ‖θ* − θ̂‖ at N = {int(last.samples)}"
     away = 100 * abs(last.theta_error / limit(3) - 1)
-    why = f"{away:.2g} % from the limit without noise, {limit(3):.4g}: it does not go to 0"
+    why = f"{percent(away / 100)} from the limit without noise, {limit(3):.4g}: it does not go to 0"
     compared.append(Finding(quantity, f"{last.theta_error:.4g}", why))
     rows = table[(table.data_set == 1) & (table.curve == "uniform") & (table.samples == 1024)]
     prices = np.array([price for price in rows.price if price is not None], dtype=float)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from orthaug._base.lines import percent
 from orthaug.fitting.estimation import estimate
 from orthaug.studies.common import (
     COLOURS,
@@ -118,7 +119,7 @@ def findings(table: pd.DataFrame) -> list[Finding]:
     last = float(three.theta_error.iloc[-1])
     away = last / limit(3) - 1
     quantity = f"set 3, no noise: ‖θ* − θ̂‖ at N = {int(three.samples.iloc[-1])}"
-    why = f"{100 * abs(away):.2g} % from the limit that quadrature over the inputs' distribution gives, {limit(3):.4g}"
+    why = f"{percent(abs(away))} from the limit that quadrature over the inputs' distribution gives, {limit(3):.4g}"
     text, met = f"{last:.4g}", bool(abs(away) < 0.25)
     compared.append(Finding(quantity, text, why, "converges to a fixed number", as_published=met))
     for data_set in (2, 3):

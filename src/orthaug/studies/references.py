@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from orthaug._base.lines import percent
+
 _AXES = {
     "static": ("data_set", "noise_30dB", "structure"),
     "mass_spring_damper": ("structure", "weight"),
@@ -55,7 +57,7 @@ class Spread(NamedTuple):
 
 def _ratio(ours: float, end: float) -> str:
     ratio = ours / end
-    return f"by {100 * abs(ratio - 1):.2g} %" if abs(ratio - 1) < 0.1 else f"{ratio:.2g} times it"
+    return f"by {percent(abs(ratio - 1))}" if abs(ratio - 1) < 0.1 else f"{ratio:.2g} times it"
 
 
 @cache

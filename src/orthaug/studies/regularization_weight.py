@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
+from orthaug._base.lines import percent
 from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
 from orthaug.physics.problem import pose
 from orthaug.studies import references
@@ -184,7 +185,7 @@ def _ends(table: pd.DataFrame) -> list[Finding]:
         errors = _of(table, structure, table.weight.max()).theta_error
         away = float(errors.mean() / limit - 1)
         quantity = f"{structure}, λ = {table.weight.max():g}: relative error of θ"
-        why, met = f"{100 * abs(away):.2g} % from that θ's, {limit:.5g}", bool(abs(away) < 0.05)
+        why, met = f"{percent(abs(away))} from that θ's, {limit:.5g}", bool(abs(away) < 0.05)
         compared.append(Finding(quantity, span(errors), why, f"tends to {what}", as_published=met))
     return compared
 
