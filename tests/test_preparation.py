@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
+from helpers import unfolded
 from test_cli import make_project, run
 
 import orthaug as oa
@@ -253,13 +254,32 @@ def test_a_saved_model_knows_how_its_data_were_prepared(decimated, monkeypatch):
     raw = {"inputs": ["u"], "outputs": ["y"], "sampling_time": model.sampling_time / 2}
     record = oa.read_record("run.csv", **raw, prepare=model.preparation)
     done = run("simulate", "again", "run.csv", "--prepare", "--out", "free.csv", "--force")
-    assert done.code == 0 and "The same was done to the rows of this file." in done.err.replace("\n  ", " "), done.err
+    assert done.code == 0 and "The same was done to these data, here with outliers" in unfolded(done.err), done.err
     free = pd.read_csv("free.csv")
     (expected,) = model.simulate(record).trajectories
     np.testing.assert_allclose(free["y_model"], expected.model[:, 0], rtol=1e-12)
     np.testing.assert_allclose(np.diff(free["time"]), model.sampling_time)
     done = run("predict", "result", "run.csv", "--horizon", "3", "--prepare", "--out", "ahead.csv", "--force")
     assert done.code == 0 and len(pd.read_csv("ahead.csv")) == len(free)
+
+
+def test_a_file_of_other_instants_needs_a_word(decimated, monkeypatch):
+    """Rows of 1 s taken as rows of 2 s would run at half the speed, and nothing would tell."""
+    monkeypatch.chdir(decimated)
+    done = run("simulate", "result", "run.csv")
+    assert done.code == 2 and "give --prepare for a file as it was measured, or --no-prepare" in done.err, done.err
+    done = run("simulate", "result", "inputs.csv", "--no-prepare", "--out", "plain.csv")
+    assert done.code == 0 and "are taken as they are; --prepare does" in unfolded(done.err), done.err
+    assert len(pd.read_csv("plain.csv")) == len(pd.read_csv("inputs.csv"))
+
+
+def test_code_tells_what_its_signals_stand_for(decimated, monkeypatch):
+    monkeypatch.chdir(decimated)
+    assert run("export", "result", "--to", "c", "--out", "code").code == 0
+    for file in ("README.md", "model.h"):
+        text = (decimated / "code" / file).read_text(encoding="utf-8")
+        assert "detrend (degree 0), decimate (factor 2, phase zero), shift (channel u, samples 1)" in text
+        assert "outliers" not in text
 
 
 def test_outputs_that_a_file_lacks_are_not_prepared(decimated, monkeypatch):
@@ -286,8 +306,11 @@ def test_training_files_are_prepared_again_for_a_split_and_for_tracking(decimate
     np.testing.assert_allclose([p["value"] for p in found], [p["value"] for p in fitted], rtol=1e-9)
     done = run("track", "result", "--data", "run.csv", "--training", "run.csv", "--out", "tracked")
     assert done.code == 0, done.err
+    assert "the model was fitted to prepared data" in done.err
     done = run("explain", "result", "run.csv")
-    assert "prepared data: detrend" in done.err and "1 sample marked as missing" in done.err, done.err
+    assert "prepared data: detrend" in done.err and "1 sample marked as missing" in unfolded(done.err), done.err
+    done = run("linearize", "result")
+    assert done.code == 0 and "Operating points are those of data after these steps" in unfolded(done.err), done.err
 
 
 def test_instants_are_resampled_as_those_of_the_training_data():

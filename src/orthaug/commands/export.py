@@ -6,6 +6,7 @@ from pathlib import Path
 
 from orthaug._base.errors import InputError
 from orthaug.commands.run import prepared_notes
+from orthaug.data.preparation import MENDING
 from orthaug.export import exporting
 
 
@@ -35,4 +36,4 @@ def run(model: Path, to: str, out: Path, name: str, *, force: bool = False) -> t
         own = str(error).startswith(str(out))
         raise InputError(str(error) if own else f"{model}: {error}") from None
     what = "The code stands for data after these steps: a delay by `shift`, say, is not in it."
-    return prepared_notes(loaded, what, apart=("outliers", "fill"))
+    return prepared_notes(loaded, what=what) if any(done.step not in MENDING for done in loaded.prepared) else ()

@@ -13,7 +13,7 @@ import numpy as np
 
 from orthaug._base.folders import whole_file
 from orthaug._base.warning import Warning
-from orthaug.commands.run import Reading, held_outputs
+from orthaug.commands.run import Reading, check_instants, held_outputs
 from orthaug.data.parquet_source import open_parquet
 from orthaug.data.sources import Source
 from orthaug.data.tables import parquet_file
@@ -39,7 +39,7 @@ def long_run(model: Path, data: Path, reading: Reading, *, free: bool) -> LongRu
     """The model on a long Parquet file with all its channels; None for what is read at once.
 
     Raises:
-        InputError: no model, a file that cannot be read.
+        InputError: no model, a file that cannot be read, a model of data that had other instants.
     """
     if data.suffix.lower() != ".parquet" or reading != Reading(columns=reading.columns) or not data.is_file():
         return None
@@ -50,6 +50,7 @@ def long_run(model: Path, data: Path, reading: Reading, *, free: bool) -> LongRu
     from orthaug.models.storage import load
 
     loaded = load(model)
+    check_instants(loaded, data)
     if not isinstance(loaded, Model) or len(held_outputs(loaded, data, reading)) < len(loaded.outputs):
         return None
     source = open_parquet(

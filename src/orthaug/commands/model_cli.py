@@ -41,7 +41,7 @@ def simulate(
     rows: Rows = None,
     every: Every = 1,
     column: Columns = None,
-    prepare: Prepare = False,
+    prepare: Prepare = None,
     force: Force = False,
 ) -> None:
     """Free run of a saved model on a data file."""
@@ -73,7 +73,7 @@ def predict(
     rows: Rows = None,
     every: Every = 1,
     column: Columns = None,
-    prepare: Prepare = False,
+    prepare: Prepare = None,
     force: Force = False,
 ) -> None:
     """H-step-ahead prediction of a saved model."""
@@ -110,13 +110,15 @@ def split(
     """Parameters of a saved model under another measure, without training again."""
     from orthaug.commands import split as splitting
     from orthaug.commands.measure_options import read_measure, split_place
-    from orthaug.commands.run import read_rows
+    from orthaug.commands.run import prepared_notes, read_rows
     from orthaug.reports.text import split_text
 
     opened = splitting.open_training(model, data, read_rows(rows))
     given = {"box": box or [], "samples": [samples] if samples else [], "weights": [weights] if weights else []}
     chosen = read_measure(measure, given, split_place(opened.model, opened.record))
     prepare_jax()
+    for line in prepared_notes(opened.model, opened.record):
+        streams.say(line)
     result = splitting.split_model(opened, chosen)
     streams.echo(result.to_json() if as_json else split_text(result))
 
@@ -183,10 +185,13 @@ def linearize(
 ) -> None:
     """Operating points of a saved model, and its poles, gains and frequency response there with intervals."""
     from orthaug.commands import linearize as linearizing
+    from orthaug.commands.run import prepared_notes
 
     linearizing.check_place(out, model, *([data] if data else []), force=force)
     opened, record = linearizing.open_linear(model, data)
     prepare_jax()
+    for line in prepared_notes(opened, what="Operating points are those of data after these steps."):
+        streams.say(line)
     from orthaug.analysis.linearization import linearize as linearized
 
     found = linearized(opened, at, record, continuous=continuous)
@@ -224,7 +229,7 @@ def track(
     """Parameters of a saved model over new data by recursive least squares, with an alarm."""
     from orthaug.commands import track as tracking
     from orthaug.commands.folder import check_folder, check_kept
-    from orthaug.commands.run import read_rows
+    from orthaug.commands.run import prepared_notes, read_rows
     from orthaug.reports.tracking import track_text
 
     folder = out or Path("orthaug-out/track")
@@ -232,6 +237,8 @@ def track(
     check_kept(folder, *(data or ()), *(training or ()), model)
     opened = tracking.open_track(model, data or (), training or (), read_rows(rows), state)
     prepare_jax()
+    for line in prepared_notes(opened.model, opened.record):
+        streams.say(line)
     tracked = tracking.track(opened, forgetting=forgetting, memory=memory, state=state, follows=follows)
     text = track_text(tracked.result)
     tracking.write_tracked(tracked, folder, text, force=force)

@@ -66,7 +66,8 @@ Columns = Annotated[
     typer.Option("--column", metavar="NAME=COLUMN", help="The file's column of a channel; any number."),
 ]
 Prepare = Annotated[
-    bool, typer.Option("--prepare", help="Prepare the rows as the training data were, by the model's own steps.")
+    bool | None,
+    typer.Option("--prepare/--no-prepare", help="Prepare the rows as the training data were, by the model's steps."),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace what is there, whoever wrote it.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the summary.")]

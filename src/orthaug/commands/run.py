@@ -15,7 +15,7 @@ from orthaug._base.errors import InputError, MissingSampleError
 from orthaug._base.folders import whole_file
 from orthaug._base.warning import Warning
 from orthaug.commands.parts import long_stretches
-from orthaug.data.preparation import steps_again
+from orthaug.data.preparation import MENDING, SAMPLING, steps_again
 from orthaug.data.readers import read_record
 from orthaug.data.record import Channel, Record
 from orthaug.data.tables import check_readable, has_column
@@ -34,11 +34,11 @@ class Reading:
     rows: tuple[int, int] | None = None
     every: int = 1
     columns: Mapping[str, str] = field(default_factory=dict)
-    prepare: bool = False
-    """Whether the rows go through the steps that the model's training data went through."""
+    prepare: bool | None = None
+    """Whether the rows go through the steps of the model's training data; None where nobody has said."""
 
     @classmethod
-    def of(cls, missing: str, rows: str | None, every: int, columns: Sequence[str], prepare: bool = False) -> Reading:
+    def of(cls, missing: str, rows: str | None, every: int, columns: Sequence[str], prepare: bool | None) -> Reading:
         """Of the options of a command.
 
         Raises:
@@ -98,6 +98,8 @@ def open_run(
             raise InputError(
                 f"--column: '{name}' is no channel of the model{nearest(name, names)}; it has {', '.join(names)}."
             )
+    if reading.prepare is None:
+        check_instants(loaded, data)
     held = held_outputs(loaded, data, reading)
     if need_outputs or not loaded.inputs or len(held) == len(loaded.outputs):
         held = list(loaded.outputs)
@@ -108,8 +110,7 @@ def open_run(
         record = record_for(loaded, data, held, reading)
     except MissingSampleError as error:
         raise InputError(f"{error} --missing skip leaves such rows out.") from None
-    what = _DONE if reading.prepare else _RAW
-    rows, told = len(record) + record.missing, prepared_notes(loaded, what)
+    rows, told = len(record) + record.missing, prepared_notes(loaded, record if reading.prepare else None)
     if record.missing:
         estimated = need_outputs and loaded.form.states and not loaded.form.memory  # a state to predict from
         first = loaded.form.first_row + ahead + bool(estimated)
@@ -141,24 +142,41 @@ def record_for(model: Model | MotionModel, data: Path, outputs: Sequence[Channel
     )
 
 
+def check_instants(model: Model | MotionModel, data: Path) -> None:
+    """Raise InputError for a model of data with other instants than their files: nobody said which these are."""
+    steps = [done.named for done in model.prepared if done.step in SAMPLING]
+    if steps:
+        raise InputError(
+            f"{data}: the model was fitted to data after {', '.join(steps)}; give --prepare for a file as it was "
+            f"measured, or --no-prepare for one that has a row every {model.sampling_time:g} s already."
+        )
+
+
 def held_outputs(model: Model | MotionModel, data: Path, reading: Reading) -> list[Channel]:
     """The outputs that a file has columns of."""
     return [c for c in model.outputs if has_column(data, reading.columns.get(c.name, c.file_column))]
 
 
 _RAW = "The rows of this file are taken as they are; --prepare does the same to them."
-_DONE = "The same was done to the rows of this file."
+_DETRENDED = " Detrended signals are deviations from their trend in each file."
 
 
-def prepared_notes(model: Model | MotionModel, what: str = _RAW, apart: Sequence[str] = ()) -> tuple[str, ...]:
+def prepared_notes(model: Model | MotionModel, record: Record | None = None, what: str = _RAW) -> tuple[str, ...]:
     """What to know of a model whose training data were prepared.
 
     Args:
-        what: stands behind the steps.
-        apart: kinds of steps that are not told.
+        record: other data that went through the same; what the steps found there is told.
+        what: stands behind the steps where there are no such data.
     """
-    told = [done.text for done in model.prepared if done.step not in apart]
-    return (f"note: the model was fitted to prepared data: {', '.join(told)}. {what}",) if told else ()
+    if not model.prepared:
+        return ()
+    named = f"note: the model was fitted to prepared data: {', '.join(done.named for done in model.prepared)}."
+    trends = _DETRENDED if any(done.step == "detrend" for done in model.prepared) else ""
+    if record is None:
+        return (f"{named} {what}",)
+    found = [done.text for done in record.prepared if done.step in MENDING]
+    here = f", here with {'; '.join(found)}" if found else ""
+    return (f"{named} The same was done to these data{here}.{trends}",)
 
 
 def read_initial(initial: str | None, opened: ModelOnData) -> str | Any:

@@ -15,6 +15,10 @@ from orthaug.data.record import Experiment, Prepared, Record, same_step
 from orthaug.data.steps import STEPS, Run, Step, options_of, stretches
 
 _FILTERS = ("lowpass", "highpass", "decimate")
+MENDING = ("outliers", "fill")
+"""Steps that leave good samples as they are."""
+SAMPLING = ("decimate", "resample")
+"""Steps after which there are other instants."""
 
 
 def prepare(record: Record, *steps: Any) -> Record:
@@ -97,7 +101,7 @@ class _Account:
     filled: int = 0
 
     def count(self, before: Run, after: Run) -> None:
-        if self.kind in ("outliers", "fill"):
+        if self.kind in MENDING:
             old, new = np.isfinite(before.values), np.isfinite(after.values)
             self.marked += int((old & ~new).sum())
             self.filled += int((new & ~old).sum())

@@ -148,13 +148,17 @@ class Prepared:
     samples: int = 0
 
     @property
-    def text(self) -> str:
-        """The same in words."""
+    def named(self) -> str:
+        """The step with its options in words."""
         values = {name: " ".join(v) if isinstance(v, list) else v for name, v in self.options.items()}
-        text = f"{self.step} ({', '.join(f'{name} {value}' for name, value in values.items())})"
+        return f"{self.step} ({', '.join(f'{name} {value}' for name, value in values.items())})"
+
+    @property
+    def text(self) -> str:
+        """The same with what it found."""
         done = {"outliers": "marked as missing", "fill": "reconstructed"}.get(self.step)
         samples = "1 sample" if self.samples == 1 else f"{self.samples} samples"
-        return f"{text}: {samples} {done}" if done else text
+        return f"{self.named}: {samples} {done}" if done else self.named
 
     def with_samples(self, samples: int) -> Prepared:
         """The same step of more samples."""

@@ -72,9 +72,11 @@ def _header(program: Program, fields: list[tuple[str, Signal, int]]) -> str:
         members.append(f"    {name}_real {identifier}{size}; /* {comment((what if depth else signal.name) + unit)} */")
     inputs = "".join(f"\n *   u[{i}]  {comment(signal.label)}" for i, signal in enumerate(program.inputs))
     outputs = "".join(f"\n *   y[{i}]  {comment(signal.label)}" for i, signal in enumerate(program.outputs))
+    done = comment(program.preparation)
+    prepared = f" * Inputs and outputs stand for data after {done}.\n" if done else ""
     return f"""/* {name}: one step of a fitted model, every {program.sampling_time!r} s. Written by orthaug.
  * Model sha256 {program.digest}
- *{inputs}{outputs}
+{prepared} *{inputs}{outputs}
  */
 #ifndef {upper}_H
 #define {upper}_H

@@ -109,13 +109,14 @@ def _readme(program: Program, target: Target, rows: int) -> str:
                 "\nInputs run straight from one sample to the next, so that a step takes those of the next sample too: "
                 "a step can be made when the next inputs are known.\n"
             )
+    prepared = _of_prepared(program)
     return f"""# {program.name}
 
 A step of a fitted model, {target.summary}. Written by orthaug {__version__}.
 
 Model sha256: `{program.digest}` (`checksum` in `model.json`)
 
-Sampling time: {program.sampling_time:.9g} s. A step takes the inputs of one sample and gives its outputs.
+{prepared}Sampling time: {program.sampling_time:.9g} s. A step takes the inputs of one sample and gives its outputs.
 
 {_listed("Inputs, in order:", program.inputs)}
 {_listed("Outputs:", program.outputs)}
@@ -129,6 +130,15 @@ Sampling time: {program.sampling_time:.9g} s. A step takes the inputs of one sam
 `{VECTORS}` has {rows} steps of a free run of the model in double precision: inputs, the state before the step, and the
 outputs. Each row can be checked by itself.
 """
+
+
+def _of_prepared(program: Program) -> str:
+    if not program.preparation:
+        return ""
+    return (
+        f"**The model was fitted to prepared data: {program.preparation}.** Inputs and outputs here stand for data "
+        "after these steps: what a `shift` delays comes late by as much, and of `detrend` they are deviations.\n\n"
+    )
 
 
 def _listed(head: str, signals: Sequence[Signal]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from orthaug._base.checks import Vector, check_type
 from orthaug._base.errors import InputError
 from orthaug.data.expressions import Expression, Lag
+from orthaug.data.preparation import MENDING
 from orthaug.data.record import Channel
 from orthaug.export.nodes import Apply, Entry, Name, Node, Number, apply, identifier, node_of, total
 from orthaug.export.program import Block, Constant, Layer, Network, Program, Scheme, Signal
@@ -34,7 +36,8 @@ def program_of(model: Model | MotionModel, name: str = "model", digest: str = ""
     numbers = model.numbers
     if not all(np.isfinite(np.asarray(values)).all() for values in numbers[:6]):
         raise InputError("the model holds numbers that are not finite; fit it again.")
-    return _LOWERED[type(model)](model, name, digest)
+    prepared = ", ".join(done.named for done in model.prepared if done.step not in MENDING)
+    return replace(_LOWERED[type(model)](model, name, digest), preparation=prepared)
 
 
 class _Constants:

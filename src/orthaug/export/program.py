@@ -116,6 +116,8 @@ class Program:
     symbols: tuple[tuple[str, str], ...] = ()
     """The names of constants and intermediate results as users write them."""
     digest: str = ""
+    preparation: str = ""
+    """What the data went through that inputs, outputs and state stand for, in words."""
 
     @property
     def blocks(self) -> tuple[Block, ...]:
