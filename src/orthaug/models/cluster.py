@@ -231,7 +231,8 @@ def connected(scheduler: str | None, workers: int | None) -> Any:
 
     if scheduler is None:
         count = workers or os.cpu_count() or 1
-        with config.set({"distributed.nanny.pre-spawn-environ": _SINGLE_THREADED}):
+        own = f"{os.environ.get('XLA_FLAGS', '')} {_SINGLE_THREADED['XLA_FLAGS']}".strip()
+        with config.set({"distributed.nanny.pre-spawn-environ": _SINGLE_THREADED | {"XLA_FLAGS": own}}):
             options: dict[str, Any] = {"n_workers": count, "threads_per_worker": 1, "dashboard_address": ":0"}
             cluster = LocalCluster(**options)
             client = Client(cluster)
