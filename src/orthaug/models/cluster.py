@@ -234,21 +234,22 @@ def connected(scheduler: str | None, workers: int | None) -> Any:
         own = f"{os.environ.get('XLA_FLAGS', '')} {_SINGLE_THREADED['XLA_FLAGS']}".strip()
         with config.set({"distributed.nanny.pre-spawn-environ": _SINGLE_THREADED | {"XLA_FLAGS": own}}):
             options: dict[str, Any] = {"n_workers": count, "threads_per_worker": 1, "dashboard_address": ":0"}
-            cluster = LocalCluster(**options)
-            client = Client(cluster)
-            atexit.register(_closed, client, cluster)  # before distributed's own, which tells of tasks it cancels
+            client = Client(LocalCluster(**options))
     else:
         try:
             client = Client(scheduler, timeout=_PATIENCE)
         except (OSError, TimeoutError, ValueError) as error:
             raise InputError(f"no Dask scheduler answers at {scheduler} ({type(error).__name__}).") from None
+    atexit.register(_closed, client, own=scheduler is None)  # before distributed's own, which tells of what it cancels
     check_versions(client)
     return client
 
 
-def _closed(*parts: Any) -> None:
-    for part in parts:
-        part.close()
+def _closed(client: Any, *, own: bool) -> None:
+    cluster = client.cluster
+    client.close()
+    if own:
+        cluster.close()
 
 
 def check_versions(client: Any) -> None:
