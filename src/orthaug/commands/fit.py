@@ -15,6 +15,7 @@ from orthaug._base.parallel import one_blas_thread
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.views import MAKERS
 from orthaug._base.warning import Warning
+from orthaug.commands.attempt import attempt
 from orthaug.commands.folder import not_a_result
 from orthaug.commands.job import ALONE, AS_DECLARED, DEFAULT_BLOCKS, Job, Variant
 from orthaug.commands.kinds import kind_of
@@ -72,8 +73,11 @@ def judged(fitted: Fitted) -> Fitted:
     job, fit, warnings = fitted.job, fitted.fit, list(fitted.result.warnings)
     if not fit.status.ok or (fit.model.form.bound is None and fit.held_out is None):
         return fitted
-    verdict = judge_fit(fitted)
-    if verdict is None and fit.model.form.bound is not None and job.spec.validation.blocks != 0:
+    failed: list[Any] = []
+    verdict = attempt("the judgement of the learner", lambda: judge_fit(fitted), failed, None)
+    warnings += failed
+    asked = fit.model.form.bound is not None and job.spec.validation.blocks != 0
+    if verdict is None and asked and not failed:
         told = (
             "whether the learner helps is not judged: no part is held out, and the training data have too few "
             "rows for cross-validation in so many blocks."
