@@ -15,6 +15,7 @@ import pandas as pd
 import pytest
 import scipy.signal
 from helpers import unfolded
+from test_export import moving
 
 import orthaug as oa
 from orthaug._base.errors import InputError
@@ -319,6 +320,28 @@ def test_modes_are_the_roots_of_the_characteristic_polynomial(model):
     found = stability.modes
     assert (found.rightmost, found.fastest) == pytest.approx((-c / (2 * m), np.sqrt(k / m)))
     assert found.growing == 0 and not stability.warnings
+
+
+def test_an_angle_integrates_and_does_not_decay():
+    def told(*states):
+        given = [oa.PhysicalParameter("c", 2.0)]
+        model = moving(oa.Motion.from_equations(list(states), [oa.Output("y", "x")], given, inputs=["u"]))
+        model = replace(model, numbers=model.numbers._replace(theta_aux=np.zeros(1)))
+        return motion_stability(model, np.random.default_rng(0).normal(size=(5, len(states))), np.zeros((5, 1)))
+
+    shaft = told(oa.State("x", "v"), oa.State("v", "u - c*v - 12*i"), oa.State("i", "u - 3*i"))
+    assert shaft.text == (
+        "The linearised motion has an integrator and modes of 2 to 3 1/s along the free run. All others decay "
+        "everywhere: the largest real part is -2 1/s. What integrates neither decays nor grows: it keeps its errors."
+    )
+    assert (shaft.modes.integrators, shaft.modes.rightmost, shaft.modes.slowest) == pytest.approx((1, -2, 2))
+    mass = told(oa.State("x", "v"), oa.State("v", "c*u"))
+    assert "has 2 integrators and no other mode along" in mass.text and "decay everywhere" not in mass.text
+    swing = told(oa.State("x", "v"), oa.State("v", "c*u - 9*x"))
+    assert "has modes of 3 1/s" in swing.text and "None grows, and not all decay" in swing.text
+    runaway = told(oa.State("x", "v"), oa.State("v", "u + c*v"))
+    assert "has an integrator and modes of 2 1/s" in runaway.text and "grows, by up to 2 1/s" in runaway.text
+    assert not any("-0 " in found.text for found in (shaft, mass, swing, runaway))
 
 
 def test_compare_puts_physics_alone_and_saved_models_beside(folder, printed, result):
