@@ -154,3 +154,30 @@ def test_suspects_that_the_motion_cannot_have_are_refused() -> None:
         *(f"{kind} of u" for kind in ("cubic", "dead_zone", "saturation")),
         "offset",
     ]
+
+
+def test_what_keeps_its_sign_has_no_jump_at_zero() -> None:
+    """A level and a pump that are always positive: a dead zone of the pump is a constant there, and no friction."""
+    rng, level, rows = np.random.default_rng(5), 1.0, []
+    for u in np.repeat(rng.uniform(1, 4, 30), 10):
+        rows.append((u, level))
+        for _ in range(20):
+            level += 0.005 * (0.8 * (u - 0.6) - 0.5 * level)
+    u, y = np.array(rows).T
+    record = oa.Record.from_arrays(u=u, y=y + 0.002 * rng.normal(size=300), sampling_time=0.1)
+    tank = oa.Motion.from_equations(
+        [oa.State("h", "g*u - k*h", start="y")], [oa.Output("y", "h")], positive(g=1.0, k=1.0), inputs=["u"]
+    )
+    fit = oa.estimate(record, tank, learner=None, criterion=WHOLE)
+    found = oa.diagnose(fit)
+    assert found.verdict == "unmodelled"
+    best = found.missing.terms[0]
+    assert best.shape == "constant" and best.coefficient == pytest.approx(-0.48, rel=0.2)
+    assert "jump" not in found.text and "the equation of h lacks something constant" in found.text
+    assert not {"jump", "absolute"} & {term.shape for term in found.missing.terms}
+    assert [s.name for s in usual_motion_suspects(fit.problem) if "of h" in s.name] == [
+        "quadratic_drag of h",
+        "cubic of h",
+    ]
+    assert "curved in h" in replace(best, variable="h", shape="square", one_sided=True).meaning
+    assert "coulomb of v" in [s.name for s in usual_motion_suspects(pose_motion(data(60), spring()))]

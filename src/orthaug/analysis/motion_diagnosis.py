@@ -145,6 +145,10 @@ def _named(lacks: MissingTest, fit: MotionEstimate) -> str:
         text += f", as would {' or '.join(f'{term.expression} in that of {term.equation}' for term in others[:2])}"
     learned = {fit.problem.motion.names_of_states[i] for i in fit.problem.motion.learned[0]}
     seen = fit.model.form.bound is not None and best.equation in learned
-    sees = f"see {best.variable}" if best.variable else "stand there"
-    remedy = f"let the learner {sees}" if seen else f"add a learner to the equation of {best.equation} that may {sees}"
+    sees = f" that may see {best.variable}" if best.variable else ""
+    remedy = (
+        f"let the learner see {best.variable or 'more'}"
+        if seen
+        else f"add a learner to the equation of {best.equation}{sees}"
+    )
     return f"{text}. Give the physics such a term, or {remedy}."

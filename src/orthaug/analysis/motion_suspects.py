@@ -13,7 +13,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_label, check_unique, is_number, nearest
 from orthaug._base.errors import InputError
-from orthaug.analysis.suspects import WIDTHS, written
+from orthaug.analysis.suspects import ODD_JUMPS, WIDTHS, changes_sign, written
 from orthaug.data.expressions import Expression, parse_named
 from orthaug.physics.motion import Motion
 from orthaug.physics.motion_problem import MotionProblem
@@ -165,15 +165,17 @@ def _balanced(text: str) -> None:
 def usual_motion_suspects(problem: MotionProblem) -> tuple[MotionSuspect, ...]:
     """What is often missing: friction, drag and hardening of every state, what bends an input, an offset."""
     motion, (x, u) = problem.motion, problem.looked_at
-    moving = [(name, True) for name, row in zip(motion.names_of_states, x, strict=True) if np.ptp(row) > 0]
-    moving += [(name, False) for name, row in zip(motion.inputs, u, strict=True) if np.ptp(row) > 0]
+    moving = [(name, True, row) for name, row in zip(motion.names_of_states, x, strict=True) if np.ptp(row) > 0]
+    moving += [(name, False, row) for name, row in zip(motion.inputs, u, strict=True) if np.ptp(row) > 0]
     places = usual_places(motion)
     found = []
     for place in places:
         equation = motion.states[place].name
         where = f" in {equation}" if len(places) > 1 else ""
-        for name, is_state in moving:
+        for name, is_state, row in moving:
             for kind in _OF_STATES if is_state else _OF_INPUTS:
+                if kind in ODD_JUMPS and not changes_sign(row):
+                    continue
                 width = motion_width(name, problem) if kind in WIDTHS else None
                 label = f"{kind} of {name}{where}"
                 found.append(MotionSuspect.of(kind, name, width=width, equation=equation, name=label))
