@@ -159,7 +159,7 @@ def _analysed(job: MotionJob, fit: MotionEstimate, free_run: Response, warnings:
     from orthaug.analysis.learned_part import equation_parts
     from orthaug.analysis.motion_budget import motion_budget
     from orthaug.analysis.motion_diagnosis import diagnose_motion
-    from orthaug.analysis.motion_ground import suspected_bias
+    from orthaug.analysis.motion_ground import softened_bias, suspected_bias
     from orthaug.analysis.motion_modes import motion_stability
     from orthaug.analysis.motion_substeps import substep_bias
 
@@ -180,7 +180,7 @@ def _analysed(job: MotionJob, fit: MotionEstimate, free_run: Response, warnings:
 
     def biases() -> Any:
         table = suspected_bias(fit, job.suspects) if job.suspects else []
-        budget = motion_budget(fit, table)
+        budget = motion_budget(fit, table, softened_bias(fit, job.suspects))
         warnings.extend(budget.warnings if budget else ())
         return [entry.as_dict() for entry in table] or None, budget
 
