@@ -15,6 +15,7 @@ import pandas as pd
 import pytest
 import scipy.signal
 from helpers import unfolded
+from test_export import moving
 
 import orthaug as oa
 from orthaug._base.errors import InputError
@@ -321,6 +322,28 @@ def test_modes_are_the_roots_of_the_characteristic_polynomial(model):
     assert found.growing == 0 and not stability.warnings
 
 
+def test_an_angle_integrates_and_does_not_decay():
+    def told(*states):
+        given = [oa.PhysicalParameter("c", 2.0)]
+        model = moving(oa.Motion.from_equations(list(states), [oa.Output("y", "x")], given, inputs=["u"]))
+        model = replace(model, numbers=model.numbers._replace(theta_aux=np.zeros(1)))
+        return motion_stability(model, np.random.default_rng(0).normal(size=(5, len(states))), np.zeros((5, 1)))
+
+    shaft = told(oa.State("x", "v"), oa.State("v", "u - c*v - 12*i"), oa.State("i", "u - 3*i"))
+    assert shaft.text == (
+        "The linearised motion has an integrator and modes of 2 to 3 1/s along the free run. All others decay "
+        "everywhere: the largest real part is -2 1/s. What integrates neither decays nor grows: it keeps its errors."
+    )
+    assert (shaft.modes.integrators, shaft.modes.rightmost, shaft.modes.slowest) == pytest.approx((1, -2, 2))
+    mass = told(oa.State("x", "v"), oa.State("v", "c*u"))
+    assert "has 2 integrators and no other mode along" in mass.text and "decay everywhere" not in mass.text
+    swing = told(oa.State("x", "v"), oa.State("v", "c*u - 9*x"))
+    assert "has modes of 3 1/s" in swing.text and "None grows, and not all decay" in swing.text
+    runaway = told(oa.State("x", "v"), oa.State("v", "u + c*v"))
+    assert "has an integrator and modes of 2 1/s" in runaway.text and "grows, by up to 2 1/s" in runaway.text
+    assert not any("-0 " in found.text for found in (shaft, mass, swing, runaway))
+
+
 def test_compare_puts_physics_alone_and_saved_models_beside(folder, printed, result):
     saved = folder / "out"
     code, out, err = orthaug("compare", folder / "msd.toml", "--out", folder / "both", "--model", saved, "--json")
@@ -400,6 +423,92 @@ def test_suspects_are_weighed_before_a_fit_and_after_it(folder, result):
     assert rows["m"]["ci95_with_bias"] == pytest.approx(rows["m"]["ci95"], rel=1e-3)
     assert "of what the learner found is friction" in out and "biased" in [w["code"] for w in told["warnings"]]
     assert (folder / "suspects" / "figures" / "bias.png").exists()
+
+
+MOTOR = """
+[data]
+sampling_time = 0.01
+inputs = ["V"]
+outputs = ["W", "I"]
+train = { files = ["motor.csv"] }
+[motion]
+substeps = 2
+[motion.states]
+w = { derivative = "(K*i - b*w)/J", start = "W", learned = true }
+i = { derivative = "(V - R*i - K*w)/L", start = "I" }
+[motion.outputs]
+W = "w"
+I = "i"
+[motion.parameters]
+K = { initial = 0.5, min = 0 }
+J = { initial = 0.05, min = 0 }
+b = { initial = 0.1, min = 0 }
+R = { initial = 1.0, min = 0 }
+L = { initial = 0.05, min = 0 }
+[learner]
+hidden = [2]
+inputs = ["w"]
+[[suspects]]
+name = "stiction"
+kind = "coulomb"
+on = "w"
+equation = "w"
+[[suspects]]
+name = "wear"
+kind = "cubic"
+on = "i"
+equation = "w"
+[training]
+iterations = 5
+[validation]
+blocks = 0
+"""
+
+
+@pytest.fixture(scope="module")
+def motor(tmp_path_factory) -> Path:
+    """A motor whose resistance and inductance stand in the equation that no learner is added to."""
+    random, (w, i), rows = np.random.default_rng(3), (0.0, 0.0), []
+    for volts in np.repeat(random.uniform(-5, 5, 15), 20):
+        rows.append((volts, w, i))
+        for _ in range(20):
+            dw = (0.6 * i - 0.1 * w - 0.2 * np.tanh(w / 0.05)) / 0.04
+            w, i = w + 5e-4 * dw, i + 5e-4 * (volts - 1.2 * i - 0.6 * w) / 0.06
+    measured = np.array(rows) + np.array([0.0, 0.02, 0.02]) * random.normal(size=(300, 3))
+    path = tmp_path_factory.mktemp("motor")
+    pd.DataFrame(measured, columns=["V", "W", "I"]).to_csv(path / "motor.csv", index=False)
+    (path / "spec.toml").write_text(MOTOR)
+    return path / "spec.toml"
+
+
+def test_parameters_of_equations_without_a_learner_are_not_moved_by_what_it_sees(motor):
+    code, out, err = orthaug("check", motor, "--json")
+    assert code == 0, err
+    stiction, wear = strict(out)["bias"]
+    assert stiction["seen"] and not wear["seen"]
+    assert [stiction["bias"][name] for name in "KJRL"] == pytest.approx([0, 0, 0, 0], abs=1e-9)
+    assert stiction["bias"]["b"] < 0 and wear["bias"]["R"] != 0
+
+
+def test_an_analysis_that_fails_numerically_loses_no_training(motor, monkeypatch):
+    from orthaug.analysis import motion_ground, motion_modes
+
+    def fails(*_, **__):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr(motion_modes, "motion_stability", fails)
+    monkeypatch.setattr(motion_ground, "suspected_bias", fails)
+    code, out, err = orthaug("fit", motor, "--out", motor.parent / "out")
+    assert code == 0, err
+    told = strict((motor.parent / "out" / "result.json").read_text())
+    texts = [w["text"] for w in told["warnings"] if w["code"] == "analysis_failed"]
+    assert texts == [
+        "the analysis of the modes failed numerically (Singular matrix): the result stands without it.",
+        "the bias by suspects failed numerically (Singular matrix): the result stands without it.",
+    ]
+    assert told["stability"] is None and told["bias"] is None and told["residuals"] is not None
+    assert all(unfolded(text) in unfolded(out + err) for text in texts)
+    assert (motor.parent / "out" / "model").is_dir() and (motor.parent / "out" / "report.html").exists()
 
 
 BAD = {

@@ -324,6 +324,22 @@ def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(fitted:
     assert (robust.std > 1.2 * alone.std).all() and robust.freedom < 31
 
 
+@pytest.mark.parametrize(
+    ("own", "words"), [(0.0, "too little to predict it from its"), (0.2, "and 20 % of it follows")]
+)
+def test_what_is_called_coloured_is_told_with_its_correlation(own: float, words: str) -> None:
+    """A slight colour is surely there in many rows, and yet the past predicts nothing."""
+    from orthaug.analysis.motion_diagnosis import _colour
+    from orthaug.analysis.predictability import Predictable
+    from orthaug.analysis.residuals import analyse
+
+    e = np.random.default_rng(2).normal(size=(4000, 2))
+    e[1:, 0] += 0.2 * e[:-1, 0]
+    tests = analyse([e], [np.zeros((4000, 0))], [np.zeros((4000, 0))], ["y", "z"], [], [])
+    told = _colour(tests, tuple(Predictable(name, 1.0, own, 0.0, 0.0) for name in "yz"))
+    assert told.startswith("y has autocorrelations of up to 0.2") and words in told and "z" not in told
+
+
 def test_a_term_that_is_there_already_moves_the_run_as_its_parameter_does() -> None:
     """Linear in x, added to the equation of v: the spring's own column, −k/m of it by the logarithm of k."""
     from orthaug.analysis.missing_terms import doubted

@@ -11,7 +11,9 @@ from test_motion_fit import WHOLE, data, positive, spring
 import orthaug as oa
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jnp
-from orthaug.analysis.motion_budget import motion_budget
+from orthaug.analysis.budget import AS_MUCH
+from orthaug.analysis.motion_budget import motion_budget, rivals_of
+from orthaug.analysis.motion_ground import softened_bias
 from orthaug.analysis.motion_suspects import check_motion_suspects, usual_motion_suspects
 from orthaug.physics.motion_problem import pose_motion
 
@@ -154,3 +156,62 @@ def test_suspects_that_the_motion_cannot_have_are_refused() -> None:
         *(f"{kind} of u" for kind in ("cubic", "dead_zone", "saturation")),
         "offset",
     ]
+
+
+def test_what_keeps_its_sign_has_no_jump_at_zero() -> None:
+    """A level and a pump that are always positive: a dead zone of the pump is a constant there, and no friction."""
+    rng, level, rows = np.random.default_rng(5), 1.0, []
+    for u in np.repeat(rng.uniform(1, 4, 30), 10):
+        rows.append((u, level))
+        for _ in range(20):
+            level += 0.005 * (0.8 * (u - 0.6) - 0.5 * level)
+    u, y = np.array(rows).T
+    record = oa.Record.from_arrays(u=u, y=y + 0.002 * rng.normal(size=300), sampling_time=0.1)
+    tank = oa.Motion.from_equations(
+        [oa.State("h", "g*u - k*h", start="y")], [oa.Output("y", "h")], positive(g=1.0, k=1.0), inputs=["u"]
+    )
+    fit = oa.estimate(record, tank, learner=None, criterion=WHOLE)
+    found = oa.diagnose(fit)
+    assert found.verdict == "unmodelled"
+    best = found.missing.terms[0]
+    assert best.shape == "constant" and best.coefficient == pytest.approx(-0.48, rel=0.2)
+    assert "jump" not in found.text and "the equation of h lacks something constant" in found.text
+    assert not {"jump", "absolute"} & {term.shape for term in found.missing.terms}
+    assert [s.name for s in usual_motion_suspects(fit.problem) if "of h" in s.name] == [
+        "quadratic_drag of h",
+        "cubic of h",
+    ]
+    assert "curved in h" in replace(best, variable="h", shape="square", one_sided=True).meaning
+    assert "coulomb of v" in [s.name for s in usual_motion_suspects(pose_motion(data(60), spring()))]
+
+
+def test_friction_that_turns_round_smoothly_is_no_drag() -> None:
+    """6 tanh(v / 0.1) at speeds of 0.1: the jump explains less of what was learned than a drag of the wrong sign."""
+    options = {"learner": oa.MLP((4,), inputs=("v",)), "criterion": WHOLE, "blocks": 0}
+    fit = oa.estimate(data(friction=6.0, noise=0.0005), spring(learned=True), **options)
+    kinds = ("coulomb", "quadratic_drag", "cubic")
+    suspects = [oa.MotionSuspect.of(kind, "v", factor="-1/m", name=kind) for kind in kinds]
+    table, smooth = oa.suspected_bias(fit, suspects), softened_bias(fit, suspects)
+    alone, beside = motion_budget(fit, table), motion_budget(fit, table, smooth)
+    assert alone.cause.suspect.name == "quadratic_drag" and alone.coefficient < 0 and alone.of("c").ci95[0] > TRUTH[1]
+    assert beside.cause.suspect.name.startswith("coulomb as tanh(v/0.") and beside.share > 0.97
+    assert beside.coefficient == pytest.approx(6.0, rel=0.3)
+    low, high = beside.of("c").ci95
+    assert low < TRUTH[1] < high
+    rivals = rivals_of(beside.cause, (*table, *smooth))
+    assert [rival.suspect.name[:15] for rival in rivals] == ["coulomb as tanh"] and rivals[0] is not beside.cause
+    twice = motion_budget(fit, [beside.cause, replace(table[1], explained=beside.share)])  # a rival that is elsewhere
+    assert twice.of("c").ci95[1] > alone.of("c").ci95[0]
+    assert "(quadratic_drag explains as much and would move them elsewhere)" in twice.warnings[0].text
+
+
+def test_a_jump_that_is_there_stays_one(learned: oa.MotionEstimate) -> None:
+    assert softened_bias(learned, SUSPECTS) == []  # none of the kind coulomb
+    jump = oa.MotionSuspect.of("coulomb", "v - 0.1", factor="-1/m", name="dry", coefficient=0.5)
+    smooth = [entry.suspect for entry in softened_bias(learned, [jump])]
+    assert len(smooth) == 5 and all(s.expression.startswith("(-1/m)*(tanh((v - 0.1)/") for s in smooth)
+    assert {(s.equation, s.coefficient, s.jump) for s in smooth} == {(None, 0.5, None)}
+    drag = oa.MotionSuspect.of("quadratic_drag", "v", factor="-1/m", name="drag")
+    (entry,) = oa.suspected_bias(learned, [drag])
+    little = replace(entry, explained=0.99 * AS_MUCH)
+    assert motion_budget(learned, [replace(entry, explained=0.985)], [little]).cause.suspect is drag

@@ -14,7 +14,8 @@ from test_export import lagged, moving
 from test_missing import SPEC, write
 
 import orthaug as oa
-from orthaug.analysis.observer_noise import by_verdict
+from orthaug._base.lines import percent
+from orthaug.analysis.observer_noise import by_verdict, to_keep
 
 PHYSICS = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "y[k-2]"), oa.Term("g", "u[k-1]")])
 TWO = [
@@ -299,6 +300,28 @@ def test_a_model_by_itself_goes_by_how_it_was_trained():
     assert by_verdict(replace(model, statistics=free)).output == 0
 
 
+def test_a_fit_keeps_noises_by_the_likelihood_of_its_data(tmp_path):
+    """Disturbances of a motion make its errors coloured; what share of them they make no rule knows."""
+    model, _ = linear_motion()
+    noise = oa.Noise(of([[0, 0], [0, 0.001]]), of([[0.01]]))
+    records = [record_of(model, u, y) for y, _, _, u in (simulated(model, noise, 2000, seed) for seed in (11, 12))]
+    fit = oa.estimate(records[0], model.form.motion, learner=None, criterion=oa.Simulation(segment=0, washout=0))
+    kept = to_keep(fit, "equation_noise")
+    assert kept is not None and to_keep(fit, "white") is None
+    statistics = replace(fit.model.statistics, verdict="equation_noise")
+    known = replace(statistics, disturbance=kept.state, sensor=kept.output)
+    oa.save(replace(fit.model, statistics=known), tmp_path / "model")
+    observers = [oa.Observer(oa.load(tmp_path / "model")), oa.Observer(replace(fit.model, statistics=statistics))]
+    held = []
+    for observer in observers:
+        (one,) = observer.predict(records[1]).trajectories
+        held.append(np.mean((np.abs(one.model - one.measured) <= 1.96 * one.std)[one.start :]))
+    np.testing.assert_array_equal(observers[0].noise.output, kept.output)
+    assert observers[0].run(records[1]).consistency().consistent
+    assert not observers[1].run(records[1]).consistency().consistent
+    assert abs(held[0] - 0.95) < 0.015 < 0.3 < abs(held[1] - 0.95)
+
+
 # --- what is refused
 
 
@@ -466,3 +489,24 @@ def test_a_saved_model_carries_the_verdict(fitted, tmp_path):
     assert model.statistics.flown is False
     oa.save(model, tmp_path / "model")
     assert oa.load(tmp_path / "model").statistics.verdict == model.statistics.verdict != ""
+
+
+def test_a_prediction_tells_whether_its_band_is_one_of_95_percent(fitted, tmp_path):
+    done = run(
+        "predict", fitted / "out", fitted / "run.csv", "--observer", "--horizon", "2", "--out", tmp_path / "a.csv"
+    )
+    assert one_line(
+        done.err.splitlines()[-1] + "\n", "note: the innovations' squares are", "(NIS, ", "its 95 % band holds 9"
+    )
+    model = oa.load(fitted / "out")
+    small = replace(model.statistics, disturbance=0.2 * model.statistics.noise, sensor=0 * model.statistics.noise)
+    oa.save(replace(model, statistics=small), tmp_path / "model")
+    done = run("predict", tmp_path / "model", fitted / "run.csv", "--observer", "--out", tmp_path / "b.csv")
+    words = ("Do not take the band for one of 95 %: its noises are too small", ".tuned(record)")
+    assert done.code == 0 and one_line(
+        done.err.splitlines()[-1] + "\n", "warning: the innovations' squares are", *words
+    )
+    rows = np.genfromtxt(tmp_path / "b.csv", delimiter=",", names=True)
+    there = np.isfinite(rows["y"]) & np.isfinite(rows["y_model"])
+    inside = (rows["y_model_low"] <= rows["y"]) & (rows["y"] <= rows["y_model_high"])
+    assert f"its 95 % band holds {percent(inside[there].mean(), 3)} of what was measured" in done.err

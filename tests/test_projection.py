@@ -275,3 +275,25 @@ def test_nist_digits_through_blocks(data_folder, name):
         found.append(digits(through_blocks(phi[order], y[order], [5, 3]), certified["beta"]))
         reference.append(digits(scaled_qr(phi[order, 0], y[order, 0]), certified["beta"]))
     assert np.mean(found) >= np.mean(reference) - 1.0
+
+
+def test_along_directions_that_the_rows_tell_phi_may_have_columns_of_zeros():
+    rng = np.random.default_rng(4)
+    phi, v = rng.normal(size=(30, 2, 5)), rng.normal(size=(30, 2))
+    phi[..., 3:] = 0.0  # parameters of other equations
+    projection, stacked = Projection.factor(phi), phi.reshape(60, 5)
+    basis = np.array([[1.0, 0.0], [2.0, 0.0], [0.0, 1.0], [0.0, 0.0], [0.0, 0.0]])
+    expected = basis @ np.linalg.lstsq(stacked @ basis, v.reshape(-1), rcond=None)[0]
+    assert projection.solve_along(v, basis) == pytest.approx(expected, rel=1e-12)
+    everything = projection.solve_along(v, np.eye(5))  # the shortest of all that are as near
+    assert everything == pytest.approx(np.linalg.lstsq(stacked, v.reshape(-1), rcond=None)[0], rel=1e-12)
+    assert not projection.solve_along(v, np.eye(5)[:, 3:]).any()
+
+
+def test_directions_that_differ_in_what_no_row_tells_are_one():
+    phi = np.zeros((20, 1, 3))
+    phi[:, 0, :2] = np.random.default_rng(1).normal(size=(20, 2))
+    projection, basis = Projection.factor(phi), np.array([[1.0, 1.0], [0.5, 0.5], [0.0, 7.0]])
+    told = projection.told_of(basis)
+    assert told.shape == (3, 1) and np.linalg.matrix_rank(phi[:, 0] @ told) == 1
+    assert np.array_equal(projection.told_of(basis[:, :1]), basis[:, :1])

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from orthaug._base.errors import InputError
-from orthaug.analysis.suspects import KINDS, Suspect, data_width, suspect_columns
+from orthaug.analysis.suspects import KINDS, Suspect, data_width, suspect_columns, usual_suspects
 from orthaug.data.expressions import Lag, parse
+from orthaug.data.record import Record
+from orthaug.physics.baseline import Baseline, Term
+from orthaug.physics.problem import pose
 from orthaug.studies.synthetic import MassSpringDamper
 
 LAYOUT = (Lag("y", 1), Lag("y", 2), Lag("u", 1))
@@ -163,3 +166,13 @@ def test_no_width_from_data_that_do_not_move():
         data_width("u[k-1]", 0 * X, LAYOUT)
     with pytest.raises(InputError, match=r"'1/u\[k-1\]' is not finite at row 0"):
         data_width("1/u[k-1]", X, LAYOUT)
+
+
+@pytest.mark.parametrize(("rising", "named"), [(True, False), (False, True)])
+def test_a_difference_that_keeps_its_sign_has_no_friction(rising, named):
+    rng = np.random.default_rng(2)
+    y = np.cumsum(rng.uniform(0.5, 1.5, 60)) if rising else np.cumsum(rng.normal(size=60))
+    record = Record.from_arrays(rng.normal(size=60), y)
+    problem = pose(record, Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("g", "u[k]")]))
+    kinds = {suspect.name.split(" of ")[0] for suspect in usual_suspects(problem) if "y[k-1] - y[k-2]" in suspect.name}
+    assert kinds == {"quadratic_drag", "cubic"} | ({"coulomb", "stribeck"} if named else set())

@@ -31,7 +31,7 @@ from orthaug.physics.parameters import PhysicsMap
 
 LEAST_SHARE = 0.5  # of the learner's energy that a cause must explain to be named
 _NOTHING = 0.01  # of the noise: a learner that is smaller found nothing that could be explained
-_AS_MUCH = 0.98  # of what the cause explains: a rival cannot be told from it
+AS_MUCH = 0.98  # of what the cause explains: a rival cannot be told from it
 _ROUNDING = 1e-9  # of a parameter: a bias that no one can speak of
 _TOLD = 4  # parameters that a warning lists at most
 
@@ -151,7 +151,7 @@ def rival_of(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) 
     assert cause.explained
     if cause.suspect in suspects:
         return None
-    equal = [entry for entry in _usual(ground) if (entry.explained or 0.0) >= _AS_MUCH * cause.explained]
+    equal = [entry for entry in _usual(ground) if (entry.explained or 0.0) >= AS_MUCH * cause.explained]
     to_coordinates, own = ground.weighed.projection.to_coordinates, _moved(cause)
     nt = len(cause.names)
 

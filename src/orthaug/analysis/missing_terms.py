@@ -20,6 +20,7 @@ import scipy.special
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug.analysis.motion_sensitivities import Sensitivities, Terms, sensitivities
+from orthaug.analysis.suspects import changes_sign
 from orthaug.analysis.whiteness import whitening
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.physics.motion import Motion
@@ -34,6 +35,7 @@ _MEANINGS = (
     "even in {}, without a kink",
     "odd in {} and growing faster than it, as a hardening spring",
 )
+_ONE_SIDED = ("linear in {}", "", "", "curved in {}", "curved in {}, most where that is large")
 _OWN = 0.02  # of a column's size: what remains of it beside all that was estimated, so that it is one of its own
 _RANK = 1e-6  # of the largest singular value of such columns, each of size 1
 _ROWS_PER_COLUMN = 5
@@ -56,6 +58,8 @@ class MissingTerm:
     shape: str
     coefficient: float
     share: float
+    one_sided: bool = False
+    """Whether the variable keeps its sign over the data: nothing is then known of odd and even."""
 
     @property
     def expression(self) -> str:
@@ -67,7 +71,8 @@ class MissingTerm:
     @property
     def meaning(self) -> str:
         """Its kind in words."""
-        return "constant" if self.variable is None else _MEANINGS[SHAPES.index(self.shape)].format(self.variable)
+        words = _ONE_SIDED if self.one_sided else _MEANINGS
+        return "constant" if self.variable is None else words[SHAPES.index(self.shape)].format(self.variable)
 
     def __str__(self) -> str:
         return f"the equation of {self.equation} lacks something {self.meaning}: {self.expression}"
@@ -109,12 +114,13 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
     names = (*motion.names_of_states, *motion.inputs)
     equations = doubted(fit)
     count = 1 + len(SHAPES) * len(names)
-    sizes: list[Vector] = []
+    found_of: list[tuple[Vector, list[bool]]] = []
 
     def terms(points: Matrix) -> Terms:
         size = np.abs(points).max(axis=1, initial=0.0)
-        sizes.append(np.where(size > 0, size, 1.0))
-        return lambda rows: _values(rows / sizes[0][:, None])
+        size = np.where(size > 0, size, 1.0)
+        found_of.append((size, [not changes_sign(values) for values in points]))
+        return lambda rows: _values(rows / size[:, None], found_of[0][1])
 
     found = sensitivities(fit, equations, terms, count)
     if found is None:
@@ -124,7 +130,7 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
         return None
     p, freedom, share, gains, shares, coefficients = tested
     order = [int(j) for j in np.argsort(-gains) if gains[j] > _RIVAL * gains.max()]
-    listed = [_term(motion, equations, names, j, coefficients, shares, sizes[0]) for j in order]
+    listed = [_term(motion, equations, names, j, coefficients, shares, *found_of[0]) for j in order]
     return MissingTest(p, freedom, share, tuple(listed))
 
 
@@ -145,9 +151,15 @@ def doubted(fit: MotionEstimate) -> tuple[int, ...]:
     return tuple(sorted(moved)) or tuple(range(len(motion.states)))
 
 
-def _values(z: Matrix) -> Any:
-    """A constant, then the shapes of each variable: (1 + 5 n, r) of z (n, r)."""
-    shaped = [[one, np.tanh(one / _EDGE), np.abs(one), one**2, one**3] for one in z]
+def _values(z: Matrix, one_sided: list[bool]) -> Any:
+    """A constant, then the shapes of each variable: (1 + 5 n, r) of z (n, r).
+
+    Where a variable keeps its sign a jump at zero is a constant, and its size itself: zeros stand for them.
+    """
+    shaped = [
+        [one, np.tanh(one / _EDGE) * both, np.abs(one) * both, one**2, one**3]
+        for one, both in zip(z, np.logical_not(one_sided), strict=True)
+    ]
     return np.stack([np.ones(z.shape[1]), *(values for own in shaped for values in own)])
 
 
@@ -159,6 +171,7 @@ def _term(
     coefficients: Vector,
     shares: Vector,
     sizes: Vector,
+    one_sided: list[bool],
 ) -> MissingTerm:
     count = 1 + len(SHAPES) * len(names)
     equation, number = motion.names_of_states[equations[j // count]], j % count
@@ -167,7 +180,8 @@ def _term(
         return MissingTerm(equation, None, "constant", coefficient, share)
     variable, shape = divmod(number - 1, len(SHAPES))
     power = (1, 0, 1, 2, 3)[shape]
-    return MissingTerm(equation, names[variable], SHAPES[shape], coefficient / float(sizes[variable]) ** power, share)
+    coefficient /= float(sizes[variable]) ** power
+    return MissingTerm(equation, names[variable], SHAPES[shape], coefficient, share, one_sided[variable])
 
 
 def _tested(found: Sensitivities) -> tuple[float, tuple[int, int], float, Vector, Vector, Vector] | None:

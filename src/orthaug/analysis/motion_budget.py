@@ -12,11 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthaug._base.warning import Warning
-from orthaug.analysis.budget import LEAST_SHARE, ParameterBias, told_bias, with_bias
+from orthaug.analysis.budget import AS_MUCH, LEAST_SHARE, ParameterBias, told_bias, with_bias
 from orthaug.analysis.motion_bias import TermBias
 from orthaug.fitting.motion_estimates import MotionEstimate
 
 _SURE = 3.3  # standard errors of a coefficient that the residual tells: one in a thousand is so large by chance
+_ELSEWHERE = 0.5  # of a bias, from which that of a rival is another one
 _TOLD = 4  # parameters that a warning lists at most
 
 
@@ -35,20 +36,27 @@ class MotionBudget:
         return next((entry for entry in self.parameters if entry.name == name), None)
 
 
-def motion_budget(fit: MotionEstimate, table: Sequence[TermBias]) -> MotionBudget | None:
+def motion_budget(
+    fit: MotionEstimate, table: Sequence[TermBias], smooth: Sequence[TermBias] = ()
+) -> MotionBudget | None:
     """By the suspect that explains most; None where none explains enough.
 
     Args:
         table: what every suspect does to the fit.
+        smooth: the same of terms that stand beside those of the table (`softened_bias`), named where they explain
+            clearly more of a learner.
     """
     learns = fit.model.form.bound is not None
-    named = _of_learner(table) if learns else _of_residual(table)
+    named = _of_learner(table, smooth) if learns else _of_residual(table)
     if named is None:
         return None
     cause, coefficient, share, spread = named
+    rivals = rivals_of(cause, (*table, *smooth)) if learns else []
     bias, value = coefficient * cause.per_unit, fit.values
     std = np.full(len(value), np.nan) if fit.std is None else fit.std
-    ends = with_bias(value, std, fit.freedom, bias, spread * cause.per_unit)
+    apart = [np.abs((rival.coefficient_found or 0.0) * rival.per_unit - bias) for rival in rivals]
+    rest = np.hypot(spread * cause.per_unit, np.max([np.zeros(len(value)), *apart], axis=0))
+    ends = with_bias(value, std, fit.freedom, bias, rest)
     parameters = fit.problem.motion.parameters
     ends = np.clip(ends, [[p.min] for p in parameters], [[p.max] for p in parameters])
     rows = []
@@ -59,13 +67,26 @@ def motion_budget(fit: MotionEstimate, table: Sequence[TermBias]) -> MotionBudge
             relative = float(bias[i] / value[i]) if value[i] else None
             rows.append(ParameterBias(name, float(bias[i]), cause.suspect.name, share, relative, errors, limits))
     found = MotionBudget(cause, coefficient, share, tuple(rows), ())
-    warning = _warning(found, learns=learns)
+    far = [rival for rival, by in zip(rivals, apart, strict=True) if np.any(by > _ELSEWHERE * np.abs(bias))]
+    warning = _warning(found, far, learns=learns)
     return found if warning is None else MotionBudget(cause, coefficient, share, tuple(rows), (warning,))
 
 
-def _of_learner(table: Sequence[TermBias]) -> tuple[TermBias, float, float, float] | None:
+def rivals_of(cause: TermBias, table: Sequence[TermBias]) -> list[TermBias]:
+    """Terms that explain as much of the learner as a cause, which cannot be told from it."""
+    least = AS_MUCH * (cause.explained or 0.0)
+    return [entry for entry in table if entry is not cause and (entry.explained or 0.0) >= max(least, LEAST_SHARE)]
+
+
+def _of_learner(table: Sequence[TermBias], smooth: Sequence[TermBias]) -> tuple[TermBias, float, float, float] | None:
     """The term that explains most of the learner: its coefficient, share, and how unsure the coefficient is."""
-    best = max(table, key=lambda entry: entry.explained or 0.0, default=None)
+
+    def explains(entry: TermBias) -> float:
+        return entry.explained or 0.0
+
+    best, other = max(table, key=explains, default=None), max(smooth, key=explains, default=None)
+    if best is not None and other is not None and explains(best) < AS_MUCH * explains(other):
+        best = other
     if best is None or best.explained is None or best.explained < LEAST_SHARE or best.coefficient_found is None:
         return None
     unsure = abs(best.coefficient_found) * np.sqrt((1 - best.explained) / best.explained)
@@ -88,7 +109,7 @@ def _of_residual(table: Sequence[TermBias]) -> tuple[TermBias, float, float, flo
     return best, told.coefficient, told.share, float(unsure)
 
 
-def _warning(budget: MotionBudget, *, learns: bool) -> Warning | None:
+def _warning(budget: MotionBudget, rivals: Sequence[TermBias], *, learns: bool) -> Warning | None:
     """One sentence on what is biased by more than its standard error: cause, size, remedy."""
     large = [entry for entry in budget.parameters if (entry.errors or 0.0) > 1]
     if not large:
@@ -97,9 +118,12 @@ def _warning(budget: MotionBudget, *, learns: bool) -> Warning | None:
     more = f" and {len(large) - len(shown)} more" if len(large) > len(shown) else ""
     what = "the learner" if learns else "the squares that the free run leaves"
     unit = f" {budget.cause.suspect.unit}".rstrip()
+    named = ", ".join(rival.suspect.name for rival in sorted(rivals, key=lambda rival: -(rival.explained or 0.0))[:2])
+    explain = "explain" if len(rivals) > 1 else "explains"
+    other = f" ({named} {explain} as much and would move them elsewhere)" if rivals else ""
     return Warning(
         "biased",
         f"{budget.cause.suspect.name} of size {budget.coefficient:.3g}{unit} explains {100 * budget.share:.0f} % of "
         f"{what} and moves {', '.join(told_bias(entry) for entry in shown)}{more}, which the standard errors do not "
-        f"cover: add it to the equation of {budget.cause.equation}, with its size as a parameter.",
+        f"cover{other}: add it to the equation of {budget.cause.equation}, with its size as a parameter.",
     )

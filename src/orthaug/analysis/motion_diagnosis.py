@@ -23,6 +23,7 @@ from orthaug.models.response import Response
 
 _LEVEL = 0.01  # of the test of missing terms
 _SMALL = 0.05  # of the error's variance: what inputs and states tell below that is a small effect
+_LITTLE = 0.005  # of the error's variance: what its own past tells below that is none
 _LAGS = 10  # of inputs that may tell the error
 _ROWS_PER_LAG = 20
 _MOST_ROWS = 20_000  # at which the error is set beside states
@@ -72,7 +73,7 @@ def diagnose_motion(fit: MotionEstimate, free_run: Response) -> Diagnosis | None
     told = any(share.inputs > _SMALL for share in shares) or bool(curved) or lacks is not None
     white = all(test.practically_white() for test in tests)
     verdict = "unmodelled" if told else "white" if white else "equation_noise"
-    text = _words(verdict, fit, shares, followed, curved, lacks)
+    text = _words(verdict, fit, tests, shares, followed, curved, lacks)
     colour = () if white else (Warning("coloured_residual", _COLOURED),)
     return Diagnosis(verdict, text, (), tests, None, None, colour, shares, (), missing)
 
@@ -96,6 +97,7 @@ def _predictable(i: int, test: ResidualTest, errors: list, inputs: list, every: 
 def _words(
     verdict: str,
     fit: MotionEstimate,
+    tests: tuple[ResidualTest, ...],
     shares: tuple,
     followed: dict,
     curved: dict,
@@ -105,13 +107,12 @@ def _words(
     sizes = ", ".join(f"{s.rms:.3g} {units[s.name]}".strip() + f" of {s.name}" for s in shares)
     if verdict == "white":
         return f"What the free run leaves ({sizes}) is white: noise on the outputs, which is what it is trained for."
-    colour = ", ".join(f"{100 * s.own_past:.0f} % of {s.name}" for s in shares)
     if verdict == "equation_noise":
         learner = "that the learner does not see" if fit.model.form.bound is not None else "(a learner would tell)"
         return (
-            f"What the free run leaves ({sizes}) is coloured ({colour} follows from its own past), and follows no "
-            "input, no state at the same instant, and no simple term that an equation could lack: disturbances, or "
-            f"physics missing in an equation {learner}."
+            f"What the free run leaves ({sizes}) is coloured ({_colour(tests, shares)}), and follows no input, no "
+            "state at the same instant, and no simple term that an equation could lack: disturbances, or physics "
+            f"missing in an equation {learner}."
         )
     if lacks is not None:
         return f"What the free run leaves ({sizes}) holds more than noise. {_named(lacks, fit)}"
@@ -125,6 +126,17 @@ def _words(
     )
 
 
+def _colour(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) -> str:
+    """Of each output that is coloured its largest autocorrelation, and how much of it its own past tells."""
+    told = []
+    for test, share in zip(tests, shares, strict=True):
+        if not test.practically_white():
+            past = f", and {percent(share.own_past)} of it follows from its own past"
+            past = past if share.own_past > _LITTLE else ", too little to predict it from its own past"
+            told.append(f"{test.name} has autocorrelations of up to {test.largest_acf:.2f}{past}")
+    return "; ".join(told)
+
+
 def _named(lacks: MissingTest, fit: MotionEstimate) -> str:
     """What is most likely missing, and where to put it."""
     best, *others = lacks.terms
@@ -133,6 +145,10 @@ def _named(lacks: MissingTest, fit: MotionEstimate) -> str:
         text += f", as would {' or '.join(f'{term.expression} in that of {term.equation}' for term in others[:2])}"
     learned = {fit.problem.motion.names_of_states[i] for i in fit.problem.motion.learned[0]}
     seen = fit.model.form.bound is not None and best.equation in learned
-    sees = f"see {best.variable}" if best.variable else "stand there"
-    remedy = f"let the learner {sees}" if seen else f"add a learner to the equation of {best.equation} that may {sees}"
+    sees = f" that may see {best.variable}" if best.variable else ""
+    remedy = (
+        f"let the learner see {best.variable or 'more'}"
+        if seen
+        else f"add a learner to the equation of {best.equation}{sees}"
+    )
     return f"{text}. Give the physics such a term, or {remedy}."

@@ -9,7 +9,7 @@ import numpy as np
 from orthaug._base.checks import check_type
 from orthaug.analysis.motion_bias import MotionGround, TermBias
 from orthaug.analysis.motion_response import Place
-from orthaug.analysis.motion_suspects import MotionSuspect, check_motion_suspects
+from orthaug.analysis.motion_suspects import MotionSuspect, check_motion_suspects, softened
 from orthaug.analysis.robustness import block_of
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_measures import field_under
@@ -35,6 +35,18 @@ def suspected_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> li
         return []
     steps = block_of(fit) if fit.plain_covariance is not None else None
     return ground.table(suspects, fit.effective_weights, steps)
+
+
+def softened_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> list[TermBias]:
+    """What friction among the suspects does that turns round smoothly, of widths by the size of what it acts on.
+
+    Nothing without a learner: it alone shows the shape of what is missing.
+    """
+    if fit.model.form.bound is None:
+        return []
+    field = fit.split_by.field
+    smooth = softened(suspects, fit.problem.motion, fit.values, field.x, field.u)
+    return suspected_bias(fit, smooth) if smooth else []
 
 
 def ground_after(fit: MotionEstimate) -> MotionGround | None:

@@ -34,9 +34,9 @@ _STILL = 1e-9  # of the fastest mode: an integrator's eigenvalue is rounding of 
 class Modes:
     """Local eigenvalues over `points` of a run [1/s].
 
-    `rightmost` is the largest real part and `worst` the state and input where it is, `median` that of the largest real
-    part; `growing` is the share of points where it is positive. `slowest` and `fastest` are the least and largest
-    magnitude.
+    `integrators` counts those that are zero everywhere; they are in nothing else here. `rightmost` is the largest real
+    part and `worst` the state and input where it is, `median` that of the largest real part; `growing` is the share of
+    points where it is positive. `slowest` and `fastest` are the least and largest magnitude.
     """
 
     points: int
@@ -46,6 +46,7 @@ class Modes:
     slowest: float
     fastest: float
     worst: dict[str, float]
+    integrators: int = 0
 
 
 @dataclass(frozen=True)
@@ -82,11 +83,9 @@ def _of_modes(model: MotionModel, x: Matrix, u: Matrix) -> MotionStability:
     found = modes(model, x, u)
     if found is None:
         return MotionStability(None, (), "The motion has no finite derivative along its run.")
-    sizes = dict.fromkeys(f"{size:.4g}" for size in (found.slowest, found.fastest))
-    told = f"The linearised motion has modes of {' to '.join(sizes)} 1/s along the free run. "
+    told = f"The linearised motion has {_sizes(found)} along the free run. "
     if not found.growing:
-        told += f"All decay everywhere: the largest real part is {found.rightmost:.4g} 1/s."
-        return MotionStability(found, (), told)
+        return MotionStability(found, (), told + _without_growth(found))
     where = ", ".join(f"{name} = {value:.4g}" for name, value in found.worst.items())
     told += (
         f"At {percent(found.growing, 3)} of its points one grows, by up to {found.rightmost:.4g} 1/s ({where}); median "
@@ -94,6 +93,28 @@ def _of_modes(model: MotionModel, x: Matrix, u: Matrix) -> MotionStability:
     )
     warnings = (Warning("growing_mode", told),) if found.growing > _OFTEN else ()
     return MotionStability(found, warnings, told)
+
+
+def _sizes(found: Modes) -> str:
+    """How many integrators there are, and how fast the other modes."""
+    count = found.integrators
+    whole = f"{count} integrators" if count > 1 else "an integrator" if count else ""
+    if not found.fastest:
+        return f"{whole} and no other mode"
+    sizes = dict.fromkeys(f"{size:.4g}" for size in (found.slowest, found.fastest))
+    return f"{whole}{' and ' if count else ''}modes of {' to '.join(sizes)} 1/s"
+
+
+def _without_growth(found: Modes) -> str:
+    count, told = found.integrators, []
+    if found.fastest and found.rightmost < 0:
+        others = "All others decay" if count else "All decay"
+        told.append(f"{others} everywhere: the largest real part is {found.rightmost:.4g} 1/s.")
+    elif found.fastest:
+        told.append("None grows, and not all decay: the largest real part is 0.")
+    if count:
+        told.append(f"What integrates neither decays nor grows: it keeps {'their' if count > 1 else 'its'} errors.")
+    return " ".join(told)
 
 
 def modes(model: MotionModel, x: Matrix, u: Matrix) -> Modes | None:
@@ -110,17 +131,21 @@ def modes(model: MotionModel, x: Matrix, u: Matrix) -> Modes | None:
         small = np.abs(values) < 1e-300  # gone in one sample
         values = np.log(np.where(small, 1e-300, values).astype(complex)) / model.sampling_time
     size = np.abs(values)
-    largest = values.real.max(axis=1)
-    growing = largest > _STILL * max(size.max(), 1e-300)
+    fastest = float(size.max())
+    integrators = int((size <= _STILL * fastest).sum(axis=1).min())
+    others = np.take_along_axis(values, np.argsort(size, axis=1), axis=1)[:, integrators:]
+    largest = others.real.max(axis=1) if others.shape[1] else np.zeros(len(others))
+    largest = np.where(np.abs(largest) <= _STILL * fastest, 0.0, largest)
     place = rows[kept][int(np.argmax(largest))]
     return Modes(
         points=int(kept.sum()),
         rightmost=float(largest.max()),
         median=float(np.median(largest)),
-        growing=float(growing.mean()),
-        slowest=float(size.min()),
-        fastest=float(size.max()),
+        growing=float((largest > 0).mean()),
+        slowest=float(np.abs(others).min(initial=fastest)),
+        fastest=fastest,
         worst=model.form.describe(x[place], u[place]),
+        integrators=integrators,
     )
 
 

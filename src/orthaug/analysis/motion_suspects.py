@@ -7,19 +7,20 @@ the coefficient is a force in N though the equation is one of m/s².
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_label, check_unique, is_number, nearest
 from orthaug._base.errors import InputError
-from orthaug.analysis.suspects import WIDTHS, written
+from orthaug.analysis.suspects import ODD_JUMPS, WIDTHS, changes_sign, written
 from orthaug.data.expressions import Expression, parse_named
 from orthaug.physics.motion import Motion
 from orthaug.physics.motion_problem import MotionProblem
 from orthaug.physics.suspected_motion import AddedTerm
 
 _OF_STATES = ("coulomb", "quadratic_drag", "cubic")
+_WIDTHS = (0.25, 0.5, 1.0, 2.0, 4.0)  # of friction that turns round smoothly, in median sizes of what it acts on
 _OF_INPUTS = ("cubic", "dead_zone", "saturation")
 
 
@@ -40,6 +41,8 @@ class MotionSuspect:
     equation: str | None = None
     coefficient: float | None = None
     unit: str = ""
+    jump: str | None = None
+    """What changes its sign where the expression jumps, of the kind `coulomb`."""
 
     output = None  # in the words of lagged suspects
 
@@ -77,7 +80,8 @@ class MotionSuspect:
         if factor is not None:
             _balanced(factor)
             text, label = f"({factor})*({text})", f"{factor} * {label}"
-        return cls(label if name is None else name, text, equation, coefficient, unit)
+        jump = " ".join(on.split()) if kind == "coulomb" and on is not None else None
+        return cls(label if name is None else name, text, equation, coefficient, unit, jump)
 
     def parsed(self, motion: Motion) -> Expression:
         """The expression on the motion's names.
@@ -162,18 +166,43 @@ def _balanced(text: str) -> None:
         raise InputError(f"'{text}' is no expression: its parentheses are no pairs, or it is empty.")
 
 
+def softened(
+    suspects: Sequence[MotionSuspect], motion: Motion, p: Vector, x: Matrix, u: Matrix
+) -> tuple[MotionSuspect, ...]:
+    """Friction as it is where it turns round smoothly: each suspect that jumps as tanh(v/width), of several widths.
+
+    Args:
+        p: parameters (np,); with states x (M, nx) and inputs u (M, nu) they tell the widths, in median sizes.
+    """
+    found = []
+    for suspect in suspects:
+        if suspect.jump is None:
+            continue
+        size = np.abs(MotionSuspect(suspect.jump, suspect.jump).values(motion, p, x, u))
+        size = size[np.isfinite(size) & (size > 0)]
+        on = suspect.jump if suspect.jump.isidentifier() else f"({suspect.jump})"
+        for share in _WIDTHS if len(size) else ():
+            width = float(f"{share * np.median(size):.3g}")
+            soft = f"tanh({on}/{width!r})"
+            text = suspect.expression.replace(f"sign({suspect.jump})", soft)
+            found.append(replace(suspect, name=f"{suspect.name} as {soft}", expression=text, jump=None))
+    return tuple(found)
+
+
 def usual_motion_suspects(problem: MotionProblem) -> tuple[MotionSuspect, ...]:
     """What is often missing: friction, drag and hardening of every state, what bends an input, an offset."""
     motion, (x, u) = problem.motion, problem.looked_at
-    moving = [(name, True) for name, row in zip(motion.names_of_states, x, strict=True) if np.ptp(row) > 0]
-    moving += [(name, False) for name, row in zip(motion.inputs, u, strict=True) if np.ptp(row) > 0]
+    moving = [(name, True, row) for name, row in zip(motion.names_of_states, x, strict=True) if np.ptp(row) > 0]
+    moving += [(name, False, row) for name, row in zip(motion.inputs, u, strict=True) if np.ptp(row) > 0]
     places = usual_places(motion)
     found = []
     for place in places:
         equation = motion.states[place].name
         where = f" in {equation}" if len(places) > 1 else ""
-        for name, is_state in moving:
+        for name, is_state, row in moving:
             for kind in _OF_STATES if is_state else _OF_INPUTS:
+                if kind in ODD_JUMPS and not changes_sign(row):
+                    continue
                 width = motion_width(name, problem) if kind in WIDTHS else None
                 label = f"{kind} of {name}{where}"
                 found.append(MotionSuspect.of(kind, name, width=width, equation=equation, name=label))

@@ -29,7 +29,7 @@ class Observer:
 
     Args:
         model: the model, or the fit: of a fit the residual tells how large the noises are (`diagnose`), and where both
-            are there the likelihood of its data does; a model that `orthaug fit` saved carries the verdict.
+            are there the likelihood of its data does; a model that `orthaug fit` saved carries what they told.
         noise: the covariances, where they are known better: of the disturbances in a sample, of the sensors.
 
     Raises:

@@ -27,17 +27,23 @@ _LITTLE, _MOST = 0.03, 0.9  # shares of a free run's variance that disturbances 
 BOTH = ("equation_noise", "unmodelled")  # verdicts on a free run that tell of disturbances
 _STEPS = 400  # that a disturbance is followed
 _TUNED_ROWS = 4000
+_KEPT_ROWS, _KEPT_STATES = 1000, 30  # a fit tunes on so many rows, unless the filter has more states
 _REACH = 14.0  # of the search, in e-folds
+_STEP = -1.5  # of the search at first, in e-folds
 _LARGE = 1e12
 
 
 def by_verdict(model: Model | MotionModel, verdict: str | None = None) -> Noise:
-    """The noises of a fitted model as the verdict on its residual says, by default the one that it carries.
+    """The noises of a fitted model as the verdict on its residual says, by default what it carries.
+
+    That are noises which the likelihood of its training data told, else those of its verdict.
 
     Raises:
         InputError: a model without an estimate of its noise.
     """
     kept = model.statistics
+    if verdict is None and kept.disturbance is not None and kept.sensor is not None:
+        return Noise(kept.disturbance, kept.sensor)
     if kept.noise is None or not np.all(np.diag(kept.noise) > 0):
         raise InputError(
             "the model has no estimate of its noise (few rows, or trained elsewhere); give the observer `noise=`, "
@@ -81,14 +87,28 @@ def of_fit(fit: Estimate | MotionEstimate) -> Noise:
     return begun
 
 
-def most_likely(model: Model | MotionModel, begun: Noise, record: Record) -> Noise:
+def to_keep(fit: Estimate | MotionEstimate, verdict: str) -> Noise | None:
+    """What a fit keeps with its model, by the likelihood of some of its rows, where its residual has both noises.
+
+    None where the verdict's rule is as good, without an estimate of the noise, and where a filter takes long.
+    """
+    model, kept = fit.model, fit.model.statistics
+    unknown = kept.noise is None or not np.all(np.diag(kept.noise) > 0)
+    if unknown or not kept.flown or verdict not in BOTH or not model.form.differentiable:
+        return None
+    if len(model.filtering[0].names) > _KEPT_STATES:
+        return None
+    return most_likely(model, by_verdict(model, verdict), fit.problem.record, _KEPT_ROWS)
+
+
+def most_likely(model: Model | MotionModel, begun: Noise, record: Record, rows: int = _TUNED_ROWS) -> Noise:
     """The noises of most likelihood for a record among `(q Q, r R)`, over its first rows.
 
     Where an R or Q that is zero begins, it stays zero.
     """
     form, numbers, size = model.filtering
     record = model.fitting(record, need_outputs=True, gaps=True)
-    stretches, rows = [], _TUNED_ROWS
+    stretches = []
     for experiment in record.experiments:
         piece = experiment.rows(0, rows)
         if len(piece) > form.first_row:
@@ -111,5 +131,6 @@ def most_likely(model: Model | MotionModel, begun: Noise, record: Record) -> Noi
 
     if not any(free) or not stretches:
         return begun
-    options = {"xatol": 0.02, "fatol": 0.02, "maxiter": 80}
-    return noise(scipy.optimize.minimize(cost, np.zeros(sum(free)), method="Nelder-Mead", options=options).x)
+    begin = np.concatenate([np.zeros((1, sum(free))), _STEP * np.eye(sum(free))])
+    options = {"xatol": 0.02, "fatol": 0.02, "maxiter": 80, "initial_simplex": begin}
+    return noise(scipy.optimize.minimize(cost, begin[0], method="Nelder-Mead", options=options).x)

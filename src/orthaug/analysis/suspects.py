@@ -45,8 +45,10 @@ _KINDS = {
 }
 KINDS = tuple(_KINDS)
 WIDTHS = tuple(kind for kind, entry in _KINDS.items() if entry.width)  # the kinds that need a width
+ODD_JUMPS = ("coulomb", "stribeck", "stribeck_gauss")  # the kinds that jump where their argument changes sign
 _VELOCITY = ("coulomb", "stribeck", "quadratic_drag", "cubic")
 _POSITION = ("cubic", "dead_zone")
+_CLEARLY = 0.05  # of the largest value
 _MULTIPLIED = 6  # lags at most, of which products are tried
 _INPUT = ("cubic", "dead_zone", "saturation")
 
@@ -261,6 +263,8 @@ def usual_suspects(problem: Problem) -> tuple[Suspect, ...]:
             second = next(str(lag) for lag in layout if lag.channel == channel and lag.lag == lags[1])
             pairs += [(kind, f"{first} - {second}") for kind in _VELOCITY]
     suspects = []
+    values = {on: _evaluate(parse(on), problem.rows.x, layout, f"'{on}'") for _, on in pairs}
+    pairs = [(kind, on) for kind, on in pairs if kind not in ODD_JUMPS or changes_sign(values[on])]
     for output in outputs:
         own = output if len(outputs) > 1 else None
         label = f" in {output}" if own else ""
@@ -269,6 +273,12 @@ def usual_suspects(problem: Problem) -> tuple[Suspect, ...]:
             suspects.append(Suspect.of(kind, on, width=width, output=output, name=f"{kind} of {on}{label}"))
         suspects.append(Suspect.of("offset", output=output, name=f"offset{label}"))
     return tuple(suspects)
+
+
+def changes_sign(values: Vector) -> bool:
+    """Whether values (N,) lie clearly on both sides of zero; otherwise what jumps there is as good as a constant."""
+    edge = _CLEARLY * np.abs(values).max(initial=0.0)
+    return bool(np.min(values, initial=0.0) < -edge and np.max(values, initial=0.0) > edge)
 
 
 def usual_terms(problem: Problem) -> tuple[Suspect, ...]:

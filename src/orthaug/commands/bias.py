@@ -41,11 +41,10 @@ def budget_of(job: LaggedJob, fit: Estimate) -> Budget | None:
 
 
 def with_biases(
-    job: LaggedJob, fit: Estimate, shared: Imitation | None, content: Mapping[str, Any]
+    fit: Estimate, shared: Imitation | None, content: Mapping[str, Any], budget: Budget | None
 ) -> tuple[dict[str, list[ParameterResult] | None], tuple[Warning, ...]]:
     """The rows of `parameters` and `physical_parameters` with what the learner shares and what biases them."""
     physical = content["physical_parameters"]
-    budget = budget_of(job, fit) if fit.status.ok else None
     if fit.model.structure != "orthogonal" or fit.model.form.bound is None:  # a variant of what the spec declares
         shared = None
 

@@ -15,6 +15,7 @@ from orthaug._base.parallel import one_blas_thread
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.views import MAKERS
 from orthaug._base.warning import Warning
+from orthaug.commands.attempt import attempt
 from orthaug.commands.folder import not_a_result
 from orthaug.commands.job import ALONE, AS_DECLARED, DEFAULT_BLOCKS, Job, Variant
 from orthaug.commands.kinds import kind_of
@@ -72,8 +73,11 @@ def judged(fitted: Fitted) -> Fitted:
     job, fit, warnings = fitted.job, fitted.fit, list(fitted.result.warnings)
     if not fit.status.ok or (fit.model.form.bound is None and fit.held_out is None):
         return fitted
-    verdict = judge_fit(fitted)
-    if verdict is None and fit.model.form.bound is not None and job.spec.validation.blocks != 0:
+    failed: list[Any] = []
+    verdict = attempt("the judgement of the learner", lambda: judge_fit(fitted), failed, None)
+    warnings += failed
+    asked = fit.model.form.bound is not None and job.spec.validation.blocks != 0
+    if verdict is None and asked and not failed:
         told = (
             "whether the learner helps is not judged: no part is held out, and the training data have too few "
             "rows for cross-validation in so many blocks."
@@ -119,9 +123,8 @@ def told_of(job: Job, fit: Any) -> Fitted:
         for part in job.parts:
             scores[part.name], responses[part.name] = score_part(fit.model, part, warnings)
     fit, told = kind_of(job).content(job, fit, responses, warnings)
-    if fit.status.ok and told["residuals"] is not None:  # an observer of the saved model asks for it
-        kept = replace(fit.model.statistics, verdict=told["residuals"].verdict)
-        fit = replace(fit, model=replace(fit.model, statistics=kept))
+    if fit.status.ok and told["residuals"] is not None:
+        fit = _for_observers(fit, told["residuals"].verdict, warnings)
     content = told | {
         "spec": job.declaration,
         "data": job.data,
@@ -140,6 +143,17 @@ def told_of(job: Job, fit: Any) -> Fitted:
         written = {writing: equation(fit.model, writing) for writing in ("text", "latex")}
         content |= {"terms": terms, "equation": written}
     return Fitted(job, fit, FitResult.model_validate(content), responses)
+
+
+def _for_observers(fit: Any, verdict: str, warnings: list[Any]) -> Any:
+    """The fit whose model keeps what an observer of it asks for: the verdict on the residual, and two noises."""
+    from orthaug.analysis.observer_noise import to_keep
+
+    kept = replace(fit.model.statistics, verdict=verdict)
+    noise = attempt("the noise of an observer", lambda: to_keep(fit, verdict), warnings, None)
+    if noise is not None:
+        kept = replace(kept, disturbance=np.asarray(noise.state), sensor=np.asarray(noise.output))
+    return replace(fit, model=replace(fit.model, statistics=kept))
 
 
 def judge_fit(fitted: Fitted, blocks: Sequence[Trial] | None = None, alone: Fitted | None = None) -> Verdict | None:

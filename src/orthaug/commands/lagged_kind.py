@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from orthaug._base.errors import InputError
 from orthaug._base.warning import Warning
-from orthaug.commands.bias import bias_of, with_biases
+from orthaug.commands.attempt import attempt
+from orthaug.commands.bias import bias_of, budget_of, with_biases
 from orthaug.commands.lagged_job import LaggedJob
 from orthaug.commands.shared import shared_of
 from orthaug.physics.excitation import identifiability, require_rank
@@ -61,9 +63,10 @@ def content(
     told: dict[str, Any] = dict.fromkeys((*_UNKNOWN, "residuals", "missing_lags", "stability"))
     if fit.status.ok:
         one_step, free_run = responses[job.train.name]
-        fit = robust_where_coloured(fit, one_step)
+        plain = fit
+        fit = attempt("the robust covariance", lambda: robust_where_coloured(plain, one_step), warnings, plain)
         told |= _physical_content(job, fit, warnings)
-        told["bias"] = bias_of(job, fit)
+        told["bias"] = attempt("the bias by suspects", partial(bias_of, job, fit), warnings, None)
         told |= _analysed(fit, one_step, free_run, warnings)
     shared = shared_of(job, fit.problem, others=False)
     told |= {
@@ -80,7 +83,10 @@ def content(
         "excitation": fit.excitation,
         "shared": shared,
     }
-    rows, biased = with_biases(job, fit, shared, told)
+    budget = None
+    if fit.status.ok:
+        budget = attempt("the bias that the learner implies", partial(budget_of, job, fit), warnings, None)
+    rows, biased = with_biases(fit, shared, told, budget)
     warnings += biased
     return fit, told | rows
 
@@ -166,14 +172,28 @@ def _analysed(fit: Estimate, one_step: Response, free_run: Response, warnings: l
     from orthaug.analysis.missing_lags import missing_lags
 
     problem = fit.problem
-    diagnosis = diagnose(fit, one_step=one_step, free_run=free_run)
-    steady = stability(fit.model, problem.record, response=free_run, x=problem.rows.x)
-    warnings += steady.warnings
-    if diagnosis is None:
-        told = "the residual is not analysed: there are too few rows for that, or it is rounding only."
-        warnings.append(Warning("residual_not_analysed", told))
-    else:
-        warnings += diagnosis.warnings
-    hidden = missing_lags(fit, one_step)
-    warnings += hidden.warnings if hidden else ()
-    return {"residuals": diagnosis, "missing_lags": hidden, "stability": steady}
+
+    def residuals() -> Any:
+        diagnosis = diagnose(fit, one_step=one_step, free_run=free_run)
+        if diagnosis is None:
+            told = "the residual is not analysed: there are too few rows for that, or it is rounding only."
+            warnings.append(Warning("residual_not_analysed", told))
+        else:
+            warnings.extend(diagnosis.warnings)
+        return diagnosis
+
+    def steady() -> Any:
+        found = stability(fit.model, problem.record, response=free_run, x=problem.rows.x)
+        warnings.extend(found.warnings)
+        return found
+
+    def hidden() -> Any:
+        found = missing_lags(fit, one_step)
+        warnings.extend(found.warnings if found else ())
+        return found
+
+    return {
+        "stability": attempt("the analysis of the free run's sensitivity", steady, warnings, None),
+        "residuals": attempt("the analysis of the residual", residuals, warnings, None),
+        "missing_lags": attempt("the search for missing lags", hidden, warnings, None),
+    }

@@ -87,7 +87,8 @@ def predict(
     opened = run.open_ahead(model, data, reading, horizon, initial, observer=observer)
     check_file(out, model, data, Path(initial or data), force=force)
     prepare_jax()
-    _write_response(run.predicted(opened, horizon, observer=observer), opened, out, force, opened.notes)
+    response, told = run.observed(opened, horizon) if observer else (run.predicted(opened, horizon), [])
+    _write_response(response, opened, out, force, [*opened.notes, *told])
 
 
 @app.command()

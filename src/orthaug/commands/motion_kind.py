@@ -9,6 +9,7 @@ import numpy as np
 
 from orthaug._base.errors import InputError, RankError
 from orthaug._base.warning import Warning
+from orthaug.commands.attempt import attempt
 from orthaug.commands.motion_job import MotionJob
 from orthaug.commands.motion_suspects import bias_before
 from orthaug.reports.result import CheckResult, FitResult, ParameterResult, parameter_rows
@@ -113,33 +114,20 @@ def content(
     warnings: list[Any],
 ) -> tuple[MotionEstimate, dict[str, Any]]:
     """The fit, and what results tell of it; warnings are added."""
-    from orthaug.analysis.learned_part import equation_parts
-    from orthaug.analysis.motion_budget import motion_budget
-    from orthaug.analysis.motion_diagnosis import diagnose_motion, robust_motion
-    from orthaug.analysis.motion_ground import suspected_bias
+    from orthaug.analysis.motion_diagnosis import robust_motion
     from orthaug.analysis.motion_imitation import MotionImitation
-    from orthaug.analysis.motion_modes import motion_stability
-    from orthaug.analysis.motion_substeps import substep_bias
     from orthaug.physics.excitation import Excitation, of_gram
 
     motion, form = job.problem.motion, fit.model.form
     count, gram = len(motion.names), fit.model.statistics.gram
-    budget, coarse, parts = None, None, ()
+    found: dict[str, Any] = dict.fromkeys(("budget", "coarse", "parts"))
     told: dict[str, Any] = dict.fromkeys((*_UNKNOWN, "residuals", "stability", "shared", "measure_detail"))
     if fit.status.ok:
-        fit = robust_motion(fit)
-        told["residuals"] = diagnose_motion(fit, responses[job.train.name][1])
-        warnings += [_NOT_ANALYSED] if told["residuals"] is None else told["residuals"].warnings
-        points = job.reach(fit.model, job.train.record)[0]
-        x, u = np.split(points, [form.states], axis=1)
-        told["stability"] = motion_stability(fit.model, x, u, record=job.train.record)
-        parts = equation_parts(fit, x, u) if form.bound is not None else ()
-        warnings += told["stability"].warnings
-        coarse = substep_bias(fit)
-        warnings += coarse.warnings if coarse else ()
-        table = suspected_bias(fit, job.suspects) if job.suspects else []
-        told["bias"], budget = [entry.as_dict() for entry in table] or None, motion_budget(fit, table)
-        warnings += budget.warnings if budget else ()
+        plain = fit
+        fit = attempt("the robust covariance", lambda: robust_motion(plain), warnings, plain)
+        found = _analysed(job, fit, responses[job.train.name][1], warnings)
+        told |= {name: found[name] for name in ("residuals", "stability", "bias")}
+    budget, coarse, parts = found["budget"], found["coarse"], found["parts"] or ()
     if fit.status.ok and form.bound is not None:
         split = fit.split_by
         told["shared"] = MotionImitation.of([str(entry) for entry in form.features], fit.shared)
@@ -164,6 +152,50 @@ def content(
             "substep_bias": None if coarse is None else coarse.as_dict(),
         },
     }
+
+
+def _analysed(job: MotionJob, fit: MotionEstimate, free_run: Response, warnings: list[Any]) -> dict[str, Any]:
+    """What is asked of a fit behind its training; None for an analysis that fails. Warnings are added."""
+    from orthaug.analysis.learned_part import equation_parts
+    from orthaug.analysis.motion_budget import motion_budget
+    from orthaug.analysis.motion_diagnosis import diagnose_motion
+    from orthaug.analysis.motion_ground import softened_bias, suspected_bias
+    from orthaug.analysis.motion_modes import motion_stability
+    from orthaug.analysis.motion_substeps import substep_bias
+
+    def residuals() -> Any:
+        diagnosis = diagnose_motion(fit, free_run)
+        warnings.extend([_NOT_ANALYSED] if diagnosis is None else diagnosis.warnings)
+        return diagnosis
+
+    def stability() -> Any:
+        stable = motion_stability(fit.model, x, u, record=job.train.record)
+        warnings.extend(stable.warnings)
+        return stable
+
+    def coarse() -> Any:
+        found = substep_bias(fit)
+        warnings.extend(found.warnings if found else ())
+        return found
+
+    def biases() -> Any:
+        table = suspected_bias(fit, job.suspects) if job.suspects else []
+        budget = motion_budget(fit, table, softened_bias(fit, job.suspects))
+        warnings.extend(budget.warnings if budget else ())
+        return [entry.as_dict() for entry in table] or None, budget
+
+    points = job.reach(fit.model, job.train.record)[0]
+    x, u = np.split(points, [fit.model.form.states], axis=1)
+    found = {
+        "residuals": attempt("the analysis of the residual", residuals, warnings, None),
+        "stability": attempt("the analysis of the modes", stability, warnings, None),
+        "parts": None,
+    }
+    if fit.model.form.bound is not None:
+        found["parts"] = attempt("the size of the learned part", lambda: equation_parts(fit, x, u), warnings, None)
+    found["coarse"] = attempt("the analysis of the substeps", coarse, warnings, None)
+    table, budget = attempt("the bias by suspects", biases, warnings, (None, None))
+    return found | {"bias": table, "budget": budget}
 
 
 def figures(

@@ -13,6 +13,7 @@ import numpy as np
 from orthaug._base.checks import check_choice, nearest
 from orthaug._base.errors import InputError, MissingSampleError
 from orthaug._base.folders import whole_file
+from orthaug._base.lines import percent
 from orthaug._base.warning import Warning
 from orthaug.commands.parts import long_stretches
 from orthaug.data.preparation import MENDING, SAMPLING, steps_again
@@ -21,6 +22,7 @@ from orthaug.data.record import Channel, Record
 from orthaug.data.tables import check_readable, has_column
 
 if TYPE_CHECKING:
+    from orthaug.analysis.observed import Consistency
     from orthaug.models.model import Model
     from orthaug.models.motion_model import MotionModel
     from orthaug.models.response import Response
@@ -246,13 +248,40 @@ def open_ahead(
     return opened if observer else replace(opened, record=with_initial(opened, read_initial(initial, opened)))
 
 
-def predicted(opened: ModelOnData, horizon: int, *, observer: bool = False) -> Response:
-    """The prediction `horizon` steps ahead, from measured outputs or from an observer's state."""
-    if not observer:
-        return opened.model.predict(opened.record, horizon=horizon)
+def predicted(opened: ModelOnData, horizon: int) -> Response:
+    """The prediction `horizon` steps ahead from measured outputs."""
+    return opened.model.predict(opened.record, horizon=horizon)
+
+
+def observed(opened: ModelOnData, horizon: int) -> tuple[Response, list[str]]:
+    """The prediction `horizon` steps ahead from an observer's state, and whether its band is what it says."""
     from orthaug.analysis.observer import Observer
 
-    return Observer(opened.model).predict(opened.record, horizon=horizon)
+    observer = Observer(opened.model)
+    response = observer.predict(opened.record, horizon=horizon)
+    return response, _of_band(observer.run(opened.record).consistency(), response)
+
+
+def _of_band(found: Consistency, response: Response) -> list[str]:
+    """NIS with its interval where outputs were measured; a warning where it leaves that, for the band is then wrong."""
+    from orthaug.models.response import BAND
+
+    apart = [(t.measured - t.model) / t.std for t in response.trajectories if t.measured is not None]
+    apart = np.concatenate([errors[np.isfinite(errors)] for errors in apart]) if apart else np.zeros(0)
+    if not np.isfinite(found.nis) or not len(apart):
+        return []
+    held, (low, high) = float(np.mean(np.abs(apart) <= BAND)), found.expected
+    told = (
+        f"the innovations' squares are {found.nis:.3g} times what the observer expects (NIS, {low:.3g} to {high:.3g} "
+        f"where it knows its noise); its 95 % band holds {percent(held, 3)} of what was measured."
+    )
+    if found.consistent:
+        return [f"note: {told}"]
+    why = "its noises are too small, or the model is wrong here" if found.nis > high else "its noises are too large"
+    return [
+        f"warning: {told} Do not take the band for one of 95 %: {why}. oa.Observer(oa.load(MODEL)).tuned(record) finds "
+        "noises by the likelihood of a record."
+    ]
 
 
 def warnings(response: Response) -> list[Warning]:

@@ -43,6 +43,8 @@ def arrays_of(model: Any) -> dict[str, np.ndarray]:
         "gram": kept.gram,
         "noise": kept.noise,
         "middle": kept.middle,
+        "disturbance": kept.disturbance,
+        "sensor": kept.sensor,
         "ridge": kept.ridge if np.ndim(kept.ridge) else None,
     }
     return {name: np.asarray(value) for name, value in arrays.items() if value is not None}
@@ -63,4 +65,6 @@ def statistics_from(arrays: dict[str, np.ndarray], declared: dict[str, Any]) -> 
         freedom=float(arrays["scalars"][1]),
         flown=bool(declared.get("flown", declared.get("kind") == "motion")),
         verdict=str(declared.get("verdict", "")),
+        disturbance=arrays.get("disturbance"),
+        sensor=arrays.get("sensor"),
     )

@@ -81,6 +81,9 @@ class Statistics:
     """Whether `noise` is of a free run's errors, and not of those one step ahead."""
     verdict: str = ""
     """What the residual says of the noise (`analysis.Diagnosis`); empty where nobody asked."""
+    disturbance: Matrix | None = None
+    """Q of an observer by the likelihood of the training data, and with it R, `sensor`; where nobody tuned it."""
+    sensor: Matrix | None = None
 
     def joint(self, nt: int) -> JointCovariance | None:
         """Cov(c, w), θ in front with nt entries."""

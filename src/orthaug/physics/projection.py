@@ -14,6 +14,8 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 
+_ROUNDING = 1e-13  # of the size of what is summed: below it a direction moves nothing
+
 
 @dataclass(frozen=True, eq=False)
 class Factor:
@@ -57,6 +59,19 @@ class Factor:
         basis = np.linalg.qr(self.to_coordinates @ directions)[0]
         return basis @ basis.T
 
+    def told_of(self, directions: Float[np.ndarray, "nt s"]) -> Float[np.ndarray, "nt r"]:
+        """A basis of some directions of θ without what Φ takes to zero; the directions as they are where that is none.
+
+        A parameter that stands in none of the rows has a column of zeros.
+        """
+        moved = self.to_coordinates @ directions
+        size = np.linalg.norm(moved, axis=0)
+        told = size > _ROUNDING * np.linalg.norm(np.abs(self.to_coordinates) @ np.abs(directions), axis=0)
+        unit = directions[:, told] / size[told]
+        _, sigma, vt = np.linalg.svd(self.to_coordinates @ unit)
+        rank = int(np.sum(sigma > _ROUNDING * sigma.max(initial=0.0)))
+        return directions if rank == directions.shape[1] else unit @ vt[:rank].T
+
     def covariance_factor(self, free: Sequence[int] | None = None) -> Float[np.ndarray, "nf nt"]:
         """A factor L with `L Lᵀ = (Φ_fᵀΦ_f)⁻¹` for the free columns, all by default; `L = Φ_f⁺Q`."""
         chosen = list(range(len(self.scale))) if free is None else list(free)
@@ -94,12 +109,22 @@ class Projection(Factor):
         return theta + self.from_coordinates(self.coordinates(values - self.phi @ theta))
 
     def solve_along(self, values: Float[np.ndarray, "N ny"], directions: Float[np.ndarray, "nt s"] | None) -> Vector:
-        """B(ΦB)⁺v, (nθ,): least squares along some directions of θ only, refined once; None for all of them."""
+        """B(ΦB)⁺v, (nθ,): least squares along some directions of θ only, refined once; None for all of them.
+
+        Φ itself need not have full rank: what no row tells stays zero.
+        """
         if directions is None:
             return self.solve(values)
-        along = self.along(directions)
-        theta = self.from_coordinates(along @ self.coordinates(values))
-        return theta + self.from_coordinates(along @ self.coordinates(values - self.phi @ theta))
+        told = self.told_of(directions)
+        if not told.shape[1]:
+            return np.zeros(len(directions))
+        basis, r = np.linalg.qr(self.to_coordinates @ told)
+
+        def along(rest: Float[np.ndarray, "N ny"]) -> Vector:
+            return told @ scipy.linalg.solve_triangular(r, basis.T @ self.coordinates(rest), check_finite=False)
+
+        theta = along(values)
+        return theta + along(values - self.phi @ theta)
 
     def orthogonal_part(self, values: Float[np.ndarray, "N ny"]) -> Float[np.ndarray, "N ny"]:
         """P⊥v = v − QQᵀv, projected twice so that what is left is orthogonal to rounding."""

@@ -231,6 +231,7 @@ class ModesResult(Content):
     slowest: Number
     fastest: Number
     worst: ByName
+    integrators: Whole = 0
 
 
 class StabilityResult(Content):

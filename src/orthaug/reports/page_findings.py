@@ -70,6 +70,7 @@ def stability_blocks(result: FitResult) -> list[Any]:
         told += [
             ["rightmost eigenvalue, real part [1/s]", number(m.rightmost, 4, m.fastest)],
             ["slowest and fastest mode [1/s]", f"{number(m.slowest, 3)} and {number(m.fastest, 3)}"],
+            *([["integrators, which are not among these", str(m.integrators)]] if m.integrators else []),
             ["points with a growing mode", percent(m.growing)],
         ]
     if found.diverges_at is not None or found.searched is not None:

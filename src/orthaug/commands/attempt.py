@@ -1,0 +1,28 @@
+"""Analyses behind a finished training: where one fails numerically the result stands, and a warning says which."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numpy as np
+
+from orthaug._base.warning import Warning
+
+T = TypeVar("T")
+_NUMERICAL = (ArithmeticError, np.linalg.LinAlgError)
+
+
+def attempt(what: str, analysis: Callable[[], T], warnings: list[Any], otherwise: T) -> T:
+    """What an analysis finds, or `otherwise` with one more warning where its numerics fail.
+
+    Args:
+        what: the analysis in words, to begin a sentence with.
+        warnings: those of the result.
+    """
+    try:
+        return analysis()
+    except _NUMERICAL as error:
+        told = f"{what} failed numerically ({str(error).rstrip('.')}): the result stands without it."
+        warnings.append(Warning("analysis_failed", told))
+        return otherwise
