@@ -40,7 +40,7 @@ class FitPage:
     responses: Mapping[str, tuple[Response, Response]]
     """One-step prediction and free run of every part."""
     alone: Mapping[str, Response] = field(default_factory=dict)
-    """Free run of the physics without the learner, of every part; empty where nothing was learned."""
+    """Free run of the model without its learner, of every part; empty where nothing was learned."""
     learned: LearnedPart | None = None
 
     @property
@@ -165,7 +165,9 @@ def _runs(page: FitPage) -> list[Any]:
     notes = [Text(w.text, "warning") for w in page.result.warnings if w.code in ("witness", "free_run_diverged")]
     band, alone = error_band(train), bool(page.alone)
     told = "A model in free run sees the inputs alone and lives on its own past; the residual is measured less model."
-    told += " Physics alone is the same model with the learner switched off." if alone else ""
+    if alone:
+        told += " The model without its learner has the same parameters and the learner switched off; it is not the"
+        told += " physics alone of the verdict, which is fitted by itself."
     told += " Between the limits of the band lie 95 % of the errors on the training data." if band else ""
     how = Text(
         "Drag over a stretch to zoom, double-click for the whole record; with the keyboard the arrows move, "

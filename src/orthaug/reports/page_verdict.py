@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from orthaug.analysis.changes import Change
 from orthaug.reports.page_blocks import number, percent
-from orthaug.reports.result import CompareResult, FitResult, ParameterResult, PartScores, RowResult
+from orthaug.reports.result import CompareResult, DataResult, FitResult, ParameterResult, PartScores, RowResult
 
 _GOOD, _POOR = 0.2, 0.5  # NRMSE of a free run up to which it is close, and from which it is far
 _ALIKE = 1.1  # ratio of errors up to which models are told to be as good as each other
 _SURE = 0.1  # standard error over value up to which a parameter is told to be known
+_NAMED = 0.5  # share of what was learned from which its cause is what to do first
+_MOST_DOUBTS = 3  # that are told in the first sentence
 _STOPPED = ("iteration_limit", "no_descent")
 _RAN_AWAY = ("free_run_diverged",)
+_TIED = ("orthogonal", "physics alone")  # of models that are as good as each other these are taken first
 
 
 class PageVerdict(NamedTuple):
@@ -34,7 +37,7 @@ class PageVerdict(NamedTuple):
 
 def fit_verdict(result: FitResult) -> PageVerdict:
     """Of a fit, from its own findings."""
-    doubts = list(_doubts(result))
+    doubts = list(_doubts(result, result.data))
     error, part = _worst(result.scores)
     bad = _ran_away(result) or (error is not None and error > _POOR) or _code(result) == "hurts"
     level = "bad" if bad else "care" if doubts else "good"
@@ -44,7 +47,7 @@ def fit_verdict(result: FitResult) -> PageVerdict:
         "bad": "Do not trust the model as it is",
     }[level]
     shown = "" if error is None else f": {_told_error(error, part)}"
-    because = f"{', but ' if level == 'care' else '; '}{_joined(doubts[:3])}" if doubts else ""
+    because = f"{', but ' if level == 'care' else '; '}{_joined(doubts[:_MOST_DOUBTS])}" if doubts else ""
     return PageVerdict(level, f"{opening}{shown}{because}.", _use(result, level), _then(result))
 
 
@@ -59,14 +62,18 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
             "Look at the warnings below, and fit again.",
         )
     errors = {row.name: _worst(row.scores)[0] or 0.0 for row in rows}
-    best = result.chosen or min(errors, key=errors.__getitem__)
+    best = result.chosen or _taken(rows, errors)
     row = next(row for row in result.comparison if row.name == best)
     error, part = _worst(row.scores)
+    doubts = list(_doubts(row, result.data))
     level = "good" if error is not None and error <= _GOOD else "care" if error is None or error <= _POOR else "bad"
+    level = "care" if level == "good" and doubts else level
     near = [name for name in errors if name != best and errors[name] <= _ALIKE * (error or 0.0)]
     how = f"it has the lowest error on the validation part, and {_told_error(error or 0.0, part)}"
     trust = f"Take “{best}”: {how if result.chosen else _told_error(error or 0.0, part) + ', less than of any other'}"
     trust += f"; {_joined([f'“{name}”' for name in near])} {_is(near)} as good within 10 %." if near else "."
+    if doubts:
+        trust = f"{trust[:-1]}. But {_joined(doubts[:_MOST_DOUBTS])}."
     alone = errors.get("physics alone")
     use = "It is the physics alone: no learner earns its place beside it."
     if best != "physics alone" and alone is not None and error is not None:
@@ -74,6 +81,14 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
         use = f"Its error on {part} is {number(learns, 2)} of that of physics alone ({percent(alone)})"
         use += f", and its learner {_word(row)}." if row.validation else "."
     return PageVerdict(level, trust, use, _after_comparison(result, row))
+
+
+def _taken(rows: Sequence[RowResult], errors: Mapping[str, float]) -> str:
+    """The model of the lowest error; of such that are as good, one whose θ means something."""
+    best = min(errors, key=errors.__getitem__)
+    earns = [row.name for row in rows if row.validation is None or row.validation.verdict == "helps"]
+    tied = [name for name in _TIED if name in earns and errors[name] <= _ALIKE * errors[best]]
+    return next(iter(tied), best)
 
 
 def _after_comparison(result: CompareResult, row: RowResult) -> str:
@@ -92,41 +107,55 @@ def _word(row: RowResult) -> str:
 
 
 def _told_error(error: float, part: str) -> str:
-    which = "on the training data" if part == "train" else f"on {part}"
-    return f"{which} its free run leaves {percent(error)} of the output's deviation"
+    return f"{_on(part)} its free run leaves {percent(error)} of the output's deviation"
 
 
-def _worst(scores: dict[str, PartScores]) -> tuple[float | None, str]:
-    """NRMSE of the free run on the held-out part where it is largest, RMS over outputs; of training if none is."""
+def _on(part: str) -> str:
+    return "on the training data" if part == "train" else f"on {part}"
+
+
+def _worst(scores: dict[str, PartScores], kind: str = "simulation") -> tuple[float | None, str]:
+    """NRMSE of the free run on the held-out part where it is largest, RMS over outputs; of training if none is.
+
+    Args:
+        kind: `prediction` for that of one step ahead.
+    """
     held_out = {part: score for part, score in scores.items() if part != "train"} or scores
     found = {}
     for part, score in held_out.items():
-        values = score.simulation.nrmse
+        values = score.kinds[kind].nrmse
         if values is not None and None not in values:
             found[part] = float(np.sqrt(np.mean(np.square(np.array(values, dtype=float)))))
     part = max(found, key=found.__getitem__) if found else ""
     return (found[part], part) if found else (None, "")
 
 
-def _code(result: FitResult) -> str | None:
-    return None if result.validation is None else result.validation.verdict
+def _code(result: FitResult | RowResult) -> str | None:
+    """The verdict on the learner; None without one, and where the model is the physics alone that was taken for it."""
+    return None if result.validation is None or _warned(result, "physics_alone") else result.validation.verdict
+
+
+def _warned(result: FitResult | RowResult, *codes: str) -> bool:
+    return any(warning.code in codes for warning in result.warnings)
 
 
 def _ran_away(result: FitResult) -> bool:
-    return any(warning.code in _RAN_AWAY for warning in result.warnings)
+    return _warned(result, *_RAN_AWAY)
 
 
-def _doubts(result: FitResult) -> Iterator[str]:
+def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
     """What speaks against the model, the gravest first."""
     runaway = [w.text.split(":")[0] for w in result.warnings if w.code in _RAN_AWAY]
     if runaway:
         yield f"its free run diverges on {_joined(runaway)}"
     if _code(result) == "hurts":
         yield "its learner makes the free run worse than physics alone"
-    if not result.data.tests and not result.data.validation and not (result.validation and result.validation.trials):
+    if not data.tests and not data.validation and not (result.validation and result.validation.trials):
         yield "it was never tried on data that it was not fitted to"
-    if result.status.code in _STOPPED:
+    if (result.status if isinstance(result, RowResult) else result.status.code) in _STOPPED:
         yield "training stopped before it converged"
+    if _warned(result, "spectral_radius_above_one"):
+        yield "it is not proved stable, for its local spectral radius is above 1 on a part of its free run"
     biased = [row.name for row in _rows(result) if _biased(row)]
     if biased:
         one = len(biased) == 1
@@ -142,8 +171,9 @@ def _doubts(result: FitResult) -> Iterator[str]:
         yield f"{_joined(list(left))} {'leaves' if len(left) == 1 else 'leave'} the range of the training data"
 
 
-def _rows(result: FitResult) -> list[ParameterResult]:
-    return [*result.parameters, *(result.physical_parameters or [])]
+def _rows(result: FitResult | RowResult) -> list[ParameterResult]:
+    physical = None if isinstance(result, RowResult) else result.physical_parameters
+    return [*result.parameters, *(physical or [])]
 
 
 def _biased(row: ParameterResult) -> bool:
@@ -155,9 +185,19 @@ def _use(result: FitResult, level: str) -> str:
     known = [row.name for row in rows if _known(row)]
     shared = [row.name for row in rows if row.shared]
     others = [row.name for row in rows if row.name not in (*known, *shared)]
-    if level == "bad" and not known:
+    ahead, part = _worst(result.scores, "prediction")
+    predicts = ahead is None or ahead <= (_GOOD if level == "bad" else _POOR)
+    if level == "bad" and ahead is not None and ahead > _POOR:
+        return (
+            "Use it for nothing but to look for what is missing: not even its prediction of the next sample holds, "
+            f"which leaves {percent(ahead)} of the output's deviation {_on(part)}."
+        )
+    if level == "bad" and not (known and predicts):
         return "Use it for nothing but to look for what is missing."
-    told = "predict the next sample" if level == "bad" else "simulate and predict within the range of its training data"
+    if level == "bad":
+        told = "predict the next sample"
+    else:
+        told = f"simulate{' and predict' if predicts else ''} within the range of its training data"
     told += f" and to read {_joined(known)} as physics" if known else ""
     told += f"; {_joined(others)} {_is(others)} too uncertain or biased for that" if others else ""
     if shared:
@@ -185,10 +225,12 @@ def _then(result: FitResult) -> str:
         return 'Take physics alone (`learner.kind = "none"`), or give the learner other inputs or fewer neurons.'
     if missing and significant:
         return f"Add {missing[0].expression} to the equation of {missing[0].equation}."
-    if result.residuals is not None and result.residuals.changes:
-        return f"{_change(result.residuals.changes[0])}."
-    if cause is not None:
+    if cause is not None and (cause.share or 0.0) > _NAMED:
         return f"Add “{cause.cause}” to the physics, for it explains {percent(cause.share)} of what was learned."
+    tried = result.validation is not None and _code(result) != "helps"
+    changes = [c for c in result.residuals.changes if c.kind != "learner" or not tried] if result.residuals else []
+    if changes:
+        return f"{_change(changes[0])}."
     if _ran_away(result):
         return 'Train on the free run (`focus = "simulation"`), or record data over the range that it leaves.'
     if not result.data.tests and not result.data.validation:
