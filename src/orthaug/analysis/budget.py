@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
-from orthaug._base.lines import percent
+from orthaug._base.lines import percent, plain_number
 from orthaug._base.warning import Warning
 from orthaug.analysis.bias import SuspectedBias
 from orthaug.analysis.measure_bias import Ground
@@ -247,4 +247,4 @@ def _warning(ground: Ground, budget: Budget, rival: SuspectedBias | None) -> War
 def told_bias(entry: ParameterBias) -> str:
     """A bias in words."""
     share = "" if entry.relative is None else f", {percent(entry.relative, sign='+')}"
-    return f"{entry.name} by {entry.value:+.2g} ({entry.errors:.2g} standard errors{share})"
+    return f"{entry.name} by {entry.value:+.2g} ({plain_number(entry.errors or 0.0)} standard errors{share})"

@@ -232,7 +232,7 @@ def suspect_columns(
 
 
 def data_width(on: str, x: Matrix, layout: Layout, constants: Mapping[str, float] | None = None) -> float:
-    """A width from the data's own scale: the median of |x| where x is not zero, in the unit of `on`.
+    """A width from the data's own scale: the median of |x| where x is not zero, to six digits, in the unit of `on`.
 
     Half of the moving samples then lie inside a dead zone, a saturation or a Stribeck peak, so that the
     data show both sides of it.
@@ -246,7 +246,7 @@ def data_width(on: str, x: Matrix, layout: Layout, constants: Mapping[str, float
         raise InputError(f"'{on}' is not finite at row {np.flatnonzero(~np.isfinite(size))[0]} of the regressor.")
     if not np.any(size > 0):
         raise InputError(f"'{on}' is zero on all rows; the data give no width. State one.")
-    return float(np.median(size[size > 0]))
+    return float(f"{np.median(size[size > 0]):.6g}")
 
 
 def usual_suspects(problem: Problem) -> tuple[Suspect, ...]:

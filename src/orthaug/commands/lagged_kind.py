@@ -12,6 +12,7 @@ from orthaug._base.warning import Warning
 from orthaug.commands.bias import bias_of, with_biases
 from orthaug.commands.lagged_job import LaggedJob
 from orthaug.commands.shared import shared_of
+from orthaug.physics.derived_units import derived_units
 from orthaug.physics.excitation import identifiability, require_rank
 from orthaug.reports.result import CheckResult, FitResult, ParameterResult, parameter_rows, physical_rows
 
@@ -66,23 +67,27 @@ def content(
         told["bias"] = bias_of(job, fit)
         told |= _analysed(fit, one_step, free_run, warnings)
     shared = shared_of(job, fit.problem, others=False)
+    rows = parameter_rows(
+        fit.problem.baseline.parameters,
+        fit.theta if fit.status.ok else np.full(len(fit.theta), np.nan),
+        fit.std,
+        fit.interval,
+        fit.one_step_theta,
+        None if fit.plain_covariance is None else np.sqrt(np.diag(fit.plain_covariance)),
+    )
+    units = derived_units(fit.problem.baseline, fit.problem.record.outputs, fit.problem.record.inputs)
     told |= {
-        "parameters": parameter_rows(
-            fit.problem.baseline.parameters,
-            fit.theta if fit.status.ok else np.full(len(fit.theta), np.nan),
-            fit.std,
-            fit.interval,
-            fit.one_step_theta,
-            None if fit.plain_covariance is None else np.sqrt(np.diag(fit.plain_covariance)),
-        ),
+        "parameters": [
+            row if row.unit else row.model_copy(update={"derived_unit": units.get(row.name)}) for row in rows
+        ],
         "standard_errors": None if fit.std is None else "plain" if fit.plain_covariance is None else "robust",
         "measure_detail": fit.measure,
         "excitation": fit.excitation,
         "shared": shared,
     }
-    rows, biased = with_biases(job, fit, shared, told)
+    found, biased = with_biases(job, fit, shared, told)
     warnings += biased
-    return fit, told | rows
+    return fit, told | found
 
 
 def figures(

@@ -52,7 +52,8 @@ class FitPlots:
             alone = self.fit.model.alone.simulate(self._record(record)).trajectories[experiment]
             limits = axis.get_ylim()
             time = np.arange(len(alone.model)) * response.sampling_time
-            axis.plot(*outline(time, alone.model[:, i]), color=ORANGE, linewidth=0.9, zorder=1.5, label="model without its learner")
+            drawn = outline(time, alone.model[:, i])
+            axis.plot(*drawn, color=ORANGE, linewidth=0.9, zorder=1.5, label="model without its learner")
             axis.set_ylim(*limits)  # physics that runs away hides nothing
             axis.legend(fontsize="small", frameon=False)
         return axis

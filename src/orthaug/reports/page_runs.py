@@ -215,7 +215,7 @@ def _residual(series: dict[str, Any], measured: str, model: str, residual: Vecto
 
 
 def _upper(curves: Sequence[str], i: int, limits: tuple[float, float] | None) -> list[dict]:
-    """Measured, band, the model without its learner and with it, of output number i; the legend tells of the first's."""
+    """Measured, band, the model without its learner and with it, of output i; the legend tells of the first."""
     found = []
     if "measured" in curves:
         line = {"color": "@measured", "width": 3}
@@ -295,7 +295,7 @@ def _told_left(left: Sequence[_Left]) -> str:
     for one in left:
         named = f"{one.channel.name} of {one.name}"
         reached = f"{number(one.farthest, 3)} {one.channel.unit}".strip()
-        told += f" At {number(one.time, 4)} s {named} leaves the panel, which shows what was measured; it goes to {reached}."
+        told += f" At {number(one.time, 4)} s {named} leaves the panel, at the triangle; it goes to {reached}."
     return told
 
 
