@@ -166,6 +166,8 @@ def test_a_page_tells_how_its_result_was_made(lagged, pages, monkeypatch):
         assert file.sha256 in cells
     assert {"orthaug fit plant.toml", oa.__version__, origin.machine, "0"} <= set(cells)
     assert page.text("title") == ["Model of y from u: plant"] == page.text("h1")
+    asked = replace(lagged.job, arguments=("fit", "a b.toml", "--out", "there", "--force"))
+    assert origin_of(asked, "fit").command == "orthaug fit 'a b.toml' --out there --force"
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
     assert origin_of(lagged.job, "fit").date == "1970-01-02 00:00 UTC"
 
@@ -200,6 +202,30 @@ def test_a_surface_stands_where_data_are_near_and_sees_the_learner(lagged, pages
     assert np.isfinite(there).any() and np.isnan(there).any() and heat["zmin"] == -heat["zmax"]
 
 
+def test_what_is_drawn_over_an_input_is_told_as_it_is(lagged, motion, pages):
+    captions = Read(pages["motion"]).text("figcaption")
+    (one,) = [caption for caption in captions if caption.startswith("Over v")]
+    assert "the one input of the learner" in one and "variance" not in one
+    assert "Its means over u[k-1] have" in " ".join(Read(pages["lagged"]).text("figcaption"))
+    for kind in ("lagged", "motion"):
+        stripes = [
+            s for f in figures(pages[kind]) for s in f["layout"].get("shapes", []) if s.get("fillcolor") == "@reach"
+        ]
+        assert stripes and all(stripe["showlegend"] and stripe["name"] for stripe in stripes)
+    (runs,) = [f for f in figures(pages["lagged"]) if f["data"][0].get("name") == "loss"]
+    assert runs["layout"]["xaxis"]["ticktext"] == ["0", "1", "2"] and runs["layout"]["xaxis"]["title"] == {
+        "text": "seed"
+    }
+
+
+def test_units_that_the_spec_does_not_give_are_those_that_the_channels_ask_for(lagged):
+    units = {row.name: (row.unit, row.derived_unit) for row in lagged.result.parameters}
+    assert units == {"a": ("1", None), "b": ("", "1"), "c": ("", None)}  # the input has no unit
+    rows = [row.model_copy(update={"unit": "", "derived_unit": "mm/N"}) for row in lagged.result.parameters]
+    told = Read(fit_report(replace(lagged, result=lagged.result.model_copy(update={"parameters": rows}))))
+    assert "(mm/N)" in told.text("td") and any("the channels' units ask for it" in c for c in told.text("caption"))
+
+
 def test_the_parameters_have_their_intervals_and_the_suspect_its_bias(pages):
     page, drawn = Read(pages["lagged"]), figures(pages["lagged"])
     assert {"a [1]", "b", "c"} == {
@@ -219,7 +245,9 @@ def test_numbers_in_cells(value, scale, shown):
 
 def test_intervals_and_shares_in_cells():
     assert interval([-1e-17, 2.0]) == "0 … 2" and interval(None) == "–"
+    assert interval([1.459492, 1.459527]) == "1.459492 … 1.459527"  # not one number twice
     assert percent(-1e-17, signed=True) == "0 %" and percent(0.0123, signed=True) == "+1.2 %"
+    assert percent(22.6) == "2260 %" and percent(-4.2, signed=True) == "−420 %" and percent(1e7) == "1·10⁹ %"
 
 
 def wave(rows: int, *, wild: int | None = None, experiments: int = 1) -> Response:
@@ -240,11 +268,30 @@ def wave(rows: int, *, wild: int | None = None, experiments: int = 1) -> Respons
 def test_a_divergence_is_seen_and_does_not_flatten_the_rest():
     (plot,) = run_plots([Run("tests.fast", wave(300, wild=200, experiments=2))], {})
     (told,) = plot.layout["annotations"]
+    (left,) = [trace for trace in plot.traces if trace.get("mode") == "markers"]
+    assert f"At {left['x'][0]:.4g} s y of the model leaves the panel" in plot.caption and plot.caption.endswith(" m.")
+    run = values(plot.series["model 0"])[round(left["x"][0] / 0.01) - 1 :]
+    low, high = plot.layout["yaxis"]["range"]
+    assert low < run[0] < high and not low < run[1] < high and left["y"] == [high if run[1] > high else low]
     assert told["text"] == "free run diverges in y" and told["x"] == pytest.approx(0.01 * (301 + 200))
     assert "leaves all bounds in y at row 200" in plot.caption and "2 experiments" in plot.caption
     low, high = plot.layout["yaxis"]["range"]
     assert -4 < low < -1 and 1 < high < 4
     assert np.isnan(values(plot.series["model 0"])[300]) and np.isnan(values(plot.series["model 0"])[-50:]).all()
+
+
+def test_a_curve_that_stays_has_no_mark_and_the_model_without_its_learner_has_its_name():
+    (plot,) = run_plots([Run("tests.slow", wave(300), wave(300))], {})
+    assert "leaves the panel" not in plot.caption and all("mode" not in trace for trace in plot.traces)
+    assert [trace["name"] for trace in plot.traces] == [
+        "measured",
+        "model without its learner",
+        "model",
+        "measured − model",
+    ]
+    assert plot.layout["yaxis2"]["title"] == {"text": "residual [m]"}
+    (away,) = run_plots([Run("tests.slow", wave(300), wave(300, wild=200))], {})
+    assert "s y of the model without its learner leaves the panel" in away.caption
 
 
 def test_long_records_are_thinned_by_their_envelope_and_said_to_be():
@@ -313,6 +360,14 @@ def test_a_witness_is_told_where_runs_are_shown(lagged):
     page = Read(fit_report(replace(lagged, result=with_warning(lagged, "witness", told))))
     (section,) = page.text("section", id="free-run")
     assert told in section
+
+
+def test_minus_signs_of_texts_are_those_of_tables_and_short_cells_stay_whole(lagged):
+    told = "moves a by -0.015, see `a-1`: y[k-1] goes from -2 to 3"
+    page = fit_report(replace(lagged, result=with_warning(lagged, "small_margin", told)))
+    assert "moves a by −0.015, see <code>a-1</code>: y[k-1] goes from −2 to 3" in page
+    whole = ["".join(text) for _, given, text in Read(page).found if "whole" in (given.get("class") or "").split()]
+    assert any(" … " in cell for cell in whole) and "(1)" in whole
 
 
 def test_what_looks_like_markup_is_text(lagged):

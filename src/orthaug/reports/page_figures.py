@@ -211,35 +211,33 @@ def residual_plots(test: ResidualTestResult, what: str, units: Mapping[str, str]
         layout["showlegend"] = True
         label = f"Correlation of the {what} of {test.name} with the inputs."
         plots.append(Plot(label, told, traces, layout, 280, small=True))
+    means = _means_plot(test, what, units)
+    return [*plots, means] if means else plots
+
+
+def _means_plot(test: ResidualTestResult, what: str, units: Mapping[str, str]) -> Plot | None:
+    """Means over the regressor that tells most; None where none was looked at."""
     curves = {name: curve for name, curve in test.regressors.items() if curve is not None}
-    if curves:
-        name = max(curves, key=lambda key: curves[key].share or 0.0)
-        curve = curves[name]
-        errors = [None if e is None else 2.576 * e for e in curve.errors]
-        dots = {
-            "x": curve.centres,
-            "y": curve.means,
-            "mode": "markers",
-            "name": "mean",
-            "error_y": {"array": errors, "color": "@learner", "thickness": 1},
-            "marker": {"color": "@learner"},
-        }
-        told = (
-            f"Mean of the {what} of {test.name} over {name} with 99 % intervals: it explains "
-            f"{percent(curve.share)} of its variance."
-        )
-        label = f"Mean of the {what} of {test.name} over {name}."
-        plots.append(
-            Plot(
-                label,
-                told,
-                [dots],
-                _titled(_lagged(name, units), _lagged(f"residual of {test.name}", units, test.name)),
-                280,
-                small=True,
-            )
-        )
-    return plots
+    if not curves:
+        return None
+    name = max(curves, key=lambda key: curves[key].share or 0.0)
+    curve = curves[name]
+    errors = [None if e is None else 2.576 * e for e in curve.errors]
+    dots = {
+        "x": curve.centres,
+        "y": curve.means,
+        "mode": "markers",
+        "name": "mean",
+        "error_y": {"array": errors, "color": "@learner", "thickness": 1},
+        "marker": {"color": "@learner"},
+    }
+    told = (
+        f"Mean of the {what} of {test.name} over {name} with 99 % intervals: it explains "
+        f"{percent(curve.share)} of its variance."
+    )
+    label = f"Mean of the {what} of {test.name} over {name}."
+    layout = _titled(_lagged(name, units), _lagged(f"residual of {test.name}", units, test.name))
+    return Plot(label, told, [dots], layout, 280, small=True)
 
 
 def bias_plot(suspects: Sequence[SuspectResult]) -> Plot:

@@ -66,8 +66,6 @@ def _curve_plot(part: LearnedPart, k: int, feature: str, share: float) -> Plot:
     layout: dict[str, Any] = {"xaxis": {"title": {"text": axis}}, "yaxis": {"title": {"text": name}}, "shapes": []}
     curve = None if part.tied(feature) else part.curve(feature)
     told, one = f"Over {feature}", len(part.features) == 1
-    if not one:
-        told += f", whose means over it tell {percent(share)} of its variance"
     if curve is not None:
         traces += _curve_traces(curve, k)
         layout["yaxis"]["range"] = list(curve_limits(curve.learned[:, k], cloud[1]))
@@ -89,6 +87,7 @@ def _curve_plot(part: LearnedPart, k: int, feature: str, share: float) -> Plot:
             }
         )
         told += ": the mean along the training data, on which other inputs move with it."
+    told += "" if one else f" Its means over {feature} have {percent(share)} of its variance."
     return Plot(f"Learned part of {name} over {feature}.", told, traces, layout, height=300, small=True)
 
 

@@ -15,11 +15,11 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug.data.record import Channel
 from orthaug.models.response import Response, Trajectory
+from orthaug.reports.clipping import Left, curves_left, frame_of, marker_of, told_left
 from orthaug.reports.page_blocks import Plot, number, percent, with_unit
 
 MOST_POINTS = 100_000  # of a curve
 _BUDGET = 560_000  # points of a page: three million letters
-_FAR = 3.0  # times the measured range: a model that leaves it is cut off at the edge of the panel
 _UPPER, _GAP = 0.64, 0.05  # share of a pair of panels that is the upper one, and what lies between panels
 _PANEL = 330  # pixels of a pair of panels
 _DASHES = ("dash", "solid", "dot", "dashdot")
@@ -67,7 +67,7 @@ def _compared(part: str, runs: Mapping[str, Response], most: int) -> Plot:
     known = None if any(m is None for m in measured) else joined(first, measured)
     series: dict[str, Any] = {}
     models = {name: joined(run, [t.model for t in run.trajectories]) for name, run in runs.items()}
-    left: list[_Left] = []
+    left: list[Left] = []
     for i, channel in enumerate(first.outputs):
         own = {"yaxis": f"y{2 * i + 1}", "showlegend": i == 0}
         if known is not None:
@@ -86,8 +86,8 @@ def _compared(part: str, runs: Mapping[str, Response], most: int) -> Plot:
             if known is not None:
                 residual = _residual(series, f"measured {i}", key, known[:, i] - models[name][:, i], most)
                 traces.append({**given, **residual, "yaxis": f"y{2 * i + 2}", "showlegend": False})
-        limits = _range(known, list(models.values()), i)
-        left += _left({name: model[:, i] for name, model in models.items()}, limits, channel, start, step)
+        limits = frame_of(known, list(models.values()), i)
+        left += curves_left({name: model[:, i] for name, model in models.items()}, limits, channel, start, step)
         layout |= _axes(i, panels, channel, limits)
     rows = len(next(iter(models.values())))
     layout["xaxis"] = {
@@ -101,8 +101,8 @@ def _compared(part: str, runs: Mapping[str, Response], most: int) -> Plot:
         "each leaves of the measured output under them."
     )
     caption += f" The run of {', '.join(lost)} diverges." if lost else ""
-    caption += _told_left(left)
-    traces += [_marker(one, first.outputs) for one in left]
+    caption += told_left(left)
+    traces += [marker_of(one, first.outputs) for one in left]
     label = f"Free runs of every model on {part}, with their residuals below."
     return Plot(label, caption, traces, layout, 60 + _PANEL * len(first.outputs), series=series)
 
@@ -171,7 +171,7 @@ def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
     layout: dict[str, Any] = {"shapes": [], "annotations": []}
     panels = 2 * len(response.outputs)
     series: dict[str, Any] = {}
-    left: list[_Left] = []
+    left: list[Left] = []
     for i, channel in enumerate(response.outputs):
         curves = {"measured": known, "physics": alone, "model": model}
         series |= {f"{k} {i}": packed(v[:, i], start, step, most) for k, v in curves.items() if v is not None}
@@ -186,8 +186,8 @@ def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
             if limits is not None:
                 layout["shapes"].append(_stripe(limits, 2 * i + 2))
         drawn = {"the model": model} | ({} if alone is None else {f"the {WITHOUT}": alone})
-        frame = _range(known, list(drawn.values()), i)
-        left += _left({name: curve[:, i] for name, curve in drawn.items()}, frame, channel, start, step)
+        frame = frame_of(known, list(drawn.values()), i)
+        left += curves_left({name: curve[:, i] for name, curve in drawn.items()}, frame, channel, start, step)
         layout |= _axes(i, panels, channel, frame)
     end = start + step * (len(model) - 1)
     layout["xaxis"] = {
@@ -198,8 +198,8 @@ def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
     _mark(layout, run, start, step)
     return Plot(
         _label(run),
-        _caption(run, most) + _told_left(left),
-        [*traces, *(_marker(one, response.outputs) for one in left)],
+        _caption(run, most) + told_left(left),
+        [*traces, *(marker_of(one, response.outputs) for one in left)],
         layout,
         60 + _PANEL * len(response.outputs),
         series=series,
@@ -246,72 +246,6 @@ def _axes(i: int, panels: int, channel: Channel, limits: list[float] | None) -> 
         "domain": [max(bottom, 0), middle - _GAP / 2],
     }
     return {f"yaxis{2 * i + 1}" if i else "yaxis": upper, f"yaxis{2 * i + 2}": lower}
-
-
-def _range(measured: Matrix | None, curves: Sequence[Matrix], i: int) -> list[float] | None:
-    """What the upper panel shows where a curve leaves what was measured by far; None for all of it."""
-    if measured is None:
-        return None
-    low, high = float(np.nanmin(measured[:, i])), float(np.nanmax(measured[:, i]))
-    width = max(high - low, 1e-300)
-    for curve in curves:
-        inside = curve[:, i][np.isfinite(curve[:, i])]
-        if len(inside) and (inside.min() < low - _FAR * width or inside.max() > high + _FAR * width):
-            return [low - width, high + width]
-    return None
-
-
-@dataclass(frozen=True)
-class _Left:
-    """A curve that leaves its panel: the instant [s], the edge it leaves by, and the value farthest out."""
-
-    name: str
-    channel: Channel
-    time: float
-    edge: float
-    above: bool
-    farthest: float
-
-
-def _left(
-    curves: Mapping[str, Vector], limits: list[float] | None, channel: Channel, start: float, step: float
-) -> list[_Left]:
-    """The curves that are cut off at the edge of a panel, in the order of the drawing."""
-    found = []
-    for name, curve in curves.items() if limits is not None else ():
-        with np.errstate(invalid="ignore"):
-            outside = np.flatnonzero((curve < limits[0]) | (curve > limits[1]))
-        if len(outside):
-            row, above = int(outside[0]), bool(curve[outside[0]] > limits[1])
-            farthest = curve[outside][np.argmax(np.abs(curve[outside] - np.mean(limits)))]
-            time = start + step * row
-            found.append(_Left(name, channel, time, limits[above], above, float(farthest)))
-    return found
-
-
-def _told_left(left: Sequence[_Left]) -> str:
-    """What a caption says of them."""
-    told = ""
-    for one in left:
-        named = f"{one.channel.name} of {one.name}"
-        reached = f"{number(one.farthest, 3)} {one.channel.unit}".strip()
-        told += f" At {number(one.time, 4)} s {named} leaves the panel, at the triangle; it goes to {reached}."
-    return told
-
-
-def _marker(left: _Left, outputs: Sequence[Channel]) -> dict[str, Any]:
-    """A triangle at the edge where a curve leaves its panel."""
-    return {
-        "x": [left.time],
-        "y": [left.edge],
-        "yaxis": f"y{2 * list(outputs).index(left.channel) + 1}",
-        "type": "scatter",
-        "mode": "markers",
-        "name": f"{left.name} leaves the panel",
-        "cliponaxis": False,
-        "showlegend": False,
-        "marker": {"color": "@bad", "size": 12, "symbol": "triangle-up" if left.above else "triangle-down"},
-    }
 
 
 def _stripe(limits: tuple[float, float], axis: int) -> dict[str, Any]:

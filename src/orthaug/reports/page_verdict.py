@@ -69,8 +69,9 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
     level = "good" if error is not None and error <= _GOOD else "care" if error is None or error <= _POOR else "bad"
     level = "care" if level == "good" and doubts else level
     near = [name for name in errors if name != best and errors[name] <= _ALIKE * (error or 0.0)]
+    less = ", less than of any other" if errors[best] <= min(errors.values()) else ""
     how = f"it has the lowest error on the validation part, and {_told_error(error or 0.0, part)}"
-    trust = f"Take “{best}”: {how if result.chosen else _told_error(error or 0.0, part) + ', less than of any other'}"
+    trust = f"Take “{best}”: {how if result.chosen else _told_error(error or 0.0, part) + less}"
     trust += f"; {_joined([f'“{name}”' for name in near])} {_is(near)} as good within 10 %." if near else "."
     if doubts:
         trust = f"{trust[:-1]}. But {_joined(doubts[:_MOST_DOUBTS])}."
