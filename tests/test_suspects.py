@@ -90,7 +90,7 @@ def test_columns_stand_in_their_output():
 
 def test_data_width_is_the_median_of_what_moves():
     assert data_width(VELOCITY, X, LAYOUT, TS) == pytest.approx(np.median(np.abs(V[1:])))
-    assert data_width("y[k-1]/3", X, LAYOUT, TS) == float(f"{np.median(np.abs(X[:, 0])) / 3:.6g}")  # in expressions
+    assert data_width("y[k-1]/3", X, LAYOUT, TS) == float(f"{np.median(np.abs(X[1:, 0])) / 3:.6g}")  # in expressions
     inside = np.abs(V[1:]) < data_width(VELOCITY, X, LAYOUT, TS)
     assert abs(inside.mean() - 0.5) < 0.02
 
