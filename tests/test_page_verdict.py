@@ -105,6 +105,7 @@ def test_a_cause_of_most_of_what_was_learned_comes_before_changes():
 
     assert "“cubic of y[k-1]”" in fit_verdict(fitted(parameters=biased(0.98), residuals=told(LAG))).then
     assert "u[k-4]" in fit_verdict(fitted(parameters=biased(0.5), residuals=told(LAG))).then
+    assert "“cubic of y[k-1]”" in fit_verdict(fitted(parameters=biased(0.5), residuals=told())).then
 
 
 def test_a_comparison_has_the_doubts_of_its_model():

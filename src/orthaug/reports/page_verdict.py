@@ -187,7 +187,7 @@ def _use(result: FitResult, level: str) -> str:
     shared = [row.name for row in rows if row.shared]
     others = [row.name for row in rows if row.name not in (*known, *shared)]
     ahead, part = _worst(result.scores, "prediction")
-    predicts = ahead is None or ahead <= (_GOOD if level == "bad" else _POOR)
+    predicts = ahead is not None and ahead <= (_GOOD if level == "bad" else _POOR)
     if level == "bad" and ahead is not None and ahead > _POOR:
         return (
             "Use it for nothing but to look for what is missing: not even its prediction of the next sample holds, "
@@ -232,6 +232,8 @@ def _then(result: FitResult) -> str:
     changes = [c for c in result.residuals.changes if c.kind != "learner" or not tried] if result.residuals else []
     if changes:
         return f"{_change(changes[0])}."
+    if cause is not None:
+        return f"Add “{cause.cause}” to the physics, for it explains {percent(cause.share)} of what was learned."
     if _ran_away(result):
         return 'Train on the free run (`focus = "simulation"`), or record data over the range that it leaves.'
     if not result.data.tests and not result.data.validation:
