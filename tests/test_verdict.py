@@ -186,6 +186,17 @@ def test_the_verdict_on_trials(trials, code):
     assert content["verdict"] == code and len(content["trials"]) == len(trials)
 
 
+def test_a_wide_interval_below_one_is_undecided():
+    """A part where most of the gain is in one stretch: on average much better, yet not surely."""
+    rng = np.random.default_rng(0)
+    alone = np.concatenate([30 * np.ones(20), rng.uniform(0.5, 1.5, 180)])
+    model = np.concatenate([np.ones(20), 2 * rng.uniform(0.5, 1.5, 180)])
+    errors = [math.sqrt(piece.mean()) for piece in (alone, model)]
+    found = judge([Trial("tests.a", *errors, pieces=([alone], [model]))])
+    assert found.code == "no_help" and found.ratio.value < 0.9 and found.ratio.high > 1
+    assert found.text.startswith("It is undecided whether the learner helps. On tests.a")
+
+
 def test_no_trial_no_verdict():
     assert judge([]) is None
 

@@ -108,7 +108,7 @@ def diagnose(fit: Estimate, *, one_step: Response | None = None, free_run: Respo
 def _concluded(seen: Finding, free_tests: tuple[ResidualTest, ...] | None) -> Diagnosis:
     """The verdict and its words."""
     misfit = any(t.follows() or t.curved_over(SHARE) for t in seen.tests) or seen.lacks
-    complete = seen.white and not misfit
+    complete = seen.white and not misfit and not seen.follows(_SMALL)
     noise = "white" if seen.free_white and seen.white else "equation_noise"
     if not seen.fit.model.form.states:
         noise = "white"
@@ -130,7 +130,7 @@ def _concluded(seen: Finding, free_tests: tuple[ResidualTest, ...] | None) -> Di
 
 def _is_small(seen: Finding) -> bool:
     """Whether what could be predicted is a small effect: no change is worth making."""
-    if seen.lacks or not seen.predictable:
+    if seen.lacks or not seen.predictable or seen.drifts or seen.follows(_SMALL):
         return False
     shares = [one.largest(own_past=not seen.simulated) for one in seen.predictable]
     unit = zip(seen.predictable, seen.fit.problem.deviation, strict=True)

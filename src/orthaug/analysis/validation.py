@@ -23,6 +23,8 @@ from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.response import Response
 
+_LIKELY = 0.9  # ratio of errors below which an interval that holds 1 leaves undecided what is not shown
+
 
 @dataclass(frozen=True)
 class Trial:
@@ -210,14 +212,16 @@ def judge(trials: Sequence[Trial], extrapolation: Sequence[Extrapolation] = ()) 
     worst = next(code for code in ("hurts", "no_help", "helps") if code in codes)
     hurt = {where for (where, _), code in zip(groups, codes, strict=True) if code == "hurts"}
     beyond = [e for e in extrapolation if e.part in hurt]
+    ratio = ratios[codes.index(worst)]
+    likely = ratio.value < _LIKELY and ratio.high > 1
     opening = {
         "helps": "The learner helps",
-        "no_help": "The learner does not help",
+        "no_help": "It is undecided whether the learner helps" if likely else "The learner does not help",
         "hurts": "The learner hurts in extrapolation" if beyond else "The learner hurts",
     }[worst]
     reasons = sentences if worst == "helps" else [s for s, c in zip(sentences, codes, strict=True) if c != "helps"]
     text = ". ".join([opening, *reasons]) + "."
-    return Verdict(worst, text, tuple(trials), tuple(extrapolation), ratios[codes.index(worst)])
+    return Verdict(worst, text, tuple(trials), tuple(extrapolation), ratio)
 
 
 def _ratio(group: Sequence[Trial], alone: float, model: float) -> Ratio:

@@ -14,6 +14,7 @@ from orthaug.reports.result import CompareResult, FitResult, ParameterResult, Pa
 _GOOD, _POOR = 0.2, 0.5  # NRMSE of a free run up to which it is close, and from which it is far
 _ALIKE = 1.1  # ratio of errors up to which models are told to be as good as each other
 _SURE = 0.1  # standard error over value up to which a parameter is told to be known
+_WORSE = 1.5  # times the error on the training data: a Gaussian error then leaves the 95 % band on a fifth of the rows
 _STOPPED = ("iteration_limit", "no_descent")
 _RAN_AWAY = ("free_run_diverged",)
 
@@ -64,9 +65,13 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
     error, part = _worst(row.scores)
     level = "good" if error is not None and error <= _GOOD else "care" if error is None or error <= _POOR else "bad"
     near = [name for name in errors if name != best and errors[name] <= _ALIKE * (error or 0.0)]
+    same = [name for name in near if percent(errors[name]) == percent(errors[best])]
+    near = [name for name in near if name not in same]
+    less = f", as does {_quoted(same)}, and no other leaves less" if same else ", less than of any other"
+    less = less.replace("as does", "as do") if len(same) > 1 else less
     how = f"it has the lowest error on the validation part, and {_told_error(error or 0.0, part)}"
-    trust = f"Take “{best}”: {how if result.chosen else _told_error(error or 0.0, part) + ', less than of any other'}"
-    trust += f"; {_joined([f'“{name}”' for name in near])} {_is(near)} as good within 10 %." if near else "."
+    trust = f"Take “{best}”: {how if result.chosen else _told_error(error or 0.0, part) + less}"
+    trust += f"; {_quoted(near)} {_is(near)} as good within 10 %." if near else "."
     alone = errors.get("physics alone")
     use = "It is the physics alone: no learner earns its place beside it."
     if best != "physics alone" and alone is not None and error is not None:
@@ -94,6 +99,19 @@ def _word(row: RowResult) -> str:
 def _told_error(error: float, part: str) -> str:
     which = "on the training data" if part == "train" else f"on {part}"
     return f"{which} its free run leaves {percent(error)} of the output's deviation"
+
+
+def _worse(scores: dict[str, PartScores]) -> tuple[float, str] | None:
+    """How many times as large as in training the free run's error on a held-out part is, where that is a lot."""
+    found = {}
+    trained = scores["train"].simulation.rmse if "train" in scores else None
+    for part, score in scores.items():
+        held = score.simulation.rmse
+        if part != "train" and trained and held:
+            ratios = [h / t for h, t in zip(held, trained, strict=True) if h is not None and t]
+            found[part] = max(ratios, default=0.0)
+    part = max(found, key=found.__getitem__) if found else ""
+    return (found[part], part) if found and found[part] > _WORSE else None
 
 
 def _worst(scores: dict[str, PartScores]) -> tuple[float | None, str]:
@@ -137,6 +155,9 @@ def _doubts(result: FitResult) -> Iterator[str]:
             "unmodelled": "its residual is not noise alone",
             "sensor_noise": "noise on the measured output biases its one-step estimates",
         }[result.residuals.verdict]
+    worse = _worse(result.scores)
+    if worse is not None:
+        yield f"its error on {worse[1]} is {number(worse[0], 2)} times that on the training data, so the band is too narrow"
     if result.validation is not None and result.validation.extrapolation:
         left = dict.fromkeys(entry.part for entry in result.validation.extrapolation)
         yield f"{_joined(list(left))} {'leaves' if len(left) == 1 else 'leave'} the range of the training data"
@@ -152,24 +173,37 @@ def _biased(row: ParameterResult) -> bool:
 
 def _use(result: FitResult, level: str) -> str:
     rows = _rows(result)
-    known = [row.name for row in rows if _known(row)]
+    sure = [row.name for row in rows if _known(row)]
+    known = sure if _noise_alone(result) else []
     shared = [row.name for row in rows if row.shared]
-    others = [row.name for row in rows if row.name not in (*known, *shared)]
+    others = [row.name for row in rows if row.name not in (*sure, *shared)]
     if level == "bad" and not known:
         return "Use it for nothing but to look for what is missing."
     told = "predict the next sample" if level == "bad" else "simulate and predict within the range of its training data"
     told += f" and to read {_joined(known)} as physics" if known else ""
-    told += f"; {_joined(others)} {_is(others)} too uncertain or biased for that" if others else ""
+    if sure and not known:
+        cover = "interval does" if len(sure) == 1 else "intervals do"
+        told += f", but do not read {_joined(sure)} as physics yet: the {cover} not cover what the residual still holds"
+    told += f"; {_joined(others)} {_is(others)} too uncertain or biased to be read so" if others else ""
     if shared:
         told += f"; {_joined(shared)} {_is(shared)} what the physics nearest to the data has, for the learner could"
         told += f" imitate {'it' if len(shared) == 1 else 'them'}"
     return f"Use it to {told}."
 
 
+def _noise_alone(result: FitResult) -> bool:
+    """Whether the residual shows nothing that would bias the parameters."""
+    return result.residuals is None or result.residuals.verdict not in ("unmodelled", "sensor_noise")
+
+
 def _known(row: ParameterResult) -> bool:
     """Whether a parameter may be read as physics."""
     sure = row.std is not None and row.value is not None and 0 < row.std <= _SURE * abs(row.value)
     return sure and not row.shared and not _biased(row)
+
+
+def _quoted(names: list[str]) -> str:
+    return _joined([f"“{name}”" for name in names])
 
 
 def _is(names: list[str]) -> str:
@@ -199,7 +233,20 @@ def _then(result: FitResult) -> str:
         entry = result.validation.extrapolation[0]
         low, high = entry.found
         return f"Record training data that reach {entry.regressor} from {number(low, 3)} to {number(high, 3)}."
+    if _undecided(result):
+        return "Keep the learner (`training.fallback = false`) and look: cross-validation leaves undecided if it helps."
+    if not _noise_alone(result):
+        return "Look at what the residual still follows (residual tests), and give the physics or a learner that."
+    if _worse(result.scores) is not None:
+        return f"Find what is different on {(_worse(result.scores) or ('', ''))[1]}, or train on more data of its kind."
     return "Nothing further is predicted to help; export it (`orthaug export`) or design the next experiment."
+
+
+def _undecided(result: FitResult) -> bool:
+    """Whether physics alone was handed over although the learner may help."""
+    fell_back = any(warning.code == "physics_alone" for warning in result.warnings)
+    ratio = None if result.validation is None else result.validation.ratio
+    return fell_back and ratio is not None and (ratio.value or 1.0) < 1 < (ratio.high or 0.0)
 
 
 def _change(change: object) -> str:
