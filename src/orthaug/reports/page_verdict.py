@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from orthaug.analysis.budget import SURE_SHARE
 from orthaug.analysis.changes import Change
 from orthaug.reports.page_blocks import number, percent
 from orthaug.reports.result import CompareResult, FitResult, ParameterResult, PartScores, RowResult
@@ -149,6 +150,8 @@ def _doubts(result: FitResult) -> Iterator[str]:
     if biased:
         one = len(biased) == 1
         carry = "carries a bias larger than its standard error" if one else "carry biases larger than their errors"
+        guessed = any(row.bias and (row.bias.share or 0.0) < SURE_SHARE for row in _rows(result) if _biased(row))
+        carry = f"probably {carry}" if guessed and result.motion is None else carry
         yield f"the estimate{'' if one else 's'} of {_joined(biased)} {carry}"
     if result.residuals is not None and result.residuals.verdict in ("unmodelled", "sensor_noise"):
         yield {
@@ -222,7 +225,10 @@ def _then(result: FitResult) -> str:
     if result.residuals is not None and result.residuals.changes:
         return f"{_change(result.residuals.changes[0])}."
     if cause is not None:
-        return f"Add “{cause.cause}” to the physics, for it explains {percent(cause.share)} of what was learned."
+        share = percent(cause.share)
+        if (cause.share or 0.0) < SURE_SHARE and result.motion is None:
+            return f"Try “{cause.cause}” in the physics: what was learned looks most like it ({share} of it)."
+        return f"Add “{cause.cause}” to the physics, for it explains {share} of what was learned."
     if _ran_away(result):
         return 'Train on the free run (`focus = "simulation"`), or record data over the range that it leaves.'
     if not result.data.tests and not result.data.validation:
