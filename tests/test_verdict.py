@@ -145,6 +145,16 @@ def test_the_range_that_is_left_is_told_once_for_a_channel():
     assert entry.share == pytest.approx(np.mean((outside < inside.min()) | (outside > inside.max())))
 
 
+@pytest.mark.parametrize(("over", "rows", "told"), [
+    (0.005, 100, False), (0.05, 1, False), (0.05, 100, True), (0.5, 1, True), (0.0, 0, False),
+])  # fmt: skip
+def test_a_range_that_is_hardly_left_is_not_told(over, rows, told):
+    """Of a range of 2 over 1000 rows: as noise on the extreme values leaves it."""
+    training, x = (np.linspace(-1, 1, 1000)[:, None] for _ in range(2))
+    x[:rows] = -1 - 2 * over
+    assert bool(extrapolation("tests.far", x, training, layout_of()[:1])) is told
+
+
 def test_the_words_of_a_range():
     words = "In u[k-1], tests.far leaves the training range of -1 to 1: it goes from -2.5 to 2, outside on 25 % of its"
     assert words in str(BEYOND)

@@ -23,6 +23,8 @@ from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.response import Response
 
+_BEYOND, _FAR = 0.01, 0.1  # of the training range: an excursion that is told, and one that counts on any row
+_OFTEN = 0.01  # of the rows: a smaller excursion counts from there on
 _LIKELY = 0.9  # ratio of errors below which an interval that holds 1 leaves undecided what is not shown
 
 
@@ -245,6 +247,8 @@ def _told(alone: float, model: float) -> str:
 def extrapolation(part: str, x: Matrix, training: Matrix, layout: Layout) -> list[Extrapolation]:
     """Entries of the regressor in which a part leaves the range of the training data; one lag a channel.
 
+    Not told is what noise does to extreme values: excursions by less than a hundredth of the range, or on few rows.
+
     Args:
         part: its name.
         x: its regressors (N, nx), in the order of the layout; `training` those of the training data.
@@ -253,8 +257,10 @@ def extrapolation(part: str, x: Matrix, training: Matrix, layout: Layout) -> lis
     for j, lag in enumerate(layout):
         low, high = float(training[:, j].min()), float(training[:, j].max())
         beyond = (x[:, j] < low) | (x[:, j] > high)
-        if beyond.any() and lag.channel not in leaving:
-            reach = (float(x[:, j].min()), float(x[:, j].max()))
+        reach = (float(x[:, j].min()), float(x[:, j].max())) if len(x) else (low, high)
+        excess = max(low - reach[0], reach[1] - high)
+        often = excess > _BEYOND * (high - low) and beyond.mean() >= _OFTEN
+        if (often or excess > _FAR * (high - low)) and lag.channel not in leaving:
             leaving[lag.channel] = Extrapolation(part, str(lag), (low, high), reach, float(beyond.mean()))
     return list(leaving.values())
 
