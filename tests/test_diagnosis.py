@@ -272,6 +272,22 @@ def test_one_step_with_sensor_noise_is_warned_and_told_the_criterion():
     assert 'train with focus = "simulation"' in found.text and "inconsistent" in found.text
 
 
+@pytest.mark.parametrize(("step", "told"), [(0.3, True), (0.02, False), (None, False)])
+def test_steps_of_an_output_are_told_where_the_one_step_error_has_their_size(step, told):
+    """Slow motion in coarse steps, as an encoder tells it; finer ones than the noise are no cause."""
+    rng = np.random.default_rng(4)
+    u, y = np.repeat(rng.normal(size=60), 30), np.zeros(1800)
+    for k in range(2, 1800):
+        y[k] = 1.9 * y[k - 1] - 0.905 * y[k - 2] + 0.005 * u[k - 1]
+    y = y + (0.05 * rng.normal(size=1800) if step == 0.02 else 0.0)
+    y = y + 0.001 * lfilter([1.0, 0.5], [1.0], rng.normal(size=1800)) if step is None else np.round(y / step) * step
+    found = of(Record.from_arrays(u, y, sampling_time=0.1))
+    assert not found.one_step[0].practically_white()
+    assert (found.steps is not None) is told and ("measured in steps of 0.3" in found.text) is told
+    if told:
+        assert found.steps == {"y": pytest.approx(0.3)} and "measure more finely" in found.text
+
+
 def test_sampling_too_fast_is_told():
     found = of(spring(10000, 0))
     assert found.noise_in_lags > 0.2 and "too fast for one-step estimation" in found.text

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -45,6 +45,8 @@ class Finding:
     free_tests: tuple[ResidualTest, ...] | None = None
     predictable: tuple[Predictable, ...] = ()
     changes: tuple[Change, ...] = ()
+    steps: Mapping[str, float] = field(default_factory=dict)
+    """Steps of the outputs whose one-step error has their size."""
 
     @property
     def lacks(self) -> bool:
@@ -122,7 +124,8 @@ def _sensor_noise(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
             f". The noise is {100 * seen.noise:.0f} % of what tells the lagged outputs apart: the sampling is too fast "
             "for one-step estimation"
         )
-    return f"{text}.", (_BIASED,) if seen.fit.std is not None else ()
+    steps = f" {_quantised(seen)}" if seen.steps else ""
+    return f"{text}.{steps}", (_BIASED,) if seen.fit.std is not None else ()
 
 
 def _unmodelled(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
@@ -132,7 +135,23 @@ def _unmodelled(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
         told += [f"the residual of {test.name} is curved over {name}" for name in test.curved_over(SHARE)]
     told = [*told[:_TOLD], *(["and more"] if len(told) > _TOLD else [])]
     opening = f"The {seen.what}, {_size(seen)}, is not noise alone: {'; '.join(told)}."
-    return " ".join(part for part in (opening, _shares(seen), _advice(seen, _cause(seen))) if part), ()
+    advice = "" if seen.steps and not seen.changes else _advice(seen, _cause(seen))
+    return " ".join(part for part in (opening, _shares(seen), _quantised(seen), advice) if part), ()
+
+
+def _quantised(seen: Finding) -> str:
+    """That the steps of an output colour the residual one step ahead, and what to do."""
+    if not seen.steps:
+        return ""
+    units = {c.name: f" {c.unit}".rstrip() for c in seen.fit.problem.record.outputs}
+    each = {test.name: f"{test.name} is measured in steps of {seen.steps[test.name]:.3g}{units[test.name]}, and the "
+            f"one-step residual ({test.rms:.2g}{units[test.name]}) is no larger"
+            for test in seen.tests if test.name in seen.steps}  # fmt: skip
+    trained = "" if seen.simulated else 'train with focus = "simulation", '
+    return (
+        f"{'; '.join(each.values())}: such steps colour it as noise on the output does, and bias one-step estimates of "
+        f"θ. For that {trained}take fewer samples (`decimate` of data.prepare), or measure more finely."
+    )
 
 
 def _cause(seen: Finding) -> str:

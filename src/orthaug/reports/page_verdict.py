@@ -154,8 +154,11 @@ def _doubts(result: FitResult) -> Iterator[str]:
         carry = f"probably {carry}" if guessed and result.motion is None else carry
         yield f"the estimate{'' if one else 's'} of {_joined(biased)} {carry}"
     if result.residuals is not None and result.residuals.verdict in ("unmodelled", "sensor_noise"):
+        coarse = list(result.residuals.steps or {})
         yield {
-            "unmodelled": "its residual is not noise alone",
+            "unmodelled": f"its one-step residual has the size of the steps of {_joined(coarse)}"
+            if coarse
+            else "its residual is not noise alone",
             "sensor_noise": "noise on the measured output biases its one-step estimates",
         }[result.residuals.verdict]
     worse = _worse(result.scores)
@@ -241,6 +244,9 @@ def _then(result: FitResult) -> str:
         return f"Record training data that reach {entry.regressor} from {number(low, 3)} to {number(high, 3)}."
     if _undecided(result):
         return "Keep the learner (`training.fallback = false`) and look: cross-validation leaves undecided if it helps."
+    if result.residuals is not None and result.residuals.steps:
+        told = "Train on the free run (`focus = \"simulation\"`), take fewer samples, or measure more finely"
+        return f"{told}: {_joined(list(result.residuals.steps))} has steps as large as the one-step residual."
     if not _noise_alone(result):
         return "Look at what the residual still follows (residual tests), and give the physics or a learner that."
     if _worse(result.scores) is not None:
