@@ -304,7 +304,9 @@ def test_the_verdict_is_built_from_the_findings(lagged, motion):
     ended = motion.result.status.model_copy(update={"code": "converged"})
     changed = {"residuals": residuals, "status": ended, "validation": None}
     coarse = fit_verdict(motion.result.model_copy(update=changed))
-    assert "its one-step residual has the size of the steps of x" in coarse.trust and "x has steps as large" in coarse.then
+    assert (
+        "its one-step residual has the size of the steps of x" in coarse.trust and "x has steps as large" in coarse.then
+    )
     train, test = (motion.result.scores[part] for part in ("train", "tests.steps"))
     far = test.simulation.model_copy(update={"rmse": [2 * value for value in train.simulation.rmse]})
     scores = {**motion.result.scores, "tests.steps": test.model_copy(update={"simulation": far})}

@@ -129,7 +129,15 @@ def _concluded(seen: Finding, free_tests: tuple[ResidualTest, ...] | None) -> Di
     text, warnings = words(verdict, seen)
     warnings = (*wild_rows(seen.one_step, seen.fit.problem.record.experiments), *warnings)
     return Diagnosis(
-        verdict, text, seen.tests, free_tests, seen.ratio, seen.noise, warnings, seen.predictable, seen.changes,
+        verdict,
+        text,
+        seen.tests,
+        free_tests,
+        seen.ratio,
+        seen.noise,
+        warnings,
+        seen.predictable,
+        seen.changes,
         steps=seen.steps or None,
     )
 

@@ -181,7 +181,9 @@ def _small(seen: Finding) -> str:
     """What is said where the tests reject, but hardly anything could be predicted."""
     colour = " Its colour is that of the noise." if seen.simulated and not seen.white else ""
     followed = seen.follows()
-    shown = f"noise for the most part, but still follows {_joined(followed)}" if followed else "noise as far as it shows"
+    shown = (
+        f"noise for the most part, but still follows {_joined(followed)}" if followed else "noise as far as it shows"
+    )
     advice = _advice(seen, "what it follows is a small effect" if followed else "it is the noise floor")
     return f"The {seen.what}, {_size(seen)}, is {shown}. {_shares(seen)}{colour} {advice}"
 

@@ -161,6 +161,8 @@ def _doubts(result: FitResult) -> Iterator[str]:
             else "its residual is not noise alone",
             "sensor_noise": "noise on the measured output biases its one-step estimates",
         }[result.residuals.verdict]
+    if _fed_back(result):
+        yield "its data look recorded under feedback, which biases it"
     worse = _worse(result.scores)
     if worse is not None:
         yield f"its error on {worse[1]} is {number(worse[0], 2)} times that on the training data, so the band is too narrow"
@@ -242,16 +244,22 @@ def _then(result: FitResult) -> str:
         entry = result.validation.extrapolation[0]
         low, high = entry.found
         return f"Record training data that reach {entry.regressor} from {number(low, 3)} to {number(high, 3)}."
+    if _fed_back(result):
+        return "Record the reference and model the whole loop, move it more, or record without the controller."
     if _undecided(result):
         return "Keep the learner (`training.fallback = false`) and look: cross-validation leaves undecided if it helps."
     if result.residuals is not None and result.residuals.steps:
-        told = "Train on the free run (`focus = \"simulation\"`), take fewer samples, or measure more finely"
+        told = 'Train on the free run (`focus = "simulation"`), take fewer samples, or measure more finely'
         return f"{told}: {_joined(list(result.residuals.steps))} has steps as large as the one-step residual."
     if not _noise_alone(result):
         return "Look at what the residual still follows (residual tests), and give the physics or a learner that."
     if _worse(result.scores) is not None:
         return f"Find what is different on {(_worse(result.scores) or ('', ''))[1]}, or train on more data of its kind."
     return "Nothing further is predicted to help; export it (`orthaug export`) or design the next experiment."
+
+
+def _fed_back(result: FitResult) -> bool:
+    return any(warning.code == "closed_loop" for warning in result.warnings)
 
 
 def _undecided(result: FitResult) -> bool:
