@@ -343,6 +343,23 @@ def test_the_verdict_is_built_from_the_findings(lagged, motion):
     biased = row.model_copy(update={"bias": type("B", (), bias)()})
     one = lagged.result.model_copy(update={"parameters": [biased]})
     assert "the estimate of a carries a bias larger than its standard error" in fit_verdict(one).trust
+    for name in ("unmodelled", "sensor_noise"):
+        residuals = motion.result.residuals.model_copy(update={"verdict": name, "changes": [], "missing": None})
+        doubted = fit_verdict(motion.result.model_copy(update={"residuals": residuals}))
+        assert doubted.level != "good" and "do not read m and k as physics yet" in doubted.use
+        assert not doubted.then.startswith("Nothing further")
+    residuals = residuals.model_copy(update={"verdict": "unmodelled", "steps": {"x": 0.1}})
+    ended = motion.result.status.model_copy(update={"code": "converged"})
+    changed = {"residuals": residuals, "status": ended, "validation": None}
+    coarse = fit_verdict(motion.result.model_copy(update=changed))
+    assert (
+        "its one-step residual has the size of the steps of x" in coarse.trust and "x has steps as large" in coarse.then
+    )
+    train, test = (motion.result.scores[part] for part in ("train", "tests.steps"))
+    far = test.simulation.model_copy(update={"rmse": [2 * value for value in train.simulation.rmse]})
+    scores = {**motion.result.scores, "tests.steps": test.model_copy(update={"simulation": far})}
+    beyond = fit_verdict(motion.result.model_copy(update={"scores": scores}))
+    assert "its error on tests.steps is 2 times that on the training data" in beyond.trust and beyond.level == "care"
     hurts = lagged.result.validation.model_copy(update={"verdict": "hurts"})
     told = fit_verdict(lagged.result.model_copy(update={"validation": hurts}))
     assert told.level == "bad" and "Take physics alone" in told.then
@@ -353,6 +370,10 @@ def test_the_verdict_of_a_comparison_names_a_model(compared):
     verdict = compare_verdict(compared.result)
     names = [row.name for row in compared.result.comparison]
     assert any(f"Take “{name}”" in verdict.trust for name in names) and "validation part" in verdict.then
+    first = next(row for row in compared.result.comparison if row.validation)
+    twin = compared.result.model_copy(update={"comparison": [first, first.model_copy(update={"name": "twin"})]})
+    trust = compare_verdict(twin.model_copy(update={"chosen": None})).trust
+    assert "as does “twin”, and no other leaves less" in trust and "less than of any other" not in trust
 
 
 def test_a_witness_is_told_where_runs_are_shown(lagged):

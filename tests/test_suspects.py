@@ -23,6 +23,7 @@ FORMS = {
     "stribeck_gauss": lambda v, w: np.sign(v) * np.exp(-((v / w) ** 2)),
     "quadratic_drag": lambda v, w: v * np.abs(v),
     "cubic": lambda v, w: v**3,
+    "square_root": lambda v, w: np.sign(v) * np.sqrt(np.abs(v)),
     "dead_zone": lambda v, w: v - np.clip(v, -w, w),
     "saturation": lambda v, w: np.clip(v, -w, w),
     "expression": lambda v, w: v,

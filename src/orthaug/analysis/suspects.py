@@ -38,6 +38,7 @@ _KINDS = {
     "stribeck_gauss": _Kind(lambda x, w: f"sign({x})*exp(-(({x})/{w})**2)", width=True),
     "quadratic_drag": _Kind(lambda x, w: f"({x})*abs({x})"),
     "cubic": _Kind(lambda x, w: f"({x})**3"),
+    "square_root": _Kind(lambda x, w: f"sign({x})*sqrt(abs({x}))"),
     "dead_zone": _Kind(lambda x, w: f"({x}) - {_clip(x, w)}", width=True),
     "saturation": _Kind(_clip, width=True),
     "offset": _Kind(lambda x, w: "1"),
@@ -47,6 +48,7 @@ KINDS = tuple(_KINDS)
 WIDTHS = tuple(kind for kind, entry in _KINDS.items() if entry.width)  # the kinds that need a width
 _VELOCITY = ("coulomb", "stribeck", "quadratic_drag", "cubic")
 _POSITION = ("cubic", "dead_zone")
+_BELOW = 0.05  # of the largest value: what is only so far below 0 counts as positive, for it is noise
 _MULTIPLIED = 6  # lags at most, of which products are tried
 _INPUT = ("cubic", "dead_zone", "saturation")
 
@@ -107,6 +109,7 @@ class Suspect:
         | `stribeck_gauss` | sign(x) exp(−(x/width)²) | v_S |
         | `quadratic_drag` | x abs(x) | |
         | `cubic` | x³ | |
+        | `square_root` | sign(x) √abs(x), as of an outflow | |
         | `dead_zone` | x − clip(x, −width, width) | half of the zone |
         | `saturation` | clip(x, −width, width) | the limit |
         | `offset` | 1, no `on` | |
@@ -250,13 +253,16 @@ def data_width(on: str, x: Matrix, layout: Layout, constants: Mapping[str, float
 
 
 def usual_suspects(problem: Problem) -> tuple[Suspect, ...]:
-    """What is often missing: friction, drag, hardening, dead zone and saturation, an offset."""
+    """What is often missing: friction, drag, hardening, dead zone, saturation, an offset, the root of a level."""
     layout, outputs = problem.layout, problem.outputs
     pairs: list[tuple[str, str]] = []
     for channel in dict.fromkeys(lag.channel for lag in layout):
         lags = sorted(lag.lag for lag in layout if lag.channel == channel)
         first = next(str(lag) for lag in layout if lag.channel == channel and lag.lag == lags[0])
         pairs += [(kind, first) for kind in (_POSITION if channel in outputs else _INPUT)]
+        values = problem.rows.x[:, [str(lag) for lag in layout].index(first)]
+        if channel in outputs and values.min() >= -_BELOW * values.max():
+            pairs.append(("square_root", first))
         if channel in outputs and len(lags) > 1:
             second = next(str(lag) for lag in layout if lag.channel == channel and lag.lag == lags[1])
             pairs += [(kind, f"{first} - {second}") for kind in _VELOCITY]

@@ -9,6 +9,7 @@ import numpy as np
 
 from orthaug._base.errors import InputError
 from orthaug._base.warning import Warning
+from orthaug.analysis.closed_loop import closed_loop
 from orthaug.commands.bias import bias_of, with_biases
 from orthaug.commands.lagged_job import LaggedJob
 from orthaug.commands.shared import shared_of
@@ -39,7 +40,7 @@ def checked(job: LaggedJob) -> CheckResult:
             "identifiability": identifiability(problem.baseline, problem.layout, problem.outputs, problem.rows.x),
             "shared": shared_of(job),
             "bias": bias_of(job) if problem.excitation.full_rank else None,
-            "warnings": job.warnings,
+            "warnings": [*job.warnings, *closed_loop(job.train.record)],
         }
     )
 
@@ -179,6 +180,7 @@ def _analysed(fit: Estimate, one_step: Response, free_run: Response, warnings: l
         warnings.append(Warning("residual_not_analysed", told))
     else:
         warnings += diagnosis.warnings
+    warnings += closed_loop(problem.record)
     hidden = missing_lags(fit, one_step)
     warnings += hidden.warnings if hidden else ()
     return {"residuals": diagnosis, "missing_lags": hidden, "stability": steady}

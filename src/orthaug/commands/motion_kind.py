@@ -9,6 +9,7 @@ import numpy as np
 
 from orthaug._base.errors import InputError, RankError
 from orthaug._base.warning import Warning
+from orthaug.analysis.closed_loop import closed_loop
 from orthaug.commands.motion_job import MotionJob
 from orthaug.commands.motion_suspects import bias_before
 from orthaug.reports.result import CheckResult, FitResult, ParameterResult, parameter_rows
@@ -78,7 +79,7 @@ def checked(job: MotionJob) -> CheckResult:
                 "best_hold": trial.best,
                 "text": text,
             },
-            "warnings": [*job.warnings, *warnings],
+            "warnings": [*job.warnings, *warnings, *closed_loop(job.train.record)],
         }
     )
 
@@ -135,6 +136,7 @@ def content(
         told["stability"] = motion_stability(fit.model, x, u, record=job.train.record)
         parts = equation_parts(fit, x, u) if form.bound is not None else ()
         warnings += told["stability"].warnings
+        warnings += closed_loop(job.train.record)
         coarse = substep_bias(fit)
         warnings += coarse.warnings if coarse else ()
         table = suspected_bias(fit, job.suspects) if job.suspects else []

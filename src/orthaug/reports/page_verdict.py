@@ -7,15 +7,25 @@ from typing import NamedTuple
 
 import numpy as np
 
+from orthaug.analysis.budget import SURE_SHARE
 from orthaug.analysis.changes import Change
 from orthaug.reports.page_blocks import number, percent
-from orthaug.reports.result import CompareResult, DataResult, FitResult, ParameterResult, PartScores, RowResult
+from orthaug.reports.result import (
+    BiasResult,
+    CompareResult,
+    DataResult,
+    FitResult,
+    ParameterResult,
+    PartScores,
+    RowResult,
+)
 
 _GOOD, _POOR = 0.2, 0.5  # NRMSE of a free run up to which it is close, and from which it is far
 _ALIKE = 1.1  # ratio of errors up to which models are told to be as good as each other
 _SURE = 0.1  # standard error over value up to which a parameter is told to be known
 _NAMED = 0.5  # share of what was learned from which its cause is what to do first
 _MOST_DOUBTS = 3  # that are told in the first sentence
+_WORSE = 1.5  # times the error on the training data: a Gaussian error then leaves the 95 % band on a fifth of the rows
 _STOPPED = ("iteration_limit", "no_descent")
 _RAN_AWAY = ("free_run_diverged",)
 _TIED = ("orthogonal", "physics alone")  # of models that are as good as each other these are taken first
@@ -69,10 +79,14 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
     level = "good" if error is not None and error <= _GOOD else "care" if error is None or error <= _POOR else "bad"
     level = "care" if level == "good" and doubts else level
     near = [name for name in errors if name != best and errors[name] <= _ALIKE * (error or 0.0)]
-    less = ", less than of any other" if errors[best] <= min(errors.values()) else ""
+    same = [name for name in near if percent(errors[name]) == percent(errors[best])]
+    near = [name for name in near if name not in same]
+    least = all(errors[best] <= other for name, other in errors.items() if name not in same)
+    less = f", as {'does' if len(same) == 1 else 'do'} {_quoted(same)}" if same else ""
+    less += (", and no other leaves less" if same else ", less than of any other") if least else ""
     how = f"it has the lowest error on the validation part, and {_told_error(error or 0.0, part)}"
     trust = f"Take “{best}”: {how if result.chosen else _told_error(error or 0.0, part) + less}"
-    trust += f"; {_joined([f'“{name}”' for name in near])} {_is(near)} as good within 10 %." if near else "."
+    trust += f"; {_quoted(near)} {_is(near)} as good within 10 %." if near else "."
     if doubts:
         trust = f"{trust[:-1]}. But {_joined(doubts[:_MOST_DOUBTS])}."
     alone = errors.get("physics alone")
@@ -113,6 +127,19 @@ def _told_error(error: float, part: str) -> str:
 
 def _on(part: str) -> str:
     return "on the training data" if part == "train" else f"on {part}"
+
+
+def _worse(scores: dict[str, PartScores]) -> tuple[float, str] | None:
+    """How many times as large as in training the free run's error on a held-out part is, where that is a lot."""
+    found = {}
+    trained = scores["train"].simulation.rmse if "train" in scores else None
+    for part, score in scores.items():
+        held = score.simulation.rmse
+        if part != "train" and trained and held:
+            ratios = [h / t for h, t in zip(held, trained, strict=True) if h is not None and t]
+            found[part] = max(ratios, default=0.0)
+    part = max(found, key=found.__getitem__) if found else ""
+    return (found[part], part) if found and found[part] > _WORSE else None
 
 
 def _worst(scores: dict[str, PartScores], kind: str = "simulation") -> tuple[float | None, str]:
@@ -161,12 +188,22 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
     if biased:
         one = len(biased) == 1
         carry = "carries a bias larger than its standard error" if one else "carry biases larger than their errors"
+        guessed = any(row.bias and (row.bias.share or 0.0) < SURE_SHARE for row in _rows(result) if _biased(row))
+        carry = f"probably {carry}" if guessed and getattr(result, "motion", None) is None else carry
         yield f"the estimate{'' if one else 's'} of {_joined(biased)} {carry}"
     if result.residuals is not None and result.residuals.verdict in ("unmodelled", "sensor_noise"):
+        coarse = list(result.residuals.steps or {})
         yield {
-            "unmodelled": "its residual is not noise alone",
+            "unmodelled": f"its one-step residual has the size of the steps of {_joined(coarse)}"
+            if coarse
+            else "its residual is not noise alone",
             "sensor_noise": "noise on the measured output biases its one-step estimates",
         }[result.residuals.verdict]
+    if _fed_back(result):
+        yield "its data look recorded under feedback, which biases it"
+    worse = _worse(result.scores)
+    if worse is not None:
+        yield f"its error on {worse[1]} is {number(worse[0], 2)} times that on the training data, so the band is too narrow"
     if result.validation is not None and result.validation.extrapolation:
         left = dict.fromkeys(entry.part for entry in result.validation.extrapolation)
         yield f"{_joined(list(left))} {'leaves' if len(left) == 1 else 'leave'} the range of the training data"
@@ -183,9 +220,10 @@ def _biased(row: ParameterResult) -> bool:
 
 def _use(result: FitResult, level: str) -> str:
     rows = _rows(result)
-    known = [row.name for row in rows if _known(row)]
+    sure = [row.name for row in rows if _known(row)]
+    known = sure if _noise_alone(result) else []
     shared = [row.name for row in rows if row.shared]
-    others = [row.name for row in rows if row.name not in (*known, *shared)]
+    others = [row.name for row in rows if row.name not in (*sure, *shared)]
     ahead, part = _worst(result.scores, "prediction")
     predicts = ahead is not None and ahead <= (_GOOD if level == "bad" else _POOR)
     if level == "bad" and ahead is not None and ahead > _POOR:
@@ -200,17 +238,29 @@ def _use(result: FitResult, level: str) -> str:
     else:
         told = f"simulate{' and predict' if predicts else ''} within the range of its training data"
     told += f" and to read {_joined(known)} as physics" if known else ""
-    told += f"; {_joined(others)} {_is(others)} too uncertain or biased for that" if others else ""
+    if sure and not known:
+        cover = "interval does" if len(sure) == 1 else "intervals do"
+        told += f", but do not read {_joined(sure)} as physics yet: the {cover} not cover what the residual still holds"
+    told += f"; {_joined(others)} {_is(others)} too uncertain or biased to be read so" if others else ""
     if shared:
         told += f"; {_joined(shared)} {_is(shared)} what the physics nearest to the data has, for the learner could"
         told += f" imitate {'it' if len(shared) == 1 else 'them'}"
     return f"Use it to {told}."
 
 
+def _noise_alone(result: FitResult) -> bool:
+    """Whether the residual shows nothing that would bias the parameters."""
+    return result.residuals is None or result.residuals.verdict not in ("unmodelled", "sensor_noise")
+
+
 def _known(row: ParameterResult) -> bool:
     """Whether a parameter may be read as physics."""
     sure = row.std is not None and row.value is not None and 0 < row.std <= _SURE * abs(row.value)
     return sure and not row.shared and not _biased(row)
+
+
+def _quoted(names: list[str]) -> str:
+    return _joined([f"“{name}”" for name in names])
 
 
 def _is(names: list[str]) -> str:
@@ -227,13 +277,13 @@ def _then(result: FitResult) -> str:
     if missing and significant:
         return f"Add {missing[0].expression} to the equation of {missing[0].equation}."
     if cause is not None and (cause.share or 0.0) > _NAMED:
-        return f"Add “{cause.cause}” to the physics, for it explains {percent(cause.share)} of what was learned."
+        return _advised(cause, result.motion is not None)
     tried = result.validation is not None and _code(result) != "helps"
     changes = [c for c in result.residuals.changes if c.kind != "learner" or not tried] if result.residuals else []
     if changes:
         return f"{_change(changes[0])}."
     if cause is not None:
-        return f"Add “{cause.cause}” to the physics, for it explains {percent(cause.share)} of what was learned."
+        return _advised(cause, result.motion is not None)
     if _ran_away(result):
         return 'Train on the free run (`focus = "simulation"`), or record data over the range that it leaves.'
     if not result.data.tests and not result.data.validation:
@@ -244,7 +294,37 @@ def _then(result: FitResult) -> str:
         entry = result.validation.extrapolation[0]
         low, high = entry.found
         return f"Record training data that reach {entry.regressor} from {number(low, 3)} to {number(high, 3)}."
+    if _fed_back(result):
+        return "Record the reference and model the whole loop, move it more, or record without the controller."
+    if _undecided(result):
+        return "Keep the learner (`training.fallback = false`) and look: cross-validation leaves undecided if it helps."
+    if result.residuals is not None and result.residuals.steps:
+        told = 'Train on the free run (`focus = "simulation"`), take fewer samples, or measure more finely'
+        return f"{told}: {_joined(list(result.residuals.steps))} has steps as large as the one-step residual."
+    if not _noise_alone(result):
+        return "Look at what the residual still follows (residual tests), and give the physics or a learner that."
+    if _worse(result.scores) is not None:
+        return f"Find what is different on {(_worse(result.scores) or ('', ''))[1]}, or train on more data of its kind."
     return "Nothing further is predicted to help; export it (`orthaug export`) or design the next experiment."
+
+
+def _fed_back(result: FitResult) -> bool:
+    return any(warning.code == "closed_loop" for warning in result.warnings)
+
+
+def _advised(cause: BiasResult, moves: bool) -> str:
+    """What to do about a cause of what was learned."""
+    share = percent(cause.share)
+    if (cause.share or 0.0) < SURE_SHARE and not moves:
+        return f"Try “{cause.cause}” in the physics: what was learned looks most like it ({share} of it)."
+    return f"Add “{cause.cause}” to the physics, for it explains {share} of what was learned."
+
+
+def _undecided(result: FitResult) -> bool:
+    """Whether physics alone was handed over although the learner may help."""
+    fell_back = any(warning.code == "physics_alone" for warning in result.warnings)
+    ratio = None if result.validation is None else result.validation.ratio
+    return fell_back and ratio is not None and (ratio.value or 1.0) < 1 < (ratio.high or 0.0)
 
 
 def _change(change: object) -> str:
