@@ -61,6 +61,12 @@ def mr_damper() -> list[float | None]:
     return [None if one is None else one[0] for one in found]
 
 
+def cascaded_tanks() -> list[float | None]:
+    """FIT of the free run on the official test: with the learner, and by physics alone."""
+    found = [scores("cascaded_tanks", "fit", variant) for variant in (AS_DECLARED, Variant(ALONE))]
+    return [None if one is None else one[0] for one in found]
+
+
 @contextmanager
 def every_error_counts() -> Iterator[None]:
     """Evidence as if errors were not coloured."""
@@ -92,7 +98,12 @@ def colour() -> list[float | None]:
 
 def main() -> None:
     print(describe())
-    for what, found in (("Silverbox, mV", silverbox()), ("MR damper, FIT", mr_damper()), ("its colour", colour())):
+    for what, found in (
+        ("Silverbox, mV", silverbox()),
+        ("MR damper, FIT", mr_damper()),
+        ("Tanks, FIT", cascaded_tanks()),
+        ("its colour", colour()),
+    ):
         print(what, " / ".join("absent" if one is None else f"{one:.4g}" for one in found))
 
 

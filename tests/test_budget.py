@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from orthaug._base.errors import InputError
-from orthaug.analysis.budget import bias_budget, ground_of
+from orthaug.analysis.budget import SURE_SHARE, bias_budget, ground_of, near_causes
 from orthaug.analysis.measure_bias import Ground
 from orthaug.analysis.missing_lags import missing_lags
-from orthaug.analysis.suspects import Suspect
+from orthaug.analysis.suspects import Suspect, usual_suspects
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
 from orthaug.fitting.estimation import estimate
@@ -112,6 +112,41 @@ def test_a_declared_suspect_comes_first_and_learner_inputs_are_named_where_they_
     assert stiffness.value == pytest.approx(fit.theta[:2].sum() - 0.7, rel=0.3)
     (warning,) = found.warnings
     assert f'set learner.inputs = ["{VELOCITY}"] for' in warning.text and "s" in warning.text.rpartition("for ")[0]
+
+
+def tank(rows=1500, zone=0.0):
+    """A tank with a free outflow, whose level is measured with noise; the pump starts at `zone`."""
+    rng = np.random.default_rng(5)
+    u, h = np.repeat(rng.uniform(0.5, 12.0, rows // 20), 20), np.full(rows, 12.0)
+    for k in range(1, rows):
+        h[k] = max(h[k - 1] + 0.4 * max(u[k - 1] - zone, 0.0) - 0.7 * np.sqrt(h[k - 1]), 0.0)
+    record = Record.from_arrays(u, h + 0.02 * rng.normal(size=rows))
+    physics = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "u[k-1]"), Term("c", "1")])
+    return estimate(record, physics, learner=MLP((8,)), solver=LevenbergMarquardt(60))
+
+
+def test_the_root_of_a_level_is_found():
+    found = bias_budget(tank())
+    assert found is not None and found.cause.suspect.name == "square_root of y[k-1]" and found.share > 0.9
+
+
+def test_a_level_about_zero_has_no_root():
+    names = [suspect.name for suspect in usual_suspects(system(f"({VELOCITY})**3").problem)]
+    assert "cubic of y[k-1]" in names and not any("square_root" in name for name in names)
+
+
+def test_a_cause_that_is_not_sure_is_told_with_those_close_to_it():
+    fit = tank(zone=5.0)
+    found = bias_budget(fit)
+    assert found is not None and found.share < SURE_SHARE
+    ground = ground_of(fit, Training())
+    near = near_causes(ground, found.cause, ())
+    assert near and all(0.5 * found.share <= (entry.explained or 0) <= found.share for entry in near)
+    (warning,) = found.warnings
+    assert warning.text.startswith(f"what the learner found looks most like {found.cause.suspect.name} (")
+    assert len({entry.suspect.on or entry.suspect.expression for entry in near}) == len(near)
+    assert f"next: {near[0].suspect.name}" in warning.text and "if it is that term, " in warning.text
+    assert near_causes(ground, found.cause, [found.cause.suspect]) == []
 
 
 def test_no_cause_no_bias():

@@ -171,4 +171,7 @@ def test_too_few_rows_name_nothing(rows):
 def test_a_change_in_words():
     criterion = Change("criterion", "simulation", 0.123, "simulation")
     assert str(criterion) == ('train with focus = "simulation": the error of its free run is predicted to fall by 12 %')
+    told = str(Change("criterion", "simulation", 0.0, "simulation"))
+    assert told.startswith('for the parameters train with focus = "simulation"') and "%" not in told
+    assert "not predicted to fall" in told
     assert Change("offset", "1", 0.2, "prediction", "y2").advice == "give the physics of y2 an offset"

@@ -214,6 +214,7 @@ KINDS = {
     "stribeck_gauss": f'on = "{VELOCITY}"\nwidth = 0.02',
     "quadratic_drag": f'on = "{VELOCITY}"',
     "cubic": 'on = "position[k-1]"',
+    "square_root": 'on = "position[k-1]"',
     "dead_zone": 'on = "force[k-1]"\nwidth = 5.0',
     "saturation": 'on = "force[k-1]"',
     "offset": "",

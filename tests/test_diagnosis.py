@@ -156,6 +156,35 @@ def test_coloured_noise_on_the_sensor_is_not_unmodelled_on_the_free_run():
     assert found.predictable[0].own_past > 0.6 and "Its colour is that of the noise" in found.text
 
 
+def friction(seed, rows=1500):
+    """An integrator behind a lag with dry friction, the output in steps of 0.01."""
+    rng = np.random.default_rng([9, seed])
+    u = np.repeat(rng.uniform(-8, 8, rows // 30 + 1), 30)[:rows]
+    y, w = np.zeros(rows), 0.0
+    for k in range(1, rows):
+        w += 0.1 * (u[k - 1] - w - 2.4 * np.tanh(w / 0.1))
+        y[k] = y[k - 1] + 0.1 * w
+    return Record.from_arrays(u, np.floor(y / 0.01) * 0.01, sampling_time=0.1)
+
+
+def test_a_free_run_that_follows_its_inputs_is_no_noise_however_white_one_step_is():
+    terms = [*PHYSICS.terms, Term("h", "u[k-2]"), Term("c", "1")]
+    found = of(friction(1), Baseline.from_terms(terms), criterion=Simulation(0, 100))
+    assert found.one_step[0].practically_white() and found.free_run[0].curved_over(0.05) == ["u[k-1]"]
+    assert found.verdict == "unmodelled" and "curved over u[k-1]" in found.text and "noise floor" not in found.text
+    assert "what it follows (u[k-1]) has a form that was not tried" in found.text
+
+
+def test_a_free_run_that_drifts_is_no_noise():
+    """A random walk on the sensor: the physics is right, yet its own past tells nearly all of the error."""
+    given, rng = second_order(0, 1500), np.random.default_rng(6)
+    walk = 0.01 * np.cumsum(rng.normal(size=1500))
+    record = Record.from_arrays(given.experiments[0].inputs, given.experiments[0].outputs[:, 0] + walk)
+    found = of(record, criterion=Simulation(0, 40))
+    assert found.predictable[0].own_past > 0.9 and found.verdict == "unmodelled"
+    assert "the error drifts" in found.text and "noise floor" not in found.text
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_missing_cubic_under_a_held_input_is_unmodelled(seed):
     assert of(second_order(seed, equation=0.02, missing="cubic", hold=20)).verdict == "unmodelled"
@@ -241,6 +270,22 @@ def test_one_step_with_sensor_noise_is_warned_and_told_the_criterion():
     assert warning.code == "sensor_noise" and "intervals do not cover" in warning.text
     assert 'focus = "simulation"' in warning.text
     assert 'train with focus = "simulation"' in found.text and "inconsistent" in found.text
+
+
+@pytest.mark.parametrize(("step", "told"), [(0.3, True), (0.02, False), (None, False)])
+def test_steps_of_an_output_are_told_where_the_one_step_error_has_their_size(step, told):
+    """Slow motion in coarse steps, as an encoder tells it; finer ones than the noise are no cause."""
+    rng = np.random.default_rng(4)
+    u, y = np.repeat(rng.normal(size=60), 30), np.zeros(1800)
+    for k in range(2, 1800):
+        y[k] = 1.9 * y[k - 1] - 0.905 * y[k - 2] + 0.005 * u[k - 1]
+    y = y + (0.05 * rng.normal(size=1800) if step == 0.02 else 0.0)
+    y = y + 0.001 * lfilter([1.0, 0.5], [1.0], rng.normal(size=1800)) if step is None else np.round(y / step) * step
+    found = of(Record.from_arrays(u, y, sampling_time=0.1))
+    assert not found.one_step[0].practically_white()
+    assert (found.steps is not None) is told and ("measured in steps of 0.3" in found.text) is told
+    if told:
+        assert found.steps == {"y": pytest.approx(0.3)} and "measure more finely" in found.text
 
 
 def test_sampling_too_fast_is_told():

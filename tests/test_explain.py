@@ -11,6 +11,9 @@ from test_cli import one_line, run, write_csv
 import orthaug as oa
 from orthaug._base.errors import InputError
 from orthaug.commands.spec import load_spec
+from orthaug.data.expressions import parse_named
+from orthaug.physics.motion import Output, State
+from orthaug.selection.added_physics import Added, added_to_motion
 from orthaug.selection.explaining import _written
 from orthaug.selection.tangent_run import MotionResponse
 
@@ -190,6 +193,31 @@ def test_the_command_tells_what_to_write_and_that_can_be_read(project):
     assert [term.parameter for term in load_spec(grown).baseline.terms] == ["a", "b", "g", "cubic"]
     page = run("explain", project / "plant", project / "run.csv").out
     assert page.startswith("y[k-1]**3 explains 9") and "[[baseline.terms]]" in page and "1/m**2" in page
+
+
+@pytest.mark.parametrize(("text", "unit"), [("T**3", "W/degC**3"), ("sign(T)", "W"), ("T", "W/degC")])
+def test_a_coefficient_within_an_equation_has_the_unit_of_the_sum_over_that_of_its_term(text, unit):
+    parameters = [oa.PhysicalParameter("h", 0.5, "W/degC"), oa.PhysicalParameter("C", 400.0, "J/degC")]
+    motion = oa.Motion.from_equations(
+        states=[State("T", "(heat - h*T)/C", unit="degC")],
+        outputs=[Output("y", "T")],
+        parameters=parameters,
+        inputs=["heat"],
+    )
+    units = {"heat": "W", "T": "degC", "h": "W/degC", "C": "J/degC"}
+    term = Added("lost", text, "T", -1e-8, "degC/s", scale=parse_named(text, motion.known, "the term"))
+    changed = added_to_motion(motion, np.array([0.5, 400.0]), [term], units)
+    (lost,) = changed.parameters
+    assert (lost.unit, lost.initial) == (unit, pytest.approx(4e-6))
+    assert changed.equations[0][2].endswith(f" - lost*{text})/C") and f'unit = "{unit}"' in changed.lines()
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_explain_takes_the_rows_of_training(project):
+    one, other = (json.loads(run("explain", project / "plant", project / "run.csv", "--json", *more).out)
+                  for more in ((), ("--rows", "0:300")))  # fmt: skip
+    assert other["points"] == 300 - (len(system(-0.3)["y"]) - one["points"]) < one["points"]
+    assert run("explain", project / "plant", project / "run.csv", "--rows", "x").code == 2
 
 
 @pytest.mark.usefixtures("without_figures")

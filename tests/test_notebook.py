@@ -121,7 +121,7 @@ def test_figures_show_what_their_names_say(fit):
     gain, phase = (fit.plot.bode(phase=p, ax=Figure().subplots()) for p in (False, True))
     assert (gain.get_yscale(), gain.get_ylabel(), phase.get_ylabel()) == ("log", "gain [m/N]", "phase [°]")
     free = fit.plot.free_run(ax=Figure().subplots())
-    assert [line.get_label() for line in free.lines] == ["measured", "model", "physics alone"]
+    assert [line.get_label() for line in free.lines] == ["measured", "model", "model without its learner"]
 
 
 @pytest.mark.parametrize(

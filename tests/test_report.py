@@ -166,6 +166,8 @@ def test_a_page_tells_how_its_result_was_made(lagged, pages, monkeypatch):
         assert file.sha256 in cells
     assert {"orthaug fit plant.toml", oa.__version__, origin.machine, "0"} <= set(cells)
     assert page.text("title") == ["Model of y from u: plant"] == page.text("h1")
+    asked = replace(lagged.job, arguments=("fit", "a b.toml", "--out", "there", "--force"))
+    assert origin_of(asked, "fit").command == "orthaug fit 'a b.toml' --out there --force"
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
     assert origin_of(lagged.job, "fit").date == "1970-01-02 00:00 UTC"
 
@@ -182,7 +184,8 @@ def test_a_spec_that_was_changed_meanwhile_is_told_as_it_was_read(lagged):
 
 
 def test_what_a_motion_learned_is_a_curve_with_its_band_and_the_reach_of_the_data(motion, pages):
-    (curve,) = [f for f in figures(pages["motion"]) if f["layout"].get("xaxis", {}).get("title") == {"text": "v [m/s]"}]
+    over = [f for f in figures(pages["motion"]) if f["layout"].get("xaxis", {}).get("title") == {"text": "v [m/s]"}]
+    (curve,) = [f for f in over if not f["layout"]["yaxis"]["title"]["text"].startswith("residual")]
     traces = {trace["name"]: trace for trace in curve["data"]}
     assert curve["layout"]["yaxis"]["title"] == {"text": "dv/dt [m/s²]"}
     assert {"training data", "learner", "beyond the data", "95 % interval", "lower limit"} == set(traces)
@@ -197,6 +200,30 @@ def test_a_surface_stands_where_data_are_near_and_sees_the_learner(lagged, pages
     heat = surface["data"][0]
     there = np.array(heat["z"], dtype=float)
     assert np.isfinite(there).any() and np.isnan(there).any() and heat["zmin"] == -heat["zmax"]
+
+
+def test_what_is_drawn_over_an_input_is_told_as_it_is(lagged, motion, pages):
+    captions = Read(pages["motion"]).text("figcaption")
+    (one,) = [caption for caption in captions if caption.startswith("Over v")]
+    assert "the one input of the learner" in one and "variance" not in one
+    assert "Its means over u[k-1] have" in " ".join(Read(pages["lagged"]).text("figcaption"))
+    for kind in ("lagged", "motion"):
+        stripes = [
+            s for f in figures(pages[kind]) for s in f["layout"].get("shapes", []) if s.get("fillcolor") == "@reach"
+        ]
+        assert stripes and all(stripe["showlegend"] and stripe["name"] for stripe in stripes)
+    (runs,) = [f for f in figures(pages["lagged"]) if f["data"][0].get("name") == "loss"]
+    assert runs["layout"]["xaxis"]["ticktext"] == ["0", "1", "2"] and runs["layout"]["xaxis"]["title"] == {
+        "text": "seed"
+    }
+
+
+def test_units_that_the_spec_does_not_give_are_those_that_the_channels_ask_for(lagged):
+    units = {row.name: (row.unit, row.derived_unit) for row in lagged.result.parameters}
+    assert units == {"a": ("1", None), "b": ("", "1"), "c": ("", None)}  # the input has no unit
+    rows = [row.model_copy(update={"unit": "", "derived_unit": "mm/N"}) for row in lagged.result.parameters]
+    told = Read(fit_report(replace(lagged, result=lagged.result.model_copy(update={"parameters": rows}))))
+    assert "(mm/N)" in told.text("td") and any("the channels' units ask for it" in c for c in told.text("caption"))
 
 
 def test_the_parameters_have_their_intervals_and_the_suspect_its_bias(pages):
@@ -218,7 +245,9 @@ def test_numbers_in_cells(value, scale, shown):
 
 def test_intervals_and_shares_in_cells():
     assert interval([-1e-17, 2.0]) == "0 … 2" and interval(None) == "–"
+    assert interval([1.459492, 1.459527]) == "1.459492 … 1.459527"  # not one number twice
     assert percent(-1e-17, signed=True) == "0 %" and percent(0.0123, signed=True) == "+1.2 %"
+    assert percent(22.6) == "2260 %" and percent(-4.2, signed=True) == "−420 %" and percent(1e7) == "1·10⁹ %"
 
 
 def wave(rows: int, *, wild: int | None = None, experiments: int = 1) -> Response:
@@ -239,11 +268,30 @@ def wave(rows: int, *, wild: int | None = None, experiments: int = 1) -> Respons
 def test_a_divergence_is_seen_and_does_not_flatten_the_rest():
     (plot,) = run_plots([Run("tests.fast", wave(300, wild=200, experiments=2))], {})
     (told,) = plot.layout["annotations"]
+    (left,) = [trace for trace in plot.traces if trace.get("mode") == "markers"]
+    assert f"At {left['x'][0]:.4g} s y of the model leaves the panel" in plot.caption and plot.caption.endswith(" m.")
+    run = values(plot.series["model 0"])[round(left["x"][0] / 0.01) - 1 :]
+    low, high = plot.layout["yaxis"]["range"]
+    assert low < run[0] < high and not low < run[1] < high and left["y"] == [high if run[1] > high else low]
     assert told["text"] == "free run diverges in y" and told["x"] == pytest.approx(0.01 * (301 + 200))
     assert "leaves all bounds in y at row 200" in plot.caption and "2 experiments" in plot.caption
     low, high = plot.layout["yaxis"]["range"]
     assert -4 < low < -1 and 1 < high < 4
     assert np.isnan(values(plot.series["model 0"])[300]) and np.isnan(values(plot.series["model 0"])[-50:]).all()
+
+
+def test_a_curve_that_stays_has_no_mark_and_the_model_without_its_learner_has_its_name():
+    (plot,) = run_plots([Run("tests.slow", wave(300), wave(300))], {})
+    assert "leaves the panel" not in plot.caption and all("mode" not in trace for trace in plot.traces)
+    assert [trace["name"] for trace in plot.traces] == [
+        "measured",
+        "model without its learner",
+        "model",
+        "measured − model",
+    ]
+    assert plot.layout["yaxis2"]["title"] == {"text": "residual [m]"}
+    (away,) = run_plots([Run("tests.slow", wave(300), wave(300, wild=200))], {})
+    assert "s y of the model without its learner leaves the panel" in away.caption
 
 
 def test_long_records_are_thinned_by_their_envelope_and_said_to_be():
@@ -295,6 +343,23 @@ def test_the_verdict_is_built_from_the_findings(lagged, motion):
     biased = row.model_copy(update={"bias": type("B", (), bias)()})
     one = lagged.result.model_copy(update={"parameters": [biased]})
     assert "the estimate of a carries a bias larger than its standard error" in fit_verdict(one).trust
+    for name in ("unmodelled", "sensor_noise"):
+        residuals = motion.result.residuals.model_copy(update={"verdict": name, "changes": [], "missing": None})
+        doubted = fit_verdict(motion.result.model_copy(update={"residuals": residuals}))
+        assert doubted.level != "good" and "do not read m and k as physics yet" in doubted.use
+        assert not doubted.then.startswith("Nothing further")
+    residuals = residuals.model_copy(update={"verdict": "unmodelled", "steps": {"x": 0.1}})
+    ended = motion.result.status.model_copy(update={"code": "converged"})
+    changed = {"residuals": residuals, "status": ended, "validation": None}
+    coarse = fit_verdict(motion.result.model_copy(update=changed))
+    assert (
+        "its one-step residual has the size of the steps of x" in coarse.trust and "x has steps as large" in coarse.then
+    )
+    train, test = (motion.result.scores[part] for part in ("train", "tests.steps"))
+    far = test.simulation.model_copy(update={"rmse": [2 * value for value in train.simulation.rmse]})
+    scores = {**motion.result.scores, "tests.steps": test.model_copy(update={"simulation": far})}
+    beyond = fit_verdict(motion.result.model_copy(update={"scores": scores}))
+    assert "its error on tests.steps is 2 times that on the training data" in beyond.trust and beyond.level == "care"
     hurts = lagged.result.validation.model_copy(update={"verdict": "hurts"})
     told = fit_verdict(lagged.result.model_copy(update={"validation": hurts}))
     assert told.level == "bad" and "Take physics alone" in told.then
@@ -305,6 +370,10 @@ def test_the_verdict_of_a_comparison_names_a_model(compared):
     verdict = compare_verdict(compared.result)
     names = [row.name for row in compared.result.comparison]
     assert any(f"Take “{name}”" in verdict.trust for name in names) and "validation part" in verdict.then
+    first = next(row for row in compared.result.comparison if row.validation)
+    twin = compared.result.model_copy(update={"comparison": [first, first.model_copy(update={"name": "twin"})]})
+    trust = compare_verdict(twin.model_copy(update={"chosen": None})).trust
+    assert "as does “twin”, and no other leaves less" in trust and "less than of any other" not in trust
 
 
 def test_a_witness_is_told_where_runs_are_shown(lagged):
@@ -312,6 +381,14 @@ def test_a_witness_is_told_where_runs_are_shown(lagged):
     page = Read(fit_report(replace(lagged, result=with_warning(lagged, "witness", told))))
     (section,) = page.text("section", id="free-run")
     assert told in section
+
+
+def test_minus_signs_of_texts_are_those_of_tables_and_short_cells_stay_whole(lagged):
+    told = "moves a by -0.015, see `a-1`: y[k-1] goes from -2 to 3"
+    page = fit_report(replace(lagged, result=with_warning(lagged, "small_margin", told)))
+    assert "moves a by −0.015, see <code>a-1</code>: y[k-1] goes from −2 to 3" in page
+    whole = ["".join(text) for _, given, text in Read(page).found if "whole" in (given.get("class") or "").split()]
+    assert any(" … " in cell for cell in whole) and "(1)" in whole
 
 
 def test_what_looks_like_markup_is_text(lagged):

@@ -60,13 +60,13 @@ def test_rows_of_the_baseline_penalty():
 
 
 def test_the_baseline_penalty_needs_initial_values():
-    with pytest.raises(InputError, match=r"a, c starts? at 0.*`initial`.*orthogonal structure"):
+    with pytest.raises(InputError, match=r"a, c start at 0.*`initial`.*orthogonal structure"):
         BaselinePenalty().penalty(NAMES, np.array([0.0, 1.0, 0.0]), 1.0)
 
 
 def test_an_initial_value_of_zero_is_refused_before_training():
     record, baseline = Record.from_arrays(np.arange(9.0), np.arange(9.0) ** 2), Baseline.from_terms([Term("b", "u[k]")])
-    with pytest.raises(InputError, match="b starts at 0"):
+    with pytest.raises(InputError, match="but b starts at 0"):
         estimate(record, baseline, structure=BaselinePenalty())
 
 

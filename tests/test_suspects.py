@@ -26,6 +26,7 @@ FORMS = {
     "stribeck_gauss": lambda v, w: np.sign(v) * np.exp(-((v / w) ** 2)),
     "quadratic_drag": lambda v, w: v * np.abs(v),
     "cubic": lambda v, w: v**3,
+    "square_root": lambda v, w: np.sign(v) * np.sqrt(np.abs(v)),
     "dead_zone": lambda v, w: v - np.clip(v, -w, w),
     "saturation": lambda v, w: np.clip(v, -w, w),
     "expression": lambda v, w: v,
@@ -93,6 +94,7 @@ def test_columns_stand_in_their_output():
 
 def test_data_width_is_the_median_of_what_moves():
     assert data_width(VELOCITY, X, LAYOUT, TS) == pytest.approx(np.median(np.abs(V[1:])))
+    assert data_width("y[k-1]/3", X, LAYOUT, TS) == float(f"{np.median(np.abs(X[1:, 0])) / 3:.6g}")  # in expressions
     inside = np.abs(V[1:]) < data_width(VELOCITY, X, LAYOUT, TS)
     assert abs(inside.mean() - 0.5) < 0.02
 

@@ -145,6 +145,16 @@ def test_the_range_that_is_left_is_told_once_for_a_channel():
     assert entry.share == pytest.approx(np.mean((outside < inside.min()) | (outside > inside.max())))
 
 
+@pytest.mark.parametrize(("over", "rows", "told"), [
+    (0.005, 100, False), (0.05, 1, False), (0.05, 100, True), (0.5, 1, True), (0.0, 0, False),
+])  # fmt: skip
+def test_a_range_that_is_hardly_left_is_not_told(over, rows, told):
+    """Of a range of 2 over 1000 rows: as noise on the extreme values leaves it."""
+    training, x = (np.linspace(-1, 1, 1000)[:, None] for _ in range(2))
+    x[:rows] = -1 - 2 * over
+    assert bool(extrapolation("tests.far", x, training, layout_of()[:1])) is told
+
+
 def test_the_words_of_a_range():
     words = "In u[k-1], tests.far leaves the training range of -1 to 1: it goes from -2.5 to 2, outside on 25 % of its"
     assert words in str(BEYOND)
@@ -184,6 +194,17 @@ def test_the_verdict_on_trials(trials, code):
     assert found.code == code and found.text.startswith(f"{opening[code]}. ") and found.text.endswith(".")
     content = json.loads(ValidationResult.model_validate(found).to_json())
     assert content["verdict"] == code and len(content["trials"]) == len(trials)
+
+
+def test_a_wide_interval_below_one_is_undecided():
+    """A part where most of the gain is in one stretch: on average much better, yet not surely."""
+    rng = np.random.default_rng(0)
+    alone = np.concatenate([30 * np.ones(20), rng.uniform(0.5, 1.5, 180)])
+    model = np.concatenate([np.ones(20), 2 * rng.uniform(0.5, 1.5, 180)])
+    errors = [math.sqrt(piece.mean()) for piece in (alone, model)]
+    found = judge([Trial("tests.a", *errors, pieces=([alone], [model]))])
+    assert found.code == "no_help" and found.ratio.value < 0.9 and found.ratio.high > 1
+    assert found.text.startswith("It is undecided whether the learner helps. On tests.a")
 
 
 def test_no_trial_no_verdict():

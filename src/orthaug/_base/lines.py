@@ -26,9 +26,19 @@ def percent(share: float, digits: int = 2, *, sign: str = "") -> str:
         >>> percent(0.25, sign="+")
         '+25 %'
     """
-    text = f"{100 * share:{sign}.{digits}g}"
-    value = float(text)
-    return f"{value:{sign}.0f} %" if 100 <= abs(value) < 1e7 else f"{text} %"
+    return f"{plain_number(100 * share, digits, sign=sign)} %"
+
+
+def plain_number(value: float, digits: int = 2, *, sign: str = "") -> str:
+    """A number with so many digits, and without an exponent unless it is tiny or huge.
+
+    Examples:
+        >>> [plain_number(value) for value in (0.0123, 1634.2)]
+        ['0.012', '1600']
+    """
+    text = f"{value:{sign}.{digits}g}"
+    rounded = float(text)
+    return f"{rounded:{sign}.0f}" if 100 <= abs(rounded) < 1e7 else text
 
 
 def table(rows: Sequence[Sequence[str]], width: int = WIDTH) -> list[str]:
@@ -72,15 +82,18 @@ def _blocks(head: Sequence[str], widths: Sequence[int], width: int) -> list[list
 
 
 def fold(lines: Iterable[str], width: int = WIDTH) -> list[str]:
-    """Lines of at most `width` columns: sentences go on indented, the last cell of a row under itself.
+    r"""Lines of at most `width` columns: sentences go on indented, the last cell of a row under itself.
 
     Examples:
         >>> fold(["warning: the interval does not cover it"], width=30)
         ['warning: the interval does not', '  cover it']
         >>> fold(["regressor  position[k-1], force[k-1]"], width=28)
         ['regressor  position[k-1],', '           force[k-1]']
+        >>> fold(["It may.\nThe run stays within its bounds here."], width=24)
+        ['It may.', 'The run stays within its', '  bounds here.']
     """
-    return [part for line in lines for part in (_folded(line, width) if len(line) > width else [line])]
+    single = (one for line in lines for one in line.split("\n"))
+    return [part for line in single for part in (_folded(line, width) if len(line) > width else [line])]
 
 
 def _folded(line: str, width: int) -> list[str]:

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
-from orthaug._base.lines import percent
+from orthaug._base.lines import percent, plain_number
 from orthaug._base.warning import Warning
 from orthaug.analysis.bias import SuspectedBias
 from orthaug.analysis.measure_bias import Ground
@@ -32,6 +32,9 @@ from orthaug.physics.parameters import PhysicsMap
 LEAST_SHARE = 0.5  # of the learner's energy that a cause must explain to be named
 _NOTHING = 0.01  # of the noise: a learner that is smaller found nothing that could be explained
 AS_MUCH = 0.98  # of what the cause explains: a rival cannot be told from it
+SURE_SHARE = 0.9  # from which on a cause is told without a doubt
+_NEAR = 0.5  # of what the cause explains: a rival that is named beside it
+_MOST_RIVALS = 3
 _ROUNDING = 1e-9  # of a parameter: a bias that no one can speak of
 _TOLD = 4  # parameters that a warning lists at most
 
@@ -118,7 +121,7 @@ def budget_on(ground: Ground, fit: Estimate, suspects: Sequence[Suspect]) -> Bud
         moved = _physical(ground.physics, fit, bias)
         rows = told(physical.names, np.array(physical.value), own, moved, rest[len(names) :])
     found = Budget(cause, share, parameters, rows, ())
-    warning = _warning(ground, found, rival_of(ground, cause, suspects))
+    warning = _warning(ground, found, rival_of(ground, cause, suspects), near_causes(ground, cause, suspects))
     return found if warning is None else replace(found, warnings=(warning,))
 
 
@@ -160,6 +163,19 @@ def rival_of(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) 
 
     farthest = max(equal, key=apart, default=None)
     return farthest if farthest and apart(farthest) > 0.5 * np.linalg.norm(to_coordinates @ own[:nt]) else None
+
+
+def near_causes(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) -> list[SuspectedBias]:
+    """The next best causes, one of each variable, beside one that no one declared and that is not sure."""
+    assert cause.explained
+    if cause.suspect in suspects or cause.explained >= SURE_SHARE:
+        return []
+    others = [entry for entry in _usual(ground) if entry.suspect != cause.suspect and entry.explained]
+    near = [entry for entry in others if (entry.explained or 0.0) >= _NEAR * cause.explained]
+    best: dict[str, SuspectedBias] = {}
+    for entry in sorted(near, key=lambda entry: -(entry.explained or 0.0)):
+        best.setdefault(entry.suspect.on or entry.suspect.expression, entry)
+    return list(best.values())[:_MOST_RIVALS]
 
 
 def left_over(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) -> Vector:
@@ -226,8 +242,10 @@ def _physical(physics: PhysicsMap, fit: Estimate, bias: Vector) -> Vector:
     return np.asarray(biased) - np.asarray(free)
 
 
-def _warning(ground: Ground, budget: Budget, rival: SuspectedBias | None) -> Warning | None:
-    """One sentence on what is biased by more than its standard error: cause, size, remedies."""
+def _warning(
+    ground: Ground, budget: Budget, rival: SuspectedBias | None, near: Sequence[SuspectedBias]
+) -> Warning | None:
+    """What is biased by more than its standard error: cause, size, remedies; and how sure the cause is."""
     every = (*budget.physical, *budget.parameters)
     large = [entry for entry in every if (entry.errors or 0.0) > 1 and abs(entry.relative or 1.0) > _ROUNDING]
     if not large:
@@ -237,6 +255,15 @@ def _warning(ground: Ground, budget: Budget, rival: SuspectedBias | None) -> War
     more = f" and {len(large) - len(shown)} more" if len(large) > len(shown) else ""
     cures = remedies(ground, budget.cause, [entry.name for entry in large])
     other = "" if rival is None else f" ({rival.suspect.name} explains as much and would move them elsewhere)"
+    if budget.share < SURE_SHARE:
+        close = ", ".join(f"{entry.suspect.name} {percent(entry.explained or 0.0)}" for entry in near)
+        beside = f"; next: {close}" if near else ""
+        return Warning(
+            "biased",
+            f"what the learner found looks most like {budget.cause.suspect.name} ({percent(budget.share)} of it"
+            f"{beside}), which would move {listed}{more}, and the standard errors do not cover that{other}: if it is "
+            f"that term, {' or '.join(cures)}.",
+        )
     return Warning(
         "biased",
         f"{budget.cause.suspect.name} explains {100 * budget.share:.0f} % of the learner and moves {listed}{more}, "
@@ -247,4 +274,4 @@ def _warning(ground: Ground, budget: Budget, rival: SuspectedBias | None) -> War
 def told_bias(entry: ParameterBias) -> str:
     """A bias in words."""
     share = "" if entry.relative is None else f", {percent(entry.relative, sign='+')}"
-    return f"{entry.name} by {entry.value:+.2g} ({entry.errors:.2g} standard errors{share})"
+    return f"{entry.name} by {entry.value:+.2g} ({plain_number(entry.errors or 0.0)} standard errors{share})"

@@ -63,7 +63,17 @@ class Change:
             "learner": f"give it {self.what}",
         }[self.kind]
 
+    @property
+    def gains(self) -> bool:
+        """Whether the error is predicted to fall by enough to name it."""
+        return self.fall >= fall_of(WORTH)
+
     def __str__(self) -> str:
+        if self.kind == "criterion" and not self.gains:
+            return (
+                f"for the parameters {self.advice}, which does not bias them; the error of its free run is not "
+                "predicted to fall"
+            )
         error = "its error one step ahead" if self.of == "prediction" else "the error of its free run"
         return f"{self.advice}: {error} is predicted to fall by {percent(self.fall)}"
 

@@ -7,6 +7,7 @@ With many rows every test rejects; so effects are measured, as shares of varianc
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +21,7 @@ from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, rm
 from orthaug.analysis.verdict_text import SHARE, Finding, words
 from orthaug.analysis.wild_rows import wild_rows
 from orthaug.data.regressors import Lags
+from orthaug.data.survey import step_of
 from orthaug.fitting.criteria import Simulation
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import estimate
@@ -41,7 +43,8 @@ class Diagnosis:
     `one_step` and `free_run` are the tests of the two residuals per output. `ratio` is the free run's RMS error against
     the one-step error, `noise_in_lags` the share of noise in the least excited direction of the lagged outputs.
     `predictable` is what could be predicted of the error that was minimised, per output. `changes` are predicted to
-    lower it, the first of them by most; there is none where it is noise. `missing` is the test of terms that the
+    lower it, the first of them by most; there is none where it is noise. `steps` are the steps of those outputs whose
+    one-step error is no larger, None where there are none. `missing` is the test of terms that the
     equations of a motion could lack; None for other models.
     """
 
@@ -55,6 +58,7 @@ class Diagnosis:
     predictable: tuple[Predictable, ...] = ()
     changes: tuple[Change, ...] = ()
     missing: MissingTest | None = None
+    steps: Mapping[str, float] | None = None
 
     def __repr__(self) -> str:
         return f"Diagnosis({self.verdict}: {self.text})"
@@ -76,6 +80,7 @@ def diagnose(fit: Estimate, *, one_step: Response | None = None, free_run: Respo
         return None
     white = all(test.practically_white() for test in tests)
     seen = Finding(fit, simulated, one_step, tests, white=white, free_white=True, ratio=None, noise=None)
+    seen = replace(seen, steps={} if white else _steps(problem, tests))
     if not model.form.states:
         return _concluded(replace(seen, **_effects(fit, one_step, one_step, False)), None)
     free_run = model.simulate(problem.record) if free_run is None else free_run
@@ -108,7 +113,7 @@ def diagnose(fit: Estimate, *, one_step: Response | None = None, free_run: Respo
 def _concluded(seen: Finding, free_tests: tuple[ResidualTest, ...] | None) -> Diagnosis:
     """The verdict and its words."""
     misfit = any(t.follows() or t.curved_over(SHARE) for t in seen.tests) or seen.lacks
-    complete = seen.white and not misfit
+    complete = seen.white and not misfit and not seen.follows(_SMALL)
     noise = "white" if seen.free_white and seen.white else "equation_noise"
     if not seen.fit.model.form.states:
         noise = "white"
@@ -124,13 +129,32 @@ def _concluded(seen: Finding, free_tests: tuple[ResidualTest, ...] | None) -> Di
     text, warnings = words(verdict, seen)
     warnings = (*wild_rows(seen.one_step, seen.fit.problem.record.experiments), *warnings)
     return Diagnosis(
-        verdict, text, seen.tests, free_tests, seen.ratio, seen.noise, warnings, seen.predictable, seen.changes
+        verdict,
+        text,
+        seen.tests,
+        free_tests,
+        seen.ratio,
+        seen.noise,
+        warnings,
+        seen.predictable,
+        seen.changes,
+        steps=seen.steps or None,
     )
+
+
+def _steps(problem: Problem, tests: tuple[ResidualTest, ...]) -> dict[str, float]:
+    """The steps of the outputs that are measured in such as the one-step error has the size of."""
+    found = {}
+    for i, test in enumerate(tests):
+        step = step_of(np.concatenate([e.outputs[:, i] for e in problem.record.experiments]))
+        if step is not None and (test.rms or np.inf) <= step:
+            found[test.name] = step
+    return found
 
 
 def _is_small(seen: Finding) -> bool:
     """Whether what could be predicted is a small effect: no change is worth making."""
-    if seen.lacks or not seen.predictable:
+    if seen.lacks or not seen.predictable or seen.drifts or seen.follows(_SMALL):
         return False
     shares = [one.largest(own_past=not seen.simulated) for one in seen.predictable]
     unit = zip(seen.predictable, seen.fit.problem.deviation, strict=True)

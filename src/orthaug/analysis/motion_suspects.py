@@ -143,7 +143,7 @@ def check_motion_suspects(suspects: Sequence[MotionSuspect], problem: MotionProb
 
 
 def motion_width(on: str, problem: MotionProblem) -> float:
-    """A width from the data's own scale: the median of |on| where it is not zero, over guessed states and inputs.
+    """A width from the data: the median of |on| where it is not zero, to six digits, over guessed states and inputs.
 
     Raises:
         InputError: an expression that cannot be read, that is not finite, or zero everywhere.
@@ -152,7 +152,7 @@ def motion_width(on: str, problem: MotionProblem) -> float:
     size = np.abs(MotionSuspect(on, on).values(motion, motion.initial, x.T, u.T))
     if not np.isfinite(size).all() or not np.any(size > 0):
         raise InputError(f"'{on}' is zero or not finite over the guessed states; the data give no `width`. State one.")
-    return float(np.median(size[size > 0]))
+    return float(f"{np.median(size[size > 0]):.6g}")
 
 
 def _balanced(text: str) -> None:

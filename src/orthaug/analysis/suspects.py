@@ -38,6 +38,7 @@ _KINDS = {
     "stribeck_gauss": _Kind(lambda x, w: f"sign({x})*exp(-(({x})/{w})**2)", width=True),
     "quadratic_drag": _Kind(lambda x, w: f"({x})*abs({x})"),
     "cubic": _Kind(lambda x, w: f"({x})**3"),
+    "square_root": _Kind(lambda x, w: f"sign({x})*sqrt(abs({x}))"),
     "dead_zone": _Kind(lambda x, w: f"({x}) - {_clip(x, w)}", width=True),
     "saturation": _Kind(_clip, width=True),
     "offset": _Kind(lambda x, w: "1"),
@@ -49,6 +50,7 @@ ODD_JUMPS = ("coulomb", "stribeck", "stribeck_gauss")  # the kinds that jump whe
 _VELOCITY = ("coulomb", "stribeck", "quadratic_drag", "cubic")
 _POSITION = ("cubic", "dead_zone")
 _CLEARLY = 0.05  # of the largest value
+_BELOW = 0.05  # of the largest value: what is only so far below 0 counts as positive, for it is noise
 _MULTIPLIED = 6  # lags at most, of which products are tried
 _INPUT = ("cubic", "dead_zone", "saturation")
 
@@ -109,6 +111,7 @@ class Suspect:
         | `stribeck_gauss` | sign(x) exp(−(x/width)²) | v_S |
         | `quadratic_drag` | x abs(x) | |
         | `cubic` | x³ | |
+        | `square_root` | sign(x) √abs(x), as of an outflow | |
         | `dead_zone` | x − clip(x, −width, width) | half of the zone |
         | `saturation` | clip(x, −width, width) | the limit |
         | `offset` | 1, no `on` | |
@@ -234,7 +237,7 @@ def suspect_columns(
 
 
 def data_width(on: str, x: Matrix, layout: Layout, constants: Mapping[str, float] | None = None) -> float:
-    """A width from the data's own scale: the median of |x| where x is not zero, in the unit of `on`.
+    """A width from the data's own scale: the median of |x| where x is not zero, to six digits, in the unit of `on`.
 
     Half of the moving samples then lie inside a dead zone, a saturation or a Stribeck peak, so that the
     data show both sides of it.
@@ -248,17 +251,20 @@ def data_width(on: str, x: Matrix, layout: Layout, constants: Mapping[str, float
         raise InputError(f"'{on}' is not finite at row {np.flatnonzero(~np.isfinite(size))[0]} of the regressor.")
     if not np.any(size > 0):
         raise InputError(f"'{on}' is zero on all rows; the data give no width. State one.")
-    return float(np.median(size[size > 0]))
+    return float(f"{np.median(size[size > 0]):.6g}")
 
 
 def usual_suspects(problem: Problem) -> tuple[Suspect, ...]:
-    """What is often missing: friction, drag, hardening, dead zone and saturation, an offset."""
+    """What is often missing: friction, drag, hardening, dead zone, saturation, an offset, the root of a level."""
     layout, outputs = problem.layout, problem.outputs
     pairs: list[tuple[str, str]] = []
     for channel in dict.fromkeys(lag.channel for lag in layout):
         lags = sorted(lag.lag for lag in layout if lag.channel == channel)
         first = next(str(lag) for lag in layout if lag.channel == channel and lag.lag == lags[0])
         pairs += [(kind, first) for kind in (_POSITION if channel in outputs else _INPUT)]
+        values = problem.rows.x[:, [str(lag) for lag in layout].index(first)]
+        if channel in outputs and values.min() >= -_BELOW * values.max():
+            pairs.append(("square_root", first))
         if channel in outputs and len(lags) > 1:
             second = next(str(lag) for lag in layout if lag.channel == channel and lag.lag == lags[1])
             pairs += [(kind, f"{first} - {second}") for kind in _VELOCITY]

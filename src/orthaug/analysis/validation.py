@@ -23,6 +23,10 @@ from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.response import Response
 
+_BEYOND, _FAR = 0.01, 0.1  # of the training range: an excursion that is told, and one that counts on any row
+_OFTEN = 0.01  # of the rows: a smaller excursion counts from there on
+_LIKELY = 0.9  # ratio of errors below which an interval that holds 1 leaves undecided what is not shown
+
 
 @dataclass(frozen=True)
 class Trial:
@@ -210,14 +214,16 @@ def judge(trials: Sequence[Trial], extrapolation: Sequence[Extrapolation] = ()) 
     worst = next(code for code in ("hurts", "no_help", "helps") if code in codes)
     hurt = {where for (where, _), code in zip(groups, codes, strict=True) if code == "hurts"}
     beyond = [e for e in extrapolation if e.part in hurt]
+    ratio = ratios[codes.index(worst)]
+    likely = ratio.value < _LIKELY and ratio.high > 1
     opening = {
         "helps": "The learner helps",
-        "no_help": "The learner does not help",
+        "no_help": "It is undecided whether the learner helps" if likely else "The learner does not help",
         "hurts": "The learner hurts in extrapolation" if beyond else "The learner hurts",
     }[worst]
     reasons = sentences if worst == "helps" else [s for s, c in zip(sentences, codes, strict=True) if c != "helps"]
     text = ". ".join([opening, *reasons]) + "."
-    return Verdict(worst, text, tuple(trials), tuple(extrapolation), ratios[codes.index(worst)])
+    return Verdict(worst, text, tuple(trials), tuple(extrapolation), ratio)
 
 
 def _ratio(group: Sequence[Trial], alone: float, model: float) -> Ratio:
@@ -241,6 +247,8 @@ def _told(alone: float, model: float) -> str:
 def extrapolation(part: str, x: Matrix, training: Matrix, layout: Layout) -> list[Extrapolation]:
     """Entries of the regressor in which a part leaves the range of the training data; one lag a channel.
 
+    Not told is what noise does to extreme values: excursions by less than a hundredth of the range, or on few rows.
+
     Args:
         part: its name.
         x: its regressors (N, nx), in the order of the layout; `training` those of the training data.
@@ -249,8 +257,10 @@ def extrapolation(part: str, x: Matrix, training: Matrix, layout: Layout) -> lis
     for j, lag in enumerate(layout):
         low, high = float(training[:, j].min()), float(training[:, j].max())
         beyond = (x[:, j] < low) | (x[:, j] > high)
-        if beyond.any() and lag.channel not in leaving:
-            reach = (float(x[:, j].min()), float(x[:, j].max()))
+        reach = (float(x[:, j].min()), float(x[:, j].max())) if len(x) else (low, high)
+        excess = max(low - reach[0], reach[1] - high)
+        often = excess > _BEYOND * (high - low) and beyond.mean() >= _OFTEN
+        if (often or excess > _FAR * (high - low)) and lag.channel not in leaving:
             leaving[lag.channel] = Extrapolation(part, str(lag), (low, high), reach, float(beyond.mean()))
     return list(leaving.values())
 

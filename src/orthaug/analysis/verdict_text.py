@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from orthaug.fitting.estimates import Estimate
 from orthaug.models.response import Response
 
 SHARE = 0.01  # of the residual's variance: what a regressor explains of it counts from there
+_SLOW = 0.9  # of a free run's variance: what its own past tells from there on is a drift rather than noise
 _TOLD = 5  # findings that a text lists at most
 _TOO_FAST = 0.05  # noise variance / smallest variance among the lagged outputs
 
@@ -43,6 +45,8 @@ class Finding:
     free_tests: tuple[ResidualTest, ...] | None = None
     predictable: tuple[Predictable, ...] = ()
     changes: tuple[Change, ...] = ()
+    steps: Mapping[str, float] = field(default_factory=dict)
+    """Steps of the outputs whose one-step error has their size."""
 
     @property
     def lacks(self) -> bool:
@@ -53,6 +57,17 @@ class Finding:
     def own(self) -> tuple[ResidualTest, ...]:
         """The tests of the error that was minimised."""
         return self.free_tests if self.fit.criterion.simulates and self.free_tests is not None else self.tests
+
+    @property
+    def drifts(self) -> bool:
+        """Whether a free run's error is slow, and white noise in the equation does not explain that."""
+        slow = any(one.own_past > _SLOW for one in self.predictable)
+        return self.simulated and slow and not self.white and not self.sensor
+
+    def follows(self, share: float = SHARE) -> tuple[str, ...]:
+        """What the error that was minimised still follows: surely, and by more than a share of its variance."""
+        inputs = (name for test in self.own for name in test.follows(float(np.sqrt(share))))
+        return tuple(dict.fromkeys([*inputs, *(name for test in self.own for name in test.curved_over(share))]))
 
     @property
     def what(self) -> str:
@@ -99,15 +114,18 @@ def _sensor_noise(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     if seen.simulated:
         more = f" {_sentence(seen.changes[0])}" if seen.changes else ""
         return f"{text}, which the simulation criterion suits.{more}", ()
-    text += '. One-step estimates of θ are then inconsistent: train with focus = "simulation"'
+    text += '. One-step estimates of θ are then inconsistent: for the parameters train with focus = "simulation"'
     if seen.changes and seen.changes[0].kind == "criterion":
-        text += f"; the error of the free run is predicted to fall by {percent(seen.changes[0].fall)}"
+        fall = seen.changes[0].fall
+        gain = f"predicted to fall by {percent(fall)}" if seen.changes[0].gains else "not predicted to fall"
+        text += f"; the error of the free run is {gain}"
     if seen.noise is not None and seen.noise > _TOO_FAST:
         text += (
             f". The noise is {100 * seen.noise:.0f} % of what tells the lagged outputs apart: the sampling is too fast "
             "for one-step estimation"
         )
-    return f"{text}.", (_BIASED,) if seen.fit.std is not None else ()
+    steps = f" {_quantised(seen)}" if seen.steps else ""
+    return f"{text}.{steps}", (_BIASED,) if seen.fit.std is not None else ()
 
 
 def _unmodelled(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
@@ -117,14 +135,57 @@ def _unmodelled(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
         told += [f"the residual of {test.name} is curved over {name}" for name in test.curved_over(SHARE)]
     told = [*told[:_TOLD], *(["and more"] if len(told) > _TOLD else [])]
     opening = f"The {seen.what}, {_size(seen)}, is not noise alone: {'; '.join(told)}."
-    return " ".join(part for part in (opening, _shares(seen), _advice(seen, "that is not what is missing")) if part), ()
+    advice = "" if seen.steps and not seen.changes else _advice(seen, _cause(seen))
+    return " ".join(part for part in (opening, _shares(seen), _quantised(seen), advice) if part), ()
+
+
+def _quantised(seen: Finding) -> str:
+    """That the steps of an output colour the residual one step ahead, and what to do."""
+    if not seen.steps:
+        return ""
+    units = {c.name: f" {c.unit}".rstrip() for c in seen.fit.problem.record.outputs}
+    each = {test.name: f"{test.name} is measured in steps of {seen.steps[test.name]:.3g}{units[test.name]}, and the "
+            f"one-step residual ({test.rms:.2g}{units[test.name]}) is no larger"
+            for test in seen.tests if test.name in seen.steps}  # fmt: skip
+    trained = "" if seen.simulated else 'train with focus = "simulation", '
+    return (
+        f"{'; '.join(each.values())}: such steps colour it as noise on the output does, and bias one-step estimates of "
+        f"θ. For that {trained}take fewer samples (`decimate` of data.prepare), or measure more finely."
+    )
+
+
+def _cause(seen: Finding) -> str:
+    """What may stand behind a residual that none of the changes that were tried lowers, and what to do."""
+    followed = [name for test in seen.own for name in (*test.follows(), *test.curved_over(SHARE))]
+    if followed:
+        return (
+            f"what it follows ({_joined(followed[:_TOLD])}) has a form that was not tried, or comes with dynamics that "
+            "the lags do not hold; suspects of your own (`[[suspects]]`) test a form"
+        )
+    if seen.drifts:
+        return (
+            "the error drifts, which neither white noise in the equation nor noise on the sensor explains; a "
+            "disturbance that was not recorded, or slow dynamics that the physics lacks, would: record it as an input"
+        )
+    return (
+        "its colour is that of a disturbance or of noise on the output that neither criterion describes; its own past "
+        "predicts it, an input that was not recorded might"
+    )
+
+
+def _joined(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def _small(seen: Finding) -> str:
     """What is said where the tests reject, but hardly anything could be predicted."""
     colour = " Its colour is that of the noise." if seen.simulated and not seen.white else ""
-    advice = _advice(seen, "it is the noise floor")
-    return f"The {seen.what}, {_size(seen)}, is noise as far as it shows. {_shares(seen)}{colour} {advice}"
+    followed = seen.follows()
+    shown = (
+        f"noise for the most part, but still follows {_joined(followed)}" if followed else "noise as far as it shows"
+    )
+    advice = _advice(seen, "what it follows is a small effect" if followed else "it is the noise floor")
+    return f"The {seen.what}, {_size(seen)}, is {shown}. {_shares(seen)}{colour} {advice}"
 
 
 def _size(seen: Finding) -> str:

@@ -20,6 +20,7 @@ from orthaug.commands.program import (
     OutFolder,
     SpecPath,
     app,
+    arguments,
     main,
     other_writes,
     prepare_jax,
@@ -92,7 +93,8 @@ def fit(
     job = open_job(spec)
     check_inputs_kept(job, folder)
     prepare_jax()
-    job = keeping(job, folder, resume=resume)
+    asked = arguments("fit", spec, out=out, resume=resume, json=as_json, force=force)
+    job = replace(keeping(job, folder, resume=resume), arguments=asked)
     learns, rows = job.spec.declared_learner() is not None, getattr(job.problem, "count", 0)
     with training_bar(job.run_count, job.iterations, learns, rows) as progress:
         fitted = fit_job(job, progress)
@@ -130,6 +132,8 @@ def compare(
     prepare_jax()
     from orthaug.commands import compare as comparing
 
+    asked = arguments("compare", spec, out=out, model=model, json=as_json, force=force)
+    job = replace(job, arguments=asked)
     with training_bar(job.run_count * len(job.compared), job.iterations) as progress:
         comparison = comparing.compare(job, model or (), progress)
     if other_writes():

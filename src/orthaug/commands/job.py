@@ -70,6 +70,8 @@ class Job(ABC):
     problem: Any
     checkpoints: Checkpoints | None = None
     """Where the states of training are kept."""
+    arguments: tuple[str, ...] = ()
+    """Of the command that asked for it; none from Python."""
 
     def __repr__(self) -> str:
         parts = ", ".join(f"{part.name} {len(part.record)} rows" for part in self.parts)

@@ -10,10 +10,12 @@ import numpy as np
 
 from orthaug._base.errors import InputError
 from orthaug._base.warning import Warning
+from orthaug.analysis.closed_loop import closed_loop
 from orthaug.commands.attempt import attempt
 from orthaug.commands.bias import bias_of, budget_of, with_biases
 from orthaug.commands.lagged_job import LaggedJob
 from orthaug.commands.shared import shared_of
+from orthaug.physics.derived_units import derived_units
 from orthaug.physics.excitation import identifiability, require_rank
 from orthaug.reports.result import CheckResult, FitResult, ParameterResult, parameter_rows, physical_rows
 
@@ -40,7 +42,7 @@ def checked(job: LaggedJob) -> CheckResult:
             "identifiability": identifiability(problem.baseline, problem.layout, problem.outputs, problem.rows.x),
             "shared": shared_of(job),
             "bias": bias_of(job) if problem.excitation.full_rank else None,
-            "warnings": job.warnings,
+            "warnings": [*job.warnings, *closed_loop(job.train.record)],
         }
     )
 
@@ -69,15 +71,19 @@ def content(
         told["bias"] = attempt("the bias by suspects", partial(bias_of, job, fit), warnings, None)
         told |= _analysed(fit, one_step, free_run, warnings)
     shared = shared_of(job, fit.problem, others=False)
+    rows = parameter_rows(
+        fit.problem.baseline.parameters,
+        fit.theta if fit.status.ok else np.full(len(fit.theta), np.nan),
+        fit.std,
+        fit.interval,
+        fit.one_step_theta,
+        None if fit.plain_covariance is None else np.sqrt(np.diag(fit.plain_covariance)),
+    )
+    units = derived_units(fit.problem.baseline, fit.problem.record.outputs, fit.problem.record.inputs)
     told |= {
-        "parameters": parameter_rows(
-            fit.problem.baseline.parameters,
-            fit.theta if fit.status.ok else np.full(len(fit.theta), np.nan),
-            fit.std,
-            fit.interval,
-            fit.one_step_theta,
-            None if fit.plain_covariance is None else np.sqrt(np.diag(fit.plain_covariance)),
-        ),
+        "parameters": [
+            row if row.unit else row.model_copy(update={"derived_unit": units.get(row.name)}) for row in rows
+        ],
         "standard_errors": None if fit.std is None else "plain" if fit.plain_covariance is None else "robust",
         "measure_detail": fit.measure,
         "excitation": fit.excitation,
@@ -86,9 +92,9 @@ def content(
     budget = None
     if fit.status.ok:
         budget = attempt("the bias that the learner implies", partial(budget_of, job, fit), warnings, None)
-    rows, biased = with_biases(fit, shared, told, budget)
+    found, biased = with_biases(fit, shared, told, budget)
     warnings += biased
-    return fit, told | rows
+    return fit, told | found
 
 
 def figures(
@@ -192,6 +198,7 @@ def _analysed(fit: Estimate, one_step: Response, free_run: Response, warnings: l
         warnings.extend(found.warnings if found else ())
         return found
 
+    warnings += closed_loop(problem.record)
     return {
         "stability": attempt("the analysis of the free run's sensitivity", steady, warnings, None),
         "residuals": attempt("the analysis of the residual", residuals, warnings, None),

@@ -133,14 +133,15 @@ def explain(
         list[str] | None, typer.Option("--function", metavar="NAME", help="In products, such as abs; any number.")
     ] = None,
     most: Annotated[int, typer.Option("--terms", metavar="N", help="Terms at most.")] = 6,
+    rows: Rows = None,
     as_json: AsJson = False,
 ) -> None:
     """Which terms the learner of a saved model has found, and what to write into the physics."""
     from orthaug.commands.explain import explain_model
-    from orthaug.commands.run import Reading, open_run
+    from orthaug.commands.run import Reading, open_run, read_rows
     from orthaug.reports.explanation_text import explain_text
 
-    opened = open_run(model, data, reading=Reading(prepare=True))
+    opened = open_run(model, data, reading=Reading(rows=read_rows(rows), prepare=True))
     prepare_jax()
     for line in opened.notes:
         streams.say(line)

@@ -9,6 +9,7 @@ import numpy as np
 
 from orthaug._base.errors import InputError, RankError
 from orthaug._base.warning import Warning
+from orthaug.analysis.closed_loop import closed_loop
 from orthaug.commands.attempt import attempt
 from orthaug.commands.motion_job import MotionJob
 from orthaug.commands.motion_suspects import bias_before
@@ -79,7 +80,7 @@ def checked(job: MotionJob) -> CheckResult:
                 "best_hold": trial.best,
                 "text": text,
             },
-            "warnings": [*job.warnings, *warnings],
+            "warnings": [*job.warnings, *warnings, *closed_loop(job.train.record)],
         }
     )
 
@@ -126,6 +127,7 @@ def content(
         plain = fit
         fit = attempt("the robust covariance", lambda: robust_motion(plain), warnings, plain)
         found = _analysed(job, fit, responses[job.train.name][1], warnings)
+        warnings += closed_loop(job.train.record)
         told |= {name: found[name] for name in ("residuals", "stability", "bias")}
     budget, coarse, parts = found["budget"], found["coarse"], found["parts"] or ()
     if fit.status.ok and form.bound is not None:

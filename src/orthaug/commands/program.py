@@ -160,6 +160,24 @@ def other_writes() -> bool:
     return text is not None
 
 
+def arguments(command: str, spec: Path, **options: Any) -> tuple[str, ...]:
+    """What a command was asked for, to be asked again: the options that were given, under their names.
+
+    Examples:
+        >>> arguments("fit", Path("a.toml"), out=Path("b"), resume=False, model=None, force=True)
+        ('fit', 'a.toml', '--out', 'b', '--force')
+    """
+    told = [command, str(spec)]
+    for name, value in options.items():
+        if value is True:
+            told.append(f"--{name}")
+        elif value:
+            told += [
+                part for one in (value if isinstance(value, list) else [value]) for part in (f"--{name}", str(one))
+            ]
+    return tuple(told)
+
+
 def prepare_jax() -> None:
     """Keep compiled programs for the next command."""
     from orthaug._base.jax import use_compilation_cache

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
+import shlex
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Protocol
@@ -76,7 +77,7 @@ def origin_of(job: Job, command: str) -> Origin:
     return Origin(
         name=job.path.stem,
         toml=_toml(job),
-        command=f"orthaug {command} {job.path.name}",
+        command=shlex.join(("orthaug", *(job.arguments or (command, job.path.name)))),
         date=now.strftime("%Y-%m-%d %H:%M UTC"),
         machine=f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
         versions=versions,

@@ -33,6 +33,7 @@ _HELD = 6  # rows at the largest or smallest value from which on it is suspected
 _OFTEN = 5.0  # times the rows that a value usually has
 _LONGER = 3.0  # times the rows for which other values are usually held
 _LEVELS = 20  # of a signal at least, for one with fewer stands at its extremes anyway
+_FINEST = 1e5  # steps within the range from which on rounding of the numbers could make them
 _COARSE = 0.02  # steps of a signal over its standard deviation that are told
 SPIKE = 15.0
 """Deviations from its neighbours that a sample is a spike from on."""
@@ -118,19 +119,26 @@ class Column:
     @property
     def quantum(self) -> float | None:
         """The step of which all values are multiples, where it is coarse beside the standard deviation."""
-        levels = np.unique(self.finite)
-        if len(levels) < 3 or np.ptp(levels) == 0:
+        step = step_of(self.finite)
+        if step is None or step <= _COARSE * float(self.finite.std()):
             return None
-        step = float(np.diff(levels).min())
-        multiples = (levels - levels[0]) / step
-        even = np.abs(multiples - np.round(multiples)).max() < _SAME * max(float(multiples.max()), 1e3)
-        coarse = step > _COARSE * float(self.finite.std())
-        return step if even and coarse and len(levels) < len(self.finite) / 2 else None
+        return step if len(np.unique(self.finite)) < len(self.finite) / 2 else None
 
     @property
     def kind(self) -> str:
         """'input' or 'output' where the name says so, otherwise ''."""
         return "input" if _INPUT.match(self.name) else "output" if _OUTPUT.match(self.name) else ""
+
+
+def step_of(values: Vector) -> float | None:
+    """The step of which all differences between values are multiples, up to rounding; None where there is none."""
+    levels = np.unique(values)
+    if len(levels) < 3 or not np.isfinite(levels[[0, -1]]).all():
+        return None
+    step = float(np.diff(levels).min())
+    multiples = (levels - levels[0]) / step
+    even = np.abs(multiples - np.round(multiples)).max() < _SAME * max(float(multiples.max()), 1e3)
+    return step if even and multiples.max() < _FINEST else None
 
 
 @dataclass(frozen=True, eq=False)

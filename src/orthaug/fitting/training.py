@@ -13,6 +13,7 @@ import numpy as np
 from orthaug._base.checks import finite_or_none
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jax
+from orthaug._base.lines import percent
 from orthaug._base.log import LOG
 from orthaug._base.parallel import Threads, one_blas_thread
 from orthaug._base.progress import Tell
@@ -259,13 +260,21 @@ def _fell_back(held_out: HeldOut) -> Warning:
     model, alone = (math.sqrt(mean_square(p)) for p in (held_out.runs[held_out.chosen], held_out.alone))
     ratio = held_out.ratio
     errors = f"its error is {model:.4g} deviations of the output, that of physics alone {alone:.4g}"
-    surely = "surely " if model < alone else ""
     if math.isinf(model):
         errors = "every one of its starts runs away there"
-    elif surely:
+    elif model < alone:
         errors += f"; {ratio}"
+    where = held_out.where
+    if model < alone and ratio.high > 1:
+        text = (
+            f"it is undecided in {where} whether the learner is better than physics alone ({errors}), so the result is "
+            "physics alone, the simpler of the two; `fallback = false` keeps the learner, whose error there is "
+            f"{percent(1 - model / alone)} lower by the best guess. Test parts have no say in this choice."
+        )
+        return Warning("physics_alone", text)
+    surely = "surely " if model < alone else ""
     text = (
-        f"in {held_out.where} the learner is not {surely}better than physics alone ({errors}), so the result is "
+        f"in {where} the learner is not {surely}better than physics alone ({errors}), so the result is "
         "physics alone; `fallback = false` keeps the learner."
     )
     return Warning("physics_alone", text)

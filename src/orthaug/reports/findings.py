@@ -144,6 +144,8 @@ class MissingResult(Content):
 class DiagnosisResult(Content):
     """What the residuals say about the noise, and which change would help."""
 
+    absent = frozenset({"steps"})
+
     verdict: str
     text: str
     one_step: list[ResidualTestResult]
@@ -153,6 +155,7 @@ class DiagnosisResult(Content):
     predictable: list[PredictableResult]
     changes: list[ChangeResult]
     missing: MissingResult | None = None
+    steps: ByName | None = None
 
 
 class LagResult(Content):

@@ -36,7 +36,7 @@ class FitPlots:
     def free_run(
         self, record: Record | None = None, *, output: str | None = None, experiment: int = 0, ax: Axes | None = None
     ) -> Axes:
-        """Measured output, free run of the model, and that of its physics alone, over time [s].
+        """Measured output, free run of the model, and that of the model without its learner, over time [s].
 
         Args:
             record: any with the model's channels; None for that of training.
@@ -52,7 +52,8 @@ class FitPlots:
             alone = self.fit.model.alone.simulate(self._record(record)).trajectories[experiment]
             limits = axis.get_ylim()
             time = np.arange(len(alone.model)) * response.sampling_time
-            axis.plot(*outline(time, alone.model[:, i]), color=ORANGE, linewidth=0.9, zorder=1.5, label="physics alone")
+            drawn = outline(time, alone.model[:, i])
+            axis.plot(*drawn, color=ORANGE, linewidth=0.9, zorder=1.5, label="model without its learner")
             axis.set_ylim(*limits)  # physics that runs away hides nothing
             axis.legend(fontsize="small", frameon=False)
         return axis

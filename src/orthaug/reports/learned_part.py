@@ -24,7 +24,9 @@ _BATCH = 512  # points of a compiled call
 _CURVE = 200  # points of a curve
 _BEYOND = 0.2  # of the data's reach, drawn at each side of it
 _BINS = 24  # of means over a feature
-_CELLS = 36  # of a surface, in each direction
+_CELLS = 36  # of a surface, in each direction, in which data are looked for
+_FINER = 2  # times as many in which the learned part is drawn
+_IN_A_CELL = 3  # points of the data on average, where their means are drawn
 _TIED = 0.95  # correlation with another feature from which others at their medians are no state of the system
 Reach = Callable[[Matrix], Matrix | None]
 """Half the length of 95 % intervals of the learned part (M, nl) at points (M, n); None where there are none."""
@@ -183,15 +185,19 @@ class LearnedPart:
         low, high = pair.min(axis=0), pair.max(axis=0)
         width = np.maximum(high - low, 1e-300)
         alone = self.alone(across, along)
-        count = _CELLS if alone else _CELLS // 2
+        count = _CELLS if alone else min(max(int(np.sqrt(len(pair) / _IN_A_CELL)), _CELLS // 4), _CELLS)
         cells = np.minimum((count * (pair - low) / width).astype(int), count - 1)
-        first, second = (low[k] + width[k] * (np.arange(count) + 0.5) / count for k in (0, 1))
+        size = _FINER * count if alone else count
+        first, second = (low[k] + width[k] * (np.arange(size) + 0.5) / size for k in (0, 1))
         if alone:
-            rows = np.tile(np.median(self.points, axis=0), (_CELLS * _CELLS, 1))
-            rows[:, self.variables.index(across)] = np.repeat(first, _CELLS)
-            rows[:, self.variables.index(along)] = np.tile(second, _CELLS)
-            learned = self.at(rows).reshape(_CELLS, _CELLS, -1)
-            learned = np.where(_near(cells)[..., None], learned, np.nan)
+            rows = np.tile(np.median(self.points, axis=0), (size * size, 1))
+            rows[:, self.variables.index(across)] = np.repeat(first, size)
+            rows[:, self.variables.index(along)] = np.tile(second, size)
+            batch = max(len(self.points), _BATCH)  # of as many there is a program
+            found = [self.at(rows[start : start + batch]) for start in range(0, len(rows), batch)]
+            learned = np.concatenate(found).reshape(size, size, -1)
+            near = np.repeat(np.repeat(_near(cells), _FINER, axis=0), _FINER, axis=1)
+            learned = np.where(near[..., None], learned, np.nan)
         else:
             learned = _mean_in_cells(cells, self.values, count)
         return Surface(first, second, learned)

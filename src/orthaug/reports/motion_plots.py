@@ -1,4 +1,4 @@
-"""Figures of fitted motions: the free run beside physics alone, states, what acts in it, and what was learned."""
+"""Figures of fitted motions: the free run with and without learner, states, what acts in it, and what was learned."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ _COLUMNS = 3  # panels beside each other
 
 @plain
 def run_figure(response: Response, title: str, *, learns: bool) -> Figure:
-    """Measured output, model and, where something was learned, physics alone; below it their differences."""
+    """Measured output, model and, where something was learned, the model without its learner; below, differences."""
     trajectory = response.trajectories[0]
     time, rows = window(response)
     figure, axes = panels(response, f"{title}: {extent(response, rows)}", heights=(2, 1))
     drawn = [("model", trajectory.model, BLACK, "-")]
-    drawn = [("physics alone", trajectory.baseline, ORANGE, "--"), *drawn] if learns else drawn
+    drawn = [("model without its learner", trajectory.baseline, ORANGE, "--"), *drawn] if learns else drawn
     for i, channel in enumerate(response.outputs):
         upper, lower = axes[2 * i], axes[2 * i + 1]
         if trajectory.measured is not None:

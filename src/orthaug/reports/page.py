@@ -17,7 +17,7 @@ import jinja2
 from markupsafe import Markup, escape
 
 from orthaug.reports.fields import WarningResult
-from orthaug.reports.page_blocks import Plot, Section, plots_of
+from orthaug.reports.page_blocks import Plot, Section, plots_of, prose
 from orthaug.reports.page_compare import ComparePage, compare_sections
 from orthaug.reports.page_fit import FitPage, Origin, fit_sections
 from orthaug.reports.page_verdict import PageVerdict, compare_verdict, fit_verdict
@@ -85,6 +85,7 @@ def _page(
         number_of={id(plot): i for i, plot in enumerate(plots)},
         key=id,
         ticked=_ticked,
+        prose=prose,
         kind_of=lambda block: type(block).__name__,
         style=_template("page.css"),
         script=_template("page.js"),
@@ -94,11 +95,12 @@ def _page(
 
 
 def _ticked(text: str) -> Markup:
-    """Text in which what stands between backticks is code."""
+    """Text in which what stands between backticks is code, and minus signs are those of the tables."""
     parts = [
-        Markup("<code>{}</code>").format(part) if i % 2 else escape(part) for i, part in enumerate(text.split("`"))
+        Markup("<code>{}</code>").format(part) if i % 2 else escape(prose(part))
+        for i, part in enumerate(text.split("`"))
     ]
-    return Markup("").join(parts) if len(parts) % 2 else escape(text)
+    return Markup("").join(parts) if len(parts) % 2 else escape(prose(text))
 
 
 def _figure(plot: Plot) -> dict[str, Any]:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from orthaug._base import lines
+
 _LARGE = 7  # digits before the point from which a power of ten is written
 _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _ROUNDING = 1e-12  # of its scale: a number below is rounding of zero
+_MOST_DIGITS = 15
+_MINUS = re.compile(r"(?<![\w\])}.-])-(?=[\d.])")  # before a number that stands by itself
 
 
 def number(value: float | None, digits: int = 5, scale: float | None = None) -> str:
@@ -27,11 +33,25 @@ def number(value: float | None, digits: int = 5, scale: float | None = None) -> 
 
 
 def interval(ends: Sequence[float | None] | None, digits: int = 5) -> str:
-    """The two ends of an interval; a dash where there is none."""
+    """The two ends of an interval, of so many digits at least that they are told apart; a dash where there is none."""
     if ends is None:
         return "–"
-    scale = max((abs(end) for end in ends if end is not None), default=None)
+    known = [end for end in ends if end is not None]
+    scale = max(map(abs, known), default=None)
+    digits = digits_for(scale, max(known) - min(known), digits) if known else digits
     return " … ".join(number(end, digits, scale) for end in ends)
+
+
+def digits_for(value: float | None, spread: float | None, least: int) -> int:
+    """Digits of a value that show two of its spread, but `least`.
+
+    Examples:
+        >>> digits_for(1.45951, 9e-6, 5), digits_for(1.45951, 0.1, 5)
+        (8, 5)
+    """
+    if not value or not spread or not math.isfinite(value / spread):
+        return least
+    return min(max(least, math.ceil(math.log10(abs(value / spread))) + 2), _MOST_DIGITS)
 
 
 def percent(share: float | None, digits: int = 2, *, signed: bool = False) -> str:
@@ -41,7 +61,23 @@ def percent(share: float | None, digits: int = 2, *, signed: bool = False) -> st
     shown = 0.0 if abs(share) < _ROUNDING else 100 * share
     if shown and abs(shown) < 10**-3:
         return "< 0.001 %"
-    return f"{f'{shown:+.{digits}g}' if signed and shown else f'{shown:.{max(digits, 3)}g}'} %".replace("-", "−")
+    told = (
+        lines.percent(shown / 100, digits, sign="+") if signed and shown else lines.percent(shown / 100, max(digits, 3))
+    )
+    mantissa, power, rest = told.partition("e")
+    if power:
+        told = f"{mantissa}·10{str(int(rest.removesuffix(' %'))).translate(_RAISED)} %"
+    return told.replace("-", "−")
+
+
+def prose(text: str) -> str:
+    """A sentence with the minus signs that tables have.
+
+    Examples:
+        >>> prose("moves y[k-1] by -0.015, from -2 to 3")
+        'moves y[k-1] by −0.015, from −2 to 3'
+    """
+    return _MINUS.sub("−", text)
 
 
 def with_unit(name: str, unit: str | None) -> str:

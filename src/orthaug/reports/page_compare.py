@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from orthaug.models.response import Response
-from orthaug.reports.page_blocks import Grid, Section, Table, Text, interval, number
+from orthaug.reports.page_blocks import Grid, Section, Table, Text, digits_for, interval, number
 from orthaug.reports.page_figures import parameter_comparison
-from orthaug.reports.page_fit import Origin, origin_blocks, score_blocks
+from orthaug.reports.page_fit import Origin, origin_blocks, score_blocks, unit_cell, units_of_result
 from orthaug.reports.page_runs import compared_plots
 from orthaug.reports.result import CompareResult
 
@@ -38,7 +38,7 @@ def compare_sections(page: ComparePage) -> list[Section]:
     scores = {row.name: row.scores for row in result.comparison}
     found = [
         Section("models", "Models", _models(result)),
-        Section("scores", "Scores", score_blocks(scores, page.outputs)),
+        Section("scores", "Scores", score_blocks(scores, page.outputs, units_of_result(result))),
         Section("parameters", "Parameters", _parameters(result)),
         Section("free-run", "Free run", list(compared_plots(page.responses))),
         Section(
@@ -92,7 +92,14 @@ def _parameters(result: CompareResult) -> list[Any]:
     if not result.comparison or not result.comparison[0].parameters:
         return []
     rows = [
-        [row.name, p.name, number(p.value, 6), p.unit or "–", number(p.std, 2, p.value), interval(p.ci95)]
+        [
+            row.name,
+            p.name,
+            number(p.value, digits_for(p.value, p.std, 6)),
+            unit_cell(p),
+            number(p.std, 2, p.value),
+            interval(p.ci95),
+        ]
         for row in result.comparison
         for p in row.parameters
     ]

@@ -31,7 +31,7 @@ def interval_plot(rows: Sequence[ParameterResult]) -> Plot | None:
     for i, row in enumerate(drawn):
         number = str(i + 1) if i else ""
         first = {"95 % interval": i == 0, "estimate": i == 0, "initial value": i == _first(drawn, _near)}
-        first["95 % interval with the bias"] = i == _first(drawn, lambda r: bool(r.ci95_with_bias))
+        first["95 % interval less the bias"] = i == _first(drawn, lambda r: bool(r.ci95_with_bias))
         for trace in _interval_traces(row):
             own = {"xaxis": f"x{number}", "yaxis": f"y{number}", "legendgroup": trace["name"]}
             traces.append({**own, **trace, "showlegend": first[trace["name"]]})
@@ -49,7 +49,11 @@ def interval_plot(rows: Sequence[ParameterResult]) -> Plot | None:
         layout[f"xaxis{number}"] = {"anchor": f"y{number}", "nticks": 6, "zeroline": False, "range": _reach(row)}
     caption = (
         "Every parameter on an axis of its own: the circle is the estimate, the thick bar its 95 % interval"
-        + ("; the thin bar covers its bias too." if told else ".")
+        + (
+            "; the thin bar is its 95 % interval once the bias is taken out, which need not hold the estimate."
+            if told
+            else "."
+        )
         + " A diamond is the initial value, where it is near enough to be shown."
     )
     label = "Intervals of " + ", ".join(row.name for row in drawn) + "; the table above has their numbers."
@@ -60,7 +64,7 @@ def _interval_traces(row: ParameterResult) -> list[dict[str, Any]]:
     """Bars of the intervals, the circle of the estimate, and the diamond of the initial value where it is near."""
     bars = {"95 % interval": (row.ci95, "@model", 7)}
     if row.ci95_with_bias and None not in row.ci95_with_bias:
-        bars = {"95 % interval with the bias": (row.ci95_with_bias, "@bias", 3), **bars}
+        bars = {"95 % interval less the bias": (row.ci95_with_bias, "@bias", 3), **bars}
     found: list[dict[str, Any]] = [
         {"name": name, "x": ends, "y": [0, 0], "mode": "lines", "line": {"color": color, "width": width}}
         for name, (ends, color, width) in bars.items()
@@ -82,7 +86,14 @@ def _tick(row: ParameterResult) -> str:
     """The name of a parameter, and half its interval in per cent of it."""
     low, high = row.ci95 or (None, None)
     half = None if low is None or high is None or not row.value else abs((high - low) / (2 * row.value))
-    return f"<b>{with_unit(row.name, row.unit)}</b>" + ("" if half is None else f"<br>± {percent(half)}")
+    return f"<b>{with_unit(row.name, row.unit or _other_than_1(row))}</b>" + (
+        "" if half is None else f"<br>± {percent(half)}"
+    )
+
+
+def _other_than_1(row: ParameterResult) -> str:
+    """The unit that the channels ask for, where a label has to name it."""
+    return "" if row.derived_unit in (None, "1") else row.derived_unit
 
 
 def _reach(row: ParameterResult) -> list[float]:
@@ -167,8 +178,8 @@ def score_plot(scores: Mapping[str, Mapping[str, PartScores]], outputs: Sequence
     return Plot("NRMSE of every part; the table has the numbers.", caption, traces, layout, height=110 + 30 * count)
 
 
-def residual_plots(test: ResidualTestResult, what: str) -> list[Plot]:
-    """Autocorrelation, correlation with the inputs, and means over the most telling regressor."""
+def residual_plots(test: ResidualTestResult, what: str, units: Mapping[str, str]) -> list[Plot]:
+    """Autocorrelation, correlation with the inputs, and means over the most telling regressor; units by channel."""
     plots = []
     if test.acf is not None and test.acf_band is not None:
         lags = list(range(1, len(test.acf)))
@@ -177,7 +188,7 @@ def residual_plots(test: ResidualTestResult, what: str) -> list[Plot]:
             f"Autocorrelation of the {what} of {test.name}; the band holds 99 % of the values that noise gives."
             f" The largest is {_digits(test.largest_acf)}."
         )
-        layout = _titled("lag [samples]", "autocorrelation") | {"shapes": [_band(test.acf_band)]}
+        layout = _titled("lag [samples]", "autocorrelation") | {"shapes": [_band(test.acf_band)], "showlegend": True}
         plots.append(Plot(f"Autocorrelation of the {what} of {test.name}.", told, [bars], layout, 280, small=True))
     shown = {name: cross for name, cross in test.cross.items() if cross is not None}
     if shown:
@@ -200,26 +211,33 @@ def residual_plots(test: ResidualTestResult, what: str) -> list[Plot]:
         layout["showlegend"] = True
         label = f"Correlation of the {what} of {test.name} with the inputs."
         plots.append(Plot(label, told, traces, layout, 280, small=True))
+    means = _means_plot(test, what, units)
+    return [*plots, means] if means else plots
+
+
+def _means_plot(test: ResidualTestResult, what: str, units: Mapping[str, str]) -> Plot | None:
+    """Means over the regressor that tells most; None where none was looked at."""
     curves = {name: curve for name, curve in test.regressors.items() if curve is not None}
-    if curves:
-        name = max(curves, key=lambda key: curves[key].share or 0.0)
-        curve = curves[name]
-        errors = [None if e is None else 2.576 * e for e in curve.errors]
-        dots = {
-            "x": curve.centres,
-            "y": curve.means,
-            "mode": "markers",
-            "name": "mean",
-            "error_y": {"array": errors, "color": "@learner", "thickness": 1},
-            "marker": {"color": "@learner"},
-        }
-        told = (
-            f"Mean of the {what} of {test.name} over {name} with 99 % intervals: it explains "
-            f"{percent(curve.share)} of its variance."
-        )
-        label = f"Mean of the {what} of {test.name} over {name}."
-        plots.append(Plot(label, told, [dots], _titled(name, f"residual of {test.name}"), 280, small=True))
-    return plots
+    if not curves:
+        return None
+    name = max(curves, key=lambda key: curves[key].share or 0.0)
+    curve = curves[name]
+    errors = [None if e is None else 2.576 * e for e in curve.errors]
+    dots = {
+        "x": curve.centres,
+        "y": curve.means,
+        "mode": "markers",
+        "name": "mean",
+        "error_y": {"array": errors, "color": "@learner", "thickness": 1},
+        "marker": {"color": "@learner"},
+    }
+    told = (
+        f"Mean of the {what} of {test.name} over {name} with 99 % intervals: it explains "
+        f"{percent(curve.share)} of its variance."
+    )
+    label = f"Mean of the {what} of {test.name} over {name}."
+    layout = _titled(_lagged(name, units), _lagged(f"residual of {test.name}", units, test.name))
+    return Plot(label, told, [dots], layout, 280, small=True)
 
 
 def bias_plot(suspects: Sequence[SuspectResult]) -> Plot:
@@ -272,8 +290,11 @@ def restart_plot(restarts: Sequence[RestartResult]) -> Plot | None:
     }
     losses = [run.loss for run in restarts if run.loss]
     wide = bool(losses) and max(losses) > _DECADES * min(losses) > 0
-    layout = _titled("run", "loss") | {"showlegend": False}
-    layout["xaxis"] = {"title": {"text": "run"}, "tickformat": "d", "dtick": 1 + len(restarts) // 12}
+    seeds = [str(run.seed) for run in restarts]
+    names = seeds if len(set(seeds)) == len(seeds) else place
+    layout = _titled("seed" if names is seeds else "seed, regularization", "loss")
+    shown = range(0, len(restarts), 1 + len(restarts) // 12)
+    layout["xaxis"] |= {"tickvals": [i + 1 for i in shown], "ticktext": [names[i] for i in shown]}
     layout["yaxis"] = {"title": {"text": "loss"}, "type": "log" if wide else "linear"}
     caption = "The loss that every start came to; the large dot is the chosen one. "
     caption += "Where several starts end at the same loss, it is hardly a poor minimum."
@@ -308,7 +329,10 @@ def parameter_comparison(rows: Sequence[RowResult]) -> list[Plot]:
             },
         }
         layout = {
-            "xaxis": {"title": {"text": with_unit(parameter.name, parameter.unit)}, "nticks": 6},
+            "xaxis": {
+                "title": {"text": with_unit(parameter.name, parameter.unit or _other_than_1(parameter))},
+                "nticks": 6,
+            },
             "yaxis": {"autorange": "reversed", "automargin": True, "type": "category"},
             "showlegend": False,
         }
@@ -336,7 +360,14 @@ def _band(half: float) -> dict[str, Any]:
         "fillcolor": "@reach",
         "line": {"width": 0},
         "layer": "below",
+        "name": "99 % of what noise gives",
+        "showlegend": True,
     }
+
+
+def _lagged(name: str, units: Mapping[str, str], channel: str | None = None) -> str:
+    """What stands at an axis, with the unit of its channel, or of the lag that it is."""
+    return with_unit(name, units.get(channel or name.partition("[")[0]))
 
 
 def _digits(value: float | None) -> str:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
-from orthaug.reports.page_blocks import Grid, Table, Text, number, percent
+from orthaug.reports.page_blocks import Grid, Table, Text, number, percent, with_unit
 from orthaug.reports.page_figures import bias_plot, residual_plots, restart_plot
 from orthaug.reports.residual_tests import ResidualTestResult
 from orthaug.reports.result import FitResult
 
 
-def residuals_blocks(result: FitResult) -> list[Any]:
-    """What the residuals tell, output by output."""
+def residuals_blocks(result: FitResult, units: Mapping[str, str]) -> list[Any]:
+    """What the residuals tell, output by output; units by channel."""
     blocks: list[Any] = []
     found = result.residuals
     if found is None:
@@ -20,20 +21,27 @@ def residuals_blocks(result: FitResult) -> list[Any]:
     else:
         blocks.append(Text(found.text))
         tests = [("one-step residual", found.one_step), ("error of the free run", found.free_run or [])]
-        rows = [_test_cells(what, test) for what, group in tests for test in group]
+        rows = [_test_cells(what, test, units) for what, group in tests for test in group]
         head = ["residual", "RMS", "mean", "white", "Ljung-Box p", "largest autocorrelation", "follows", "curved over"]
         blocks.append(
-            Table("Tests of the residuals on the training data, at the levels that the result tells.", head, rows)
+            Table(
+                "Tests of the residuals on the training data, at the levels that the result tells; RMS and mean are in "
+                "the output's unit.",
+                head,
+                rows,
+            )
         )
-        blocks += [Grid(plots) for what, group in tests for test in group if (plots := residual_plots(test, what))]
+        blocks += [
+            Grid(plots) for what, group in tests for test in group if (plots := residual_plots(test, what, units))
+        ]
     blocks += [Text(result.missing_lags.text)] if result.missing_lags else []
     return blocks
 
 
-def _test_cells(what: str, test: ResidualTestResult) -> list[str]:
+def _test_cells(what: str, test: ResidualTestResult, units: Mapping[str, str]) -> list[str]:
     white = {True: "yes", False: "no", None: "–"}[test.white]
     return [
-        f"{what} of {test.name}",
+        f"{what} of {with_unit(test.name, units.get(test.name))}",
         number(test.rms, 3),
         number(test.mean, 2, test.rms),
         white,
@@ -67,9 +75,15 @@ def stability_blocks(result: FitResult) -> list[Any]:
         told.append(["rate of the best norm", number(found.contraction.rate, 4)])
     if found.modes:
         m = found.modes
+        slow, fast = number(m.slowest, 3), number(m.fastest, 3)
+        modes = (
+            ["modes [1/s]", f"all at {slow}"]
+            if slow == fast
+            else ["slowest and fastest mode [1/s]", f"{slow} and {fast}"]
+        )
         told += [
             ["rightmost eigenvalue, real part [1/s]", number(m.rightmost, 4, m.fastest)],
-            ["slowest and fastest mode [1/s]", f"{number(m.slowest, 3)} and {number(m.fastest, 3)}"],
+            modes,
             *([["integrators, which are not among these", str(m.integrators)]] if m.integrators else []),
             ["points with a growing mode", percent(m.growing)],
         ]

@@ -10,7 +10,18 @@ import numpy as np
 
 from orthaug.models.response import Response
 from orthaug.reports.learned_part import LearnedPart
-from orthaug.reports.page_blocks import Code, Plot, Section, Table, Text, interval, number, percent
+from orthaug.reports.page_blocks import (
+    Code,
+    Plot,
+    Section,
+    Table,
+    Text,
+    digits_for,
+    interval,
+    number,
+    percent,
+    with_unit,
+)
 from orthaug.reports.page_figures import interval_plot, score_plot
 from orthaug.reports.page_findings import excitation_blocks, residuals_blocks, restarts_blocks, stability_blocks
 from orthaug.reports.page_learned import learned_blocks
@@ -40,7 +51,7 @@ class FitPage:
     responses: Mapping[str, tuple[Response, Response]]
     """One-step prediction and free run of every part."""
     alone: Mapping[str, Response] = field(default_factory=dict)
-    """Free run of the physics without the learner, of every part; empty where nothing was learned."""
+    """Free run of the model without its learner, of every part; empty where nothing was learned."""
     learned: LearnedPart | None = None
 
     @property
@@ -49,8 +60,22 @@ class FitPage:
         return tuple(channel.name for _, free in self.responses.values() for channel in free.outputs)[: self._count]
 
     @property
+    def units(self) -> dict[str, str]:
+        """Of channels and states, by name."""
+        return units_of_result(self.result) | {
+            c.name: c.unit for _, free in self.responses.values() for c in free.outputs
+        }
+
+    @property
     def _count(self) -> int:
         return len(next(iter(self.responses.values()))[1].outputs)
+
+
+def units_of_result(result: FitResult | CompareResult) -> dict[str, str]:
+    """Of channels and states by name, as the spec declares them."""
+    states = (result.spec.get("motion") or {}).get("states") or {}
+    channels = (result.spec.get("data") or {}).get("channels") or {}
+    return {name: given.get("unit") or "" for name, given in {**states, **channels}.items()}
 
 
 def fit_sections(page: FitPage) -> list[Section]:
@@ -61,11 +86,11 @@ def fit_sections(page: FitPage) -> list[Section]:
         Section("free-run", "Free run", _runs(page)),
         Section("share", "Physics and learner", _shares(page)),
         Section("learned", "What was learned", _learned(page)),
-        Section("residuals", "Residual tests", residuals_blocks(result)),
+        Section("residuals", "Residual tests", residuals_blocks(result, page.units)),
         Section("stability", "Stability", stability_blocks(result)),
         Section("excitation", "Excitation and suspects", excitation_blocks(result)),
         Section("restarts", "Training and restarts", restarts_blocks(result)),
-        Section("scores", "Scores", score_blocks({"": result.scores}, page.outputs)),
+        Section("scores", "Scores", score_blocks({"": result.scores}, page.outputs, page.units)),
         Section("reproduce", "How to reproduce it", origin_blocks(page.origin, result)),
     ]
     return [section for section in found if section.blocks]
@@ -86,14 +111,22 @@ def _parameters(result: FitResult) -> list[Any]:
     shared = any(row.shared is not None for row in rows)
     columns += ["learner could imitate it"] if shared else []
     caption = f"What was estimated. {told[result.standard_errors]}"
+    if any(row.derived_unit for row in rows):
+        caption += " A unit in brackets is not the spec's: the channels' units ask for it."
     if biased:
-        caption += " The bias is estimate less truth, as far as one suspected term explains what the learner found."
+        caption += " The bias is estimate less truth, as far as one suspected term explains what the learner found;"
+        caption += " the interval with it is that of the estimate less its bias."
     blocks: list[Any] = [Table(caption, columns, [_parameter_cells(row, biased, shared) for row in rows])]
     plot = interval_plot(rows)
     blocks += [plot] if plot else []
     cause = next((row.bias for row in rows if row.bias), None)
     if cause is not None:
-        blocks.append(Text(f"The bias budget: {percent(cause.share)} of what the learner found is {cause.cause}."))
+        blocks.append(
+            Text(
+                f"The bias budget: {percent(cause.share)} of what the learner found is {cause.cause}, once what the "
+                "physics can imitate is taken out of both; what is drawn over one input alone may tell less."
+            )
+        )
     if result.physical_consistency:
         blocks.append(Text(result.physical_consistency.text))
     if result.shared is not None:
@@ -101,12 +134,17 @@ def _parameters(result: FitResult) -> list[Any]:
     return blocks + _equations(result)
 
 
+def unit_cell(row: ParameterResult) -> str:
+    """The unit of the spec, or in brackets the one that follows from those of the channels."""
+    return row.unit or (f"({row.derived_unit})" if row.derived_unit else "–")
+
+
 def _parameter_cells(row: ParameterResult, biased: bool, shared: bool) -> list[str]:
     scale = row.value
     cells = [
         row.name,
-        number(row.value, 6),
-        row.unit or "–",
+        number(row.value, digits_for(row.value, row.std, 6)),
+        unit_cell(row),
         number(row.std, 2, scale),
         interval(row.ci95),
         number(row.initial),
@@ -165,7 +203,9 @@ def _runs(page: FitPage) -> list[Any]:
     notes = [Text(w.text, "warning") for w in page.result.warnings if w.code in ("witness", "free_run_diverged")]
     band, alone = error_band(train), bool(page.alone)
     told = "A model in free run sees the inputs alone and lives on its own past; the residual is measured less model."
-    told += " Physics alone is the same model with the learner switched off." if alone else ""
+    if alone:
+        told += " The model without its learner has the same parameters and the learner switched off; it is not the"
+        told += " physics alone of the verdict, which is fitted by itself."
     told += " Between the limits of the band lie 95 % of the errors on the training data." if band else ""
     how = Text(
         "Drag over a stretch to zoom, double-click for the whole record; with the keyboard the arrows move, "
@@ -244,7 +284,9 @@ def _learned(page: FitPage) -> list[Any]:
     return list(learned_blocks(page.learned, page.result.measure or ""))
 
 
-def score_blocks(scores: Mapping[str, Mapping[str, PartScores]], outputs: Sequence[str]) -> list[Any]:
+def score_blocks(
+    scores: Mapping[str, Mapping[str, PartScores]], outputs: Sequence[str], units: Mapping[str, str]
+) -> list[Any]:
     """Scores as a plot and a table; of one model, or of several by their names."""
     rows = []
     named = any(scores)
@@ -259,7 +301,7 @@ def score_blocks(scores: Mapping[str, Mapping[str, PartScores]], outputs: Sequen
                             *([row] if named else []),
                             part,
                             horizon,
-                            output,
+                            with_unit(output, units.get(output)),
                             number(cells[0], 4),
                             number(cells[1], 4),
                             number(cells[2], 4),

@@ -38,10 +38,14 @@ def _told(part: LearnedPart, ranked: list[str], shares: Any, measure: str) -> st
     explained = shares.max(axis=1)
     told = f"The learner sees {', '.join(part.features)}, and adds to {', '.join(part.names)}"
     told += f" what the {measure} measure does not give to the physics" if measure else ""
-    told += ". The curves show what it adds over each input, the one that explains most of its variance first."
+    if len(ranked) == 1:
+        return f"{told}. The curve shows what it adds over that input."
+    told += ". The curves show what it adds over each input, the one first that tells most: the share of its variance"
+    told += " that its means over bins of the input have."
     idle = [name for name in ranked[1:] if explained[part.features.index(name)] < _LEVEL]
     if idle:
-        told += f" By themselves {', '.join(idle)} explain next to nothing of it."
+        itself, tells = ("itself", "tells") if len(idle) == 1 else ("themselves", "tell")
+        told += f" By {itself} {', '.join(idle)} {tells} next to nothing of it."
     return told
 
 
@@ -61,14 +65,15 @@ def _curve_plot(part: LearnedPart, k: int, feature: str, share: float) -> Plot:
     ]
     layout: dict[str, Any] = {"xaxis": {"title": {"text": axis}}, "yaxis": {"title": {"text": name}}, "shapes": []}
     curve = None if part.tied(feature) else part.curve(feature)
-    told = f"Over {feature}, which explains {percent(share)}"
+    told, one = f"Over {feature}", len(part.features) == 1
     if curve is not None:
         traces += _curve_traces(curve, k)
         layout["yaxis"]["range"] = list(curve_limits(curve.learned[:, k], cloud[1]))
         reach = curve.along[curve.inside]
         layout["shapes"].append(_stripe(float(reach[0]), float(reach[-1])))
-        told += ", all else at its median: solid where the data reach, dashed beyond"
-        told += "; the band is its 95 % interval." if curve.half is not None else "."
+        told += (", the one input of the learner" if one else ", all else at its median") + ": solid within the shaded"
+        told += " reach of the data, dashed beyond; the dots are what it adds along the training data"
+        told += ", and the band is its 95 % interval." if curve.half is not None else "."
     else:
         centres, means = part.means(feature)
         traces.append(
@@ -82,6 +87,7 @@ def _curve_plot(part: LearnedPart, k: int, feature: str, share: float) -> Plot:
             }
         )
         told += ": the mean along the training data, on which other inputs move with it."
+    told += "" if one else f" Its means over {feature} have {percent(share)} of its variance."
     return Plot(f"Learned part of {name} over {feature}.", told, traces, layout, height=300, small=True)
 
 
@@ -135,6 +141,8 @@ def _stripe(low: float, high: float) -> dict[str, Any]:
         "fillcolor": "@reach",
         "line": {"width": 0},
         "layer": "below",
+        "name": "reach of the data",
+        "showlegend": True,
     }
 
 
@@ -153,7 +161,7 @@ def _surface_plot(part: LearnedPart, k: int, across: str, along: str) -> Plot:
         "zmin": -reach,
         "zmax": reach,
         "colorscale": "@diverging",
-        "colorbar": {"title": {"text": part.names[k], "side": "right"}, "thickness": 14},
+        "colorbar": {"title": {"text": part.names[k], "side": "top"}, "thickness": 14},
     }
     few = np.linspace(0, len(part.seen) - 1, min(len(part.seen), _CLOUD)).astype(int)
     points = {

@@ -13,21 +13,23 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug.data.record import Channel
 from orthaug.models.response import Response, Trajectory
+from orthaug.reports.clipping import Left, curves_left, frame_of, marker_of, told_left
 from orthaug.reports.page_blocks import Plot, number, percent, with_unit
 
 MOST_POINTS = 100_000  # of a curve
 _BUDGET = 560_000  # points of a page: three million letters
-_FAR = 3.0  # times the measured range: a model that leaves it is cut off at the edge of the panel
 _UPPER, _GAP = 0.64, 0.05  # share of a pair of panels that is the upper one, and what lies between panels
 _PANEL = 330  # pixels of a pair of panels
 _DASHES = ("dash", "solid", "dot", "dashdot")
 _MOST_BREAKS = 40  # between experiments that are marked
+WITHOUT = "model without its learner"  # its name where it is drawn: the physics that is fitted by itself is another
 
 
 @dataclass(frozen=True)
 class Run:
-    """A free run on a part; `alone` that of the physics without the learner, None where nothing was learned."""
+    """A free run on a part; `alone` that of the model without its learner, None where nothing was learned."""
 
     part: str
     response: Response
@@ -35,7 +37,7 @@ class Run:
 
 
 def run_plots(runs: Sequence[Run], band: Mapping[str, tuple[float, float]]) -> list[Plot]:
-    """A plot for every part: measured, model, physics alone, and the residual.
+    """A plot for every part: measured, model, the model without its learner, and the residual.
 
     Args:
         band: of each output the two limits between which 95 % of the errors on the training data lie.
@@ -65,6 +67,7 @@ def _compared(part: str, runs: Mapping[str, Response], most: int) -> Plot:
     known = None if any(m is None for m in measured) else joined(first, measured)
     series: dict[str, Any] = {}
     models = {name: joined(run, [t.model for t in run.trajectories]) for name, run in runs.items()}
+    left: list[Left] = []
     for i, channel in enumerate(first.outputs):
         own = {"yaxis": f"y{2 * i + 1}", "showlegend": i == 0}
         if known is not None:
@@ -83,8 +86,9 @@ def _compared(part: str, runs: Mapping[str, Response], most: int) -> Plot:
             if known is not None:
                 residual = _residual(series, f"measured {i}", key, known[:, i] - models[name][:, i], most)
                 traces.append({**given, **residual, "yaxis": f"y{2 * i + 2}", "showlegend": False})
-        ranges = [_range(known, model, i) for model in models.values()]
-        layout |= _axes(i, panels, with_unit(channel.name, channel.unit), next((r for r in ranges if r), None))
+        limits = frame_of(known, list(models.values()), i)
+        left += curves_left({name: model[:, i] for name, model in models.items()}, limits, channel, start, step)
+        layout |= _axes(i, panels, channel, limits)
     rows = len(next(iter(models.values())))
     layout["xaxis"] = {
         "title": {"text": "time [s]"},
@@ -97,6 +101,8 @@ def _compared(part: str, runs: Mapping[str, Response], most: int) -> Plot:
         "each leaves of the measured output under them."
     )
     caption += f" The run of {', '.join(lost)} diverges." if lost else ""
+    caption += told_left(left)
+    traces += [marker_of(one, first.outputs) for one in left]
     label = f"Free runs of every model on {part}, with their residuals below."
     return Plot(label, caption, traces, layout, 60 + _PANEL * len(first.outputs), series=series)
 
@@ -165,6 +171,7 @@ def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
     layout: dict[str, Any] = {"shapes": [], "annotations": []}
     panels = 2 * len(response.outputs)
     series: dict[str, Any] = {}
+    left: list[Left] = []
     for i, channel in enumerate(response.outputs):
         curves = {"measured": known, "physics": alone, "model": model}
         series |= {f"{k} {i}": packed(v[:, i], start, step, most) for k, v in curves.items() if v is not None}
@@ -178,7 +185,10 @@ def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
             )
             if limits is not None:
                 layout["shapes"].append(_stripe(limits, 2 * i + 2))
-        layout |= _axes(i, panels, with_unit(channel.name, channel.unit), _range(known, model, i))
+        drawn = {"the model": model} | ({} if alone is None else {f"the {WITHOUT}": alone})
+        frame = frame_of(known, list(drawn.values()), i)
+        left += curves_left({name: curve[:, i] for name, curve in drawn.items()}, frame, channel, start, step)
+        layout |= _axes(i, panels, channel, frame)
     end = start + step * (len(model) - 1)
     layout["xaxis"] = {
         "title": {"text": "time [s]" if not several else "time, experiments one after another [s]"},
@@ -188,8 +198,8 @@ def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
     _mark(layout, run, start, step)
     return Plot(
         _label(run),
-        _caption(run, most),
-        traces,
+        _caption(run, most) + told_left(left),
+        [*traces, *(marker_of(one, response.outputs) for one in left)],
         layout,
         60 + _PANEL * len(response.outputs),
         series=series,
@@ -205,7 +215,7 @@ def _residual(series: dict[str, Any], measured: str, model: str, residual: Vecto
 
 
 def _upper(curves: Sequence[str], i: int, limits: tuple[float, float] | None) -> list[dict]:
-    """Measured, band, physics alone and model of output number i; the legend tells of the first output's."""
+    """Measured, band, the model without its learner and with it, of output i; the legend tells of the first."""
     found = []
     if "measured" in curves:
         line = {"color": "@measured", "width": 3}
@@ -217,35 +227,25 @@ def _upper(curves: Sequence[str], i: int, limits: tuple[float, float] | None) ->
         found.append({**edge, **fill, "edge": "max", "plus": limits[1], "name": "95 % band"})
     if "physics" in curves:
         line = {"color": "@physics", "width": 1.3, "dash": "dash"}
-        found.append({"series": f"physics {i}", "name": "physics alone", "line": line})
+        found.append({"series": f"physics {i}", "name": WITHOUT, "line": line})
     found.append({"series": f"model {i}", "name": "model", "line": {"color": "@model", "width": 1.3}})
     own = {"yaxis": f"y{2 * i + 1}", "showlegend": i == 0}
     return [{**own, "legendgroup": trace["name"], **trace} for trace in found]
 
 
-def _axes(i: int, panels: int, title: str, limits: list[float] | None) -> dict[str, Any]:
+def _axes(i: int, panels: int, channel: Channel, limits: list[float] | None) -> dict[str, Any]:
     """The two panels of an output from the top down, on the x axis that all share."""
     high = 2 / panels
     top = 1 - i * high
     middle = top - (high - _GAP) * _UPPER
     bottom = top - high + (_GAP if i + 1 < panels // 2 else 0)
+    title = with_unit(channel.name, channel.unit)
     upper = {"title": {"text": title}, "domain": [middle, top]} | ({"range": limits} if limits else {})
-    lower = {"title": {"text": "residual"}, "domain": [max(bottom, 0), middle - _GAP / 2]}
-    return {
-        f"yaxis{2 * i + 1}".replace("yaxis1", "yaxis") if i == 0 else f"yaxis{2 * i + 1}": upper,
-        f"yaxis{2 * i + 2}": lower,
+    lower = {
+        "title": {"text": with_unit("residual", channel.unit)},
+        "domain": [max(bottom, 0), middle - _GAP / 2],
     }
-
-
-def _range(measured: Matrix | None, model: Matrix, i: int) -> list[float] | None:
-    """What the upper panel shows where the model leaves what was measured by far; None for all of it."""
-    if measured is None:
-        return None
-    low, high = float(np.nanmin(measured[:, i])), float(np.nanmax(measured[:, i]))
-    width, inside = max(high - low, 1e-300), model[:, i][np.isfinite(model[:, i])]
-    if not len(inside) or (inside.min() > low - _FAR * width and inside.max() < high + _FAR * width):
-        return None
-    return [low - width, high + width]
+    return {f"yaxis{2 * i + 1}" if i else "yaxis": upper, f"yaxis{2 * i + 2}": lower}
 
 
 def _stripe(limits: tuple[float, float], axis: int) -> dict[str, Any]:
@@ -269,7 +269,7 @@ def _mark(layout: dict[str, Any], run: Run, start: float, step: float) -> None:
     for i, trajectory in enumerate(run.response.trajectories):
         if i and breaks:
             layout["shapes"].append(_line(start + step * (row - 0.5), "@grid", "dot"))
-        for name, told in (("free run", trajectory), ("physics alone", _of(run.alone, i))):
+        for name, told in (("free run", trajectory), (f"the {WITHOUT}", _of(run.alone, i))):
             if told is not None and told.diverged:
                 at = start + step * (row + told.diverged[0])
                 layout["shapes"].append(_line(at, "@bad", "solid"))
@@ -308,7 +308,7 @@ def _line(x: float, color: str, dash: str) -> dict[str, Any]:
 
 def _label(run: Run) -> str:
     outputs = ", ".join(channel.name for channel in run.response.outputs)
-    shown = "measured, physics alone and model" if run.alone is not None else "measured and model"
+    shown = f"measured, model and {WITHOUT}" if run.alone is not None else "measured and model"
     return f"Free run on {run.part}: {outputs} over time, {shown}, with the residual below."
 
 

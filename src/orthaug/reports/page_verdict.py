@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from orthaug.analysis.budget import SURE_SHARE
 from orthaug.analysis.changes import Change
 from orthaug.reports.page_blocks import number, percent
-from orthaug.reports.result import CompareResult, FitResult, ParameterResult, PartScores, RowResult
+from orthaug.reports.result import (
+    BiasResult,
+    CompareResult,
+    DataResult,
+    FitResult,
+    ParameterResult,
+    PartScores,
+    RowResult,
+)
 
 _GOOD, _POOR = 0.2, 0.5  # NRMSE of a free run up to which it is close, and from which it is far
 _ALIKE = 1.1  # ratio of errors up to which models are told to be as good as each other
 _SURE = 0.1  # standard error over value up to which a parameter is told to be known
+_NAMED = 0.5  # share of what was learned from which its cause is what to do first
+_MOST_DOUBTS = 3  # that are told in the first sentence
+_WORSE = 1.5  # times the error on the training data: a Gaussian error then leaves the 95 % band on a fifth of the rows
 _STOPPED = ("iteration_limit", "no_descent")
 _RAN_AWAY = ("free_run_diverged",)
+_TIED = ("orthogonal", "physics alone")  # of models that are as good as each other these are taken first
 
 
 class PageVerdict(NamedTuple):
@@ -34,7 +47,7 @@ class PageVerdict(NamedTuple):
 
 def fit_verdict(result: FitResult) -> PageVerdict:
     """Of a fit, from its own findings."""
-    doubts = list(_doubts(result))
+    doubts = list(_doubts(result, result.data))
     error, part = _worst(result.scores)
     bad = _ran_away(result) or (error is not None and error > _POOR) or _code(result) == "hurts"
     level = "bad" if bad else "care" if doubts else "good"
@@ -44,7 +57,7 @@ def fit_verdict(result: FitResult) -> PageVerdict:
         "bad": "Do not trust the model as it is",
     }[level]
     shown = "" if error is None else f": {_told_error(error, part)}"
-    because = f"{', but ' if level == 'care' else '; '}{_joined(doubts[:3])}" if doubts else ""
+    because = f"{', but ' if level == 'care' else '; '}{_joined(doubts[:_MOST_DOUBTS])}" if doubts else ""
     return PageVerdict(level, f"{opening}{shown}{because}.", _use(result, level), _then(result))
 
 
@@ -59,14 +72,23 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
             "Look at the warnings below, and fit again.",
         )
     errors = {row.name: _worst(row.scores)[0] or 0.0 for row in rows}
-    best = result.chosen or min(errors, key=errors.__getitem__)
+    best = result.chosen or _taken(rows, errors)
     row = next(row for row in result.comparison if row.name == best)
     error, part = _worst(row.scores)
+    doubts = list(_doubts(row, result.data))
     level = "good" if error is not None and error <= _GOOD else "care" if error is None or error <= _POOR else "bad"
+    level = "care" if level == "good" and doubts else level
     near = [name for name in errors if name != best and errors[name] <= _ALIKE * (error or 0.0)]
+    same = [name for name in near if percent(errors[name]) == percent(errors[best])]
+    near = [name for name in near if name not in same]
+    least = all(errors[best] <= other for name, other in errors.items() if name not in same)
+    less = f", as {'does' if len(same) == 1 else 'do'} {_quoted(same)}" if same else ""
+    less += (", and no other leaves less" if same else ", less than of any other") if least else ""
     how = f"it has the lowest error on the validation part, and {_told_error(error or 0.0, part)}"
-    trust = f"Take “{best}”: {how if result.chosen else _told_error(error or 0.0, part) + ', less than of any other'}"
-    trust += f"; {_joined([f'“{name}”' for name in near])} {_is(near)} as good within 10 %." if near else "."
+    trust = f"Take “{best}”: {how if result.chosen else _told_error(error or 0.0, part) + less}"
+    trust += f"; {_quoted(near)} {_is(near)} as good within 10 %." if near else "."
+    if doubts:
+        trust = f"{trust[:-1]}. But {_joined(doubts[:_MOST_DOUBTS])}."
     alone = errors.get("physics alone")
     use = "It is the physics alone: no learner earns its place beside it."
     if best != "physics alone" and alone is not None and error is not None:
@@ -74,6 +96,14 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
         use = f"Its error on {part} is {number(learns, 2)} of that of physics alone ({percent(alone)})"
         use += f", and its learner {_word(row)}." if row.validation else "."
     return PageVerdict(level, trust, use, _after_comparison(result, row))
+
+
+def _taken(rows: Sequence[RowResult], errors: Mapping[str, float]) -> str:
+    """The model of the lowest error; of such that are as good, one whose θ means something."""
+    best = min(errors, key=errors.__getitem__)
+    earns = [row.name for row in rows if row.validation is None or row.validation.verdict == "helps"]
+    tied = [name for name in _TIED if name in earns and errors[name] <= _ALIKE * errors[best]]
+    return next(iter(tied), best)
 
 
 def _after_comparison(result: CompareResult, row: RowResult) -> str:
@@ -92,58 +122,97 @@ def _word(row: RowResult) -> str:
 
 
 def _told_error(error: float, part: str) -> str:
-    which = "on the training data" if part == "train" else f"on {part}"
-    return f"{which} its free run leaves {percent(error)} of the output's deviation"
+    return f"{_on(part)} its free run leaves {percent(error)} of the output's deviation"
 
 
-def _worst(scores: dict[str, PartScores]) -> tuple[float | None, str]:
-    """NRMSE of the free run on the held-out part where it is largest, RMS over outputs; of training if none is."""
+def _on(part: str) -> str:
+    return "on the training data" if part == "train" else f"on {part}"
+
+
+def _worse(scores: dict[str, PartScores]) -> tuple[float, str] | None:
+    """How many times as large as in training the free run's error on a held-out part is, where that is a lot."""
+    found = {}
+    trained = scores["train"].simulation.rmse if "train" in scores else None
+    for part, score in scores.items():
+        held = score.simulation.rmse
+        if part != "train" and trained and held:
+            ratios = [h / t for h, t in zip(held, trained, strict=True) if h is not None and t]
+            found[part] = max(ratios, default=0.0)
+    part = max(found, key=found.__getitem__) if found else ""
+    return (found[part], part) if found and found[part] > _WORSE else None
+
+
+def _worst(scores: dict[str, PartScores], kind: str = "simulation") -> tuple[float | None, str]:
+    """NRMSE of the free run on the held-out part where it is largest, RMS over outputs; of training if none is.
+
+    Args:
+        kind: `prediction` for that of one step ahead.
+    """
     held_out = {part: score for part, score in scores.items() if part != "train"} or scores
     found = {}
     for part, score in held_out.items():
-        values = score.simulation.nrmse
+        values = score.kinds[kind].nrmse
         if values is not None and None not in values:
             found[part] = float(np.sqrt(np.mean(np.square(np.array(values, dtype=float)))))
     part = max(found, key=found.__getitem__) if found else ""
     return (found[part], part) if found else (None, "")
 
 
-def _code(result: FitResult) -> str | None:
-    return None if result.validation is None else result.validation.verdict
+def _code(result: FitResult | RowResult) -> str | None:
+    """The verdict on the learner; None without one, and where the model is the physics alone that was taken for it."""
+    return None if result.validation is None or _warned(result, "physics_alone") else result.validation.verdict
+
+
+def _warned(result: FitResult | RowResult, *codes: str) -> bool:
+    return any(warning.code in codes for warning in result.warnings)
 
 
 def _ran_away(result: FitResult) -> bool:
-    return any(warning.code in _RAN_AWAY for warning in result.warnings)
+    return _warned(result, *_RAN_AWAY)
 
 
-def _doubts(result: FitResult) -> Iterator[str]:
+def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
     """What speaks against the model, the gravest first."""
     runaway = [w.text.split(":")[0] for w in result.warnings if w.code in _RAN_AWAY]
     if runaway:
         yield f"its free run diverges on {_joined(runaway)}"
     if _code(result) == "hurts":
         yield "its learner makes the free run worse than physics alone"
-    if not result.data.tests and not result.data.validation and not (result.validation and result.validation.trials):
+    if not data.tests and not data.validation and not (result.validation and result.validation.trials):
         yield "it was never tried on data that it was not fitted to"
-    if result.status.code in _STOPPED:
+    if (result.status if isinstance(result, RowResult) else result.status.code) in _STOPPED:
         yield "training stopped before it converged"
+    if _warned(result, "spectral_radius_above_one"):
+        yield "it is not proved stable, for its local spectral radius is above 1 on a part of its free run"
     biased = [row.name for row in _rows(result) if _biased(row)]
     if biased:
         one = len(biased) == 1
         carry = "carries a bias larger than its standard error" if one else "carry biases larger than their errors"
+        guessed = any(row.bias and (row.bias.share or 0.0) < SURE_SHARE for row in _rows(result) if _biased(row))
+        carry = f"probably {carry}" if guessed and getattr(result, "motion", None) is None else carry
         yield f"the estimate{'' if one else 's'} of {_joined(biased)} {carry}"
     if result.residuals is not None and result.residuals.verdict in ("unmodelled", "sensor_noise"):
+        coarse = list(result.residuals.steps or {})
         yield {
-            "unmodelled": "its residual is not noise alone",
+            "unmodelled": f"its one-step residual has the size of the steps of {_joined(coarse)}"
+            if coarse
+            else "its residual is not noise alone",
             "sensor_noise": "noise on the measured output biases its one-step estimates",
         }[result.residuals.verdict]
+    if _warned(result, "closed_loop"):
+        yield "its data look recorded under feedback, which biases it"
+    worse = _worse(result.scores)
+    if worse is not None:
+        times = number(worse[0], 2)
+        yield f"its error on {worse[1]} is {times} times that on the training data, so the band is too narrow"
     if result.validation is not None and result.validation.extrapolation:
         left = dict.fromkeys(entry.part for entry in result.validation.extrapolation)
         yield f"{_joined(list(left))} {'leaves' if len(left) == 1 else 'leave'} the range of the training data"
 
 
-def _rows(result: FitResult) -> list[ParameterResult]:
-    return [*result.parameters, *(result.physical_parameters or [])]
+def _rows(result: FitResult | RowResult) -> list[ParameterResult]:
+    physical = None if isinstance(result, RowResult) else result.physical_parameters
+    return [*result.parameters, *(physical or [])]
 
 
 def _biased(row: ParameterResult) -> bool:
@@ -152,24 +221,47 @@ def _biased(row: ParameterResult) -> bool:
 
 def _use(result: FitResult, level: str) -> str:
     rows = _rows(result)
-    known = [row.name for row in rows if _known(row)]
+    sure = [row.name for row in rows if _known(row)]
+    known = sure if _noise_alone(result) else []
     shared = [row.name for row in rows if row.shared]
-    others = [row.name for row in rows if row.name not in (*known, *shared)]
-    if level == "bad" and not known:
+    others = [row.name for row in rows if row.name not in (*sure, *shared)]
+    ahead, part = _worst(result.scores, "prediction")
+    predicts = ahead is not None and ahead <= (_GOOD if level == "bad" else _POOR)
+    if level == "bad" and ahead is not None and ahead > _POOR:
+        return (
+            "Use it for nothing but to look for what is missing: not even its prediction of the next sample holds, "
+            f"which leaves {percent(ahead)} of the output's deviation {_on(part)}."
+        )
+    if level == "bad" and not (known and predicts):
         return "Use it for nothing but to look for what is missing."
-    told = "predict the next sample" if level == "bad" else "simulate and predict within the range of its training data"
+    if level == "bad":
+        told = "predict the next sample"
+    else:
+        told = f"simulate{' and predict' if predicts else ''} within the range of its training data"
     told += f" and to read {_joined(known)} as physics" if known else ""
-    told += f"; {_joined(others)} {_is(others)} too uncertain or biased for that" if others else ""
+    if sure and not known:
+        cover = "interval does" if len(sure) == 1 else "intervals do"
+        told += f", but do not read {_joined(sure)} as physics yet: the {cover} not cover what the residual still holds"
+    told += f"; {_joined(others)} {_is(others)} too uncertain or biased to be read so" if others else ""
     if shared:
         told += f"; {_joined(shared)} {_is(shared)} what the physics nearest to the data has, for the learner could"
         told += f" imitate {'it' if len(shared) == 1 else 'them'}"
     return f"Use it to {told}."
 
 
+def _noise_alone(result: FitResult) -> bool:
+    """Whether the residual shows nothing that would bias the parameters."""
+    return result.residuals is None or result.residuals.verdict not in ("unmodelled", "sensor_noise")
+
+
 def _known(row: ParameterResult) -> bool:
     """Whether a parameter may be read as physics."""
     sure = row.std is not None and row.value is not None and 0 < row.std <= _SURE * abs(row.value)
     return sure and not row.shared and not _biased(row)
+
+
+def _quoted(names: list[str]) -> str:
+    return _joined([f"“{name}”" for name in names])
 
 
 def _is(names: list[str]) -> str:
@@ -185,10 +277,14 @@ def _then(result: FitResult) -> str:
         return 'Take physics alone (`learner.kind = "none"`), or give the learner other inputs or fewer neurons.'
     if missing and significant:
         return f"Add {missing[0].expression} to the equation of {missing[0].equation}."
-    if result.residuals is not None and result.residuals.changes:
-        return f"{_change(result.residuals.changes[0])}."
+    if cause is not None and (cause.share or 0.0) > _NAMED:
+        return _advised(cause, result.motion is not None)
+    tried = result.validation is not None and _code(result) != "helps"
+    changes = [c for c in result.residuals.changes if c.kind != "learner" or not tried] if result.residuals else []
+    if changes:
+        return f"{_change(changes[0])}."
     if cause is not None:
-        return f"Add “{cause.cause}” to the physics, for it explains {percent(cause.share)} of what was learned."
+        return _advised(cause, result.motion is not None)
     if _ran_away(result):
         return 'Train on the free run (`focus = "simulation"`), or record data over the range that it leaves.'
     if not result.data.tests and not result.data.validation:
@@ -199,7 +295,33 @@ def _then(result: FitResult) -> str:
         entry = result.validation.extrapolation[0]
         low, high = entry.found
         return f"Record training data that reach {entry.regressor} from {number(low, 3)} to {number(high, 3)}."
+    if _warned(result, "closed_loop"):
+        return "Record the reference and model the whole loop, move it more, or record without the controller."
+    if _undecided(result):
+        return "Keep the learner (`training.fallback = false`) and look: cross-validation leaves undecided if it helps."
+    if result.residuals is not None and result.residuals.steps:
+        told = 'Train on the free run (`focus = "simulation"`), take fewer samples, or measure more finely'
+        return f"{told}: {_joined(list(result.residuals.steps))} has steps as large as the one-step residual."
+    if not _noise_alone(result):
+        return "Look at what the residual still follows (residual tests), and give the physics or a learner that."
+    if _worse(result.scores) is not None:
+        return f"Find what is different on {(_worse(result.scores) or ('', ''))[1]}, or train on more data of its kind."
     return "Nothing further is predicted to help; export it (`orthaug export`) or design the next experiment."
+
+
+def _advised(cause: BiasResult, moves: bool) -> str:
+    """What to do about a cause of what was learned."""
+    share = percent(cause.share)
+    if (cause.share or 0.0) < SURE_SHARE and not moves:
+        return f"Try “{cause.cause}” in the physics: what was learned looks most like it ({share} of it)."
+    return f"Add “{cause.cause}” to the physics, for it explains {share} of what was learned."
+
+
+def _undecided(result: FitResult) -> bool:
+    """Whether physics alone was handed over although the learner may help."""
+    fell_back = any(warning.code == "physics_alone" for warning in result.warnings)
+    ratio = None if result.validation is None else result.validation.ratio
+    return fell_back and ratio is not None and (ratio.value or 1.0) < 1 < (ratio.high or 0.0)
 
 
 def _change(change: object) -> str:

@@ -107,10 +107,12 @@ class BiasResult(Content):
 class ParameterResult(Content):
     """A parameter with its interval."""
 
-    absent: ClassVar = frozenset({"one_step", "profile95", "plain_std", "shared"})
+    absent: ClassVar = frozenset({"derived_unit", "one_step", "profile95", "plain_std", "shared"})
 
     name: str
     unit: str
+    derived_unit: str | None = None
+    """What the channels' units ask for, where the spec gives none."""
     initial: Number
     value: Number
     one_step: Number = None

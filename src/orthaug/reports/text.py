@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from orthaug._base.lines import fold, percent, table
+from orthaug.analysis.budget import SURE_SHARE
 from orthaug.reports.fields import WarningResult
 from orthaug.reports.findings import SharedResult, SuspectResult
 from orthaug.reports.result import (
@@ -187,6 +188,8 @@ def _bias_lines(result: FitResult) -> list[str]:
     cause, share, width = rows[0].bias.cause, rows[0].bias.share or 0.0, _width(rows)
     what = "learner found" if result.motion is None or result.shared is not None else "free run leaves"
     lines = [f"{100 * share:.0f} % of what the {what} is {cause}. The bias that implies:"]
+    if result.motion is None and share < SURE_SHARE:
+        lines = [f"What the learner found looks most like {cause}: {percent(share)} of it. The bias if it is that:"]
     lines.append(f"{'parameter':<{width}}  {'bias':>11}  {'of std':>7}  {'of value':>9}  {'95 % interval with it':^29}")
     for row in rows:
         bias = row.bias.value if row.bias else None

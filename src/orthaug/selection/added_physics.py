@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Vector
-from orthaug.data.expressions import FUNCTIONS, SAMPLING_TIME
+from orthaug.data.expressions import FUNCTIONS, SAMPLING_TIME, Expression
+from orthaug.data.writing import coefficient_unit
 from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicalParameter
@@ -23,6 +24,7 @@ _DIVIDED = re.compile(r"\((?P<inner>.+)\)\s*/\s*(?P<by>[A-Za-z_]\w*)")
 class Added:
     """A term to be added: its parameter's `name`, the `text` with its `width` as a number, and where it goes.
 
+    `scale` is the expression whose unit the term has; None for one that is told no unit by.
     `template` has `{width}` where the width stands, None without one.
     """
 
@@ -34,6 +36,7 @@ class Added:
     width: float | None = None
     width_unit: str | None = None
     template: str | None = None
+    scale: Expression | None = None
 
 
 def names_for(kinds: Sequence[str], taken: Sequence[str]) -> list[str]:
@@ -114,7 +117,7 @@ def added_to_motion(motion: Motion, values: Vector, added: Sequence[Added], unit
             product = one.template.format(width=width)
         inside = _DIVIDED.fullmatch(text.strip())
         if inside and _balanced(inside["inner"]) and inside["by"] in start:
-            coefficient, unit = coefficient * start[inside["by"]], _unit_of_first(inside["inner"], units)
+            coefficient, unit = coefficient * start[inside["by"]], _unit_inside(inside["inner"], one, units)
         sign, factor = ("-", -1.0) if coefficient < 0 else ("+", 1.0)
         summand = f" {sign} {one.name}" + ("" if product == "1" else f"*{_closed(product)}")
         if inside and _balanced(inside["inner"]) and inside["by"] in start:
@@ -143,6 +146,14 @@ def added_to_motion(motion: Motion, values: Vector, added: Sequence[Added], unit
         for name in places
     )
     return ChangedMotion(changed, tuple(new), equations)
+
+
+def _unit_inside(inner: str, added: Added, units: dict[str, str]) -> str:
+    """The unit of a term's coefficient within a sum; none where the sum's or the term's is not told."""
+    unit = _unit_of_first(inner, units)
+    if not unit or added.scale is None:
+        return unit
+    return coefficient_unit(unit, added.scale, units) or ""
 
 
 def _unit_of_first(inner: str, units: dict[str, str]) -> str:

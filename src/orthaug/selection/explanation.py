@@ -250,7 +250,7 @@ def _terms(space: Space, chosen: Sequence[Candidate], fitted: Fit) -> tuple[Expl
     for i, one in enumerate(chosen):
         place, unit = ground.places[one.place]
         whole = space.explained(columns[: i + 1])
-        scale = one.on if one.kind in ("dead_zone", "saturation") and one.on is not None else one.text
+        scale = _scale(one.kind, one.on, one.text)
         found.append(
             ExplainingTerm(
                 parameter=names[i],
@@ -269,6 +269,11 @@ def _terms(space: Space, chosen: Sequence[Candidate], fitted: Fit) -> tuple[Expl
         )
         before = whole
     return tuple(found)
+
+
+def _scale(kind: str, on: str | None, text: str) -> str:
+    """The expression whose unit a term has."""
+    return on if kind in ("dead_zone", "saturation") and on is not None else text
 
 
 def _base_name(candidate: Candidate) -> str:
@@ -295,4 +300,5 @@ def _added(ground: Ground, term: ExplainingTerm) -> Added:
         unit = coefficient_unit("1", ground.parse(str(term.on)), ground.units)
         unit = None if unit is None else ground.units.get(str(term.on), "")
     where = (term.added_to, term.coefficient, term.unit)
-    return Added(term.parameter, term.expression, *where, term.width, unit, template)
+    scale = ground.parse(_scale(term.kind, term.on, term.expression))
+    return Added(term.parameter, term.expression, *where, term.width, unit, template, scale)

@@ -258,9 +258,9 @@ def _findings(told: Mapping[str, Any], bias: Sequence[Mapping[str, Any]]) -> Non
 def _units(units: Sequence[tuple[str, str, str | None]]) -> None:
     """What the spec says of units, where it is not what the regressors ask for; both are written in one way here."""
     for name, given, asked in units:
-        if asked is not None and given not in (asked, "") and not (asked == "" and given == "1"):
-            note(f"Unit of {name}: the spec says {given}, output and regressor ask for {asked or '1'}.", "care")
-    wanted = [f"{name} in {asked or '1'}" for name, given, asked in units if asked and not given]
+        if asked is not None and given not in (asked, ""):
+            note(f"Unit of {name}: the spec says {given}, output and regressor ask for {asked}.", "care")
+    wanted = [f"{name} in {asked}" for name, given, asked in units if asked not in (None, "1") and not given]
     if wanted:
         text(f"Units, from those of the channels: {', '.join(wanted)}.", "p", "hint")
 

@@ -23,10 +23,9 @@ from orthaug.commands import check as checking
 from orthaug.commands import init as starting
 from orthaug.commands.job import Job
 from orthaug.commands.opening import open_job
-from orthaug.data.expressions import parse
 from orthaug.data.record import Channel, check_step
 from orthaug.data.survey import Column, Survey
-from orthaug.data.writing import coefficient_unit
+from orthaug.physics.derived_units import derived_units
 from orthaug.reports.text import check_text
 
 MOST = 3000
@@ -166,12 +165,11 @@ def _units(job: Job) -> list[tuple[str, str, str | None]]:
     """Of each parameter of a baseline: its name, the unit that the spec gives, and what its regressor asks for."""
     if job.spec.baseline is None:
         return []
-    channels = {channel.name: channel.unit for channel in (*job.train.record.inputs, *job.train.record.outputs)}
-    first, constants, told = job.train.record.outputs[0].name, job.spec.baseline.constants, {}
-    for term in job.spec.baseline.terms:
-        expression = parse(str(term.regressor), constants)
-        told[term.parameter] = (term.unit or "", coefficient_unit(channels[term.output or first], expression, channels))
-    return [(name, *units) for name, units in told.items()]
+    record, baseline = job.train.record, job.problem.baseline
+    derived, given = derived_units(baseline, record.outputs, record.inputs), {}
+    for term in baseline.terms:
+        given[term.parameter] = term.unit or given.get(term.parameter, "")
+    return [(name, unit, derived.get(name)) for name, unit in given.items()]
 
 
 def _prepared_curves(job: Job) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 "use strict";
 (async () => {
   const COLUMNS = 1400; // of pixels for which the least and the largest value of a curve are drawn
+  const PAPER = 0.76; // height of a plot on paper over that on a screen
   const FONT = { family: "system-ui, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif", size: 12 };
   const CONFIG = {
     responsive: false, displaylogo: false, doubleClick: "reset", showTips: false,
@@ -114,10 +115,12 @@
       hoverlabel: { bgcolor: "@shade", font: { color: "@ink" } },
       legend: { orientation: "h", x: 0, y: 1, yanchor: "bottom", xanchor: "left", bgcolor: "rgba(0,0,0,0)" },
       modebar: { bgcolor: "rgba(0,0,0,0)", color: "@soft", activecolor: "@ink" },
-      height: figure.height, width, ...own,
+      height: heightOf(figure), width, ...own,
     }, from);
   }
 
+  /* On paper plots are lower, so that few pages end where the next plot does not fit. */
+  const heightOf = (figure) => (onPaper ? Math.round(PAPER * figure.height) : figure.height);
   const widthOf = (place) => (onPaper ? (figures[place.dataset.figure].small ? 320 : 660) : place.clientWidth);
   const home = (figure) => figure.layout.xaxis?.range ?? [0, 1];
   const flown = (figure) => figure.data.some((trace) => trace.series || trace.minus);
@@ -126,6 +129,7 @@
     const figure = figures[place.dataset.figure], from = style();
     const now = place.layout && flown(figure) ? place.layout.xaxis.range : home(figure);
     const shown = layout(figure, from, widthOf(place));
+    place.style.height = `${heightOf(figure)}px`;
     if (flown(figure)) shown.xaxis.range = [...now];
     return Plotly.react(place, coloured(traces(figure, now), from), shown, CONFIG);
   }

@@ -1,0 +1,186 @@
+"""Were the inputs recorded under feedback? Whether past outputs tell an input beside its own past.
+
+In open loop an input is told by nothing but its own past. Under feedback, past outputs carry the reference and the
+disturbances into it (Granger 1969; Söderström and Stoica 1989, ch. 10).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+import scipy.special
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.lines import percent
+from orthaug._base.parallel import one_blas_thread
+from orthaug._base.warning import Warning
+from orthaug.analysis.predictability import BlockSums, Share
+from orthaug.data.record import Record
+
+_LEVEL = 0.001  # of the test, divided by the number of inputs
+_SHARE = 0.02  # of what the own past leaves of an input: what the outputs tell counts from there on
+_SURE = 4.0  # standard errors over blocks by which it stands out
+_INPUT_LAGS, _OUTPUT_LAGS = 40, 4
+_BESIDE = 10  # lags of the other inputs
+_LEVELS = 6  # of an input that is held: those before the last change that count as its past
+_HELD = 0.2  # share of rows that repeat the row before: from there on only changes are looked at
+_ROWS_PER_COLUMN = 5
+_MOST = 20_000
+_NOTHING = 1e-3  # of an input's deviation: what its own past leaves is then no surprise
+_JUMP = 8.0  # times the median size of what its own past leaves of an input
+_ROUNDS = 4
+_PERIODIC = 0.9  # autocorrelation at a period, beyond what short lags tell
+
+
+@dataclass(frozen=True)
+class Feedback:
+    """That past outputs tell `share` of what the own past of the input `name` leaves, at the level `p`."""
+
+    name: str
+    share: float
+    p: float
+
+
+def feedback_in(record: Record) -> tuple[Feedback, ...]:
+    """The inputs that surely follow past outputs; of an input that its own past tells, nothing can be said."""
+    found = []
+    with one_blas_thread():
+        for j, channel in enumerate(record.inputs):
+            told = _told(record, j)
+            if told is not None and told[1] < _LEVEL / len(record.inputs):
+                found.append(Feedback(channel.name, *told))
+    return tuple(found)
+
+
+def closed_loop(record: Record) -> tuple[Warning, ...]:
+    """A warning where inputs follow outputs: what that does to estimates, and what to do."""
+    found = feedback_in(record)
+    if not found:
+        return ()
+    named = ", ".join(f"{one.name} ({percent(one.share)} of what its own past leaves)" for one in found)
+    outputs = ", ".join(channel.name for channel in record.outputs)
+    text = (
+        f"past {outputs} predict{'s' if len(record.outputs) == 1 else ''} {named}: the data look recorded under "
+        "feedback. An estimate is then consistent only with the right noise: one step ahead white noise in the "
+        "equation, on the free run white noise on the sensor, in both the whole physics; else what the feedback makes "
+        "of noise and of missing physics is taken for an effect of the input. Record the reference and model the loop "
+        "with it as the input, move the reference much more than the noise is, or record without the controller."
+    )
+    return (Warning("closed_loop", text),)
+
+
+def _told(record: Record, j: int) -> tuple[float, float] | None:
+    """Share and level by which past outputs tell input j; None where that is not enough, or cannot be told."""
+    found = (_rows(e.inputs[:, j], np.delete(e.inputs, j, axis=1), e.outputs) for e in record.experiments)
+    pieces = [piece for piece in found if piece is not None and len(piece[2])]
+    if not pieces:
+        return None
+    widths = {(own.shape[1], outputs.shape[1]) for own, outputs, _ in pieces}
+    if len(widths) > 1:  # some are held and some are not: those of which there are more
+        best = max(widths, key=lambda width: sum(len(p[2]) for p in pieces if (p[0].shape[1], p[1].shape[1]) == width))
+        pieces = [p for p in pieces if (p[0].shape[1], p[1].shape[1]) == best]
+    own, outputs, target = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
+    return told_beside(own, outputs, target)
+
+
+def told_beside(own: Matrix, others: Matrix, target: Vector) -> tuple[float, float] | None:
+    """Cross-validated share of what `own` leaves of a target that `others` tell, and the level of a robust Wald test.
+
+    None where there are too few rows, `own` leaves nothing, or the share is not surely large enough.
+    """
+    usual = _usual(own, target)
+    own, others, target = _scaled(own[usual]), _scaled(others[usual]), target[usual]
+    if len(target) < _ROWS_PER_COLUMN * (own.shape[1] + others.shape[1] + 1) or not np.ptp(target):
+        return None
+    base = np.column_stack([np.ones(len(target)), own])
+    orthonormal = np.asarray(scipy.linalg.qr(base, mode="economic", pivoting=True)[0])
+    q = orthonormal[:, : int(np.linalg.matrix_rank(base))]
+    left = target - q @ (q.T @ target)
+    if left.std() < _NOTHING * target.std():
+        return None
+    beside = others - q @ (q.T @ others)
+    sums = BlockSums.of(np.column_stack([base, others]), target)
+    share: Share = sums.share(range(base.shape[1], base.shape[1] + others.shape[1]), range(base.shape[1]))
+    if share.value < _SHARE or share.value < _SURE * share.error:
+        return None
+    return share.value, _wald(beside, left)
+
+
+def _usual(own: Matrix, target: Vector) -> np.ndarray:
+    """The rows on which an input does not jump: those of a reference would hide all that lies between them."""
+    base, kept = np.column_stack([np.ones(len(target)), _scaled(own)]), np.ones(len(target), dtype=bool)
+    for _ in range(_ROUNDS):
+        if kept.sum() < _ROWS_PER_COLUMN * base.shape[1]:
+            break
+        left = np.abs(target - base @ np.linalg.lstsq(base[kept], target[kept], rcond=1e-10)[0])
+        kept = left <= _JUMP * max(float(np.median(left)), _NOTHING * float(target.std()))
+    return kept
+
+
+def _wald(columns: Matrix, target: Vector) -> float:
+    """Level at which all coefficients are 0, robust against errors of unequal size (White 1980)."""
+    u, size, _ = np.linalg.svd(columns, full_matrices=False)
+    u = u[:, size > 1e-9 * size.max(initial=0.0)]
+    told = u.T @ target
+    scores = u * (target - u @ told)[:, None]
+    spread = scores.T @ scores * len(target) / max(len(target) - u.shape[1], 1)
+    statistic = float(told @ np.linalg.lstsq(spread, told, rcond=None)[0])
+    return float(scipy.special.chdtrc(max(u.shape[1], 1), statistic))
+
+
+def _rows(u: Vector, beside: Matrix, y: Matrix) -> tuple[Matrix, Matrix, Vector] | None:
+    """Past of an input and those `beside` it, past outputs, and the input's value, on the rows that are looked at."""
+    u, beside, y = u[-_MOST:], beside[-_MOST:], y[-_MOST:]
+    changes = np.flatnonzero(np.diff(u)) + 1
+    if len(changes) < (1 - _HELD) * (len(u) - 1):
+        levels = np.concatenate([u[:1], u[changes]])
+        period = _period(levels, _LEVELS)
+        past = _LEVELS if period is None else max(period + 1, _LEVELS)
+        rows, own = changes[past - 1 :], _lagged(levels, range(1, _LEVELS + 1), past)
+        own = own if period is None else np.column_stack([own, _lagged(levels, range(period - 1, period + 2), past)])
+        own = np.column_stack([own, levels[past - 1 : -1] ** 2, levels[past - 1 : -1] ** 3]) if len(own) else own
+        enough = rows >= _BESIDE
+        own = np.column_stack([own[enough], _past(beside, rows[enough], _BESIDE)])
+        return own, _past(y, rows[enough], _OUTPUT_LAGS), u[rows[enough]]
+    lags = min(_INPUT_LAGS, len(u) // (2 * _ROWS_PER_COLUMN))
+    period = _period(u, lags)
+    past = max(lags, _BESIDE) if period is None else max(period + 1, _BESIDE)
+    if len(u) <= past:
+        return None
+    own = _lagged(u, range(1, lags + 1), past)
+    own = own if period is None else np.column_stack([own, _lagged(u, range(period - 1, period + 2), past)])
+    rows = np.arange(past, len(u))
+    return np.column_stack([own, _past(beside, rows, _BESIDE)]), _past(y, rows, _OUTPUT_LAGS), u[past:]
+
+
+def _lagged(x: Vector, lags: range, first: int) -> Matrix:
+    rows = np.arange(first, len(x))
+    return np.column_stack([x[rows - lag] for lag in lags]) if len(rows) else np.zeros((0, len(lags)))
+
+
+def _past(y: Matrix, rows: np.ndarray, lags: int) -> Matrix:
+    return np.column_stack([y[rows - lag] for lag in range(1, lags + 1)])
+
+
+def _period(x: Vector, beyond: int) -> int | None:
+    """The lag, larger than `beyond`, at which a signal repeats itself; None where it does not within its half."""
+    n = len(x)
+    centred = x - x.mean()
+    power = np.abs(np.fft.rfft(centred, 2 * n)) ** 2
+    acf = np.fft.irfft(power)[:n]
+    lags = np.arange(n)
+    head = np.concatenate([[0.0], np.cumsum(centred**2)])
+    norm = np.sqrt(np.maximum(head[n - lags] * (head[n] - head[lags]), np.finfo(float).tiny))
+    r = (acf / norm)[: n // 2 + 1]
+    later = np.arange(beyond + 1, len(r) - 1)
+    peaks = (
+        later[(r[later] > _PERIODIC) & (r[later] >= r[later - 1]) & (r[later] >= r[later + 1])] if len(later) else []
+    )
+    return int(peaks[np.argmax(r[peaks])]) if len(peaks) else None
+
+
+def _scaled(x: Matrix) -> Matrix:
+    size = x.std(axis=0)
+    return (x - x.mean(axis=0)) / np.where(size > 0, size, 1.0)

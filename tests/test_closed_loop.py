@@ -1,0 +1,109 @@
+"""Feedback in the data: found under noise and a reference in steps, and no false alarm in open loop."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import scipy.signal as ss
+from test_cli import run, write_csv
+
+from orthaug.analysis.closed_loop import closed_loop, feedback_in
+from orthaug.data.record import Record
+
+ROWS = 1500
+
+
+def held(rng, hold, rows=ROWS):
+    return np.repeat(rng.uniform(-2, 2, rows // hold + 1), hold)[:rows]
+
+
+def multisine(rng, period, rows=ROWS):
+    phases = rng.uniform(0, 2 * np.pi, period // 3)
+    return sum(np.cos(2 * np.pi * (i + 1) * np.arange(rows) / period + p) for i, p in enumerate(phases))
+
+
+INPUTS = {
+    "white": lambda rng: rng.normal(size=ROWS),
+    "slow": lambda rng: ss.lfilter([0.3], [1, -0.95], rng.normal(size=ROWS)),
+    "smooth": lambda rng: ss.lfilter(*ss.butter(4, 0.1), rng.normal(size=ROWS)),
+    "walk": lambda rng: 0.1 * np.cumsum(rng.normal(size=ROWS)),
+    "multisine": lambda rng: multisine(rng, 240),
+    "long multisine": lambda rng: multisine(rng, ROWS),
+    "PRBS": lambda rng: np.resize(np.repeat(ss.max_len_seq(8)[0] * 2.0 - 1, 3), ROWS),
+    "binary": lambda rng: np.repeat(rng.choice([-1.0, 1.0], ROWS), 7)[:ROWS],
+    "three levels": lambda rng: np.repeat(rng.choice([-1.0, 0.0, 1.0], ROWS), 7)[:ROWS],
+    "steps": lambda rng: held(rng, 25),
+    "steps with noise": lambda rng: held(rng, 25) + 0.02 * rng.normal(size=ROWS),
+    "stairs": lambda rng: np.repeat(np.abs(np.arange(ROWS // 10 + 1) % 16 - 8.0), 10)[:ROWS],
+    "sine with noise": lambda rng: np.sin(np.arange(ROWS) / 17) + 0.05 * rng.normal(size=ROWS),
+    "chirp": lambda rng: ss.chirp(np.arange(ROWS), 0.002, ROWS, 0.1),
+    "ramps": lambda rng: np.interp(np.arange(ROWS), np.arange(0, ROWS + 40, 40), rng.uniform(-2, 2, ROWS // 40 + 2)),
+}
+
+
+def plant(reference, rng, noise, gain=None, friction=False):
+    """Input and measured output; with `gain` the input is that times reference less measured output."""
+    u, y, x, w = np.array(reference, dtype=float), np.zeros(len(reference)), 0.0, 0.0
+    for k in range(len(u)):
+        past = u[k - 1] if k else 0.0
+        w += 0.1 * (4 * past - w - (np.tanh(w / 0.1) if friction else 0.0))
+        x = 0.98 * x + 0.05 * w + 0.02 * rng.normal()
+        y[k] = x + noise * rng.normal()
+        if gain is not None:
+            u[k] = gain * (reference[k] - y[k])
+    return u, y
+
+
+@pytest.mark.parametrize("kind", INPUTS)
+def test_no_false_alarm_in_open_loop(kind):
+    for seed in range(4):
+        rng = np.random.default_rng([seed, list(INPUTS).index(kind)])
+        u, y = plant(INPUTS[kind](rng), rng, (0.01, 0.3)[seed % 2], friction=seed > 1)
+        assert feedback_in(Record.from_arrays(u, y)) == ()
+
+
+def test_an_input_that_follows_another_is_no_feedback():
+    """The output knows the first input, of which the second is a late copy."""
+    rng = np.random.default_rng(0)
+    u, y = plant(ss.lfilter([0.3], [1, -0.95], rng.normal(size=ROWS)), rng, 0.01)
+    late = np.concatenate([np.zeros(5), u[:-5]]) + 0.01 * rng.normal(size=ROWS)
+    assert feedback_in(Record.from_arrays(np.column_stack([u, late]), y)) == ()
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.05, 0.3])
+@pytest.mark.parametrize("gain", [0.3, 1.0])
+def test_a_controller_is_found(noise, gain):
+    rng = np.random.default_rng(3)
+    record = Record.from_arrays(*plant(held(rng, 100), rng, noise, gain))
+    (found,) = feedback_in(record)
+    assert found.name == "u" and found.p < 0.001 and found.share > 0.02
+    (warning,) = closed_loop(record)
+    assert warning.code == "closed_loop" and "past y predicts u" in warning.text
+    assert "Record the reference" in warning.text and "white noise in the equation" in warning.text
+
+
+@pytest.mark.parametrize("rows", [3, 30, 120])
+def test_too_few_rows_tell_nothing(rows):
+    rng = np.random.default_rng(3)
+    assert closed_loop(Record.from_arrays(*plant(held(rng, 10, rows), rng, 0.1, 1.0))) == ()
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_check_and_fit_name_it(tmp_path):
+    rng = np.random.default_rng(3)
+    u, y = plant(held(rng, 100), rng, 0.05, 1.0)
+    write_csv(tmp_path / "loop.csv", u=u, y=y)
+    terms = "".join(
+        f'[[baseline.terms]]\nparameter = "{name}"\nregressor = "{text}"\n'
+        for name, text in (("a", "y[k-1]"), ("b", "y[k-2]"), ("g", "u[k-1]"))
+    )
+    data = '[data]\nsampling_time = 1\ninputs = ["u"]\noutputs = ["y"]\ntrain = { files = ["loop.csv"] }\n'
+    (tmp_path / "loop.toml").write_text(f'{data}{terms}[learner]\nkind = "none"\n', encoding="utf-8")
+    checked = json.loads(run("check", tmp_path / "loop.toml", "--json").out)
+    assert "closed_loop" in [warning["code"] for warning in checked["warnings"]]
+    assert run("fit", tmp_path / "loop.toml", "--out", tmp_path / "result").code == 0
+    result = json.loads((tmp_path / "result" / "result.json").read_text())
+    assert [warning["code"] for warning in result["warnings"]].count("closed_loop") == 1
+    assert "its data look recorded under feedback" in (tmp_path / "result" / "report.html").read_text()
