@@ -165,7 +165,8 @@ def _doubts(result: FitResult) -> Iterator[str]:
         yield "its data look recorded under feedback, which biases it"
     worse = _worse(result.scores)
     if worse is not None:
-        yield f"its error on {worse[1]} is {number(worse[0], 2)} times that on the training data, so the band is too narrow"
+        times = f"{number(worse[0], 2)} times that on the training data"
+        yield f"its error on {worse[1]} is {times}, so the band is too narrow"
     if result.validation is not None and result.validation.extrapolation:
         left = dict.fromkeys(entry.part for entry in result.validation.extrapolation)
         yield f"{_joined(list(left))} {'leaves' if len(left) == 1 else 'leave'} the range of the training data"
