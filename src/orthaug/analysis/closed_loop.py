@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 import scipy.special
 
 from orthaug._base.checks import Matrix, Vector
@@ -29,6 +28,7 @@ _HELD = 0.2  # share of rows that repeat the row before: from there on only chan
 _ROWS_PER_COLUMN = 5
 _MOST = 20_000
 _NOTHING = 1e-3  # of an input's deviation: what its own past leaves is then no surprise
+_RANK = 1e-10
 _JUMP = 8.0  # times the median size of what its own past leaves of an input
 _ROUNDS = 4
 _PERIODIC = 0.9  # autocorrelation at a period, beyond what short lags tell
@@ -73,8 +73,8 @@ def closed_loop(record: Record) -> tuple[Warning, ...]:
 
 def _told(record: Record, j: int) -> tuple[float, float] | None:
     """Share and level by which past outputs tell input j; None where that is not enough, or cannot be told."""
-    found = (_rows(e.inputs[:, j], np.delete(e.inputs, j, axis=1), e.outputs) for e in record.experiments)
-    pieces = [piece for piece in found if piece is not None and len(piece[2])]
+    every = (_rows(e.inputs[:, j], np.delete(e.inputs, j, axis=1), e.outputs) for e in record.experiments)
+    pieces = [piece for piece in every if piece is not None and len(piece[2])]
     if not pieces:
         return None
     widths = {(own.shape[1], outputs.shape[1]) for own, outputs, _ in pieces}
@@ -95,8 +95,8 @@ def told_beside(own: Matrix, others: Matrix, target: Vector) -> tuple[float, flo
     if len(target) < _ROWS_PER_COLUMN * (own.shape[1] + others.shape[1] + 1) or not np.ptp(target):
         return None
     base = np.column_stack([np.ones(len(target)), own])
-    orthonormal = np.asarray(scipy.linalg.qr(base, mode="economic", pivoting=True)[0])
-    q = orthonormal[:, : int(np.linalg.matrix_rank(base))]
+    orthonormal, size, _ = np.linalg.svd(base, full_matrices=False)
+    q = orthonormal[:, size > _RANK * size[0]]
     left = target - q @ (q.T @ target)
     if left.std() < _NOTHING * target.std():
         return None

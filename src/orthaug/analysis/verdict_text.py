@@ -114,11 +114,14 @@ def _sensor_noise(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     if seen.simulated:
         more = f" {_sentence(seen.changes[0])}" if seen.changes else ""
         return f"{text}, which the simulation criterion suits.{more}", ()
-    text += '. One-step estimates of θ are then inconsistent: for the parameters train with focus = "simulation"'
+    text += '. One-step estimates of θ are then inconsistent: train with focus = "simulation"'
     if seen.changes and seen.changes[0].kind == "criterion":
         fall = seen.changes[0].fall
-        gain = f"predicted to fall by {percent(fall)}" if seen.changes[0].gains else "not predicted to fall"
-        text += f"; the error of the free run is {gain}"
+        text += (
+            f"; the error of the free run is predicted to fall by {percent(fall)}"
+            if seen.changes[0].gains
+            else " for the sake of the parameters; the error of the free run is not predicted to fall"
+        )
     if seen.noise is not None and seen.noise > _TOO_FAST:
         text += (
             f". The noise is {100 * seen.noise:.0f} % of what tells the lagged outputs apart: the sampling is too fast "

@@ -168,9 +168,9 @@ class BaselinePenalty:
         """
         zero = [name for name, value in zip(names, initial, strict=True) if value == 0]
         if zero:
-            starts = "starts" if len(zero) == 1 else "start"
+            start = "starts" if len(zero) == 1 else "start"
             raise InputError(
-                f"the baseline penalty is relative to the initial values, but {', '.join(zero)} {starts} at 0; "
+                f"the baseline penalty is relative to the initial values, but {', '.join(zero)} {start} at 0; "
                 "give it another `initial`, or use the orthogonal structure."
             )
         root = np.sqrt(self.weight) * unit

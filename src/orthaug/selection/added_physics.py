@@ -24,8 +24,8 @@ _DIVIDED = re.compile(r"\((?P<inner>.+)\)\s*/\s*(?P<by>[A-Za-z_]\w*)")
 class Added:
     """A term to be added: its parameter's `name`, the `text` with its `width` as a number, and where it goes.
 
-    `scale` is the expression whose unit the term has; None for one that is told no unit by.
-    `template` has `{width}` where the width stands, None without one.
+    `scale` is the expression whose unit the term has; None for one by which no unit is told. `template` has `{width}`
+    where the width stands, None without one.
     """
 
     name: str
