@@ -180,5 +180,6 @@ def test_every_argument_of_a_function_and_of_a_declaration_is_told():
 def test_the_most_used_names_have_examples():
     wanted = """read_record Record Channel Lags Term Baseline MLP Terms Motion PhysicalParameter PhysicsMap Uniform
     Samples Simulation Prediction prepare Detrend Lowpass Decimate Outliers Shift save Model estimate Suspect
-    MotionSuspect export numpy_step identifiability scores Orthogonal verdict diagnose stability bias_budget linearize"""
+    MotionSuspect export numpy_step identifiability scores Orthogonal verdict diagnose stability bias_budget
+    linearize"""
     assert {name for name in wanted.split() if ">>> " not in (inspect.getdoc(getattr(orthaug, name)) or "")} == set()

@@ -6,10 +6,17 @@ import re
 import textwrap
 from collections.abc import Iterable, Sequence
 
-WIDTH = 100  # columns of what is printed
+WIDTH = 100  # columns of what is printed, at most
+_NARROWEST = 40  # below, folded tables are harder to read than lines that the terminal breaks
+_screen = [WIDTH]
 _LAST_CELL = re.compile(r"^.*\S {2,}(?=\S)|^ +(?=\S)")
 _LATEST = 64  # column at which the last cell of a row may begin for it to be folded there
 _GAP = "  "
+
+
+def fit_screen(columns: int) -> None:
+    """Let what is printed from now on fit a terminal of so many columns, 40 to 100; 0 where they are not known."""
+    _screen[0] = min(WIDTH, max(columns, _NARROWEST)) if columns > 0 else WIDTH
 
 
 def counted(number: int, thing: str) -> str:
@@ -31,10 +38,11 @@ def percent(share: float, digits: int = 2, *, sign: str = "") -> str:
     return f"{value:{sign}.0f} %" if 100 <= abs(value) < 1e7 else f"{text} %"
 
 
-def table(rows: Sequence[Sequence[str]], width: int = WIDTH) -> list[str]:
-    """Rows of cells as lines, the first row the head. Rows may be of different lengths.
+def table(rows: Sequence[Sequence[str]], width: int | None = None) -> list[str]:
+    """Rows of cells as lines of at most `width` columns (None: the screen's), the first row the head.
 
-    Columns that do not fit stand below, under the first column again; an interval stays beside its value.
+    Rows may be of different lengths. Columns that do not fit stand below, under the first column again; an interval
+    stays beside its value.
 
     Examples:
         >>> table([["part", "RMSE", "FIT %"], ["test", "0.1 m", "90"]])
@@ -46,7 +54,7 @@ def table(rows: Sequence[Sequence[str]], width: int = WIDTH) -> list[str]:
     whole = [[*row, *[""] * (count - len(row))] for row in rows]
     widths = [max(len(row[i]) for row in whole) for i in range(count)]
     lines: list[str] = []
-    for block in _blocks(whole[0], widths, width):
+    for block in _blocks(whole[0], widths, width or _screen[0]):
         lines += [""] if lines else []
         lines += [_GAP.join(row[i].ljust(widths[i]) for i in block).rstrip() for row in whole]
     return lines
@@ -71,8 +79,10 @@ def _blocks(head: Sequence[str], widths: Sequence[int], width: int) -> list[list
     return blocks
 
 
-def fold(lines: Iterable[str], width: int = WIDTH) -> list[str]:
-    """Lines of at most `width` columns: sentences go on indented, the last cell of a row under itself.
+def fold(lines: Iterable[str], width: int | None = None) -> list[str]:
+    """Lines of at most `width` columns (None: the screen's).
+
+    Sentences go on indented, the last cell of a row under itself.
 
     Examples:
         >>> fold(["warning: the interval does not cover it"], width=30)
@@ -80,7 +90,8 @@ def fold(lines: Iterable[str], width: int = WIDTH) -> list[str]:
         >>> fold(["regressor  position[k-1], force[k-1]"], width=28)
         ['regressor  position[k-1],', '           force[k-1]']
     """
-    return [part for line in lines for part in (_folded(line, width) if len(line) > width else [line])]
+    most = width or _screen[0]
+    return [part for line in lines for part in (_folded(line, most) if len(line) > most else [line])]
 
 
 def _folded(line: str, width: int) -> list[str]:

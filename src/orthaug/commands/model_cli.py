@@ -107,7 +107,10 @@ def split(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Parameters of a saved model under another measure, without training again."""
+    """Parameters of a saved model under another measure.
+
+    Without training again.
+    """
     from orthaug.commands import split as splitting
     from orthaug.commands.measure_options import read_measure, split_place
     from orthaug.commands.run import read_rows
@@ -132,7 +135,10 @@ def explain(
     most: Annotated[int, typer.Option("--terms", metavar="N", help="Terms at most.")] = 6,
     as_json: AsJson = False,
 ) -> None:
-    """Which terms the learner of a saved model has found, and what to write into the physics."""
+    """Which terms the learner of a saved model has found.
+
+    And what to write into the physics.
+    """
     from orthaug.commands.explain import explain_model
     from orthaug.commands.run import Reading, open_run
     from orthaug.reports.explanation_text import explain_text
@@ -181,7 +187,10 @@ def linearize(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Operating points of a saved model, and its poles, gains and frequency response there with intervals."""
+    """Operating points of a saved model; its poles and gains.
+
+    With intervals, and the frequency response.
+    """
     from orthaug.commands import linearize as linearizing
 
     linearizing.check_place(out, model, *([data] if data else []), force=force)
@@ -221,7 +230,10 @@ def track(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Parameters of a saved model over new data by recursive least squares, with an alarm."""
+    """Parameters of a saved model over new data, with an alarm.
+
+    By recursive least squares with forgetting.
+    """
     from orthaug.commands import track as tracking
     from orthaug.commands.folder import check_folder, check_kept
     from orthaug.commands.run import read_rows

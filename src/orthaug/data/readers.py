@@ -46,7 +46,7 @@ def read_record(
     r"""Read one file; several row ranges are experiments of their own.
 
     Args:
-        path: of a file with one of the endings in docs/spec.md, such as `.csv`, `.xlsx` or `.mat`.
+        path: of a file that ends in .csv, .tsv, .parquet, .xlsx, .npz, .mat or .h5.
         inputs, outputs: channel names, or `Channel`s with column, unit, scale and offset.
         sampling_time: seconds between rows; or `time`, the column that holds the instants.
         rows: half-open range `(start, stop)` of data rows, or several; None for all.
