@@ -126,16 +126,9 @@ def test_lines_end_alike_on_every_system():
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_completion(shell, tmp_path):
     words = {"COMP_WORDS": "orthaug fit --r", "COMP_CWORD": "2", "_TYPER_COMPLETE_ARGS": "orthaug fit --r"}
-    settings = {
-        "PATH": "",
-        "HOME": str(tmp_path),
-        "USERPROFILE": str(tmp_path),
-        "PYTHONPATH": str(ROOT / "src"),
-        **words,
-    }
-    settings |= {
-        name: os.environ[name] for name in ("SYSTEMROOT",) if name in os.environ
-    }  # Windows starts none without
+    homes = dict.fromkeys(("HOME", "USERPROFILE"), str(tmp_path))
+    system = {name: os.environ[name] for name in ("SYSTEMROOT",) if name in os.environ}  # Windows starts none without
+    settings = {"PATH": "", "PYTHONPATH": str(ROOT / "src"), **homes, **system, **words}
     settings |= {"_ORTHAUG_COMPLETE": f"complete_{shell}", "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
     command = [sys.executable, "-m", "orthaug"]
     done = subprocess.run(command, env=settings, capture_output=True, text=True, timeout=60, check=False)
