@@ -231,9 +231,7 @@ def _groups(groups: Any, rows: int) -> Iterator[Group]:
         raise InputError(f"`groups` has the shape {labels.shape}; expected one label for each of {rows} rows.")
     bare = [k for k, label in enumerate(labels.tolist()) if label is None or label != label]
     if bare:
-        raise InputError(
-            f"`groups` has no label at row {bare[0]}: found {labels[bare[0]]}. Every row needs its experiment."
-        )
+        raise InputError(f"`groups` has no label at row {bare[0]}: found {labels[bare[0]]}; every row needs one.")
     try:
         found, first = np.unique(labels, return_index=True)
     except TypeError:

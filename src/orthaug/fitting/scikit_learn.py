@@ -111,7 +111,7 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """As of scikit-learn.
 
         Raises:
-            InputError (a ValueError): a field of a declaration, such as `learner__hidden`; declarations are exchanged whole.
+            InputError (a ValueError): a field of a declaration, which is exchanged whole: no `learner__hidden`.
         """
         for name in params:
             own, field, rest = name.partition("__")
