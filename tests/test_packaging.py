@@ -106,6 +106,15 @@ def test_the_wheel_carries_what_tells_of_every_key():
     assert {name for name in properties if f"## [{name}]" not in keys_of_a_spec().replace("[[", "[")} == set()
 
 
+@pytest.mark.parametrize("page", ["README.md", "docs/start.md", "docs/install.md"])
+def test_every_extra_is_told(page):
+    extras = set(PROJECT["project"]["optional-dependencies"]) - {"dev"}
+    told = set(
+        re.findall(r"`(\w+)`", text(page).partition("xtra")[2].partition("\n\n[")[0].partition("\nWhere an extra")[0])
+    )
+    assert extras <= told
+
+
 def test_the_image_sees_what_it_copies():
     kept = [line[1:] for line in text(".dockerignore").splitlines() if line.startswith("!")]
     (line,) = [line for line in text("packaging/Containerfile").splitlines() if line.startswith("COPY pyproject")]
