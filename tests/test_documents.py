@@ -168,4 +168,10 @@ def test_a_page_of_the_site_that_loads_from_a_network_is_found(monkeypatch):
         "[a](../examples/mpc.py) [b](https://x.y) [c](spec.md#data) [d](absent.md)", "docs/export.md"
     )
     assert linked == {"../examples/mpc.py": "examples/mpc.py", "spec.md": "docs/spec.md"}
+    section = '<nav class="md-nav" data-md-level="1" aria-labelledby="l">'
+    named = hooks.NAMED.sub(
+        r'\1 aria-label="\3"\2\3', f'{section} <label class="md-nav__title"><span></span> Theory </label>'
+    )
+    assert named.startswith('<nav class="md-nav" data-md-level="1" aria-label="Theory">')
+    assert hooks.boost("export.md") > hooks.boost("reference/further.md") > hooks.boost("repository/README.md")
     assert hooks.place("examples/mpc.py") == "repository/examples/mpc.py" and hooks.place("docs/spec.md") == "spec.md"

@@ -23,6 +23,10 @@ LINK = re.compile(r"(\]\()([^)#\s]+)([^)]*\))")
 LOADED = re.compile(r"<(?:script|link|img|iframe)\b[^>]*\b(?:src|href)=[\"']?(?:https?:)?//[^>]*>")
 NOT_RUN = re.compile(r"^<!-- not run: (.+?) -->$", re.MULTILINE)
 PLACE = "repository"
+NAMED = re.compile(  # a section of the navigation, by a label that may be hidden
+    r'(<nav class="md-nav" data-md-level="\d+") aria-labelledby="\w+"'
+    r'([^>]*>\s*<label class="md-nav__title"[^>]*>\s*<span[^>]*></span>\s*)([^<]*[^<\s])'
+)
 ALWAYS = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "examples/README.md", "benchmarks/README.md")
 
 
@@ -90,6 +94,6 @@ def on_post_page(output: str, page, config) -> str:
     """Under `strict` refuses a page that would load something from a network; typesets formulas, names the search."""
     for tag in LOADED.findall(output):
         logging.getLogger("mkdocs.hooks").warning("%s loads from a network: %s", page.file.src_uri, tag)
-    return formulas.typeset(output).replace(
+    return formulas.typeset(NAMED.sub(r'\1 aria-label="\3"\2\3', output)).replace(
         'data-md-component="search" role="dialog"', 'data-md-component="search" role="dialog" aria-label="Search"'
     )
