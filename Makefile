@@ -1,4 +1,5 @@
-# Everything runs in .venv, which the first target makes once and keeps until a dependency changes.
+# Everything runs in .venv, which the first target makes once and keeps until a dependency changes. It takes the first of
+# PYTHONS that can make one: PYTHONS=python3.11 make test.
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
@@ -7,7 +8,7 @@
 BIN := .venv/bin
 STAMP := .venv/ready
 LOG := .venv/setup.log
-PYTHONS := python3.13 python3.12 python3.11 python3
+PYTHONS ?= python3.13 python3.12 python3.11 python3
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 14

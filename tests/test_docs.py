@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import ast
 import importlib
+import inspect
 import re
+import textwrap
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 import pytest
@@ -24,6 +27,10 @@ PAGES = [
     *(ROOT / name for name in ("CONTRIBUTING.md", "README.md", "CHANGELOG.md", "examples/README.md")),
 ]
 TEXTS = {str(page.relative_to(ROOT)): page.read_text(encoding="utf-8") for page in PAGES}
+MADE = {  # by functions: nobody writes their arguments
+    *("Estimate", "MotionEstimate", "Model", "MotionModel", "Response", "Trajectory", "Status", "Explanation"),
+    *("LinearView", "Linearization", "Selection", "PhysicsMap"),
+}
 DEVELOPERS = ("CONTRIBUTING.md", "docs/design.md", "docs/notation.md")  # their names are the code's, not a spec's
 
 
@@ -118,6 +125,13 @@ def test_every_name_of_the_code_is_a_word_of_the_code(page):
     assert {name for name in named if name not in WORDS} == set()
 
 
+def test_every_numbered_fact_is_told():
+    told = re.findall(r"^\| (F\d+) \|", TEXTS["docs/guide/theory.md"], re.MULTILINE)
+    texts = [*TEXTS.values(), *(file.read_text(encoding="utf-8") for file in SOURCE.rglob("*.py"))]
+    named = set(re.findall(r"[(\s](F\d{1,2})[),:.\s]", " ".join(texts)))
+    assert told == [f"F{i + 1}" for i in range(12)] and named - set(told) == set()
+
+
 def test_the_rooms_are_told_in_their_order():
     told = tuple(re.findall(r"^\| `(\w+)` \|", TEXTS["CONTRIBUTING.md"], re.MULTILINE))
     assert told == ROOMS
@@ -137,3 +151,42 @@ def test_the_learner_of_the_example_is_one_file_and_one_entry(tmp_path):
     assert Bound(polynomial(), nz=2, ny=1).size == 4
     with pytest.raises(orthaug.InputError, match="`highest` must be a whole number, 2 or more; got 1"):
         polynomial(highest=1)
+
+
+def told(thing: type | object) -> str:
+    """The docstrings of a function or of a class, of its fields and of its makers."""
+    if not inspect.isclass(thing):
+        return inspect.getdoc(thing) or ""
+    body = ast.parse(textwrap.dedent(inspect.getsource(thing))).body[0]
+    fields = [
+        f"{before.target.id}: {ast.literal_eval(text.value)}"
+        for before, text in zip(body.body, body.body[1:], strict=False)  # type: ignore[attr-defined]
+        if isinstance(before, ast.AnnAssign) and isinstance(before.target, ast.Name) and isinstance(text, ast.Expr)
+    ]
+    makers = [inspect.getdoc(member) or "" for name, member in inspect.getmembers(thing) if name.startswith("from_")]
+    bases = [inspect.getsource(base) for base in thing.__mro__[1:] if base.__name__.startswith("_")]
+    return "\n".join([inspect.getdoc(thing) or "", *fields, *makers, *bases])
+
+
+def test_every_argument_of_a_function_and_of_a_declaration_is_told():
+    known = {"name", "resident"}  # what the name says, and what only the engines' own code gives
+    untold = {}
+    for name in orthaug.__all__:
+        thing = getattr(orthaug, name)
+        made = inspect.isclass(thing) and (not is_dataclass(thing) or name in MADE)
+        if inspect.ismodule(thing) or made:
+            continue
+        arguments = (
+            [f.name for f in fields(thing) if f.init] if inspect.isclass(thing) else inspect.signature(thing).parameters
+        )
+        text = told(thing)
+        untold[name] = {one for one in arguments if not re.search(rf"\b{one}\b", text)} - known
+    assert {name: missing for name, missing in untold.items() if missing} == {} and len(untold) > 50
+
+
+def test_the_most_used_names_have_examples():
+    wanted = """read_record Record Channel Lags Term Baseline MLP Terms Motion PhysicalParameter PhysicsMap Uniform
+    Samples Simulation Prediction prepare Detrend Lowpass Decimate Outliers Shift save Model estimate Suspect
+    MotionSuspect export numpy_step identifiability scores Orthogonal verdict diagnose stability bias_budget
+    linearize"""
+    assert {name for name in wanted.split() if ">>> " not in (inspect.getdoc(getattr(orthaug, name)) or "")} == set()

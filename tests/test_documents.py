@@ -13,6 +13,7 @@ import matplotlib
 import pytest
 from documents import ROOT, Page, blocks, differences, pages
 
+import orthaug
 from orthaug.export.kinds import TARGETS
 
 SOURCE = ROOT / "src" / "orthaug"
@@ -20,7 +21,9 @@ SOURCE = ROOT / "src" / "orthaug"
 PAGES = {page.relative_to(ROOT).as_posix(): page for page in pages()}
 BLOCKS = {name: list(blocks(page.read_text(encoding="utf-8"))) for name, page in PAGES.items()}
 RUNNING = [name for name, found in BLOCKS.items() if any(block.not_run is None for block in found)]
-NOT_RUN = 8
+REFERENCE = "".join(page.read_text(encoding="utf-8") for page in sorted((ROOT / "docs" / "reference").glob("*.md")))
+RESULTS = ("analysis", "selection", "inference")  # rooms whose classes are results
+NOT_RUN = 10
 OPTIONAL = ("casadi", "control", "dask", "distributed", "pyarrow", "sklearn")
 
 
@@ -71,12 +74,36 @@ def test_few_blocks_are_not_run_and_each_says_why():
 
 def test_every_public_name_is_in_the_reference():
     public = re.findall(r"^from \.[\w.]+ import (\w+) as \1$", (SOURCE / "__init__.pyi").read_text(), re.MULTILINE)
-    told = [
-        name
-        for page in sorted((ROOT / "docs" / "reference").glob("*.md"))
-        for name in re.findall(r"^::: orthaug\.(\w+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
-    ]
+    told = re.findall(r"^::: orthaug\.(\w+)$", REFERENCE, re.MULTILINE)
     assert sorted(told) == sorted(public) and len(public) > 80
+
+
+def test_what_functions_return_is_in_the_reference():
+    """Every class of ours that a public function returns, and every class of a result that its fields hold."""
+    classes: dict[str, list[tuple[str, ast.ClassDef]]] = {}
+    public = set(orthaug.__all__)
+    annotations = [str(getattr(getattr(orthaug, name), "__annotations__", {}).get("return")) for name in public]
+    for file in sorted(SOURCE.rglob("*.py")):
+        for node in ast.parse(file.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef):
+                classes.setdefault(node.name, []).append((file.relative_to(SOURCE).parts[0], node))
+    returned = set(classes).intersection(re.findall(r"\b[A-Z]\w+", " ".join(annotations)))
+    held = {
+        name
+        for owner in returned | (public & set(classes))
+        for room, node in classes[owner]
+        if room in RESULTS and (owner in returned or f"orthaug.{room}." in getattr(orthaug, owner).__module__)
+        for child in node.body
+        if isinstance(child, ast.AnnAssign)
+        for name in re.findall(r"\b[A-Z]\w+", ast.unparse(child.annotation))
+        if any(room in RESULTS for room, _ in classes.get(name, ()))
+    }
+    assert {"Verdict", "Budget", "Diagnosis", "Job", "Fitted"} <= returned and "SuspectedBias" in held
+    told = re.findall(r"^::: orthaug\.(?:[\w.]+\.)?(\w+)$", REFERENCE, re.MULTILINE)
+    assert (returned | held) - set(told) == set()
+    assert {"PhysicalEstimate", "Observations", "Tracking", "Alarm", "FitPlots", "Page"} <= set(told)
+    for shown in ("Estimate", "MotionEstimate"):
+        assert re.search(rf"^::: orthaug\.{shown}\n    options: .*plot, report", REFERENCE, re.MULTILINE)
 
 
 def test_every_page_is_in_the_navigation():
@@ -141,4 +168,10 @@ def test_a_page_of_the_site_that_loads_from_a_network_is_found(monkeypatch):
         "[a](../examples/mpc.py) [b](https://x.y) [c](spec.md#data) [d](absent.md)", "docs/export.md"
     )
     assert linked == {"../examples/mpc.py": "examples/mpc.py", "spec.md": "docs/spec.md"}
+    section = '<nav class="md-nav" data-md-level="1" aria-labelledby="l">'
+    named = hooks.NAMED.sub(
+        r'\1 aria-label="\3"\2\3', f'{section} <label class="md-nav__title"><span></span> Theory </label>'
+    )
+    assert named.startswith('<nav class="md-nav" data-md-level="1" aria-label="Theory">')
+    assert hooks.boost("export.md") > hooks.boost("reference/further.md") > hooks.boost("repository/README.md")
     assert hooks.place("examples/mpc.py") == "repository/examples/mpc.py" and hooks.place("docs/spec.md") == "spec.md"

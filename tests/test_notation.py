@@ -44,7 +44,7 @@ NAMES = [f"{row.get('label') or row['symbol']} {row['in the code']}"[:60] for ro
 
 
 def symbols_of(row: Row) -> set[str]:
-    cell = row.get("symbol", "–")
+    cell = row.get("symbol", "–").replace("\\", "")  # of stars, which would be emphasis
     return {cell, *cell.split(", ")} - {"–"}
 
 

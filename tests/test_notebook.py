@@ -153,6 +153,15 @@ def test_new_axes_are_pyplots_where_it_is_in_use():
     assert done.stdout.split("\n")[0] == "False [1] True"
 
 
+def test_a_motion_has_a_page_too(motion):
+    u = np.sin(np.arange(120.0) ** 1.2)
+    speed = np.zeros(121)
+    for k in range(120):
+        speed[k + 1] = np.exp(-0.05) * speed[k] + (1 - np.exp(-0.05)) * u[k]
+    record = oa.Record.from_arrays(u, speed[:120], sampling_time=0.1, outputs=["x"])
+    assert "c*v" in oa.estimate(record, motion, learner=None).report().html
+
+
 def test_the_page_of_a_fit(fit, tmp_path):
     page = fit.report(tmp_path / "page.html", tests={"again": fit.problem.record})
     assert page.path.read_text(encoding="utf-8") == page.html

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import pytest
 import yaml
 
 import orthaug
+from orthaug.commands.keys import keys_of_a_spec, schema_of_a_spec
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -95,10 +97,47 @@ def test_the_container_copies_what_is_there():
     assert {"pyproject.toml", "src"} <= set(names) and all((ROOT / name).exists() for name in names)
 
 
+def test_the_wheel_carries_what_tells_of_every_key():
+    wheel = PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]
+    assert wheel["force-include"] == {"docs/spec.md": "orthaug/commands/spec.md"}
+    assert keys_of_a_spec() == text("docs/spec.md").rstrip()  # which init's specs and the app point at
+    properties = schema_of_a_spec()["properties"]
+    assert {"data", "baseline", "motion", "learner", "structure", "training"} <= set(properties)
+    assert {name for name in properties if f"## [{name}]" not in keys_of_a_spec().replace("[[", "[")} == set()
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/start.md", "docs/install.md"])
+def test_every_extra_is_told(page):
+    extras = set(PROJECT["project"]["optional-dependencies"]) - {"dev"}
+    told = set(
+        re.findall(r"`(\w+)`", text(page).partition("xtra")[2].partition("\n\n[")[0].partition("\nWhere an extra")[0])
+    )
+    assert extras <= told
+
+
+def test_the_image_sees_what_it_copies():
+    kept = [line[1:] for line in text(".dockerignore").splitlines() if line.startswith("!")]
+    (line,) = [line for line in text("packaging/Containerfile").splitlines() if line.startswith("COPY pyproject")]
+    assert {*line.split()[1:-1], "docs/spec.md", "src"} == set(kept)
+
+
+def test_the_suite_runs_on_the_python_that_is_set_up():
+    suite = yaml.safe_load(text(".github/workflows/test.yml"))["jobs"]["suite"]["steps"]
+    (python,) = [step["with"]["python-version"] for step in suite if "python-version" in step.get("with", {})]
+    (pythons,) = [step["env"]["PYTHONS"] for step in suite if step.get("run") == ".ci/run"]
+    assert pythons == f"python{python}" and re.search(r"^PYTHONS \?= ", text("Makefile"), re.MULTILINE)
+
+
+def test_lines_end_alike_on_every_system():
+    assert text(".gitattributes").startswith("* text=auto eol=lf\n")
+
+
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_completion(shell, tmp_path):
     words = {"COMP_WORDS": "orthaug fit --r", "COMP_CWORD": "2", "_TYPER_COMPLETE_ARGS": "orthaug fit --r"}
-    settings = {"PATH": "", "HOME": str(tmp_path), "PYTHONPATH": str(ROOT / "src"), **words}
+    homes = dict.fromkeys(("HOME", "USERPROFILE"), str(tmp_path))
+    system = {name: os.environ[name] for name in ("SYSTEMROOT",) if name in os.environ}  # Windows starts none without
+    settings = {"PATH": "", "PYTHONPATH": str(ROOT / "src"), **homes, **system, **words}
     settings |= {"_ORTHAUG_COMPLETE": f"complete_{shell}", "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
     command = [sys.executable, "-m", "orthaug"]
     done = subprocess.run(command, env=settings, capture_output=True, text=True, timeout=60, check=False)

@@ -185,7 +185,13 @@ def test_what_is_refused_and_how():
         (oa.AugmentedRegressor("speed"), X, "`physics` must be 'linear', a list of expressions or Terms"),
         (oa.AugmentedRegressor(3), X, "`physics` must be 'linear'.*got 3"),
         (oa.AugmentedRegressor(["speed[k-1]"], learner=None), X, "the rows of X have no order"),
-        (oa.AugmentedRegressor(["mass*speed"]), X, "baseline term 'theta1': .*mass"),
+        (oa.AugmentedRegressor(["mass*speed"]), X, "unknown column 'mass'; the columns are speed, angle"),
+        (oa.AugmentedRegressor({"drag": "sped**2 + 1e3"}), X, "unknown column 'sped', did you mean"),
+        (
+            oa.AugmentedRegressor(learner=None),
+            X.assign(angle=1.0),
+            r"constant \(1\).* PolynomialFeatures .*include_bias",
+        ),
         (oa.AugmentedRegressor(lambda x: x), X, r"returned shape \(2,\) for one row; expected \(n_outputs, n_param"),
         (oa.AugmentedRegressor(), X.assign(angle=1.0), "channel 'angle' is constant"),
         (oa.AugmentedRegressor(["speed", "2*speed"]), X, "rank-deficient"),
@@ -281,6 +287,37 @@ def test_narx_of_several_outputs_and_lags():
     narx = oa.AugmentedNARX(lags=oa.Lags(na=1, nb=2), learner=None).fit(u[:, None], both)
     assert [str(i) for i in narx.coef_table_.index[:4]] == ["intercept_y0", "intercept_y1", "y0_1_y0", "y0_1_y1"]
     assert narx.first_row_ == 2 and narx.predict(u[:, None], both).shape == both.shape
+
+
+def test_of_the_outputs_only_the_first_rows_start_a_free_run(narx, records):
+    X, y, groups, _ = records
+    behind = np.array(y, dtype=float)
+    behind[10:20] = np.nan
+    np.testing.assert_array_equal(narx.simulate(X, behind, groups), narx.simulate(X, y, groups))
+    behind[0] = np.nan
+    with pytest.raises(oa.InputError, match="`initial` is not finite at row 0"):
+        narx.simulate(X, behind, groups)
+
+
+@pytest.mark.parametrize(
+    ("label", "words"), [(None, "no label at row 3"), (np.nan, "no label at row 3"), (2, "int, str")]
+)
+def test_labels_of_experiments(narx, records, label, words):
+    X, y, _, _ = records
+    groups = np.array(["a"] * len(X), dtype=object)
+    groups[3] = label
+    with pytest.raises(oa.InputError, match=words):
+        narx.predict(X, y, groups)
+
+
+def test_what_sets_a_field_of_a_declaration_names_the_remedy():
+    model = oa.AugmentedRegressor(learner=SMALL)
+    with pytest.raises(
+        oa.InputError, match=r'give `learner` itself, in a grid \{"learner": \[oa.MLP\(hidden=…\), …\]\}'
+    ):
+        model.set_params(learner__hidden=(3,))
+    with pytest.raises(ValueError, match="Invalid parameter"):
+        model.set_params(learned=None)
 
 
 def test_what_a_narx_refuses_and_how(narx, records):

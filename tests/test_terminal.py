@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import subprocess
@@ -11,9 +12,9 @@ from pathlib import Path
 import pytest
 from test_cli import SPEC, make_project, run
 
-from orthaug._base.lines import WIDTH, fold, table
+from orthaug._base.lines import WIDTH, fit_screen, fold, table
 from orthaug._base.log import LOG, show_log
-from orthaug.commands import bars
+from orthaug.commands import bars, streams
 
 COMMAND = [sys.executable, "-m", "orthaug"]
 LEARNER = """kind = "mlp"
@@ -49,6 +50,30 @@ def test_help_fits():
     names = ("fit", "predict", "track", "linearize", "reproduce")
     for arguments in (("--help",), *((name, "--help") for name in names)):
         assert fits(run(*arguments).out)
+
+
+def test_help_cuts_no_line_of_a_command(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    told = run("--help").out.partition("Commands:")[2]
+    assert "..." not in told and len(told.splitlines()) > 15
+
+
+@pytest.mark.parametrize(("columns", "most"), [(80, 80), (200, 100), (0, 100), (20, 40)])
+def test_lines_fit_a_terminal_that_is_narrower(columns, most, monkeypatch):
+    screen = io.StringIO()
+    screen.isatty, screen.fileno = lambda: True, lambda: 1  # type: ignore[method-assign]
+    monkeypatch.setattr(os, "get_terminal_size", lambda number: os.terminal_size((columns, 24)))
+    monkeypatch.setattr(sys, "stdout", screen)
+    words = " ".join(["word"] * 60)
+    try:
+        streams.prepare()
+        folded = fold([words])
+        assert most - len("word ") < max(map(len, folded)) <= most
+    finally:
+        fit_screen(0)
+    monkeypatch.setattr(sys, "stdout", io.StringIO())
+    streams.prepare()
+    assert fold([words]) == fold([words], WIDTH)
 
 
 def test_sentences_and_cells_go_on_in_the_next_line():

@@ -10,15 +10,23 @@ import logging
 import os
 import posixpath
 import re
+import sys
 from pathlib import Path
 
 from mkdocs.structure.files import File, Files
+
+sys.path.append(os.fspath(Path(__file__).resolve().parent))
+import formulas  # noqa: E402  (beside this file, which is no package)
 
 ROOT = Path(__file__).resolve().parents[2]
 LINK = re.compile(r"(\]\()([^)#\s]+)([^)]*\))")
 LOADED = re.compile(r"<(?:script|link|img|iframe)\b[^>]*\b(?:src|href)=[\"']?(?:https?:)?//[^>]*>")
 NOT_RUN = re.compile(r"^<!-- not run: (.+?) -->$", re.MULTILINE)
 PLACE = "repository"
+NAMED = re.compile(  # a section of the navigation, by a label that may be hidden
+    r'(<nav class="md-nav" data-md-level="\d+") aria-labelledby="\w+"'
+    r'([^>]*>\s*<label class="md-nav__title"[^>]*>\s*<span[^>]*></span>\s*)([^<]*[^<\s])'
+)
 ALWAYS = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "examples/README.md", "benchmarks/README.md")
 
 
@@ -57,8 +65,21 @@ def on_files(files: Files, config) -> Files:
     return files
 
 
+def on_config(config):
+    """Without a page for addresses that are not there: opened from disk it finds none of its own files."""
+    config.theme.static_templates.discard("404.html")
+    return config
+
+
+def boost(uri: str) -> float:
+    """How much a page counts in the search: what tells how to do something stands before lists of names."""
+    room = uri.partition("/")[0]
+    return {"reference": 0.2, PLACE: 0.1, "design.md": 0.3, "notation.md": 0.3}.get(room, 3.0)
+
+
 def on_page_markdown(markdown: str, page, config, files: Files) -> str:
     """Bends the links of a page to where their targets are in the site, and shows why a block is not run."""
+    page.meta.setdefault("search", {"boost": boost(page.file.src_uri)})
     here = posixpath.dirname(page.file.src_uri)
     found = targets(markdown, origin(page.file.src_uri))
 
@@ -70,9 +91,9 @@ def on_page_markdown(markdown: str, page, config, files: Files) -> str:
 
 
 def on_post_page(output: str, page, config) -> str:
-    """Under `strict` refuses a page that would load something from a network; names the search for screen readers."""
+    """Under `strict` refuses a page that would load something from a network; typesets formulas, names the search."""
     for tag in LOADED.findall(output):
         logging.getLogger("mkdocs.hooks").warning("%s loads from a network: %s", page.file.src_uri, tag)
-    return output.replace(
+    return formulas.typeset(NAMED.sub(r'\1 aria-label="\3"\2\3', output)).replace(
         'data-md-component="search" role="dialog"', 'data-md-component="search" role="dialog" aria-label="Search"'
     )

@@ -6,10 +6,17 @@ import re
 import textwrap
 from collections.abc import Iterable, Sequence
 
-WIDTH = 100  # columns of what is printed
+WIDTH = 100  # columns of what is printed, at most
+_NARROWEST = 40  # below, folded tables are harder to read than lines that the terminal breaks
+_screen = [WIDTH]
 _LAST_CELL = re.compile(r"^.*\S {2,}(?=\S)|^ +(?=\S)")
 _LATEST = 64  # column at which the last cell of a row may begin for it to be folded there
 _GAP = "  "
+
+
+def fit_screen(columns: int) -> None:
+    """Let what is printed from now on fit a terminal of so many columns, 40 to 100; 0 where they are not known."""
+    _screen[0] = min(WIDTH, max(columns, _NARROWEST)) if columns > 0 else WIDTH
 
 
 def counted(number: int, thing: str) -> str:
@@ -41,10 +48,11 @@ def plain_number(value: float, digits: int = 2, *, sign: str = "") -> str:
     return f"{rounded:{sign}.0f}" if 100 <= abs(rounded) < 1e7 else text
 
 
-def table(rows: Sequence[Sequence[str]], width: int = WIDTH) -> list[str]:
-    """Rows of cells as lines, the first row the head. Rows may be of different lengths.
+def table(rows: Sequence[Sequence[str]], width: int | None = None) -> list[str]:
+    """Rows of cells as lines of at most `width` columns (None: the screen's), the first row the head.
 
-    Columns that do not fit stand below, under the first column again; an interval stays beside its value.
+    Rows may be of different lengths. Columns that do not fit stand below, under the first column again; an interval
+    stays beside its value.
 
     Examples:
         >>> table([["part", "RMSE", "FIT %"], ["test", "0.1 m", "90"]])
@@ -56,7 +64,7 @@ def table(rows: Sequence[Sequence[str]], width: int = WIDTH) -> list[str]:
     whole = [[*row, *[""] * (count - len(row))] for row in rows]
     widths = [max(len(row[i]) for row in whole) for i in range(count)]
     lines: list[str] = []
-    for block in _blocks(whole[0], widths, width):
+    for block in _blocks(whole[0], widths, width or _screen[0]):
         lines += [""] if lines else []
         lines += [_GAP.join(row[i].ljust(widths[i]) for i in block).rstrip() for row in whole]
     return lines
@@ -81,8 +89,10 @@ def _blocks(head: Sequence[str], widths: Sequence[int], width: int) -> list[list
     return blocks
 
 
-def fold(lines: Iterable[str], width: int = WIDTH) -> list[str]:
-    r"""Lines of at most `width` columns: sentences go on indented, the last cell of a row under itself.
+def fold(lines: Iterable[str], width: int | None = None) -> list[str]:
+    r"""Lines of at most `width` columns (None: the screen's).
+
+    Sentences go on indented, the last cell of a row under itself.
 
     Examples:
         >>> fold(["warning: the interval does not cover it"], width=30)
@@ -92,8 +102,9 @@ def fold(lines: Iterable[str], width: int = WIDTH) -> list[str]:
         >>> fold(["It may.\nThe run stays within its bounds here."], width=24)
         ['It may.', 'The run stays within its', '  bounds here.']
     """
+    most = width or _screen[0]
     single = (one for line in lines for one in line.split("\n"))
-    return [part for line in single for part in (_folded(line, width) if len(line) > width else [line])]
+    return [part for line in single for part in (_folded(line, most) if len(line) > most else [line])]
 
 
 def _folded(line: str, width: int) -> list[str]:

@@ -86,9 +86,27 @@ def bias_budget(
     """The bias that what the learner found implies; None where no cause explains enough of it.
 
     Args:
+        fit: with a learner and the orthogonal structure; of others there is no budget.
         suspects: terms that may be missing, looked at first.
         physics: the map from physical parameters to θ, for their biases.
         measure: what θ was split under, where that is not the training measure.
+
+    Returns:
+        The `cause`, the `share` of the learner that it explains, and the bias of each of `parameters` and `physical`,
+        estimate less truth, with an interval that covers bias and noise together.
+
+    Raises:
+        InputError: another measure than that of the fit; a suspect on channels or lags that the data do not have.
+
+    Examples:
+        >>> import orthaug as oa
+        >>> u = np.random.default_rng(0).uniform(-1, 1, 300)
+        >>> record = oa.Record.from_arrays(u, 2 * u + u**3 + 0.05 * np.random.default_rng(1).normal(size=300))
+        >>> gain = oa.Baseline.from_terms([oa.Term("gain", "u[k]")])
+        >>> fit = oa.estimate(record, gain, learner=oa.Terms(("u[k]**3",)), structure=oa.Orthogonal(shared="all"))
+        >>> budget = bias_budget(fit, [oa.Suspect("cubic", "u[k]**3")])
+        >>> budget.cause.suspect.name, round(budget.of("gain").value, 1)  # θ took 0.6 of the cubic
+        ('cubic', 0.6)
     """
     if not fit.status.ok or fit.model.structure != "orthogonal" or fit.model.form.bound is None:
         return None

@@ -57,6 +57,15 @@ def stability(
 
     Raises:
         InputError: as the single checks.
+
+    Examples:
+        >>> import orthaug as oa
+        >>> u = [1.0, 2.0, 0.0, 3.0, 1.0, 0.0]
+        >>> record = oa.Record.from_arrays(u=u, y=[0.0, 0.5, 1.25, 0.625, 1.8125, 1.40625])  # 0.5 (y[k-1] + u[k-1])
+        >>> physics = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")])
+        >>> found = stability(oa.estimate(record, physics, learner=None).model, record)
+        >>> print(found.diverges_at, round(found.contraction.rate, 6))
+        None 0.5
     """
     gradients, run = lipschitz(model, record, x=x), feedback(model, record, response=response)
     contracts = contraction(model, record, box=box, along=run)

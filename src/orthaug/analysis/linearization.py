@@ -70,6 +70,14 @@ def linearize(
 
     Raises:
         InputError: no point of rest, a name that the model does not have, a record that does not fit.
+
+    Examples:
+        >>> import orthaug as oa
+        >>> u = [1.0, 2.0, 0.0, 3.0, 1.0, 0.0]
+        >>> record = oa.Record.from_arrays(u=u, y=[0.0, 0.5, 1.25, 0.625, 1.8125, 1.40625])  # 0.5 (y[k-1] + u[k-1])
+        >>> physics = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")])
+        >>> round(linearize(oa.estimate(record, physics, learner=None))[0].poles[0].z.real, 6)
+        0.5
     """
     kinds = Model | MotionModel | Estimate | MotionEstimate
     check_type(model, kinds, "model", "a fitted model, or what estimate returns")

@@ -41,7 +41,14 @@ class SubstepBias:
 
 
 def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
-    """The part of p̂ that is the integrator's; None of a motion that is not integrated, or without normal equations."""
+    """The part of p̂ that is the integrator's; None of a motion that is not integrated, or without normal equations.
+
+    Args:
+        fit: of a motion, from `estimate`.
+
+    Returns:
+        p̂ less what a fit with twice the substeps would give, to first order, in the units of p and in standard errors.
+    """
     motion, course, numbers = fit.problem.motion, fit.course, fit.model.numbers
     slope, substeps = fit.split_by.slope, course.dynamics.substeps
     if motion.integrator == "discrete" or fit.scores is None or slope is None or 2 * substeps > MOST_SUBSTEPS:

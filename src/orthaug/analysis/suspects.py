@@ -70,6 +70,8 @@ class Suspect:
     Examples:
         >>> Suspect("drag", "v[k-1]*abs(v[k-1])", coefficient=-0.1).lags
         (Lag(channel='v', lag=1),)
+        >>> Suspect.of("coulomb", "v[k-1]").expression
+        'sign(v[k-1])'
     """
 
     name: str

@@ -34,6 +34,17 @@ def verdict(
 
     Raises:
         InputError: a record without outputs or with other channels; an estimate that is not usable.
+
+    Examples:
+        >>> import numpy as np
+        >>> import orthaug as oa
+        >>> u = np.random.default_rng(0).uniform(-1, 1, 300)
+        >>> record = oa.Record.from_arrays(u, 2 * u + u**3 + 0.05 * np.random.default_rng(1).normal(size=300))
+        >>> gain = oa.Baseline.from_terms([oa.Term("gain", "u[k]")])
+        >>> train, test = record.split(0.7)
+        >>> fit = oa.estimate(train, gain, learner=oa.Terms(("u[k]**3",)))
+        >>> verdict(fit, oa.estimate(train, gain, learner=None), test).code
+        'helps'
     """
     for name, estimate in (("fit", fit), ("alone", alone)):
         check_type(estimate, Estimate | MotionEstimate, name, "an Estimate")

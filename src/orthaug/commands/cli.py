@@ -150,7 +150,10 @@ def design(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """An input within limits under which suspected terms and noise disturb the parameters least."""
+    """Design an input that biases the parameters least.
+
+    Within limits, against suspected terms and noise: [design] of the spec.
+    """
     from orthaug.commands import design as designing
     from orthaug.commands.folder import check_file
     from orthaug.commands.opening import open_job
@@ -167,7 +170,10 @@ def design(
 
 @app.command()
 def select(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force: Force = False) -> None:
-    """Choose orders, delay and terms (or a network's width and inputs), and write a spec with the choice."""
+    """Choose orders, delay and terms, and write a spec with them.
+
+    Or a network's width and inputs: [selection] of the spec.
+    """
     from orthaug.commands.bars import selection_bar
     from orthaug.commands.folder import check_folder, check_inputs_kept
     from orthaug.commands.select import open_select, select_for, steps_at_most, write_selected
@@ -197,7 +203,10 @@ def init(
     sampling_time: Annotated[float | None, typer.Option("--sampling-time", metavar="S", help="Between rows.")] = None,
     force: Force = False,
 ) -> None:
-    """Look at a data file, and write a first spec for it that runs; asks where it is on a terminal."""
+    """Look at a data file, and write a first spec that runs.
+
+    Asks for the columns where it is on a terminal and they are not given.
+    """
     from orthaug._base.errors import InputError
     from orthaug.commands.folder import check_file
     from orthaug.commands.init import assign, draft, look, question, write_spec
@@ -231,7 +240,10 @@ def page(
     port: Annotated[int | None, typer.Option("--port", metavar="N", help="A free one without it.")] = None,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open it in the browser.")] = True,
 ) -> None:
-    """A page on this machine to look at data, write physics, train and export."""
+    """A page on this machine to do all of this in a browser.
+
+    Look at data, write physics, train, compare and export.
+    """
     from orthaug.commands.app.server import serve
 
     serve(spec, port=port, browser=browser)
@@ -242,14 +254,20 @@ def schema(
     command: Annotated[
         str,
         typer.Argument(
-            metavar="[COMMAND]", help="fit, check, compare, split, design, select, explain, linearize or track."
+            metavar="[WHAT]",
+            help="fit, check, compare, split, design, select, explain, linearize or track: what the command writes; "
+            "spec: a spec file; keys: every key of a spec, in words.",
         ),
     ] = "fit",
 ) -> None:
-    """The JSON schema of what a command writes."""
+    """The JSON schema of a result or a spec; keys: in words."""
+    from orthaug.commands.keys import keys_of_a_spec, schema_of_a_spec
     from orthaug.reports.schemas import RESULTS, schema_of
 
-    streams.echo(_json(schema_of(check_choice(command, RESULTS, "COMMAND"))))
+    if check_choice(command, (*RESULTS, "spec", "keys"), "WHAT") == "keys":
+        streams.echo(keys_of_a_spec())
+    else:
+        streams.echo(_json(schema_of_a_spec() if command == "spec" else schema_of(command)))
 
 
 @app.command()
@@ -265,7 +283,10 @@ def reproduce(
     ] = None,
     force: Force = False,
 ) -> None:
-    """The paper's figures and tables, each number beside the published one; goes on where it was interrupted."""
+    """The paper's figures and tables beside the published ones.
+
+    Goes on where it was interrupted.
+    """
     from orthaug.studies import reproduction
 
     folder = out or Path("orthaug-out/reproduction")

@@ -144,6 +144,6 @@ def job_of(fit: Any, tests: Mapping[str, Record]) -> Job:
     )
     measure = Training() if fit.model.measure == "training" else getattr(fit.measure, "measure", None) or Training()
     if isinstance(fit, MotionEstimate):
-        return MotionJob(measure=measure, **named)
+        return MotionJob(measure=measure, engine=InMemory(), **named)
     weighed = weigh_problem(measure, problem)
     return LaggedJob(weighed=weighed, physics=None, engine=InMemory(), **named)

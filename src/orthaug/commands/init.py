@@ -249,7 +249,7 @@ def _spec(
     """The spec with comments."""
     document = tomlkit.document()
     document.add(tomlkit.comment(f"Written by orthaug init from {found.path.name}. Run: orthaug fit {out.name}"))
-    document.add(tomlkit.comment("Every key: docs/spec.md. What is written here is a start, not a verdict."))
+    document.add(tomlkit.comment("Every key: orthaug schema keys. What is written here is a start, not a verdict."))
     document.add("data", _data(found, roles, out, rows, cut, missing, named))
     document.add(tomlkit.nl())
     document.add(

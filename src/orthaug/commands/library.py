@@ -23,6 +23,9 @@ Spec = str | os.PathLike | Job
 def load_spec(path: str | os.PathLike) -> Job:
     """Read a spec and all its data, and check them against each other; nothing is trained.
 
+    Args:
+        path: of the spec, a TOML file; paths in it start at its folder.
+
     Returns:
         What `fit_spec` and `compare` take. `train.record`, `validation` and `tests` are its data, `problem` the rows
         with the physics, `spec` the declarations.

@@ -108,7 +108,10 @@ def split(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Parameters of a saved model under another measure, without training again."""
+    """Parameters of a saved model under another measure.
+
+    Without training again.
+    """
     from orthaug.commands import split as splitting
     from orthaug.commands.measure_options import read_measure, split_place
     from orthaug.commands.run import prepared_notes, read_rows
@@ -136,7 +139,10 @@ def explain(
     rows: Rows = None,
     as_json: AsJson = False,
 ) -> None:
-    """Which terms the learner of a saved model has found, and what to write into the physics."""
+    """Which terms the learner of a saved model has found.
+
+    And what to write into the physics.
+    """
     from orthaug.commands.explain import explain_model
     from orthaug.commands.run import Reading, open_run, read_rows
     from orthaug.reports.explanation_text import explain_text
@@ -185,7 +191,10 @@ def linearize(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Operating points of a saved model, and its poles, gains and frequency response there with intervals."""
+    """Operating points of a saved model; its poles and gains.
+
+    With intervals, and the frequency response.
+    """
     from orthaug.commands import linearize as linearizing
     from orthaug.commands.run import prepared_notes
 
@@ -228,7 +237,10 @@ def track(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Parameters of a saved model over new data by recursive least squares, with an alarm."""
+    """Parameters of a saved model over new data, with an alarm.
+
+    By recursive least squares with forgetting.
+    """
     from orthaug.commands import track as tracking
     from orthaug.commands.folder import check_folder, check_kept
     from orthaug.commands.run import prepared_notes, read_rows

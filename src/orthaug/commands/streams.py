@@ -9,6 +9,8 @@ import unicodedata
 from contextlib import suppress
 from typing import Any, TextIO
 
+from orthaug._base.lines import fit_screen
+
 _PLAIN = {
     **{"‖": "||", "±": "+-", "…": "...", "–": "-", "−": "-", "×": "x", "·": "*", "⊥": "_|_", "ᵀ": "^T", "\u0303": "~"},
     **{"≤": "<=", "≥": ">=", "≠": "!=", "≈": "~", "→": "->", "½": "1/2", "\u2011": "-", "√": "sqrt", "∂": "d"},
@@ -25,6 +27,9 @@ def prepare() -> None:
         stream = getattr(sys, name)
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="orthaug.plain")
+    with suppress(OSError, ValueError, AttributeError):
+        if sys.stdout.isatty():  # in pipes and files lines stay what tests and programs know
+            fit_screen(os.get_terminal_size(sys.stdout.fileno()).columns)
 
 
 def plain(error: UnicodeError) -> tuple[str, int]:

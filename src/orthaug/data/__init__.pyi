@@ -1,4 +1,7 @@
 from .dask_source import open_frame as open_frame
+from .filters import Decimate as Decimate
+from .filters import Highpass as Highpass
+from .filters import Lowpass as Lowpass
 from .parquet_source import open_parquet as open_parquet
 from .preparation import prepare as prepare
 from .readers import read_record as read_record
@@ -6,11 +9,8 @@ from .record import Channel as Channel
 from .record import Experiment as Experiment
 from .record import Record as Record
 from .regressors import Lags as Lags
-from .steps import Decimate as Decimate
 from .steps import Detrend as Detrend
 from .steps import Fill as Fill
-from .steps import Highpass as Highpass
-from .steps import Lowpass as Lowpass
 from .steps import Outliers as Outliers
 from .steps import Resample as Resample
 from .steps import Shift as Shift

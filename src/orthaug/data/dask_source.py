@@ -140,6 +140,8 @@ def open_frame(
 
     Args:
         frame: a `dask.dataframe.DataFrame`.
+        inputs, outputs: channel names, or `Channel`s with column, unit, scale and offset.
+        sampling_time: seconds between rows.
         experiment: the column, of numbers, that tells experiments apart; each is in one piece.
         columns: the frame's column for a channel.
         missing: "error", or "skip" to end a stretch at rows with a missing sample.

@@ -180,8 +180,13 @@ def open_parquet(
     """Look at the files without reading their channels: rows, columns and their types, experiments, sampling time.
 
     Args:
-        experiment: a column of whole numbers that tells experiments apart within a file; None for one a file. The
-            other arguments are those of `read_record`.
+        paths: of the files, in order; none of them reaches into the next.
+        inputs, outputs: channel names, or `Channel`s with column, unit, scale and offset.
+        sampling_time: seconds between rows; or `time`, the column that holds the instants.
+        experiment: a column of whole numbers that tells experiments apart within a file; None for one a file.
+        columns: the files' column for a channel, `{"position": "yVal"}`.
+        missing: "error", or "skip" to end a stretch at rows with a missing sample.
+        partition_rows: rows of a partition at least; row groups are never cut.
 
     Raises:
         InputError: a file that cannot be read, has no rows, lacks a column or holds another type in it; experiments

@@ -12,7 +12,8 @@ from orthaug._base.checks import check_type
 from orthaug._base.errors import InputError
 from orthaug._base.warning import Warning
 from orthaug.data.record import Experiment, Prepared, Record, same_step
-from orthaug.data.steps import STEPS, Run, Step, options_of, stretches
+from orthaug.data.runs import Run, Step, stretches
+from orthaug.data.steps import STEPS, options_of
 
 _FILTERS = ("lowpass", "highpass", "decimate")
 MENDING = ("outliers", "fill")

@@ -17,7 +17,8 @@ from orthaug._base.checks import Vector, check_choice, check_count, check_type
 from orthaug._base.errors import InputError, MissingSampleError, shown
 from orthaug.data.preparation import check_steps, prepared_experiments
 from orthaug.data.record import Channel, Experiment, Record, as_channels, check_step, same_step
-from orthaug.data.steps import Fill, Outliers, Resample, Run
+from orthaug.data.runs import Run
+from orthaug.data.steps import Fill, Outliers, Resample
 from orthaug.data.tables import Table, check_readable, has_column, read_table
 
 RowRange = tuple[int, int] | list[int]
@@ -42,10 +43,10 @@ def read_record(
     experiment: str | None = None,
     prepare: Sequence[Any] = (),
 ) -> Record:
-    """Read one file; several row ranges are experiments of their own.
+    r"""Read one file; several row ranges are experiments of their own.
 
     Args:
-        path: of a file with one of the endings in docs/spec.md, such as `.csv`, `.xlsx` or `.mat`.
+        path: of a file that ends in .csv, .tsv, .parquet, .xlsx, .npz, .mat or .h5.
         inputs, outputs: channel names, or `Channel`s with column, unit, scale and offset.
         sampling_time: seconds between rows; or `time`, the column that holds the instants.
         rows: half-open range `(start, stop)` of data rows, or several; None for all.
@@ -60,6 +61,14 @@ def read_record(
 
     Raises:
         InputError: no such file, wrong type, missing columns, cells that are empty or no finite numbers.
+
+    Examples:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = Path(folder, "run.csv")
+        ...     _ = file.write_text("force,position\\n0,0\\n1,0.5\\n2,1.5\\n", encoding="utf-8")
+        ...     read_record(file, inputs=["force"], outputs=["position"], sampling_time=0.01)
+        Record(1 experiment, 3 samples, Ts = 0.01 s, inputs: force; outputs: position)
     """
     path = _path(path)
     channels = [as_channels(inputs, "inputs"), as_channels(outputs, "outputs")]

@@ -24,7 +24,12 @@ def same_step(step: float, other: float) -> bool:
 
 @dataclass(frozen=True)
 class Channel:
-    """A named signal with its unit, and how files hold it: `value = scale * cell + offset` of `column`."""
+    """A named signal with its unit, and how files hold it: `value = scale * cell + offset` of `column`.
+
+    Examples:
+        >>> Channel("force", "N", column="F (kN)", scale=1000.0).label
+        'force [N]'
+    """
 
     name: str
     unit: str = ""
@@ -186,8 +191,9 @@ class Record(Shown):
     sampling_time: float
     experiments: tuple[Experiment, ...]
     time_column: str | None = None
+    """The column of the file that holds the instants, where there is one."""
     missing: int = 0
-    """Rows that were left out because a sample was missing."""
+    """Rows that were left out because a sample was missing: 0 unless it was read with `missing="skip"` or prepared."""
     prepared: tuple[Prepared, ...] = ()
     """What was done to the samples, in order."""
 
@@ -229,6 +235,10 @@ class Record(Shown):
 
         Raises:
             InputError: lengths that differ, cells that are not finite, names that do not fit.
+
+        Examples:
+            >>> Record.from_arrays([0.0, 1.0], [[0, 1], [2, 3]], outputs=[Channel("angle", "rad"), "speed"])
+            Record(1 experiment, 2 samples, Ts = 1 s, inputs: u; outputs: angle, speed)
         """
         if u is None and y is None:
             raise InputError("a record needs `u`, `y` or both; got neither.")

@@ -2,113 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import Ge, Gt
 
-from orthaug._base.checks import Matrix, Vector, check_number, check_type, nearest
+from orthaug._base.checks import Vector, check_number, check_type
 from orthaug._base.errors import InputError, shown
 from orthaug._base.registry import OneOf, Registry, check_fields
+from orthaug.data.filters import Decimate, Highpass, Lowpass
+from orthaug.data.runs import Channels, Run
 
 _MAD = 1.4826  # standard deviations of a normal variable in its median absolute deviation
 _FLOOR = 0.1  # of the usual local deviation: the least that a window is taken to have
 _APART = 3.0  # steps between instants from which on nothing is interpolated
-_ANTI_ALIAS, _RIPPLE, _CORNER = 8, 0.05, 0.8  # Chebyshev filter of decimation: order, dB, share of the new Nyquist
 _CHUNK = 100_000  # rows of windows at once
 
-Phase = Annotated[str, OneOf(("zero", "causal"))]
 Method = Annotated[str, OneOf(("linear", "pchip"))]
-Channels = tuple[str, ...] | None
-
-
-@dataclass(frozen=True, eq=False)
-class Run:
-    """An experiment on its way through the steps: `values` (N, n), NaN where a sample is missing, at `instants` [s]."""
-
-    values: Matrix
-    instants: Vector
-    names: tuple[str, ...]
-    inputs: int
-    """How many of the channels, the first ones, are inputs."""
-    step: float
-    """Sampling time [s]; of uneven instants the usual one."""
-    even: bool = True
-    first: int = 0
-    """Rows that were cut off at the begin."""
-    stride: int = 1
-    moved: bool = False
-    """Whether the samples are no rows of the file any more."""
-
-    def columns(self, channels: Channels, usual: range | None = None) -> list[int]:
-        """Indices of channels; without names the usual ones, which are all unless given."""
-        if channels is None:
-            return list(range(len(self.names)) if usual is None else usual)
-        check_type(channels, tuple | list, "channels", "a list of channel names")
-        for name in channels:
-            if name not in self.names:
-                known = ", ".join(self.names)
-                raise InputError(f"`channels`: no channel '{name}'{nearest(name, self.names)}; there are {known}.")
-        return [self.names.index(name) for name in channels]
-
-    def holding(self, columns: list[int], values: Matrix) -> Run:
-        """The same with other values in some columns."""
-        changed = self.values.copy()
-        changed[:, columns] = values
-        return replace(self, values=changed)
-
-    def check_even(self, what: str) -> None:
-        """Raise InputError where the instants are uneven."""
-        if not self.even:
-            raise InputError(f"{what} needs even sampling; put a step `resample` before it.")
-
-
-class Step(Protocol):
-    """A step of preparation: a frozen declaration."""
-
-    def apply(self, run: Run) -> Run:
-        """The experiment after the step.
-
-        Raises:
-            InputError: what cannot be done with these samples.
-        """
-        ...
-
-
-def stretches(values: Matrix) -> Iterator[slice]:
-    """Half-open ranges of rows without a missing sample."""
-    there = np.isfinite(values).all(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int)))
-    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        yield slice(begin, end)
-
-
-def _filtered(values: Matrix, sections: Matrix, phase: str, what: str) -> Matrix:
-    """Every stretch without a gap through a filter; those too short for it are missing."""
-    from scipy.signal import sosfilt, sosfilt_zi, sosfiltfilt
-
-    result, pad = np.full_like(values, np.nan), 3 * (2 * len(sections) + 1)
-    for part in stretches(values):
-        piece = values[part]
-        if phase == "causal":
-            start = sosfilt_zi(sections)[:, :, None] * piece[0]
-            result[part] = sosfilt(sections, piece, axis=0, zi=start)[0]
-        elif len(piece) > pad:
-            result[part] = sosfiltfilt(sections, piece, axis=0, padtype="odd", padlen=pad)
-    if not np.isfinite(result).all(axis=1).any():
-        longest = max((part.stop - part.start for part in stretches(values)), default=0)
-        raise InputError(
-            f"{what}: the longest stretch without a gap has {longest} rows, a filter of zero phase needs {pad + 1}: "
-            'fill gaps before, take a lower order, or phase = "causal".'
-        )
-    return result
 
 
 @dataclass(frozen=True)
 class Detrend:
-    """Takes the mean (`degree` 0) or the straight line (1) out of each channel, of each experiment its own."""
+    """Takes the mean (`degree` 0) or the straight line (1) out of each channel, of each experiment its own.
+
+    Args:
+        degree: 0 for the mean, 1 for a straight line.
+        channels: names; None for all, inputs and outputs.
+
+    Examples:
+        >>> from orthaug.data import Record, prepare
+        >>> record = Record.from_arrays(u=[1.0, 3.0], y=[5.0, 6.0], sampling_time=0.1)
+        >>> prepare(record, Detrend()).experiments[0].inputs.T
+        array([[-1.,  1.]])
+    """
 
     degree: Annotated[int, Ge(0)] = 0
     channels: Channels = None
@@ -129,74 +56,14 @@ class Detrend:
 
 
 @dataclass(frozen=True)
-class _Butterworth:
-    """A Butterworth filter. Of zero phase it goes forth and back, which squares its gain: −6 dB at the cutoff."""
-
-    cutoff: Annotated[float, Gt(0)]
-    """Hz"""
-    order: Annotated[int, Ge(1)] = 4
-    phase: Phase = "zero"
-    channels: Channels = None
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-        if self.order > 10:
-            raise InputError(f"`order` must be at most 10; got {shown(self.order)}.")
-
-    def _through(self, run: Run, kind: str) -> Run:
-        from scipy.signal import butter
-
-        run.check_even(f"`{kind}`")
-        nyquist = 0.5 / run.step
-        if self.cutoff >= nyquist:
-            raise InputError(
-                f"`cutoff`: {self.cutoff:g} Hz is not below {nyquist:g} Hz, half the sampling frequency at steps of "
-                f"{run.step:g} s; take a lower one."
-            )
-        columns = run.columns(self.channels)
-        sections = np.asarray(butter(self.order, self.cutoff / nyquist, kind, output="sos"))
-        return run.holding(columns, _filtered(run.values[:, columns], sections, self.phase, f"`{kind}`"))
-
-
-@dataclass(frozen=True)
-class Lowpass(_Butterworth):
-    """A Butterworth low-pass over all channels alike; `cutoff` in Hz."""
-
-    def apply(self, run: Run) -> Run:
-        return self._through(run, "lowpass")
-
-
-@dataclass(frozen=True)
-class Highpass(_Butterworth):
-    """A Butterworth high-pass over all channels alike; `cutoff` in Hz."""
-
-    def apply(self, run: Run) -> Run:
-        return self._through(run, "highpass")
-
-
-@dataclass(frozen=True)
-class Decimate:
-    """Keeps each `factor`-th row behind a Chebyshev low-pass of order 8 at 0.8 of the new Nyquist frequency."""
-
-    factor: Annotated[int, Ge(2)]
-    phase: Phase = "zero"
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-
-    def apply(self, run: Run) -> Run:
-        from scipy.signal import cheby1
-
-        run.check_even("`decimate`")
-        sections = np.asarray(cheby1(_ANTI_ALIAS, _RIPPLE, _CORNER / self.factor, output="sos"))
-        values = _filtered(run.values, sections, self.phase, "`decimate`")[:: self.factor]
-        kept = replace(run, values=values, instants=run.instants[:: self.factor], step=run.step * self.factor)
-        return replace(kept, stride=run.stride * self.factor)
-
-
-@dataclass(frozen=True)
 class Resample:
-    """Uneven time stamps onto an even grid, from the first on; nothing across more than three steps."""
+    """Uneven time stamps onto an even grid, from the first on; nothing across more than three steps.
+
+    Args:
+        sampling_time: s; None for the median of the steps.
+        method: "linear" between neighbours, or "pchip", a smooth cubic without overshoot. Both look at the next
+            sample, and neither removes what is faster than the new grid: put a `Lowpass` before it where that matters.
+    """
 
     sampling_time: float | None = None
     """s; None for the median of the steps."""
@@ -242,7 +109,18 @@ def _between(t: Vector, column: Vector, grid: Vector, method: str, most: float) 
 class Outliers:
     """Hampel's: samples over `threshold` deviations off the median of `window` rows on either side are missing.
 
-    The deviation is 1.4826 times the median absolute one. Without `channels` outputs are looked at, for inputs jump.
+    The deviation is 1.4826 times the median absolute one.
+
+    Args:
+        window: rows on either side, 1 or more.
+        threshold: deviations from which on a sample is missing.
+        channels: names; None for the outputs, for inputs jump on purpose.
+
+    Examples:
+        >>> from orthaug.data import Record, prepare
+        >>> record = Record.from_arrays(u=[0.0] * 9, y=[0.0, 0.1, 0.0, 0.1, 50.0, 0.1, 0.0, 0.1, 0.0])
+        >>> prepare(record, Outliers(), Fill()).experiments[0].outputs[4]
+        array([0.1])
     """
 
     window: Annotated[int, Ge(1)] = 5
@@ -278,7 +156,13 @@ class Outliers:
 
 @dataclass(frozen=True)
 class Fill:
-    """Reconstructs gaps of at most `most` samples between measured ones; longer ones stay."""
+    """Reconstructs gaps of at most `most` samples between measured ones; longer ones stay.
+
+    Args:
+        most: samples of a gap that is filled.
+        method: "linear" between the neighbours, or "pchip", a smooth cubic without overshoot.
+        channels: names; None for all, inputs and outputs.
+    """
 
     most: Annotated[int, Ge(1)] = 3
     method: Method = "linear"
@@ -303,7 +187,18 @@ class Fill:
 
 @dataclass(frozen=True)
 class Shift:
-    """Delays an input by `samples`: row k gets what was at row k − samples. The rows without one are cut off."""
+    """Delays an input by `samples`: row k gets what was at row k − samples. The rows without one are cut off.
+
+    Args:
+        channel: an input's name.
+        samples: a whole number; negative to let the input come earlier.
+
+    Examples:
+        >>> from orthaug.data import Record, prepare
+        >>> moved = prepare(Record.from_arrays(u=[1.0, 2.0, 3.0], y=[4.0, 5.0, 6.0]), Shift("u", 1)).experiments[0]
+        >>> moved.inputs.T, moved.outputs.T
+        (array([[1., 2.]]), array([[5., 6.]]))
+    """
 
     channel: str
     samples: int

@@ -16,7 +16,8 @@ from orthaug._base.checks import Vector
 from orthaug._base.errors import LONGEST, InputError
 from orthaug.data.expressions import SAMPLING_TIME, is_name
 from orthaug.data.readers import JITTER
-from orthaug.data.steps import Outliers, Run
+from orthaug.data.runs import Run
+from orthaug.data.steps import Outliers
 from orthaug.data.tables import column_names, read_table
 
 _UNITS = re.compile(

@@ -83,6 +83,17 @@ def export(
     Raises:
         InputError: an unknown target, a model that has no code (a Python function, an ensemble, a spline hold), or a
             folder that cannot be written.
+
+    Examples:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> import orthaug as oa
+        >>> record = oa.Record.from_arrays(u=np.sin(np.arange(50.0)), y=2 * np.sin(np.arange(50.0)))
+        >>> fit = oa.estimate(record, oa.Baseline.from_terms([oa.Term("gain", "u[k]")]), learner=None)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = export(fit.model, Path(folder, "code"), to="c", name="plant")
+        ...     sorted(file.name for file in Path(folder, "code").iterdir())
+        ['README.md', 'check.c', 'manifest.json', 'plant.c', 'plant.h', 'vectors.csv']
     """
     check_type(model, Model | MotionModel, "model", "a fitted model")
     check_type(folder, str | os.PathLike, "folder", "a folder's name")

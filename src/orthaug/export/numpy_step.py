@@ -119,8 +119,26 @@ class NumpyStep:
 def numpy_step(model: Model | MotionModel) -> NumpyStep:
     """The step of a fitted model in NumPy alone, for loops in Python and where JAX is too slow to call.
 
+    Args:
+        model: as `estimate` or `load` gives it.
+
+    Returns:
+        `state, outputs = step(state, inputs)`; `step.state_names` and `step.step_inputs` tell what is in both.
+
     Raises:
         InputError: physics or a learner that is a Python function, an ensemble, a spline hold.
+
+    Examples:
+        >>> import orthaug as oa
+        >>> u = [1.0, 2.0, 0.0, 3.0, 1.0, 0.0]
+        >>> record = oa.Record.from_arrays(u=u, y=[0.0, 0.5, 1.25, 0.625, 1.8125, 1.40625])  # 0.5 (y[k-1] + u[k-1])
+        >>> physics = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")])
+        >>> step = numpy_step(oa.estimate(record, physics, learner=None).model)
+        >>> step.state_names, step.step_inputs
+        (('y[k-1]', 'u[k-1]'), ('u',))
+        >>> state, outputs = step([4.0, 1.0], [1.0])
+        >>> outputs.round(6), state.round(6)
+        (array([2.5]), array([2.5, 1. ]))
     """
     return NumpyStep(program_of(model))
 

@@ -47,7 +47,12 @@ class Criterion(Protocol):
 
 @dataclass(frozen=True)
 class Prediction:
-    """Declaration: the error of the prediction `horizon` steps ahead; 1 is the paper's criterion (eq:cost_fun)."""
+    """Declaration: the error of the prediction `horizon` steps ahead; 1 is the paper's criterion (eq:cost_fun).
+
+    Examples:
+        >>> Prediction(10).flown
+        Simulation(segment=10, washout=9, start_iterations=20, exact_start=True)
+    """
 
     simulates = False
     washout = 0
@@ -84,6 +89,10 @@ class Simulation:
         washout: leading steps of a segment that are not scored, until its start is forgotten.
         start_iterations: one-step iterations that training starts from.
         exact_start: whether a segment starts exactly from what was measured; None for the rule above.
+
+    Examples:
+        >>> Simulation(segment=0, washout=0).estimates_pasts  # whole experiments, from starts that are estimated
+        True
     """
 
     one_step = False

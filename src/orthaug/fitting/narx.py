@@ -166,12 +166,12 @@ class AugmentedNARX(Augmented):
         model = self._fitted().model
         X = checked_again(self, X)
         found = np.full((len(X), len(self.output_names_)), np.nan)
-        start = None if initial is None else as_signal(initial, "initial")
+        whole = initial is not None and np.ndim(initial) > 0 and len(initial) == len(X)
         for group in _groups(groups, len(X)):
-            if start is None:
-                begin: Any = "zero"
-            else:
-                begin = start[group.rows] if len(start) == len(X) else start
+            begin: Any = "zero"
+            if initial is not None:  # what lies behind the first rows may hold anything
+                given = np.asarray(initial)[group.rows] if whole else initial
+                begin = as_signal(given[: self.first_row_] if np.ndim(given) else given, "initial")
             found[group.rows] = model.simulate(self._record(X, None, [group]), initial=begin).model
         return self._shaped(found)
 
@@ -229,6 +229,13 @@ def _groups(groups: Any, rows: int) -> Iterator[Group]:
     labels = np.asarray(groups)
     if labels.shape != (rows,):
         raise InputError(f"`groups` has the shape {labels.shape}; expected one label for each of {rows} rows.")
-    found, first = np.unique(labels, return_index=True)
+    bare = [k for k, label in enumerate(labels.tolist()) if label is None or label != label]
+    if bare:
+        raise InputError(f"`groups` has no label at row {bare[0]}: found {labels[bare[0]]}; every row needs one.")
+    try:
+        found, first = np.unique(labels, return_index=True)
+    except TypeError:
+        kinds = sorted({type(label).__name__ for label in labels})
+        raise InputError(f"`groups` mixes labels of the types {', '.join(kinds)}; take one type.") from None
     for label in found[np.argsort(first)]:
         yield Group(label, np.flatnonzero(labels == label))

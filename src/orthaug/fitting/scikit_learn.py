@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from orthaug._base.checks import check_count
+from orthaug._base.checks import check_count, nearest
 from orthaug._base.errors import InputError, TrainingError, shown
 from orthaug._base.jax import jax
-from orthaug.data.expressions import is_name
+from orthaug.data.expressions import RESERVED, SAMPLING_TIME, is_name
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags, Layout
 from orthaug.fitting.estimates import Estimate
@@ -77,19 +77,17 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
         seed = self.random_state
         if seed is None or isinstance(seed, np.random.RandomState):
             seed = int(check_random_state(seed).randint(2**31 - 1))
-        fit = estimate(
-            record,
-            baseline,
-            lags=lags,
-            learner=learner,
-            structure=Orthogonal() if self.structure is None else self.structure,
-            solver=LevenbergMarquardt() if self.solver is None else self.solver,
-            regularization=self.regularization,
-            restarts=self.restarts,
-            seed=check_count(seed, "random_state", least=0),
-            output_weights=self.output_weights,
-            **more,
-        )
+        options: dict[str, Any] = {"lags": lags, "learner": learner, "regularization": self.regularization, **more}
+        options |= {"restarts": self.restarts, "output_weights": self.output_weights}
+        options["structure"] = Orthogonal() if self.structure is None else self.structure
+        options["solver"] = LevenbergMarquardt() if self.solver is None else self.solver
+        try:
+            fit = estimate(record, baseline, seed=check_count(seed, "random_state", least=0), **options)
+        except InputError as error:
+            if not any(f"'{name}' is constant (1)" in str(error) for name in input_names(self)):
+                raise
+            hint = "A column of ones is what PolynomialFeatures adds first: give it include_bias=False."
+            raise InputError(f"{error} {hint}") from None
         if fit.model.form.first_row and not self._ordered:
             raise InputError("the rows of X have no order, so there are no lags of them; use an AugmentedNARX.")
         if not fit.status.ok:
@@ -108,6 +106,23 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Standard deviation of the noise of each output (n_outputs,); None where no degrees of freedom are left."""
         noise = self._fitted().model.statistics.noise
         return None if noise is None else np.sqrt(np.diag(noise))
+
+    def set_params(self, **params: Any) -> Any:
+        """As of scikit-learn.
+
+        Raises:
+            InputError (a ValueError): a field of a declaration, which is exchanged whole: no `learner__hidden`.
+        """
+        for name in params:
+            own, field, rest = name.partition("__")
+            value = getattr(self, own, None)
+            if field and is_dataclass(value) and not isinstance(value, type):
+                kind = type(value).__name__
+                raise InputError(
+                    f"`{name}`: {kind} is a declaration that is exchanged whole; give `{own}` itself, in a grid "
+                    f'{{"{own}": [oa.{kind}({rest}=…), …]}}.'
+                )
+        return super().set_params(**params)  # type: ignore[misc]
 
     def _shaped(self, values: np.ndarray) -> np.ndarray:
         """Values (n, n_outputs) with as many axes as y had."""
@@ -243,4 +258,17 @@ def baseline_of(physics: Any, layout: Layout, outputs: Sequence[str], names: Seq
             "`physics` must be 'linear', a list of expressions or Terms, a mapping of parameters to expressions, a "
             f"Baseline, or a function of a row; got {shown(physics)}."
         )
+    for term in physics:
+        _check_columns(term.regressor, names)
     return Baseline.from_terms([replace(t, regressor=at_now(t.regressor, names)) for t in physics])
+
+
+def _check_columns(text: Any, names: Sequence[str]) -> None:
+    """Raise InputError for a name in an expression of columns that is none of them."""
+    found = re.findall(r"(?<![\w.])[A-Za-z_]\w*\b(?!\s*[\[(])", text) if names and isinstance(text, str) else []
+    for name in found:
+        if name not in (*names, *RESERVED, SAMPLING_TIME):
+            known = ", ".join(names)
+            raise InputError(
+                f"physics '{text}': unknown column '{name}'{nearest(name, names)}; the columns are {known}."
+            )

@@ -80,6 +80,11 @@ class Orthogonal:
 
     A learner that sees less can imitate only some directions of θ. `shared` "auto" projects along these alone,
     `θ_aux = B(Φ_μB)⁺F_μ`; the others are what the fit determines beside the learner (F8). "all" is the paper.
+
+    Examples:
+        >>> from orthaug.inference.measures import Symmetrized
+        >>> Orthogonal(measure=Symmetrized(), shared="all").measure.name
+        'symmetrized'
     """
 
     projects = True

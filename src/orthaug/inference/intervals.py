@@ -67,7 +67,12 @@ def joint_covariance(problem: Problem, model: Model, convention: str = "calibrat
 def prediction_std(model: Model, record: Record) -> list[Matrix]:
     """Standard error of the one-step prediction on every row of every experiment, (N, ny); NaN on the first lags.
 
-    It is that of the fitted function, `√(ψ Cov(c, w) ψᵀ)`; a new measurement adds the noise, `model.noise`.
+    It is that of the fitted function, `√(ψ Cov(c, w) ψᵀ)`. A new measurement adds the noise, whose covariance (ny, ny)
+    is `model.statistics.noise`: its standard deviation is `√(std² + diag(noise))`.
+
+    Args:
+        model: with statistics, as a fit has them.
+        record: inputs and outputs, measured.
 
     Raises:
         InputError: a model without statistics, other channels.

@@ -142,6 +142,10 @@ class Samples:
     Args:
         columns: values (M,) of each lag, `{"force[k-1]": …}`.
         weights: (M,), none negative; None for equal ones.
+
+    Examples:
+        >>> Samples({"u[k-1]": [-1.0, 0.0, 1.0]}, weights=[0.25, 0.5, 0.25]).name
+        'samples'
     """
 
     columns: Mapping[str, Any]
@@ -186,6 +190,10 @@ class Uniform:
 
     Args:
         box: limits of raw lags, `{"force[k-1]": (-200, 200)}`; lags that are not named take the data's own range.
+
+    Examples:
+        >>> Uniform(box={"u[k-1]": (-2, 2)}).name  # fit.split(Uniform(…)) gives θ under it
+        'uniform'
     """
 
     box: Annotated[Mapping[str, Annotated[Sequence[float], Len(2, 2)]], Option("box")] = field(default_factory=dict)

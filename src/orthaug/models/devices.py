@@ -28,7 +28,12 @@ _MATRICES = 3  # the sum so far, what a chunk adds, and what all devices have
 
 @dataclass(frozen=True)
 class Devices(Here):
-    """All rows in the memory of the devices, in equal shares; `count` of them, None for all there are."""
+    """All rows in the memory of the devices, in equal shares.
+
+    Args:
+        count: devices; None for all there are.
+        limit: rows of a chunk.
+    """
 
     count: int | None = None
     limit: int = CHUNK_ROWS

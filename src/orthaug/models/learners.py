@@ -65,13 +65,16 @@ class Learner(Protocol):
 class MLP:
     """Fully connected feedforward network with a linear output layer.
 
-    Initialised as in Sect. 5.1 of the paper (Xavier): weights uniform on (-a, a) with
-    `a = gain √(6 / (fan_in + fan_out))`, biases zero.
+    Initialised as in Sect. 5.1 (Xavier): weights uniform on (-a, a), `a = gain √(6 / (fan_in + fan_out))`, biases 0.
 
     Args:
         hidden: neurons of each hidden layer; () is a linear learner.
         activation: one of tanh, relu, gelu, sigmoid, silu, elu, softplus, identity.
         inputs: what it sees, as expressions or raw lags; None for all lags.
+
+    Examples:
+        >>> MLP(hidden=(8, 8), inputs=("v[k-1]", "x[k-1] - x[k-2]"))
+        MLP(hidden=(8, 8), activation='tanh', inputs=('v[k-1]', 'x[k-1] - x[k-2]'))
     """
 
     hidden: tuple[Annotated[int, Ge(1)], ...] = (16,)
@@ -84,18 +87,15 @@ class MLP:
         if isinstance(self.inputs, str):
             raise InputError(f"`inputs` must be a tuple of expressions, such as ('{self.inputs}',); got one text.")
         if not isinstance(self.inputs, list | tuple | None) or any(not isinstance(i, str) for i in self.inputs or ()):
-            raise InputError(
-                f"`inputs` must be a tuple of expressions, or None for all lags; got {shown(self.inputs)}."
-            )
+            got = shown(self.inputs)
+            raise InputError(f"`inputs` must be a tuple of expressions, or None for all lags; got {got}.")
         object.__setattr__(self, "hidden", tuple(self.hidden))
-        if self.inputs is not None:
-            object.__setattr__(self, "inputs", tuple(self.inputs))
+        object.__setattr__(self, "inputs", None if self.inputs is None else tuple(self.inputs))
         if any(isinstance(n, bool) or not isinstance(n, int) or n < 1 for n in self.hidden):
             raise InputError(f"`hidden` must be whole numbers of neurons, 1 or more; got {shown(self.hidden)}.")
         if len(self.hidden) > MOST_LAYERS:
-            raise InputError(
-                f"`hidden` has {len(self.hidden)} layers; at most {MOST_LAYERS} are taken: more compile for minutes."
-            )
+            has = f"`hidden` has {len(self.hidden)} layers"
+            raise InputError(f"{has}; at most {MOST_LAYERS} are taken: more compile for minutes.")
         check_fields(self)
 
     def silent(self, tree: Tree) -> Tree:
@@ -169,7 +169,7 @@ class PhysicsAlone:
 
 @dataclass(frozen=True)
 class Function:
-    """Any JAX function `f(weights, z) -> (ny,)` with `initial(key) -> weights`, a pytree of float arrays.
+    """Any JAX function `f(weights, z) -> (ny,)` with `initial(key) -> weights`, a pytree. `inputs` as of `MLP`.
 
     Examples:
         >>> quadratic = Function(lambda w, z: w * z[:1] ** 2, initial=lambda key: jnp.zeros(1))
@@ -190,7 +190,7 @@ class Function:
 
 @dataclass(frozen=True)
 class EquinoxModule:
-    """An Equinox module; `build(key)` makes it, and calling it with z (nz,) gives (ny,)."""
+    """An Equinox module; `build(key)` makes it, and calling it with z (nz,) gives (ny,). `inputs` as of `MLP`."""
 
     build: Callable[[Any], Any]
     inputs: tuple[str, ...] | None = None
@@ -218,7 +218,7 @@ class EquinoxModule:
 class External:
     """A model trained elsewhere: `function(x)` on NumPy rows (N, nx) → (N, ny), with nothing left to train.
 
-    It is called back from compiled code, so it may come from any toolbox; it has no weights.
+    It is called back from compiled code, so it may come from any toolbox. `inputs` as of `MLP`, `ny` outputs.
     """
 
     differentiable = False

@@ -62,6 +62,18 @@ class Model(OnRecords, Shown):
 
     `weight` (ny, ny) is the inner product of criterion and measure: rows multiplied by it are whitened. `deviation`
     (ny,) is that of the training outputs. From the `statistics` every function of the model has an interval.
+
+    Examples:
+        >>> import orthaug as oa
+        >>> u = [1.0, 2.0, 0.0, 3.0, 1.0, 0.0]
+        >>> record = oa.Record.from_arrays(u=u, y=[0.0, 0.5, 1.25, 0.625, 1.8125, 1.40625])  # 0.5 (y[k-1] + u[k-1])
+        >>> physics = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")])
+        >>> model = oa.estimate(record, physics, learner=None).model
+        >>> other = oa.Record.from_arrays(u=[1.0, 1.0, 1.0], y=[4.0, 0.0, 0.0])
+        >>> model.simulate(other).trajectories[0].model.T.round(6)  # from the first output on its own
+        array([[ nan, 2.5 , 1.75]])
+        >>> model.predict(other).trajectories[0].model.T.round(6)  # from the measured ones
+        array([[nan, 2.5, 0.5]])
     """
 
     form: Lagged
@@ -116,6 +128,10 @@ class Model(OnRecords, Shown):
 
     def predict(self, record: Record, horizon: int = 1) -> Response:
         """Predict each row from outputs measured up to `horizon` samples before it.
+
+        Args:
+            record: inputs and outputs, measured.
+            horizon: samples ahead, 1 or more.
 
         Raises:
             InputError: a record without outputs, other channels, a horizon below 1, too few rows.

@@ -41,7 +41,16 @@ class Scores:
 
 
 def scores(measured: Matrix, model: Matrix) -> Scores:
-    """RMSE, NRMSE (population standard deviation of the scored samples) and FIT of each column, (N, ny)."""
+    """RMSE, NRMSE (population standard deviation of the scored samples) and FIT of each column.
+
+    Args:
+        measured: (N, ny); what is NaN is not scored.
+        model: (N, ny), in the same units.
+
+    Examples:
+        >>> scores(np.array([[0.0], [1.0], [2.0]]), np.array([[0.0], [1.0], [1.0]])).rmse
+        array([0.57735027])
+    """
     with np.errstate(all="ignore"):
         there = np.isfinite(measured)  # what is missing is not scored
         scored = True if there.all() else there

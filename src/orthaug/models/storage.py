@@ -45,6 +45,17 @@ def save(model: Model | MotionModel, folder: str | Path, *, force: bool = False)
 
     Raises:
         InputError: the folder cannot be written, or holds something else.
+
+    Examples:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> import orthaug as oa
+        >>> record = oa.Record.from_arrays(u=np.sin(np.arange(50.0)), y=2 * np.sin(np.arange(50.0)))
+        >>> fit = oa.estimate(record, oa.Baseline.from_terms([oa.Term("gain", "u[k]")]), learner=None)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save(fit.model, Path(folder, "model"))
+        ...     load(Path(folder, "model"))
+        Model(orthogonal, θ: gain, learner: none)
     """
     with whole_folder(Path(folder), not_a_model, force=force) as partial:
         write(model, partial)

@@ -40,7 +40,7 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Stream(Here):
-    """Rows stay in their files; memory holds a few chunks of them."""
+    """Rows stay in their files; memory holds a few chunks of them, of `limit` rows."""
 
     limit: int = CHUNK_ROWS
     resident: bool = False

@@ -43,6 +43,8 @@ class Terms:
     Examples:
         >>> Terms(degree=2, exclude=["1"]).over(["x", "v"]).terms
         ('x', 'v', 'x**2', 'x*v', 'v**2')
+        >>> Terms(("v[k-1]*abs(v[k-1])",)).terms
+        ('v[k-1]*abs(v[k-1])',)
     """
 
     terms: tuple[str, ...] = ()

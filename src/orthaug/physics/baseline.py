@@ -21,7 +21,7 @@ from orthaug.data.regressors import Layout, in_order
 
 @dataclass(frozen=True)
 class Parameter:
-    """One entry of θ: name, initial value θ⁰, unit and bounds."""
+    """One entry of θ: name, initial value θ⁰, unit and the bounds `min` and `max`."""
 
     name: str
     initial: float = 0.0
@@ -72,6 +72,10 @@ class Term:
     `initial`, `unit` and the bounds `min` and `max` belong to the parameter: one of its terms gives them, or none
     (0, no unit, no bounds). `fixed` keeps `initial` as a known coefficient: the term is subtracted from the output
     first, and the learner is not made orthogonal to it. `output` may be left out where there is only one.
+
+    Examples:
+        >>> Baseline.from_terms([Term("one", "y[k-1]", initial=1.0, fixed=True), Term("b", "Ts*u[k-1]", unit="m/N")])
+        Baseline(1*y[k-1] + b*(Ts*u[k-1]))
     """
 
     parameter: str
@@ -116,9 +120,17 @@ class Baseline(Shown):
     def from_terms(cls, terms: Sequence[Term], constants: Mapping[str, float] | None = None) -> Baseline:
         """One term per summand; expressions may use the names in `constants`, and `Ts` for the sampling time.
 
+        Args:
+            terms: the same parameter may stand in several.
+            constants: numbers by name.
+
         Raises:
             InputError: an expression that is not arithmetic on lagged channels, or terms of one parameter
                 that disagree on its initial value, unit or being fixed.
+
+        Examples:
+            >>> Baseline.from_terms([Term("g", "c*u[k]**2")], constants={"c": 0.5}).names
+            ('g',)
         """
         if not isinstance(terms, Sequence) or not all(isinstance(term, Term) for term in terms):
             raise InputError(f"`terms` must be a list of Terms, such as [Term('a', 'y[k-1]')]; got {shown(terms)}.")

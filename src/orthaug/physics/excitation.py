@@ -106,7 +106,17 @@ def identifiability(baseline: Baseline, layout: Layout, outputs: Sequence[str], 
     """Rank of φ at random points of a box twice as wide as the data's (width 1 where the data do not move).
 
     Args:
+        baseline: φ and the names of θ.
+        layout: what the columns of `x` are, `Lags(…).layout(outputs, inputs)`.
+        outputs: names of the outputs, in order.
         x: regressors (N, nx), only for their ranges. The points are the same on every call.
+
+    Examples:
+        >>> from orthaug.data.regressors import Lags
+        >>> from orthaug.physics.baseline import Term
+        >>> twice = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "2*y[k-1]")])
+        >>> identifiability(twice, Lags(na=1).layout(["y"], []), ["y"], np.array([[0.0], [1.0]])).rank
+        1
     """
     nt = len(baseline.names)
     if not nt:

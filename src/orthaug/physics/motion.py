@@ -28,9 +28,12 @@ _DERIVATIVE = "derivative of "
 
 @dataclass(frozen=True)
 class State:
-    """A state: its equation, where it starts (a number, an output, "derivative of" one, None: guessed), its unit.
+    """A state and its equation, such as `State("v", "(force - c*v)/m", start="derivative of position", unit="m/s")`.
 
-    `derivative` is text, or None where the motion is a function.
+    Args:
+        derivative: in time, of a discrete motion the state one sample later; None where the motion is a function.
+        start: a first guess, for starts are always estimated: a number, an output, "derivative of" one, or None.
+        learned: whether the learner is added to this equation.
     """
 
     name: str
@@ -49,7 +52,12 @@ class State:
 
 @dataclass(frozen=True)
 class Output:
-    """An output channel as an expression of the states; None where the motion is a function."""
+    """An output channel, such as `Output("position", "x")`.
+
+    Args:
+        expression: of states, inputs and parameters; None where the motion is a function.
+        learned: whether the learner is added to it: a sensor's curve, rather than a force that is missing.
+    """
 
     name: str
     expression: str | None = None
@@ -58,7 +66,7 @@ class Output:
 
 @dataclass(frozen=True)
 class Motion(Shown):
-    """Equations of motion; make one with `from_equations` or `from_functions`. Hashable.
+    """Equations of motion; `from_equations` or `from_functions` make one and tell of its fields. Hashable.
 
     Examples:
         >>> motion = Motion.from_equations(
@@ -101,8 +109,9 @@ class Motion(Shown):
         Args:
             inputs: names of the input channels, in the record's order.
             define: names for longer expressions.
-            integrator: rk4, exact (the linear part by matrix exponential), or discrete.
-            hold: how inputs run between samples: zero-order, first-order or spline.
+            integrator: "rk4" (Runge-Kutta of order 4), "exact" (the linear part by matrix exponential), or "discrete".
+            substeps: steps of the integrator in a sample, 1 to 256; None to choose them by the data.
+            hold: inputs between samples: "zero-order" (a value is held), "first-order" (straight) or "spline".
 
         Raises:
             InputError: names or expressions that cannot be, definitions that need each other, parameters that

@@ -45,7 +45,14 @@ _COMPLEX = SimpleNamespace(
 
 @dataclass(frozen=True)
 class PhysicalParameter:
-    """One entry of p: name, initial value, unit and bounds."""
+    """One entry of p: name, initial value, unit and bounds.
+
+    A `min` of 0 says that it is positive: it is then estimated as a logarithm, and its interval is positive too.
+
+    Examples:
+        >>> PhysicalParameter("m", 1.2, "kg", min=0)
+        PhysicalParameter(name='m', initial=1.2, unit='kg', min=0, max=inf)
+    """
 
     name: str
     initial: float

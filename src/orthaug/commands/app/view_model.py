@@ -48,7 +48,7 @@ class ModelView:
                     self.physics = ui.element("div")
                 with card("Learner and training"):
                     self.learner = ui.element("div")
-                hint = "What the forms write. Every key is in docs/spec.md; forms and text change each other."
+                hint = "What the forms write; forms and text change each other. Every key: orthaug schema keys."
                 with card("Spec", hint):
                     self.editor = ui.textarea("spec in TOML", value=self.session.spec).classes("editor")
                     self.editor.props("outlined stack-label spellcheck=false autocapitalize=off autogrow debounce=250")
