@@ -195,8 +195,56 @@ def test_uneven_instants_are_resampled(tmp_path):
     assert data["prepare"][-1]["sampling_time"] == 0.1 and "1 sample far from all neighbours" in done.out
 
 
-def test_a_name_that_stands_twice_is_told(tmp_path, monkeypatch):
+def test_columns_of_one_name_are_told_apart(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.StringIO())
-    (tmp_path / "a.csv").write_text("u,u,y\n" + "".join(f"{k % 7},{k},{k % 5}\n" for k in range(40)))
-    done = run("init", tmp_path / "a.csv", "--inputs", "u", "--outputs", "y", "--out", tmp_path / "spec.toml")
-    assert done.code == 2 and "column 'u' cannot be a channel: its name stands twice" in done.err
+    u, y = plant(300)
+    rows = "".join(f"{a},{b},{c}\n" for a, b, c in zip(u, y, np.roll(u, 7), strict=True))
+    (tmp_path / "a.csv").write_text("y,T [K],T [K]\n" + rows)
+    out = tmp_path / "spec.toml"
+    done = run("init", tmp_path / "a.csv", "--inputs", "y", "--outputs", "T [K]", "--out", out)
+    assert done.code == 2 and "the name 'T [K]' stands twice; from the left: T [K].0, T [K].1" in done.err
+    assert run("init", tmp_path / "a.csv", "--inputs", "y", "--outputs", "T [K].0", "--out", out).code == 0
+    assert tomllib.loads(out.read_text())["data"]["channels"] == {"T_0": {"column": "T [K].0", "unit": "K"}}
+
+
+NOTHING = [
+    ("u,y\n1,2\n", (), "no column could be a channel, 1 row: u (constant), y (constant). A first model needs"),
+    ("u,y\n1,\n2,\n3,\n", (), '--inputs "" --outputs "u"; columns that are not named are left out. No channels: '
+     "y (no numbers)."),
+    ("u,y\n1,\n2,\n3,\n", ("--inputs", "u"), "an input already (u), and none is left for an output; left out: y (no"),
+    ("a,b,c\n1,2,4\n2,1,7\n", ("--outputs", "b"), 'only outputs are named: a, b, c. Say both, separated by commas, '
+     'such as --inputs "a,c" --outputs "b" (--inputs "" for none)'),
+    ("a,b,c\n1,2,4\n2,1,7\n", ("--inputs", "c"), '--inputs "c" --outputs "b"; columns'),
+    ("a,b,c\n1,2,4\n2,1,7\n", ("--inputs", "A"), "no column 'A', did you mean 'a'?"),
+    ("-1.5,2\n1,2\n2,3\n", (), "the first line holds numbers; a header with names is expected there"),
+    ("bench 3, May\nu\nnone\n", (), "expected one for each signal, under a header. The names that were found are "
+     "'bench 3, May'; a line above the header must begin with #"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("content", "options", "message"), NOTHING, ids=range(len(NOTHING)))
+def test_a_proposal_respects_what_was_given_and_is_never_empty(tmp_path, monkeypatch, content, options, message):
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    (tmp_path / "a.csv").write_text(content)
+    done = run("init", tmp_path / "a.csv", *options, "--out", tmp_path / "spec.toml")
+    assert done.code == 2 and message in " ".join(done.err.split()), done.err
+
+
+def test_an_encoding_that_was_guessed_is_told(tmp_path):
+    u, y = plant(300)
+    rows = "".join(f"{a},{b}\n" for a, b in zip(u, y, strict=True))
+    (tmp_path / "a.csv").write_bytes(("u,y [µm]\n" + rows).encode("cp1252"))
+    done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
+    assert done.code == 0 and "a.csv: 300 rows, 2 columns; no UTF-8, so read as Windows-1252" in done.out
+    assert run("check", tmp_path / "spec.toml").code == 0
+
+
+def test_on_a_terminal_it_asks_again(tmp_path, monkeypatch):
+    u, y = plant(300)
+    pd.DataFrame({"force": u, "position": y}).to_csv(tmp_path / "a.csv", index=False)
+    terminal = io.StringIO("Forze\nforce\nforce\nposition\n0.02\n")
+    terminal.isatty = lambda: True  # type: ignore[method-assign]
+    monkeypatch.setattr(sys, "stdin", terminal)
+    done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
+    assert done.code == 0, done.err
+    assert "no column 'Forze', did you mean 'force'?" in done.err and "'force' is named twice" in done.err

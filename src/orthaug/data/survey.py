@@ -12,12 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from orthaug._base.checks import Vector
-from orthaug._base.errors import LONGEST, InputError
+from orthaug._base.checks import Vector, nearest
+from orthaug._base.errors import LONGEST, InputError, shown
 from orthaug.data.expressions import SAMPLING_TIME, is_name
 from orthaug.data.readers import JITTER
 from orthaug.data.steps import Outliers, Run
-from orthaug.data.tables import column_names, read_table
+from orthaug.data.tables import column_names, read_table, reading_note
+from orthaug.data.text_files import numbers_only
 
 _UNITS = re.compile(
     r"A|mA|V|mV|kV|W|kW|N|kN|mN|Nm|m|mm|cm|km|um|s|ms|us|rad|mrad|deg|rpm|Hz|kHz|Pa|kPa|MPa|bar|mbar|K|degC|degF|kg|J|"
@@ -159,6 +160,8 @@ class Survey:
     path: Path
     columns: tuple[Column, ...]
     clock: Clock
+    note: str = ""
+    """What to know of how the file was read."""
 
     @property
     def signals(self) -> tuple[Column, ...]:
@@ -172,10 +175,13 @@ class Survey:
         Raises:
             InputError: no such column, one without numbers, or one that never changes.
         """
+        twice = [c.header for c in self.columns if c.header in (f"{name}.0", f"{name}.1")]
+        if len(twice) == 2 and not any(c.header == name for c in self.columns):
+            raise InputError(f"{self.path}: the name '{name}' stands twice; from the left: {', '.join(twice)}.")
         named = [c for c in self.columns if c.header == name] or [c for c in self.columns if c.name == name]
         if not named:
-            known = ", ".join(c.header for c in self.columns)
-            raise InputError(f"{self.path}: no column '{name}'; the file has {known}.")
+            known = [c.header for c in self.columns]
+            raise InputError(f"{self.path}: no column '{name}'{nearest(name, known)}; the file has {', '.join(known)}.")
         column = named[0]
         if column.unusable:
             raise InputError(f"{self.path}: column '{name}' cannot be a channel: {column.unusable}.")
@@ -200,6 +206,8 @@ def survey(path: Path) -> Survey:
     """
     columns: list[Column] = []
     every = list(column_names(path))
+    if numbers_only(every):
+        raise InputError(f"{path}: the first line holds numbers; a header with names is expected there. Write one.")
     headers = list(dict.fromkeys(every))
     try:
         table = read_table(path, headers).columns
@@ -215,12 +223,22 @@ def survey(path: Path) -> Survey:
         name = channel_name(base, [c.name for c in columns])
         columns.append(Column(header, name, unit, values, unusable))
     if all(c.unusable for c in columns):
-        raise InputError(f"{path}: no column holds numbers; expected one for each signal, under a header.")
-    return Survey(path, tuple(columns), _clock(columns))
+        raise InputError(
+            f"{path}: no column holds numbers; expected one for each signal, under a header. The names that were found "
+            f"are {shown(', '.join(every))}; a line above the header must begin with # or %."
+        )
+    return Survey(path, tuple(columns), _clock(columns), reading_note(path))
 
 
 def split_header(header: str) -> tuple[str, str]:
-    """Name and unit of a header: `force [N]`, `force (N)`, `force_N`; an index, as in `U[2]`, is no unit."""
+    """Name and unit of a header: `force [N]`, `force (N)`, `force_N`; an index, as in `U[2]`, is no unit.
+
+    The number that tells columns of one name apart stays with the name: `force [N].1` is `force.1` in N.
+    """
+    numbered = re.fullmatch(r"(.*)(\.\d+)", header)
+    if numbered:
+        base, unit = split_header(numbered[1])
+        return (base + numbered[2], unit) if unit else (header, "")
     found = _BRACKETS.match(header)
     if found and found[1] and not re.fullmatch(r"[\d:,\s]+", found[2]):
         return found[1].strip(), found[2].strip()
