@@ -107,7 +107,9 @@ def test_encodings_of_windows(tmp_path, encoding):
     assert layout(path).note == ("no UTF-8, so read as Windows-1252" if encoding == "cp1252" else "")
 
 
-@pytest.mark.parametrize("above", ["Messung 4711\n", "Prüfstand 3; Mai\n\nohne Last\n", "a, b, c, d\n", '"bench, 3"\n'])
+@pytest.mark.parametrize(
+    "above", ["Messung 4711\n", "Datum; 4711; kalt\n\nohne Last\n", "a, b, c, d\n", '"bench, 3"\n']
+)
 def test_a_remark_without_a_sign_is_told_from_the_header_by_its_cells(tmp_path, above):
     path = put(tmp_path, "run.csv", above + "u,y\n1,2\n3,4\n")
     assert values(path, "u", "y") == [[1.0, 3.0], [2.0, 4.0]]

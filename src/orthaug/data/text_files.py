@@ -101,14 +101,14 @@ def _layout(path: Path, encoding: str) -> Layout:
 
 
 def _below_remarks(lines: list[tuple[str, int]], *, tab: bool) -> tuple[str, int]:
-    """The first line, or, where it has another number of cells than the rows, the first with as many above them."""
-    for at, (row, _) in enumerate(lines):
+    """The first line with as many cells as the rows below, or simply the first."""
+    for at, (row, _) in enumerate(lines[1:], start=1):
         separator = ";" if ";" in row and not tab else _separator(row, tab=tab)  # decimals may be commas
         row_cells = _cells(row, separator)
-        if any(_is_number(cell, separator) for cell in row_cells):
-            above = [one for one in lines[:at] if _count(_cells(one[0], separator)) == len(row_cells) > 1]
-            first = _count(_cells(lines[0][0], separator)) if at else 0
-            return above[0] if above and first != len(row_cells) else lines[0]
+        if len(row_cells) > 1 and any(_is_number(cell, separator) for cell in row_cells):
+            count = len(row_cells)
+            above = [one for one in lines[1:at] if _count(_cells(one[0], separator)) == count]
+            return above[0] if above and len(_cells(lines[0][0], separator)) != count else lines[0]
     return lines[0]
 
 
