@@ -93,7 +93,7 @@ def test_a_file_is_seen_and_its_spec_runs(csv, tmp_path):
         assert told in done.out, told
     assert "rows at 1.5" not in done.out
     spec = tomllib.loads(out.read_text())
-    assert spec["data"]["missing"] == "skip" and spec["data"]["sampling_time"] == 0.01
+    assert spec["data"]["missing"] == "skip" and spec["data"]["time"] == "time [ms]"
     assert spec["data"]["channels"]["position"] == {"column": "position_mm", "unit": "mm"}
     assert [t["regressor"] for t in spec["baseline"]["terms"]] == ["position[k-1]", "position[k-2]", "force[k-3]"]
     assert run("check", out).code == 0
@@ -248,3 +248,53 @@ def test_on_a_terminal_it_asks_again(tmp_path, monkeypatch):
     done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
     assert done.code == 0, done.err
     assert "no column 'Forze', did you mean 'force'?" in done.err and "'force' is named twice" in done.err
+
+
+def test_dates_are_the_clock(tmp_path):
+    u, y = plant(300)
+    frame = pd.DataFrame({"logged": pd.date_range("2024-02-28", periods=300, freq="20ms"), "u": u, "y": y})
+    for ending, write in (("csv", frame.to_csv), ("parquet", frame.to_parquet), ("xlsx", frame.to_excel)):
+        write(tmp_path / f"a.{ending}", index=False)
+        done = run("init", tmp_path / f"a.{ending}", "--out", tmp_path / "spec.toml", "--force")
+        assert "sampling time: 0.02 s, from column 'logged'" in done.out, done.err
+        assert "left out" not in done.out
+        assert opening.open_job(tmp_path / "spec.toml").train.record.sampling_time == pytest.approx(0.02)
+
+
+def test_uneven_milliseconds_are_resampled_and_their_steps_told(tmp_path):
+    u, y = plant(300)
+    t = 20.0 * np.arange(300.0)
+    t[1::2] += 3.0
+    pd.DataFrame({"t [ms]": t, "u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
+    assert "from column 't [ms]'; single steps are 0.017 to 0.023 s" in str(survey(tmp_path / "a.csv").clock)
+    t[200:] += 8.0  # the parts of the spec differ by 0.3 % in their mean step
+    pd.DataFrame({"t [ms]": t, "u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
+    assert run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml").code == 0
+    assert "sampling_time" in tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
+    assert not [w for w in opening.open_job(tmp_path / "spec.toml").warnings if w.code == "other_sampling_time"]
+    t[200:] += 20.0
+    pd.DataFrame({"t [ms]": t, "u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
+    done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml", "--force")
+    assert "but the steps are uneven; single steps are 0.017 to 0.045 s" in done.out, done.err
+    job = opening.open_job(tmp_path / "spec.toml")
+    assert job.train.record.prepared[0].step == "resample"
+    assert job.train.record.sampling_time == pytest.approx(0.02, rel=0.3)
+
+
+STEPS = [
+    ("t [ms]", 20.0, "sampling_time = 1.0", "`sampling_time` is 1 s, but column 't [ms]' of a.csv tells 0.02 s"),
+    ("time", 0.1, "", "so 1 s is taken, but column 'time' of a.csv tells 0.1 s; perhaps time = \"time\" is meant"),
+    ("time", 0.1, "sampling_time = 0.1", ""),
+    ("other", 0.1, "sampling_time = 1.0", ""),
+]
+
+
+@pytest.mark.parametrize(("header", "every", "given", "told"), STEPS)
+def test_a_column_that_tells_another_step_is_a_warning(tmp_path, header, every, given, told):
+    u, y = plant(100)
+    pd.DataFrame({header: every * np.arange(100), "u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
+    spec = f'[data]\n{given}\ninputs = ["u"]\noutputs = ["y"]\ntrain = {{files = ["a.csv"]}}\n'
+    spec += '[[baseline.terms]]\nparameter = "a"\nregressor = "y[k-1]"\n'
+    (tmp_path / "spec.toml").write_text(spec)
+    warnings = [w for w in opening.open_job(tmp_path / "spec.toml").warnings if w.code == "other_sampling_time"]
+    assert len(warnings) == bool(told) and all(told in w.text for w in warnings)

@@ -33,9 +33,10 @@ def channel_names(columns: Sequence[Column]) -> list[str]:
 
 
 def time_of(found: Survey, roles: Roles) -> str | None:
-    """The column of instants in seconds, where there is one that is to be used."""
+    """The column of instants, where there is one that is to be used: uneven steps, or such as every part has."""
     clock = found.clock
-    return clock.column.header if clock.column is not None and clock.instants and not roles.sampling_time else None
+    used = clock.column is not None and clock.instants and not roles.sampling_time
+    return clock.column.header if used and clock.column and (clock.steady or not clock.even) else None
 
 
 def steps_of(found: Survey, roles: Roles) -> list[tuple[str, dict[str, Any]]]:
@@ -103,7 +104,7 @@ def _data(
     time = time_of(found, roles)
     if time is not None:
         data.add("time", time)
-        data["time"].comment(f"instants in s, {'every' if clock.even else 'mostly every'} {clock.step:g}")
+        data["time"].comment(f"{'every' if clock.even else 'mostly every'} {clock.step:g} s")
     else:
         data.add("sampling_time", step_of(found, roles))
         unknown = clock.step is None and not roles.sampling_time

@@ -7,7 +7,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from orthaug._base.checks import Matrix, Vector, nearest
 from orthaug._base.errors import InputError, MissingColumnError
 from orthaug._base.log import LOG
 from orthaug._base.memory import check_memory
+from orthaug.data.instants import dated, in_seconds
 from orthaug.data.spreadsheets import as_number, read_sheet, text_number
 from orthaug.data.text_files import Layout, layout, numbers_only
 from orthaug.data.variables import ENDINGS, foreign, read_variables, short, variable_names
@@ -31,7 +32,7 @@ class Table:
     """Columns of a file as floats, NaN where the cell is empty or no number. `where` and `cell` are for messages.
 
     `filled` counts the rows of each column up to its last cell that holds anything. In a text file `first_line` is
-    the line of row 0.
+    the line of row 0; `dated` is the column of time where it held dates.
     """
 
     path: Path
@@ -39,14 +40,19 @@ class Table:
     filled: Mapping[str, int]
     first_line: int | None = None
     cell: Callable[[str, int], str] = lambda column, row: "nan"
+    dated: str = ""
 
     def where(self, row: int) -> str:
         """`line 17 (row 15)` in a text file, `row 15` otherwise."""
         return f"row {row}" if self.first_line is None else f"line {self.first_line + row} (row {row})"
 
 
-def read_table(path: Path, columns: Sequence[str]) -> Table:
+def read_table(path: Path, columns: Sequence[str], time: str | None = None, *, most: int | None = None) -> Table:
     """The named columns of a file.
+
+    Args:
+        time: the one of them that holds instants, numbers in the unit of its header or dates: it comes in s.
+        most: rows that are enough, where a file can be read in part; None for all.
 
     Raises:
         InputError: no such file, an unknown ending, content that does not fit it, or missing columns.
@@ -56,7 +62,11 @@ def read_table(path: Path, columns: Sequence[str]) -> Table:
     if reader is None:
         raise InputError(f"{path}: unknown file type '{path.suffix}'; known are {', '.join(_READERS)}.")
     with foreign(path):
-        return reader(path, columns)
+        part = {"most": most} if reader is _read_text else {}
+        table = reader(path, columns, time, **part)
+    if time is None or table.dated:
+        return table
+    return replace(table, columns={**table.columns, time: in_seconds(table.columns[time], time)})
 
 
 def has_column(path: Path, name: str) -> bool:
@@ -120,7 +130,7 @@ def check_readable(path: Path) -> None:
         raise InputError(f"{path}: the file is empty (0 bytes).")
 
 
-def _read_text(path: Path, columns: Sequence[str]) -> Table:
+def _read_text(path: Path, columns: Sequence[str], time: str | None, most: int | None = None) -> Table:
     """CSV and TSV as they occur: byte-order mark, trailing separators, units in headers, decimal commas."""
     found = layout(path)
     header, header_line = found.names, found.header_line
@@ -129,7 +139,8 @@ def _read_text(path: Path, columns: Sequence[str]) -> Table:
     place = {name: str(index) for name, index in zip(columns, places(path, columns, header), strict=True)}
     commas = found.separator == ";" and _DECIMAL_COMMA.search(path.read_text(encoding=found.encoding)) is not None
     beyond = str(len(header))  # a column that must stay empty: cells behind the last header
-    numbers, texts, held = _cells(path, found, [*place.values(), beyond], commas)
+    apart = place[time] if time else None
+    numbers, texts, held = _cells(path, found, [*place.values(), beyond], commas, apart, most)
     extra = np.flatnonzero(np.asarray(held[beyond]))
     if extra.size:
         raise InputError(
@@ -138,19 +149,29 @@ def _read_text(path: Path, columns: Sequence[str]) -> Table:
         )
     values = {name: np.asarray(numbers[place[name]], dtype=float) for name in columns}
 
+    dates = None
+    if time and texts is not None and not np.isfinite(values[time]).any():
+        dates = dated(texts[apart].to_numpy(), f"{path}: column '{time}'")
+    values |= {time: dates} if time and dates is not None else {}
+
     def cell(column: str, row: int) -> str:
-        if texts is not None:
+        if texts is not None and place[column] in texts:
             return " ".join(str(texts.loc[row, place[column]]).split())
         value = values[column][row]
         return "" if np.isnan(value) else str(value)
 
     filled = {name: _up_to_last(np.asarray(held[place[name]])) for name in columns}
-    return Table(path, values, filled, header_line + 1, cell)
+    return Table(path, values, filled, header_line + 1, cell, time if time and dates is not None else "")
 
 
-def _cells(path: Path, found: Layout, used: list[str], commas: bool) -> tuple[Any, Any, Any]:
-    """The used columns as numbers, as text (None where all are numbers or empty), and what is not empty."""
-    plain = None if commas else _plain_numbers(path, found)
+def _cells(
+    path: Path, found: Layout, used: list[str], commas: bool, apart: str | None, most: int | None
+) -> tuple[Any, Any, Any]:
+    """The used columns as numbers, as text (None where all are numbers or empty), and what is not empty.
+
+    The one `apart` may hold text, so that it is looked at by itself.
+    """
+    plain = None if commas or most else _plain_numbers(path, found)
     if plain is not None:
         numbers = {str(i): column for i, column in enumerate(plain)}
         return numbers, None, {name: np.full(plain.shape[1], name in numbers) for name in used}
@@ -168,6 +189,7 @@ def _cells(path: Path, found: Layout, used: list[str], commas: bool) -> tuple[An
             keep_default_na=False,
             encoding=found.encoding,
             low_memory=False,
+            nrows=most,
             **options,
         )[used]
 
@@ -175,6 +197,13 @@ def _cells(path: Path, found: Layout, used: list[str], commas: bool) -> tuple[An
         with suppress(ValueError):  # something is no number: read again as text, to be able to name it
             numbers = read(dtype=dict.fromkeys(used, np.float64), na_values=[""], float_precision="round_trip")
             return numbers, None, numbers.notna()
+    if not commas and apart is not None:
+        kinds: dict[str, Any] = {**dict.fromkeys(used, np.float64), apart: str}
+        with suppress(ValueError):
+            numbers = read(dtype=kinds, na_values=[""], float_precision="round_trip")
+            texts = numbers[[apart]].fillna("").apply(lambda column: column.str.strip())
+            held = numbers.notna().assign(**{apart: texts[apart] != ""})
+            return numbers.assign(**{apart: texts[apart].map(text_number)}), texts, held
     try:
         texts = read(dtype=str).fillna("").apply(lambda column: column.str.strip())
     except ValueError as error:
@@ -216,14 +245,22 @@ def _up_to_last(held: np.ndarray) -> int:
     return int(np.flatnonzero(held)[-1]) + 1 if held.any() else 0
 
 
-def _read_parquet(path: Path, columns: Sequence[str]) -> Table:
+def _read_parquet(path: Path, columns: Sequence[str], time: str | None) -> Table:
     with parquet_file(path) as file:
         check_present(path, columns, file.schema_arrow.names)
         check_memory(16 * file.metadata.num_rows * len(columns), f"{path}: reading {file.metadata.num_rows} rows")
         table = file.read(columns=list(columns))
         table.validate(full=True)
-    return _full(
-        path, {name: _as_floats(table.column(name).to_numpy(zero_copy_only=False), name, path) for name in columns}
+    arrays = {name: table.column(name).to_numpy(zero_copy_only=False) for name in columns}
+    dates = None
+    if time and arrays[time].dtype.kind not in "fiub":
+        dates = dated(arrays.pop(time), f"{path}: column '{time}'")
+        if dates is None:
+            raise InputError(f"{path}: column '{time}' holds text; expected instants, numbers or dates.")
+    values = {name: _as_floats(array, name, path) for name, array in arrays.items()}
+    values |= {time: dates} if time and dates is not None else {}
+    return replace(
+        _full(path, {name: values[name] for name in columns}), dated=time if time and dates is not None else ""
     )
 
 
@@ -246,7 +283,7 @@ def parquet_file(path: Path) -> Iterator[Any]:
         raise InputError(f"{path}: not a readable Parquet file ({short(error)}).") from None
 
 
-def _read_excel(path: Path, columns: Sequence[str]) -> Table:
+def _read_excel(path: Path, columns: Sequence[str], time: str | None) -> Table:
     """The first worksheet."""
 
     def place(header: Sequence[str]) -> list[int]:
@@ -260,10 +297,14 @@ def _read_excel(path: Path, columns: Sequence[str]) -> Table:
     def cell(column: str, row: int) -> str:
         return "" if cells[column][row] is None else str(cells[column][row])
 
-    return Table(path, values, filled, top + 1, cell)
+    dates = None
+    if time and not np.isfinite(values[time]).any():
+        dates = dated(np.array(cells[time], dtype=object), f"{path}: column '{time}'")
+    values |= {time: dates} if time and dates is not None else {}
+    return Table(path, values, filled, top + 1, cell, time if time and dates is not None else "")
 
 
-def _read_variables(path: Path, columns: Sequence[str]) -> Table:
+def _read_variables(path: Path, columns: Sequence[str], time: str | None) -> Table:
     return _full(path, read_variables(path, columns))
 
 
@@ -282,7 +323,7 @@ def _as_floats(array: np.ndarray, name: str, path: Path) -> Vector:
         raise InputError(f"{path}: column '{name}' holds {array.dtype} values; expected numbers.") from None
 
 
-_READERS: dict[str, Callable[[Path, Sequence[str]], Table]] = {
+_READERS: dict[str, Callable[..., Table]] = {
     ".csv": _read_text,
     ".tsv": _read_text,
     ".parquet": _read_parquet,
