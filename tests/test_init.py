@@ -298,3 +298,28 @@ def test_a_column_that_tells_another_step_is_a_warning(tmp_path, header, every, 
     (tmp_path / "spec.toml").write_text(spec)
     warnings = [w for w in opening.open_job(tmp_path / "spec.toml").warnings if w.code == "other_sampling_time"]
     assert len(warnings) == bool(told) and all(told in w.text for w in warnings)
+
+
+SINGLE = [
+    ({"data": {"Ts": 2.0}}, 2.0),
+    ({"Ts": 0.5}, 0.5),
+    ({"data": {"fs": 50.0}}, 0.02),
+    ({"Fs": 50.0, "Ts": 0.02}, 0.02),
+    ({"Fs": 50.0, "Ts": 0.1}, None),
+    ({"Ts": 0.0}, None),
+    ({"gain": 3.0}, None),
+]
+
+
+@pytest.mark.parametrize(("beside", "step"), SINGLE)
+def test_a_single_number_in_a_file_of_matlab_is_the_sampling_time(tmp_path, beside, step):
+    u, y = plant(300)
+    data = {"u": u, "y": y} | beside.pop("data", {})
+    scipy.io.savemat(tmp_path / "a.mat", {"data": data} | beside)
+    done = run("init", tmp_path / "a.mat", "--out", tmp_path / "spec.toml")  # data.u and data.y are known as u and y
+    assert done.code == 0, done.err
+    data = tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
+    assert (data["inputs"], data["outputs"], data["sampling_time"]) == (["data_u"], ["data_y"], step or 1.0)
+    assert ("no column tells it" in done.out) == (step is None)
+    np.savez(tmp_path / "a.npz", u=u, y=y, **beside)
+    assert survey(tmp_path / "a.npz").clock.step == (step if beside else None)

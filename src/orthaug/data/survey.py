@@ -23,6 +23,7 @@ from orthaug.data.record import same_step
 from orthaug.data.steps import Outliers, Run
 from orthaug.data.tables import column_names, read_table, reading_note
 from orthaug.data.text_files import numbers_only
+from orthaug.data.variables import ENDINGS, scalars
 
 _INPUT = re.compile(r"^(u|u_?\d+|in|input|input_?\d+)$", re.IGNORECASE)
 _OUTPUT = re.compile(r"^(y|y_?\d+|out|output|output_?\d+)$", re.IGNORECASE)
@@ -248,7 +249,8 @@ def survey(path: Path) -> Survey:
             f"{path}: no column holds numbers; expected one for each signal, under a header. The names that were found "
             f"are {shown(', '.join(every))}; a line above the header must begin with # or %."
         )
-    return Survey(path, tuple(columns), _clock(columns), reading_note(path))
+    clock = _clock(columns)
+    return Survey(path, tuple(columns), clock if clock.column else _by_single_number(path), reading_note(path))
 
 
 def told_clock(path: Path, apart: Collection[str] = ()) -> Clock:
@@ -263,7 +265,8 @@ def told_clock(path: Path, apart: Collection[str] = ()) -> Clock:
             with suppress(InputError):
                 table = read_table(path, [header], header if is_time(header) else None, most=_HEAD)
                 columns.append(Column(header, header, "", table.columns[header], _DATES))  # in s, as dates are
-    return _clock(columns) if columns else Clock()
+    clock = _clock(columns) if columns else Clock()
+    return clock if clock.column else _by_single_number(path)
 
 
 def _as_dates(path: Path, header: str) -> tuple[Vector, str]:
@@ -300,6 +303,19 @@ def _clock(columns: Sequence[Column]) -> Clock:
         if rising and (dates or is_time(column.header)):
             return _ticking(column, column.values if dates else in_seconds(column.values, column.header))
     return Clock()
+
+
+def _by_single_number(path: Path) -> Clock:
+    """A clock of single numbers called `Ts` or `fs` beside the channels, where all that there are agree."""
+    if path.suffix.lower() not in ENDINGS:
+        return Clock()
+    found = scalars(path, lambda name: step_of(name, 1.0) is not None)
+    steps = {name: step_of(name, value) for name, value in found.items()}
+    told = {name: step for name, step in steps.items() if step is not None and np.isfinite(step)}
+    if not told or not same_step(min(told.values()), max(told.values())):
+        return Clock()
+    name, step = next(iter(told.items()))
+    return Clock(step, Column(name, name, "", np.array([found[name]])))
 
 
 def _ticking(column: Column, seconds: Vector) -> Clock:
