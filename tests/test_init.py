@@ -323,3 +323,11 @@ def test_a_single_number_in_a_file_of_matlab_is_the_sampling_time(tmp_path, besi
     assert ("no column tells it" in done.out) == (step is None)
     np.savez(tmp_path / "a.npz", u=u, y=y, **beside)
     assert survey(tmp_path / "a.npz").clock.step == (step if beside else None)
+
+
+def test_a_lag_that_is_a_guess_is_told_in_the_spec(tmp_path):
+    rng = np.random.default_rng(0)
+    pd.DataFrame({"u": rng.normal(size=30), "y": rng.normal(size=30)}).to_csv(tmp_path / "a.csv", index=False)
+    done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
+    assert done.code == 0 and "no lag of it is significant" in done.out
+    assert "# no lag of it is significant, so this is a guess" in (tmp_path / "spec.toml").read_text()

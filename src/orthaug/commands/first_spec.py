@@ -16,6 +16,7 @@ from orthaug.selection.first_orders import FirstModel
 
 FILLED = 3
 """Rows of a gap that the spec's step `fill` reconstructs at most."""
+_CLEARLY = "first significant at lag {}; from here on it runs clearly better on rows held out"
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +155,11 @@ def _relative(path: Path, out: Path) -> str:
 def _baseline(named: tuple[list[str], list[str]], model: FirstModel) -> Any:
     inputs, outputs = named
     terms, orders = [], model.orders
+    told = {}
+    for name, nk, seen in zip(inputs, orders.nk, model.delays, strict=True):
+        if seen != nk:
+            why = "no lag of it is significant, so this is a guess" if seen is None else _CLEARLY.format(seen)
+            told[f"{name}[k-{nk}]" if nk else f"{name}[k]"] = why
     for output in outputs:
         own = f"_{output}" if len(outputs) > 1 else ""
         found = [(f"a{i}{own}", f"{output}[k-{i}]") for i in range(1, orders.na + 1)]
@@ -165,6 +171,8 @@ def _baseline(named: tuple[list[str], list[str]], model: FirstModel) -> Any:
             term = tomlkit.table()
             term.add("parameter", f"{parameter}_" if parameter in (*inputs, *outputs) else parameter)
             term.add("regressor", regressor)
+            if regressor in told:
+                term["regressor"].comment(told[regressor])
             if own:
                 term.add("output", output)
             terms.append(term)

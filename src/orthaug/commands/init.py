@@ -207,7 +207,7 @@ def _account(found: Survey, roles: Roles, rows: int, missing: int, cut: int, mod
             lines[-1] = f"{lacking(missing)}: gaps of up to {FILLED} rows are filled, longer ones left out"
     for name, late, seen in zip(channel_names(roles.inputs), model.orders.nk, model.delays, strict=True):
         if seen is not None and seen != late:
-            lines.append(f"the spec takes {name} from lag {late} on, which runs as well or better with as few lags")
+            lines.append(f"the spec takes {name} from lag {late} on, which runs clearly better on rows held out")
     size, errors = model.orders, ", ".join(percent(error, 3) for error in model.free_run)
     told = "one step ahead" if not roles.inputs else "in free run"
     lines.append(f"first physics: linear, {size}{', with a constant' if model.offset else ''}; {told} its error")

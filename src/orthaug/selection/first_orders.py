@@ -15,6 +15,7 @@ _MOST = 4  # lags of a channel
 _LOOKED_AT = 40_000  # rows
 _FITTED = 0.7  # share of the rows that a candidate is fitted to
 _AS_GOOD = 1.05  # free-run error over the best, up to which fewer lags are taken
+_BETTER = 1.2  # free-run error over that from another first lag, up to which the lag that a test found is kept
 _RANK = 1e-9  # singular value over the largest
 PERSISTENCE = 20  # the highest order of excitation that is looked for
 _EXCITED = 1e-6  # singular value over the largest
@@ -41,7 +42,8 @@ class FirstModel:
 def first_model(record: Record) -> FirstModel | None:
     """Delays, excitation and orders for a record; None where it has too few rows for any model.
 
-    The orders are the smallest whose free run is within 5 % of the best of up to 4 lags a channel.
+    The orders are the smallest whose free run is within 5 % of the best of up to 4 lags a channel. The first lags are
+    the significant ones, unless from 1 or 0 on the best free run is clearly better.
     """
     record = replace(record, experiments=_first_rows(record.experiments, _LOOKED_AT))
     signals = np.concatenate([np.hstack([e.outputs, e.inputs]) for e in record.experiments])
@@ -49,19 +51,32 @@ def first_model(record: Record) -> FirstModel | None:
     delays = tuple(_delay(record, i) for i in range(len(record.inputs)))
     excited = tuple(_persistence(record, i) for i in range(len(record.inputs)))
     usual = [tuple(late if delay is None else delay for delay in delays) for late in (1, 0)]
-    best: list[tuple[float, int, Orders, tuple[float, ...]]] = []
+    chosen: tuple[float, Orders, tuple[float, ...]] | None = None
     for nk in dict.fromkeys([*usual, *((late,) * len(delays) for late in (1, 0))]):  # a test may miss the first lags
-        for na, n in product(range(_MOST + 1), range(1, _MOST + 1) if record.inputs else [0]):
-            orders = Orders(na, tuple(max(1, min(n, order)) for order in excited), nk)
-            errors = _errors(record, orders, offset)
-            if errors is not None and orders.size:
-                best.append((float(np.mean(errors)), orders.size, orders, errors))
-    if not best:
+        found = _smallest(record, excited, nk, offset)
+        if found is not None and (chosen is None or found[0] * _BETTER < chosen[0]):
+            chosen = found
+    if chosen is None:
         return None
-    least = min(error for error, *_ in best)
-    near = [one for one in best if one[0] <= _AS_GOOD * least]
+    return FirstModel(chosen[1], offset, delays, excited, chosen[2])
+
+
+def _smallest(
+    record: Record, excited: tuple[int, ...], nk: tuple[int, ...], offset: bool
+) -> tuple[float, Orders, tuple[float, ...]] | None:
+    """From these first lags on: the least error of all orders, and the smallest that come near it with theirs."""
+    tried: list[tuple[float, int, Orders, tuple[float, ...]]] = []
+    for na, n in product(range(_MOST + 1), range(1, _MOST + 1) if record.inputs else [0]):
+        orders = Orders(na, tuple(max(1, min(n, order)) for order in excited), nk)
+        errors = _errors(record, orders, offset)
+        if errors is not None and orders.size:
+            tried.append((float(np.mean(errors)), orders.size, orders, errors))
+    if not tried:
+        return None
+    least = min(error for error, *_ in tried)
+    near = [one for one in tried if one[0] <= _AS_GOOD * least]
     _, _, orders, errors = min(near, key=lambda one: (one[1], one[0]))
-    return FirstModel(orders, offset, delays, excited, errors)
+    return least, orders, errors
 
 
 def _first_rows(experiments: tuple[Experiment, ...], most: int) -> tuple[Experiment, ...]:
