@@ -14,6 +14,7 @@ import scipy.signal
 from test_cli import run
 
 from orthaug.commands import opening
+from orthaug.commands.init import as_seen
 from orthaug.data.survey import channel_name, split_header, survey
 from orthaug.data.tables import column_names
 
@@ -180,6 +181,14 @@ def test_what_is_seen_of_a_column(tmp_path):
     assert survey(tmp_path / "b.csv").find("held").limits == ()  # an input between its steps is at no limit
     assert found.find("square").limits == () and found.find("square").quantum is None
     assert found.find("coarse").quantum == pytest.approx(0.1)
+    slow = 100 * np.sin(np.arange(4000) / 400)  # an encoder: fine beside the range, coarse beside a sample
+    noisy = np.round(slow + 2 * rng.normal(size=4000))
+    frame = pd.DataFrame({"encoder": np.round(slow), "fine": np.round(slow, 2), "noisy": noisy})
+    frame.to_csv(tmp_path / "c.csv", index=False)
+    assert [survey(tmp_path / "c.csv").find(name).quantum for name in frame] == [1.0, None, None]
+    assert as_seen(survey(tmp_path / "c.csv").find("encoder"), spikes=False).endswith(
+        "; in steps of 1, while it moves by 0.16 from row to row"
+    )
 
 
 def test_uneven_instants_are_resampled(tmp_path):
@@ -331,3 +340,15 @@ def test_a_lag_that_is_a_guess_is_told_in_the_spec(tmp_path):
     done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
     assert done.code == 0 and "no lag of it is significant" in done.out
     assert "# no lag of it is significant, so this is a guess" in (tmp_path / "spec.toml").read_text()
+
+
+def test_coupled_outputs_are_trained_on_the_free_run(tmp_path):
+    u, y = plant(400)
+    frame = pd.DataFrame({"u": u, "y1": y, "y2": np.gradient(y)})
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
+    assert done.code == 0 and "the past of one output tells of another" in done.out, done.err
+    assert tomllib.loads((tmp_path / "spec.toml").read_text())["training"]["focus"] == "simulation"
+    frame.drop(columns="y2").to_csv(tmp_path / "a.csv", index=False)
+    assert run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml", "--force").code == 0
+    assert "focus" not in tomllib.loads((tmp_path / "spec.toml").read_text())["training"]

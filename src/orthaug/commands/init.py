@@ -208,6 +208,8 @@ def _account(found: Survey, roles: Roles, rows: int, missing: int, cut: int, mod
     for name, late, seen in zip(channel_names(roles.inputs), model.orders.nk, model.delays, strict=True):
         if seen is not None and seen != late:
             lines.append(f"the spec takes {name} from lag {late} on, which runs clearly better on rows held out")
+    if model.coupled:
+        lines.append('the past of one output tells of another: the spec trains on the free run (focus = "simulation")')
     size, errors = model.orders, ", ".join(percent(error, 3) for error in model.free_run)
     told = "one step ahead" if not roles.inputs else "in free run"
     lines.append(f"first physics: linear, {size}{', with a constant' if model.offset else ''}; {told} its error")
@@ -240,5 +242,6 @@ def as_seen(column: Column, *, spikes: bool) -> str:
     for value, count in column.limits:
         text += f"; {counted(count, 'row')} at {value:.4g}, perhaps a limit of sensor or actuator"
     if column.quantum is not None:
-        text += f"; in steps of {column.quantum:.3g}"
+        moves = f", while it moves by {column.movement:.2g} from row to row" if column.quantum > column.movement else ""
+        text += f"; in steps of {column.quantum:.3g}{moves}"
     return text

@@ -118,15 +118,20 @@ class Column:
 
     @property
     def quantum(self) -> float | None:
-        """The step of which all values are multiples, where it is coarse beside the standard deviation."""
+        """The step of which all values are multiples, where it is coarse beside deviation or movement of a sample."""
         levels = np.unique(self.finite)
         if len(levels) < 3 or np.ptp(levels) == 0:
             return None
         step = float(np.diff(levels).min())
         multiples = (levels - levels[0]) / step
         even = np.abs(multiples - np.round(multiples)).max() < _SAME * max(float(multiples.max()), 1e3)
-        coarse = step > _COARSE * float(self.finite.std())
+        coarse = step > min(_COARSE * float(self.finite.std()), self.movement)
         return step if even and coarse and len(levels) < len(self.finite) / 2 else None
+
+    @property
+    def movement(self) -> float:
+        """By how much the signal moves between two rows, on the average."""
+        return float(np.abs(np.diff(self.finite)).mean()) if len(self.finite) > 1 else 0.0
 
     @property
     def kind(self) -> str:
