@@ -13,10 +13,12 @@ import scipy.io
 import scipy.signal
 from test_cli import run
 
-from orthaug.commands import opening
+from orthaug.commands import cli, opening
+from orthaug.commands import init as commands_init
 from orthaug.commands.init import as_seen
 from orthaug.data.survey import channel_name, split_header, survey
 from orthaug.data.tables import column_names
+from orthaug.selection import first_orders
 
 
 def plant(rows: int = 600) -> tuple[np.ndarray, np.ndarray]:
@@ -352,3 +354,16 @@ def test_coupled_outputs_are_trained_on_the_free_run(tmp_path):
     frame.drop(columns="y2").to_csv(tmp_path / "a.csv", index=False)
     assert run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml", "--force").code == 0
     assert "focus" not in tomllib.loads((tmp_path / "spec.toml").read_text())["training"]
+
+
+def test_a_long_file_is_looked_at_in_windows_and_says_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(first_orders, "LOOKED_AT", 500)
+    monkeypatch.setattr(commands_init, "LOOKED_AT", 500)
+    monkeypatch.setattr(cli, "_LARGE", 10.0)
+    monkeypatch.setattr(cli, "on_terminal", lambda: True)
+    u, y = plant(2000)
+    u[:500], y[:500] = 0.0, 0.0  # the first rows tell nothing
+    pd.DataFrame({"u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
+    done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
+    assert done.code == 0 and "reading a.csv" in done.err and "looking at signals" in done.err
+    assert "delays and orders are found on 500 of these rows" in done.out and "nk 3;" in done.out

@@ -15,7 +15,7 @@ import typer
 from orthaug._base.checks import check_choice
 from orthaug._base.errors import TrainingError
 from orthaug.commands import streams
-from orthaug.commands.bars import study_bars, training_bar
+from orthaug.commands.bars import on_terminal, study_bars, training_bar
 from orthaug.commands.program import (
     AsJson,
     Force,
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     pass
 
 __all__ = ["main"]
+_LARGE = 20e6  # bytes of a data file from which on `init` tells what it is at
 
 
 @app.command()
@@ -204,6 +205,9 @@ def init(
     check_file(out, data, force=force)
     if sampling_time is not None:
         check_step(sampling_time)
+    large = data.is_file() and data.stat().st_size > _LARGE
+    told = streams.say if large and on_terminal() else _unsaid
+    told(f"reading {data.name}")
     found = look(data)
     roles = assign(found, inputs, outputs, sampling_time)
     if roles is None:
@@ -219,9 +223,15 @@ def init(
     if roles is not None and sampling_time is None and found.clock.step is None and sys.stdin.isatty():
         roles = replace(roles, sampling_time=check_step(typer.prompt("seconds between rows", type=float, default=1.0)))
     assert roles is not None  # both are given
+    told("looking at signals, delays and orders")
     spec = draft(found, roles, out)
+    told("opening the spec as a fit would")
     write_spec(spec, out, force=force)
     streams.echo(f"{spec.account}\n\nwritten to {out}; next: orthaug fit {out}")
+
+
+def _unsaid(line: str) -> None:
+    """Nobody waits long enough to be told."""
 
 
 def _asked(text: str, check: Callable[[str], Any], default: str | None = "") -> str:

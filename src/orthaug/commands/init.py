@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from orthaug.data.readers import read_record
 from orthaug.data.record import Channel, Record
 from orthaug.data.steps import STEPS
 from orthaug.data.survey import Column, Survey, survey
-from orthaug.selection.first_orders import FirstModel, first_model
+from orthaug.selection.first_orders import LOOKED_AT, FirstModel, first_model
 
 TRAINED = 0.75  # share of the rows; the rest is a test
 _TESTED = 30  # rows of a test at least
@@ -214,6 +215,8 @@ def _account(found: Survey, roles: Roles, rows: int, missing: int, cut: int, mod
     told = "one step ahead" if not roles.inputs else "in free run"
     lines.append(f"first physics: linear, {size}{', with a constant' if model.offset else ''}; {told} its error")
     lines[-1] += f" on rows held out is {errors} of the output's standard deviation"
+    if cut - missing > LOOKED_AT:
+        lines.append(f"delays and orders are found on {LOOKED_AT} of these rows, in windows spread over them")
     lines.append("test: " + (f"rows {cut} to {rows}" if cut < rows else "none, for there are few rows"))
     return "\n".join(lines)
 

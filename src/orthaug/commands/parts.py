@@ -232,7 +232,7 @@ def _other_step(
 ) -> tuple[Warning, ...]:
     """A warning where a file tells another sampling time than the spec does."""
     channels = [*spec.channels(spec.data.inputs), *spec.channels(spec.data.outputs)]
-    used = {columns.get(c.name, c.file_column) for c in channels} | {spec.data.experiment}
+    used = {columns.get(c.name, c.file_column) for c in channels} | {spec.data.experiment or ""}
     step, given = spec.data.sampling_time or 1.0, spec.data.sampling_time is not None
     for file in files:
         clock = told_clock(path.parent / file, used)

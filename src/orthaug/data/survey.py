@@ -20,7 +20,7 @@ from orthaug.data.headers import is_time, last_part, split_header, step_of
 from orthaug.data.instants import in_seconds
 from orthaug.data.readers import JITTER
 from orthaug.data.record import same_step
-from orthaug.data.steps import Outliers, Run
+from orthaug.data.steps import Outliers
 from orthaug.data.tables import column_names, read_table, reading_note
 from orthaug.data.text_files import numbers_only
 from orthaug.data.variables import ENDINGS, scalars
@@ -102,13 +102,12 @@ class Column:
     @cached_property
     def _spiky(self) -> tuple[float, int]:
         x = self.values[: self.filled]
-        run = Run(x[:, None], np.arange(float(len(x))), (self.name,), 0, 1.0)
+        distance, deviation = Outliers().distances(x)
         usual = np.quantile(self.finite, [0.25, 0.75])
         far = np.abs(x - usual.mean()) > _OUTSIDE * np.ptp(usual)
         wild = {}
         for threshold in _LOWER:
-            marked = np.isfinite(x) & ~np.isfinite(Outliers(threshold=threshold).apply(run).values[:, 0])
-            wild[threshold] = marked & far
+            wild[threshold] = (distance > threshold * deviation) & far
         rest = x[np.isfinite(x) & ~wild[_LOWER[-1]]]
         beyond = _BEYOND * np.ptp(rest)
         alone = wild[_LOWER[-1]] & ((x > rest.max() + beyond) | (x < rest.min() - beyond))

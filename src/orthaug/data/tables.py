@@ -201,7 +201,7 @@ def _cells(
         kinds: dict[str, Any] = {**dict.fromkeys(used, np.float64), apart: str}
         with suppress(ValueError):
             numbers = read(dtype=kinds, na_values=[""], float_precision="round_trip")
-            texts = numbers[[apart]].fillna("").apply(lambda column: column.str.strip())
+            texts: Any = numbers[[apart]].fillna("").apply(lambda column: column.str.strip())
             held = numbers.notna().assign(**{apart: texts[apart] != ""})
             return numbers.assign(**{apart: texts[apart].map(text_number)}), texts, held
     try:

@@ -9,10 +9,12 @@ import numpy as np
 
 from orthaug._base.checks import Matrix
 from orthaug.data.record import Experiment, Record
+from orthaug.data.sources import RecordSource, witness
 from orthaug.selection.orders import Orders, correlated_delay
 
 _MOST = 4  # lags of a channel
-_LOOKED_AT = 40_000  # rows
+LOOKED_AT = 40_000
+"""Rows of a longer record that orders are found on, in windows spread over it."""
 _FITTED = 0.7  # share of the rows that a candidate is fitted to
 _AS_GOOD = 1.05  # free-run error over the best, up to which fewer lags are taken
 _BETTER = 1.2  # free-run error over that from another first lag, up to which the lag that a test found is kept
@@ -48,7 +50,7 @@ def first_model(record: Record) -> FirstModel | None:
     The orders are the smallest whose free run is within 5 % of the best of up to 4 lags a channel. The first lags are
     the significant ones, unless from 1 or 0 on the best free run is clearly better.
     """
-    record = replace(record, experiments=_first_rows(record.experiments, _LOOKED_AT))
+    record = _spread(record)
     signals = np.concatenate([np.hstack([e.outputs, e.inputs]) for e in record.experiments])
     offset = bool((np.abs(signals.mean(axis=0)) > _LEVEL * signals.std(axis=0)).any())
     delays = tuple(_delay(record, i) for i in range(len(record.inputs)))
@@ -100,13 +102,11 @@ def _coupled(record: Record, orders: Orders, offset: bool) -> bool:
     return False
 
 
-def _first_rows(experiments: tuple[Experiment, ...], most: int) -> tuple[Experiment, ...]:
-    found, left = [], most
-    for experiment in experiments:
-        if left > 0:
-            found.append(experiment.rows(0, left))
-        left -= len(experiment)
-    return tuple(found)
+def _spread(record: Record) -> Record:
+    """The record, or windows that are spread over it where it is long."""
+    if len(record) <= LOOKED_AT:
+        return record
+    return witness(RecordSource(record, 0), LOOKED_AT)
 
 
 def _delay(record: Record, number: int) -> int | None:
