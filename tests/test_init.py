@@ -13,9 +13,12 @@ import scipy.io
 import scipy.signal
 from test_cli import run
 
-from orthaug.commands import opening
+from orthaug.commands import cli, opening
+from orthaug.commands import init as commands_init
+from orthaug.commands.init import as_seen
 from orthaug.data.survey import channel_name, split_header, survey
 from orthaug.data.tables import column_names
+from orthaug.selection import first_orders
 
 
 def plant(rows: int = 600) -> tuple[np.ndarray, np.ndarray]:
@@ -93,7 +96,7 @@ def test_a_file_is_seen_and_its_spec_runs(csv, tmp_path):
         assert told in done.out, told
     assert "rows at 1.5" not in done.out
     spec = tomllib.loads(out.read_text())
-    assert spec["data"]["missing"] == "skip" and spec["data"]["sampling_time"] == 0.01
+    assert spec["data"]["missing"] == "skip" and spec["data"]["time"] == "time [ms]"
     assert spec["data"]["channels"]["position"] == {"column": "position_mm", "unit": "mm"}
     assert [t["regressor"] for t in spec["baseline"]["terms"]] == ["position[k-1]", "position[k-2]", "force[k-3]"]
     assert run("check", out).code == 0
@@ -180,6 +183,14 @@ def test_what_is_seen_of_a_column(tmp_path):
     assert survey(tmp_path / "b.csv").find("held").limits == ()  # an input between its steps is at no limit
     assert found.find("square").limits == () and found.find("square").quantum is None
     assert found.find("coarse").quantum == pytest.approx(0.1)
+    slow = 100 * np.sin(np.arange(4000) / 400)  # an encoder: fine beside the range, coarse beside a sample
+    noisy = np.round(slow + 2 * rng.normal(size=4000))
+    frame = pd.DataFrame({"encoder": np.round(slow), "fine": np.round(slow, 2), "noisy": noisy})
+    frame.to_csv(tmp_path / "c.csv", index=False)
+    assert [survey(tmp_path / "c.csv").find(name).quantum for name in frame] == [1.0, None, None]
+    assert as_seen(survey(tmp_path / "c.csv").find("encoder"), spikes=False).endswith(
+        "; in steps of 1, while it moves by 0.16 from row to row"
+    )
 
 
 def test_uneven_instants_are_resampled(tmp_path):
@@ -195,8 +206,164 @@ def test_uneven_instants_are_resampled(tmp_path):
     assert data["prepare"][-1]["sampling_time"] == 0.1 and "1 sample far from all neighbours" in done.out
 
 
-def test_a_name_that_stands_twice_is_told(tmp_path, monkeypatch):
+def test_columns_of_one_name_are_told_apart(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.StringIO())
-    (tmp_path / "a.csv").write_text("u,u,y\n" + "".join(f"{k % 7},{k},{k % 5}\n" for k in range(40)))
-    done = run("init", tmp_path / "a.csv", "--inputs", "u", "--outputs", "y", "--out", tmp_path / "spec.toml")
-    assert done.code == 2 and "column 'u' cannot be a channel: its name stands twice" in done.err
+    u, y = plant(300)
+    rows = "".join(f"{a},{b},{c}\n" for a, b, c in zip(u, y, np.roll(u, 7), strict=True))
+    (tmp_path / "a.csv").write_text("y,T [K],T [K]\n" + rows)
+    out = tmp_path / "spec.toml"
+    done = run("init", tmp_path / "a.csv", "--inputs", "y", "--outputs", "T [K]", "--out", out)
+    assert done.code == 2 and "the name 'T [K]' stands twice; from the left: T [K].0, T [K].1" in done.err
+    assert run("init", tmp_path / "a.csv", "--inputs", "y", "--outputs", "T [K].0", "--out", out).code == 0
+    assert tomllib.loads(out.read_text())["data"]["channels"] == {"T_0": {"column": "T [K].0", "unit": "K"}}
+
+
+NOTHING = [
+    ("u,y\n1,2\n", (), "no column could be a channel, 1 row: u (constant), y (constant). A first model needs"),
+    ("u,y\n1,\n2,\n3,\n", (), '--inputs "" --outputs "u"; columns that are not named are left out. No channels: '
+     "y (no numbers)."),
+    ("u,y\n1,\n2,\n3,\n", ("--inputs", "u"), "an input already (u), and none is left for an output; left out: y (no"),
+    ("a,b,c\n1,2,4\n2,1,7\n", ("--outputs", "b"), 'only outputs are named: a, b, c. Say both, separated by commas, '
+     'such as --inputs "a,c" --outputs "b" (--inputs "" for none)'),
+    ("a,b,c\n1,2,4\n2,1,7\n", ("--inputs", "c"), '--inputs "c" --outputs "b"; columns'),
+    ("a,b,c\n1,2,4\n2,1,7\n", ("--inputs", "A"), "no column 'A', did you mean 'a'?"),
+    ("-1.5,2\n1,2\n2,3\n", (), "the first line holds numbers; a header with names is expected there"),
+    ("bench 3, May\nu\nnone\n", (), "expected one for each signal, under a header. The names that were found are "
+     "'bench 3, May'; a line above the header must begin with #"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("content", "options", "message"), NOTHING, ids=range(len(NOTHING)))
+def test_a_proposal_respects_what_was_given_and_is_never_empty(tmp_path, monkeypatch, content, options, message):
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    (tmp_path / "a.csv").write_text(content)
+    done = run("init", tmp_path / "a.csv", *options, "--out", tmp_path / "spec.toml")
+    assert done.code == 2 and message in " ".join(done.err.split()), done.err
+
+
+def test_an_encoding_that_was_guessed_is_told(tmp_path):
+    u, y = plant(300)
+    rows = "".join(f"{a},{b}\n" for a, b in zip(u, y, strict=True))
+    (tmp_path / "a.csv").write_bytes(("u,y [µm]\n" + rows).encode("cp1252"))
+    done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
+    assert done.code == 0 and "a.csv: 300 rows, 2 columns; no UTF-8, so read as Windows-1252" in done.out
+    assert run("check", tmp_path / "spec.toml").code == 0
+
+
+def test_on_a_terminal_it_asks_again(tmp_path, monkeypatch):
+    u, y = plant(300)
+    pd.DataFrame({"force": u, "position": y}).to_csv(tmp_path / "a.csv", index=False)
+    terminal = io.StringIO("Forze\nforce\nforce\nposition\n0.02\n")
+    terminal.isatty = lambda: True  # type: ignore[method-assign]
+    monkeypatch.setattr(sys, "stdin", terminal)
+    done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
+    assert done.code == 0, done.err
+    assert "no column 'Forze', did you mean 'force'?" in done.err and "'force' is named twice" in done.err
+
+
+def test_dates_are_the_clock(tmp_path):
+    u, y = plant(300)
+    frame = pd.DataFrame({"logged": pd.date_range("2024-02-28", periods=300, freq="20ms"), "u": u, "y": y})
+    for ending, write in (("csv", frame.to_csv), ("parquet", frame.to_parquet), ("xlsx", frame.to_excel)):
+        write(tmp_path / f"a.{ending}", index=False)
+        done = run("init", tmp_path / f"a.{ending}", "--out", tmp_path / "spec.toml", "--force")
+        assert "sampling time: 0.02 s, from column 'logged'" in done.out, done.err
+        assert "left out" not in done.out
+        assert opening.open_job(tmp_path / "spec.toml").train.record.sampling_time == pytest.approx(0.02)
+
+
+def test_uneven_milliseconds_are_resampled_and_their_steps_told(tmp_path):
+    u, y = plant(300)
+    t = 20.0 * np.arange(300.0)
+    t[1::2] += 3.0
+    pd.DataFrame({"t [ms]": t, "u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
+    assert "from column 't [ms]'; single steps are 0.017 to 0.023 s" in str(survey(tmp_path / "a.csv").clock)
+    t[200:] += 8.0  # the parts of the spec differ by 0.3 % in their mean step
+    pd.DataFrame({"t [ms]": t, "u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
+    assert run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml").code == 0
+    assert "sampling_time" in tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
+    assert not [w for w in opening.open_job(tmp_path / "spec.toml").warnings if w.code == "other_sampling_time"]
+    t[200:] += 20.0
+    pd.DataFrame({"t [ms]": t, "u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
+    done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml", "--force")
+    assert "but the steps are uneven; single steps are 0.017 to 0.045 s" in done.out, done.err
+    job = opening.open_job(tmp_path / "spec.toml")
+    assert job.train.record.prepared[0].step == "resample"
+    assert job.train.record.sampling_time == pytest.approx(0.02, rel=0.3)
+
+
+STEPS = [
+    ("t [ms]", 20.0, "sampling_time = 1.0", "`sampling_time` is 1 s, but column 't [ms]' of a.csv tells 0.02 s"),
+    ("time", 0.1, "", "so 1 s is taken, but column 'time' of a.csv tells 0.1 s; perhaps time = \"time\" is meant"),
+    ("time", 0.1, "sampling_time = 0.1", ""),
+    ("other", 0.1, "sampling_time = 1.0", ""),
+]
+
+
+@pytest.mark.parametrize(("header", "every", "given", "told"), STEPS)
+def test_a_column_that_tells_another_step_is_a_warning(tmp_path, header, every, given, told):
+    u, y = plant(100)
+    pd.DataFrame({header: every * np.arange(100), "u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
+    spec = f'[data]\n{given}\ninputs = ["u"]\noutputs = ["y"]\ntrain = {{files = ["a.csv"]}}\n'
+    spec += '[[baseline.terms]]\nparameter = "a"\nregressor = "y[k-1]"\n'
+    (tmp_path / "spec.toml").write_text(spec)
+    warnings = [w for w in opening.open_job(tmp_path / "spec.toml").warnings if w.code == "other_sampling_time"]
+    assert len(warnings) == bool(told) and all(told in w.text for w in warnings)
+
+
+SINGLE = [
+    ({"data": {"Ts": 2.0}}, 2.0),
+    ({"Ts": 0.5}, 0.5),
+    ({"data": {"fs": 50.0}}, 0.02),
+    ({"Fs": 50.0, "Ts": 0.02}, 0.02),
+    ({"Fs": 50.0, "Ts": 0.1}, None),
+    ({"Ts": 0.0}, None),
+    ({"gain": 3.0}, None),
+]
+
+
+@pytest.mark.parametrize(("beside", "step"), SINGLE)
+def test_a_single_number_in_a_file_of_matlab_is_the_sampling_time(tmp_path, beside, step):
+    u, y = plant(300)
+    data = {"u": u, "y": y} | beside.pop("data", {})
+    scipy.io.savemat(tmp_path / "a.mat", {"data": data} | beside)
+    done = run("init", tmp_path / "a.mat", "--out", tmp_path / "spec.toml")  # data.u and data.y are known as u and y
+    assert done.code == 0, done.err
+    data = tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
+    assert (data["inputs"], data["outputs"], data["sampling_time"]) == (["data_u"], ["data_y"], step or 1.0)
+    assert ("no column tells it" in done.out) == (step is None)
+    np.savez(tmp_path / "a.npz", u=u, y=y, **beside)
+    assert survey(tmp_path / "a.npz").clock.step == (step if beside else None)
+
+
+def test_a_lag_that_is_a_guess_is_told_in_the_spec(tmp_path):
+    rng = np.random.default_rng(0)
+    pd.DataFrame({"u": rng.normal(size=30), "y": rng.normal(size=30)}).to_csv(tmp_path / "a.csv", index=False)
+    done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
+    assert done.code == 0 and "no lag of it is significant" in done.out
+    assert "# no lag of it is significant, so this is a guess" in (tmp_path / "spec.toml").read_text()
+
+
+def test_coupled_outputs_are_trained_on_the_free_run(tmp_path):
+    u, y = plant(400)
+    frame = pd.DataFrame({"u": u, "y1": y, "y2": np.gradient(y)})
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
+    assert done.code == 0 and "the past of one output tells of another" in done.out, done.err
+    assert tomllib.loads((tmp_path / "spec.toml").read_text())["training"]["focus"] == "simulation"
+    frame.drop(columns="y2").to_csv(tmp_path / "a.csv", index=False)
+    assert run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml", "--force").code == 0
+    assert "focus" not in tomllib.loads((tmp_path / "spec.toml").read_text())["training"]
+
+
+def test_a_long_file_is_looked_at_in_windows_and_says_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(first_orders, "LOOKED_AT", 500)
+    monkeypatch.setattr(commands_init, "LOOKED_AT", 500)
+    monkeypatch.setattr(cli, "_LARGE", 10.0)
+    monkeypatch.setattr(cli, "on_terminal", lambda: True)
+    u, y = plant(2000)
+    u[:500], y[:500] = 0.0, 0.0  # the first rows tell nothing
+    pd.DataFrame({"u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
+    done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
+    assert done.code == 0 and "reading a.csv" in done.err and "looking at signals" in done.err
+    assert "delays and orders are found on 500 of these rows" in done.out and "nk 3;" in done.out

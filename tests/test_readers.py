@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from orthaug._base.errors import InputError
+from orthaug.data.parquet_source import open_parquet
 from orthaug.data.readers import read_record
 from orthaug.data.record import Channel
 
@@ -257,3 +258,78 @@ def test_refused_files(tmp_path):
         read(tmp_path / "absent.csv")
     with pytest.raises(InputError, match="unknown file type '.txt'"):
         read(put(tmp_path, name="run.txt"))
+
+
+def minutes(*instants: str) -> str:
+    return "when,u,y\n" + "".join(f"{instant},{k},2\n" for k, instant in enumerate(instants))
+
+
+DATES = [
+    (("2024-03-01 12:00:00", "2024-03-01 12:00:01", "2024-03-01 12:00:02"), 1.0),
+    (("2024-03-01T23:59:59.750", "2024-03-02T00:00:00", "2024-03-02T00:00:00.250"), 0.25),
+    (("2024-03-01T12:00:00+01:00", "2024-03-01T11:00:02Z", "2024-03-01T11:00:04Z"), 2.0),
+    (("29.02.2024 23:59:58", "29.02.2024 23:59:59", "01.03.2024 00:00:00"), 1.0),  # the day comes first
+    (("01.03.2024 00:00", "02.03.2024 00:00", "03.03.2024 00:00"), 86400.0),
+    (("12/31/2024 23:59:59.5", "12/31/2024 23:59:59.75", "01/01/2025 00:00:00"), 0.25),
+    (("03/04/2024 10:00:00", "03/04/2024 10:00:01", "03/04/2024 10:00:02"), 1.0),  # either way
+    (("12:00:00.5", "12:00:01.5", "12:00:02.5"), 1.0),
+]
+
+
+@pytest.mark.parametrize(("instants", "step"), DATES)
+def test_dates_are_seconds_since_the_first_row(tmp_path, instants, step):
+    (tmp_path / "run.csv").write_text(minutes(*instants))
+    record = read_record(tmp_path / "run.csv", inputs=["u"], outputs=["y"], time="when")
+    assert record.sampling_time == step
+    later = read_record(tmp_path / "run.csv", inputs=["u"], outputs=["y"], time="when", rows=[1, 3])
+    assert later.experiments[0].start_time == step
+
+
+@pytest.mark.parametrize(
+    ("instants", "message"),
+    [
+        (("04/03/2024 10:00", "04/04/2024 10:00", "04/05/2024 10:00"), "'04/03/2024 10:00' may begin with the day"),
+        (("noon", "one", "two"), "line 2 .*'when': found 'noon'; expected a finite number"),
+        (
+            ("2024-03-01 12:00",) * 5 + ("-",) + ("2024-03-01 12:00",) * 5,
+            r"line 7 \(row 5\), column 'when': found '-'; expected a date, as in the other rows",
+        ),
+        (("2024-03-01", "2024-03-02", "2024-03-04"), "a step of 172800 s where 86400 s is usual"),
+    ],
+)
+def test_dates_that_are_refused(tmp_path, instants, message):
+    (tmp_path / "run.csv").write_text(minutes(*instants))
+    with pytest.raises(InputError, match=message):
+        read_record(tmp_path / "run.csv", inputs=["u"], outputs=["y"], time="when")
+
+
+def test_dates_beside_decimal_commas_and_in_other_files(tmp_path):
+    pandas = pytest.importorskip("pandas")
+    options = {"inputs": ["u"], "outputs": ["y"], "time": "when"}
+    lines = [f"01.03.2024 12:00:00,{k}00;{k},5;2\n" for k in range(4)]
+    (tmp_path / "run.csv").write_text("when;u;y\n" + "".join(lines))
+    assert read_record(tmp_path / "run.csv", **options).sampling_time == pytest.approx(0.1)
+    frame = pandas.DataFrame({"when": pandas.date_range("2024-03-01", periods=4, freq="20ms"), "u": 1.0, "y": 2.0})
+    for ending, write in (("parquet", frame.to_parquet), ("xlsx", frame.to_excel)):
+        write(tmp_path / f"run.{ending}", index=False)
+        record = read_record(tmp_path / f"run.{ending}", **options)
+        assert record.sampling_time == pytest.approx(0.02) and record.experiments[0].start_time == 0.0
+    source = open_parquet([tmp_path / "run.parquet"], **options)
+    assert source.sampling_time == pytest.approx(0.02) and source.window(1, 3)[0].start_time == pytest.approx(0.02)
+
+
+UNITS = [("t [ms]", 20.0, 0.02), ("Zeit (us)", 20.0, 2e-5), ("time_ms", 1.0, 1e-3), ("t [min]", 0.5, 30.0),
+         ("t_h", 2.0, 7200.0), ("t [s]", 0.1, 0.1), ("t", 0.1, 0.1), ("k [rows]", 3.0, 3.0)]  # fmt: skip
+
+
+@pytest.mark.parametrize(("header", "every", "step"), UNITS)
+def test_the_header_says_the_unit_of_the_time(tmp_path, header, every, step):
+    rows = "".join(f"{k * every:g},{k},2\n" for k in range(5))
+    (tmp_path / "run.csv").write_text(f"{header},u,y\n{rows}")
+    record = read_record(tmp_path / "run.csv", inputs=["u"], outputs=["y"], time=header, rows=[1, 5])
+    assert record.sampling_time == pytest.approx(step, rel=1e-12)
+    assert record.experiments[0].start_time == pytest.approx(step, rel=1e-12)
+    pandas = pytest.importorskip("pandas")
+    pandas.read_csv(tmp_path / "run.csv").to_parquet(tmp_path / "run.parquet")
+    source = open_parquet([tmp_path / "run.parquet"], inputs=["u"], outputs=["y"], time=header)
+    assert source.sampling_time == pytest.approx(step, rel=1e-12)

@@ -345,7 +345,7 @@ MEANING = [
     (
         "[data.channels.angle]",
         "[data.channels.angel]",
-        "'data'.*`channels.angel` is neither an input nor an output; expected one of force, voltage, position, angle",
+        "'data'.*`channels.angel` is neither an input nor an output, and `outputs` has 'angle', of which `channels`",
     ),
 ]
 

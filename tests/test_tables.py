@@ -13,6 +13,7 @@ import pytest
 from orthaug._base.errors import InputError
 from orthaug.data import tables
 from orthaug.data.tables import check_readable, column_names, has_column, read_table
+from orthaug.data.text_files import layout
 
 
 def put(folder: Path, name: str, content: str | bytes) -> Path:
@@ -94,6 +95,46 @@ HEADERS = [
     ('"u, filtered";y\n1;2\n', ["u, filtered", "y"]),
     ("1,2\n1,2\n", ["1", "2"]),
 ]
+
+
+ENCODED = ["utf-8", "utf-8-sig", "utf-16", "cp1252"]
+
+
+@pytest.mark.parametrize("encoding", ENCODED)
+def test_encodings_of_windows(tmp_path, encoding):
+    path = put(tmp_path, "run.csv", "Kraft [µN];Wärme [°C]\n1,5;2\n3;4\n".encode(encoding))
+    assert values(path, "Kraft [µN]", "Wärme [°C]") == [[1.5, 3.0], [2.0, 4.0]]
+    assert layout(path).note == ("no UTF-8, so read as Windows-1252" if encoding == "cp1252" else "")
+
+
+@pytest.mark.parametrize(
+    "above", ["Messung 4711\n", "Datum; 4711; kalt\n\nohne Last\n", "a, b, c, d\n", '"bench, 3"\n']
+)
+def test_a_remark_without_a_sign_is_told_from_the_header_by_its_cells(tmp_path, above):
+    path = put(tmp_path, "run.csv", above + "u,y\n1,2\n3,4\n")
+    assert values(path, "u", "y") == [[1.0, 3.0], [2.0, 4.0]]
+    assert read_table(path, ("u",)).first_line == above.count("\n") + 2
+    path = put(tmp_path, "run.csv", above + "u;y\n1,5;2\n3;4,5\n")
+    assert values(path, "u", "y") == [[1.5, 3.0], [2.0, 4.5]]
+
+
+def test_columns_of_one_name_are_told_apart(tmp_path):
+    path = put(tmp_path, "run.csv", "T [K],u,T [K],T [K]\n1,2,3,4\n")
+    assert column_names(path) == ["T [K].0", "u", "T [K].1", "T [K].2"]
+    assert values(path, "T [K].0", "T [K].2", "u", "T [K].1") == [[1.0], [4.0], [2.0], [3.0]]
+    with pytest.raises(InputError, match=r"no column 'T \[K\].3'"):
+        read_table(path, ("T [K].3",))
+    path = put(tmp_path, "own.csv", "T,T.0,T\n1,2,3\n")  # a name of its own stays
+    assert [values(path, name) for name in ("T.0", "T.1", "T.2")] == [[[2.0]], [[1.0]], [[3.0]]]
+
+
+def test_columns_of_one_name_in_a_workbook(tmp_path):
+    pandas = pytest.importorskip("pandas")
+    pytest.importorskip("openpyxl")
+    pandas.DataFrame([["y", "y"], [1, 2], [3, 4]]).to_excel(tmp_path / "a.xlsx", index=False, header=False)
+    assert values(tmp_path / "a.xlsx", "y.1", "y.0") == [[2.0, 4.0], [1.0, 3.0]]
+    with pytest.raises(InputError, match=r"stands 2 times; names must differ, or be told apart .* 'y.0', 'y.1'"):
+        read_table(tmp_path / "a.xlsx", ("y",))
 
 
 @pytest.mark.parametrize(("content", "names"), HEADERS)
@@ -186,9 +227,10 @@ REFUSED_TEXT = [
     ("run.csv", "\r\n  \r\n", "holds only blank lines"),
     ("run.csv", bytes(range(256)) * 4, "not a text table; expected UTF-8 text with a header row"),
     ("run.csv", b"u,y\n\x00\x01\xff\xfe\n", "not a text table; expected UTF-8"),
-    ("run.csv", "u,y\n1,2\n".encode("utf-16"), "not a text table; expected UTF-8"),
-    ("run.csv", "u,y,Kräfte\n1,2,3\n".encode("latin-1"), "not a text table; expected UTF-8"),
-    ("run.csv", "u,y,note\n1,2,kühl\n".encode("latin-1"), "not a text table; expected UTF-8"),
+    ("run.csv", "u,y\n1,2\n".encode("utf-16-le"), "not a text table; expected UTF-8"),  # no mark says so
+    ("run.csv", b"u,y,\xfc\x01\n1,2,3\n", "not a text table; expected UTF-8"),
+    ("run.csv", b"\xef\xbb\xbfu,y,\xfc\n1,2,3\n", "not a text table; expected UTF-8"),
+    ("run.csv", "1.5,2\n1,2\n", "no column 'u': the first line holds numbers; a header with names is expected"),
     ("run.csv", "u,y\n1,2\n3,4,5\n", "line 3.*3 cells.*2"),
     ("run.csv", 'u,y\n1,2\n3,"4\n5,6\n', "not a readable table.*row 2"),
     ("run.csv", "force,position\n1,2\n", "no column 'u'; the file has 'force', 'position'"),

@@ -21,7 +21,7 @@ from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, rm
 from orthaug.analysis.verdict_text import SHARE, Finding, words
 from orthaug.analysis.wild_rows import wild_rows
 from orthaug.data.regressors import Lags
-from orthaug.data.survey import step_of
+from orthaug.data.survey import quantum_of
 from orthaug.fitting.criteria import Simulation
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import estimate
@@ -146,7 +146,7 @@ def _steps(problem: Problem, tests: tuple[ResidualTest, ...]) -> dict[str, float
     """The steps of the outputs that are measured in such as the one-step error has the size of."""
     found = {}
     for i, test in enumerate(tests):
-        step = step_of(np.concatenate([e.outputs[:, i] for e in problem.record.experiments]))
+        step = quantum_of(np.concatenate([e.outputs[:, i] for e in problem.record.experiments]))
         if step is not None and (test.rms or np.inf) <= step:
             found[test.name] = step
     return found

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,7 +15,7 @@ import typer
 from orthaug._base.checks import check_choice
 from orthaug._base.errors import TrainingError
 from orthaug.commands import streams
-from orthaug.commands.bars import study_bars, training_bar
+from orthaug.commands.bars import on_terminal, study_bars, training_bar
 from orthaug.commands.program import (
     AsJson,
     Force,
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     pass
 
 __all__ = ["main"]
+_LARGE = 20e6  # bytes of a data file from which on `init` tells what it is at
 
 
 @app.command()
@@ -215,21 +218,47 @@ def init(
     check_file(out, data, force=force)
     if sampling_time is not None:
         check_step(sampling_time)
+    large = data.is_file() and data.stat().st_size > _LARGE
+    told = streams.say if large and on_terminal() else _unsaid
+    told(f"reading {data.name}")
     found = look(data)
     roles = assign(found, inputs, outputs, sampling_time)
     if roles is None:
+        asked = question(found, inputs, outputs)
         if not sys.stdin.isatty():
-            raise InputError(question(found))
+            raise InputError(asked)
         streams.say("columns: " + ", ".join(column.header for column in found.signals))
         if inputs is None:
-            inputs = typer.prompt("inputs, separated by commas (none: press enter)", default="", show_default=False)
-        roles = assign(found, inputs, outputs or typer.prompt("outputs"), sampling_time)
+            inputs = _asked("inputs, separated by commas (none: press enter)", partial(assign, found, outputs=outputs))
+        if outputs is None:
+            outputs = _asked("outputs", partial(assign, found, inputs), default=None)
+        roles = assign(found, inputs, outputs, sampling_time)
     if roles is not None and sampling_time is None and found.clock.step is None and sys.stdin.isatty():
         roles = replace(roles, sampling_time=check_step(typer.prompt("seconds between rows", type=float, default=1.0)))
-    assert roles is not None
+    assert roles is not None  # both are given
+    told("looking at signals, delays and orders")
     spec = draft(found, roles, out)
+    told("opening the spec as a fit would")
     write_spec(spec, out, force=force)
     streams.echo(f"{spec.account}\n\nwritten to {out}; next: orthaug fit {out}")
+
+
+def _unsaid(line: str) -> None:
+    """Nobody waits long enough to be told."""
+
+
+def _asked(text: str, check: Callable[[str], Any], default: str | None = "") -> str:
+    """An answer that `check` accepts; what is wrong with another one is said, and it is asked again."""
+    from orthaug._base.errors import InputError
+
+    while True:
+        answer = str(typer.prompt(text, default=default, show_default=False))
+        try:
+            check(answer)
+        except InputError as error:
+            streams.say(str(error))
+        else:
+            return answer
 
 
 @app.command("app")

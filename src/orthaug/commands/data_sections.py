@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
@@ -76,10 +77,22 @@ class Data(Section):
             raise ValueError("`sampling_time` and `time` are both given; expected one of them")
         for name in self.channels:
             if name not in (*self.inputs, *self.outputs):
-                known = ", ".join((*self.inputs, *self.outputs))
-                raise ValueError(f"`channels.{name}` is neither an input nor an output; expected one of {known}")
+                raise ValueError(self._no_channel(name))
         for name in self.tests:
             check_label(name, "the name of a test")
             if name in ("train", "validation"):
                 raise ValueError(f"`tests.{name}` has the name of another part of the data; expected another name")
         return self
+
+    def _no_channel(self, name: str) -> str:
+        """What is wrong with a section of `channels` for no channel: it, or the name that it should have met."""
+        known = (*self.inputs, *self.outputs)
+        open_names = [other for other in known if other not in self.channels]
+        close = difflib.get_close_matches(name, open_names, n=1)
+        if not close:
+            return f"`channels.{name}` is neither an input nor an output; expected one of {', '.join(known)}"
+        kind = "inputs" if close[0] in self.inputs else "outputs"
+        return (
+            f"`channels.{name}` is neither an input nor an output, and `{kind}` has '{close[0]}', of which `channels` "
+            "knows nothing; expected the same name in both, so one of them is misspelt"
+        )

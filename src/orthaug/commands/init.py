@@ -2,38 +2,26 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomlkit
 
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_file
 from orthaug._base.lines import counted, percent
+from orthaug.commands.first_spec import FILLED, Roles, channel_names, lacking, spec_text, steps_of, time_of
 from orthaug.data.readers import read_record
 from orthaug.data.record import Channel, Record
 from orthaug.data.steps import STEPS
 from orthaug.data.survey import Column, Survey, survey
-from orthaug.selection.first_orders import FirstModel, first_model
+from orthaug.selection.first_orders import LOOKED_AT, FirstModel, first_model
 
-FILLED = 3
-"""Rows of a gap that the spec's step `fill` reconstructs at most."""
 TRAINED = 0.75  # share of the rows; the rest is a test
 _TESTED = 30  # rows of a test at least
 _LISTED = 12  # columns in a message
-
-
-@dataclass(frozen=True, eq=False)
-class Roles:
-    """Which columns of a file are inputs, which outputs, and the sampling time [s] where a person said it."""
-
-    inputs: tuple[Column, ...]
-    outputs: tuple[Column, ...]
-    sampling_time: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,30 +50,80 @@ def assign(found: Survey, inputs: str | None, outputs: str | None, sampling_time
     if inputs is None and outputs is None:
         known = found.roles()
         return None if known is None else Roles(tuple(known[0]), tuple(known[1]), sampling_time)
-    if inputs is None or outputs is None:
-        return None
-    chosen = [[found.find(name) for name in _names(text)] for text in (inputs, outputs)]
-    both = [*chosen[0], *chosen[1]]
-    if not chosen[1]:
+    chosen = [None if text is None else columns_of(found, text) for text in (inputs, outputs)]
+    if outputs is not None and not chosen[1]:
         raise InputError(f"{found.path}: no output is named; give --outputs, a column or several separated by commas.")
+    both = [column for group in chosen for column in group or ()]
     for column in both:
         if both.count(column) > 1:
             raise InputError(f"{found.path}: column '{column.header}' is named twice among inputs and outputs.")
-        if column is found.clock.column:
-            raise InputError(f"{found.path}: column '{column.header}' is the time; it is no channel.")
+    if chosen[0] is None or chosen[1] is None:
+        return None
     return Roles(tuple(chosen[0]), tuple(chosen[1]), sampling_time)
 
 
-def question(found: Survey) -> str:
-    """What to give where the columns do not say what they are."""
-    names = [c.header for c in found.signals]
-    some = ", ".join(names[:_LISTED]) + (f" and {len(names) - _LISTED} more" if len(names) > _LISTED else "")
-    first = f'"{names[0]}"' if len(names) > 1 else '""'
+def columns_of(found: Survey, text: str) -> list[Column]:
+    """The columns that a text names, separated by commas.
+
+    Raises:
+        InputError: a column that is not there, has no numbers that vary, or is the time.
+    """
+    columns = [found.find(name) for name in (part.strip() for part in text.split(",")) if name]
+    for column in columns:
+        if column is found.clock.column:
+            raise InputError(f"{found.path}: column '{column.header}' is the time; it is no channel.")
+    return columns
+
+
+def question(found: Survey, inputs: str | None = None, outputs: str | None = None) -> str:
+    """What to give where the columns do not say what they are; `inputs` and `outputs` are what was given.
+
+    Raises:
+        InputError: no column could be a channel, or none is left for an output.
+    """
+    given = {id(c) for text in (inputs, outputs) for c in columns_of(found, text or "")}
+    free = [c.header for c in found.signals if id(c) not in given]
+    if not found.signals or (outputs is None and not free):
+        raise InputError(f"{found.path}: {_nothing_left(found, inputs)}")
+    listed = [c.header for c in found.signals]
+    some = ", ".join(listed[:_LISTED]) + (f" and {len(listed) - _LISTED} more" if len(listed) > _LISTED else "")
+    output = free.pop() if outputs is None else outputs
+    named = ",".join(free[:_LISTED]) if outputs is not None else free[0] if free else ""
+    proposed = f'--inputs "{named if inputs is None else inputs}" --outputs "{output}"'
+    said = "the names of the columns do not tell inputs from outputs"
+    if inputs is not None or outputs is not None:
+        said = f"only {'inputs' if outputs is None else 'outputs'} are named"
+    none = ' (--inputs "" for none)' if inputs is None and named else ""
+    others = left_out(found, [*found.signals])
     return (
-        f"{found.path}: the names of the columns do not tell inputs from outputs: {some}. Say both, separated by "
-        f'commas, such as --inputs {first} --outputs "{names[-1]}" (--inputs "" for none); columns that are not named '
-        "are left out."
+        f"{found.path}: {said}: {some}. Say both, separated by commas, such as {proposed}{none}; columns that are not "
+        f"named are left out." + (f" No channels: {others}." if others else "")
     )
+
+
+def _nothing_left(found: Survey, inputs: str | None) -> str:
+    """Why there is no output to name."""
+    rows = counted(max(column.filled for column in found.columns), "row")
+    others = left_out(found, [*found.signals])
+    if not found.signals:
+        return (
+            f"no column could be a channel, {rows}: {others}. A first model needs an output that varies, over some "
+            "dozens of rows."
+        )
+    text = f"every column that could be a channel is an input already ({inputs}), and none is left for an output"
+    return f"{text}; left out: {others}." if others else f"{text}."
+
+
+def left_out(found: Survey, used: Sequence[Column]) -> str:
+    """The columns that are not used, and why, in a list; the time is none of them."""
+    apart = {id(c) for c in (*used, found.clock.column)}
+    rest = [f"{c.header} ({why_not(c)})" for c in found.columns if id(c) not in apart]
+    return ", ".join(rest[:_LISTED]) + (f" and {len(rest) - _LISTED} more" if len(rest) > _LISTED else "")
+
+
+def why_not(column: Column) -> str:
+    """Why a column is no channel."""
+    return column.unusable or ("constant" if column.constant else "not named")
 
 
 def draft(found: Survey, roles: Roles, out: Path) -> Draft:
@@ -104,8 +142,8 @@ def draft(found: Survey, roles: Roles, out: Path) -> Draft:
             f"{found.path}: {len(record)} usable rows are too few for a first model of these channels, or the inputs "
             "are combinations of each other. Give more rows, or fewer inputs."
         )
-    named = (_channel_names(roles.inputs), _channel_names(roles.outputs))
-    text = _spec(found, roles, out, rows, cut, missing, named, model)
+    named = (channel_names(roles.inputs), channel_names(roles.outputs))
+    text = spec_text(found, roles, out, rows, cut, missing, named, model)
     return Draft(text, _account(found, roles, rows, missing, cut, model))
 
 
@@ -127,10 +165,6 @@ def _names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
-def _channel_names(columns: Sequence[Column]) -> list[str]:
-    return [column.name for column in columns]
-
-
 def _extent(roles: Roles) -> tuple[int, int]:
     """Rows up to the last value of any channel, and how many of them lack one."""
     columns = [*roles.inputs, *roles.outputs]
@@ -147,31 +181,10 @@ def _record(found: Survey, roles: Roles, cut: int, missing: int) -> Record:
     """The training rows."""
     inputs, outputs = ([Channel(c.name, c.unit, c.header) for c in group] for group in (roles.inputs, roles.outputs))
     options: dict[str, Any] = {"rows": (0, cut), "missing": "skip" if missing or not found.clock.even else "error"}
-    options["prepare"] = [STEPS.declare(kind, keys) for kind, keys in _steps(found, roles)]
+    options["prepare"] = [STEPS.declare(kind, keys) for kind, keys in steps_of(found, roles)]
     if not found.clock.even:
-        options["time"] = _time(found, roles)
+        options["time"] = time_of(found, roles)
     return read_record(found.path, inputs=inputs, outputs=outputs, **options)
-
-
-def _time(found: Survey, roles: Roles) -> str | None:
-    """The column of instants in seconds, where there is one that is to be used."""
-    clock = found.clock
-    return clock.column.header if clock.column is not None and clock.instants and not roles.sampling_time else None
-
-
-def _steps(found: Survey, roles: Roles) -> list[tuple[str, dict[str, Any]]]:
-    """Preparation that the data need: spikes of outputs replaced, uneven instants put onto a grid."""
-    steps: list[tuple[str, dict[str, Any]]] = []
-    if any(column.spikes for column in roles.outputs):
-        threshold = min(column.threshold for column in roles.outputs)
-        steps += [("outliers", {"threshold": threshold}), ("fill", {"most": FILLED, "method": "pchip"})]
-    if _time(found, roles) and not found.clock.even:
-        steps.append(("resample", {"sampling_time": found.clock.step}))
-    return steps
-
-
-def _step(found: Survey, roles: Roles) -> float:
-    return roles.sampling_time or found.clock.step or 1.0
 
 
 def _account(found: Survey, roles: Roles, rows: int, missing: int, cut: int, model: FirstModel) -> str:
@@ -179,33 +192,33 @@ def _account(found: Survey, roles: Roles, rows: int, missing: int, cut: int, mod
     step = f"{roles.sampling_time:g} s, as given" if roles.sampling_time else str(found.clock)
     if roles.sampling_time is None and found.clock.step is None:
         step += "; 1 s is written: change it"
-    lines = [f"{found.path.name}: {rows} rows, {len(found.columns)} columns", f"sampling time: {step}"]
+    told = f"; {found.note}" if found.note else ""
+    lines = [f"{found.path.name}: {rows} rows, {len(found.columns)} columns{told}", f"sampling time: {step}"]
     for kind, columns in (("input", roles.inputs), ("output", roles.outputs)):
         lines += [f"{kind:<7}{as_seen(column, spikes=kind == 'output')}" for column in columns]
     used = {id(c) for c in (*roles.inputs, *roles.outputs, found.clock.column)}
     for column in (c for c in found.columns if id(c) not in used):
-        why = column.unusable or ("constant" if column.constant else "not named")
-        lines.append(f"left out: {column.header} ({why})")
+        lines.append(f"left out: {column.header} ({why_not(column)})")
     for column, delay, order in zip(roles.inputs, model.delays, model.persistence, strict=True):
         lines.append(f"{column.name} excites {_order(order)}; {_delay(delay)}")
     if missing:
-        filled = any(kind == "fill" for kind, _ in _steps(found, roles))
-        lines.append(f"{_lacking(missing)} and will be left out, with all windows that touch them")
+        filled = any(kind == "fill" for kind, _ in steps_of(found, roles))
+        lines.append(f"{lacking(missing)} and will be left out, with all windows that touch them")
         if filled:
-            lines[-1] = f"{_lacking(missing)}: gaps of up to {FILLED} rows are filled, longer ones left out"
-    for name, late, seen in zip(_channel_names(roles.inputs), model.orders.nk, model.delays, strict=True):
+            lines[-1] = f"{lacking(missing)}: gaps of up to {FILLED} rows are filled, longer ones left out"
+    for name, late, seen in zip(channel_names(roles.inputs), model.orders.nk, model.delays, strict=True):
         if seen is not None and seen != late:
-            lines.append(f"the spec takes {name} from lag {late} on, which runs as well or better with as few lags")
+            lines.append(f"the spec takes {name} from lag {late} on, which runs clearly better on rows held out")
+    if model.coupled:
+        lines.append('the past of one output tells of another: the spec trains on the free run (focus = "simulation")')
     size, errors = model.orders, ", ".join(percent(error, 3) for error in model.free_run)
     told = "one step ahead" if not roles.inputs else "in free run"
     lines.append(f"first physics: linear, {size}{', with a constant' if model.offset else ''}; {told} its error")
     lines[-1] += f" on rows held out is {errors} of the output's standard deviation"
+    if cut - missing > LOOKED_AT:
+        lines.append(f"delays and orders are found on {LOOKED_AT} of these rows, in windows spread over them")
     lines.append("test: " + (f"rows {cut} to {rows}" if cut < rows else "none, for there are few rows"))
     return "\n".join(lines)
-
-
-def _lacking(rows: int) -> str:
-    return f"{counted(rows, 'row')} lack{'s' if rows == 1 else ''} a value"
 
 
 def _delay(delay: int | None) -> str:
@@ -232,121 +245,6 @@ def as_seen(column: Column, *, spikes: bool) -> str:
     for value, count in column.limits:
         text += f"; {counted(count, 'row')} at {value:.4g}, perhaps a limit of sensor or actuator"
     if column.quantum is not None:
-        text += f"; in steps of {column.quantum:.3g}"
+        moves = f", while it moves by {column.movement:.2g} from row to row" if column.quantum > column.movement else ""
+        text += f"; in steps of {column.quantum:.3g}{moves}"
     return text
-
-
-def _spec(
-    found: Survey,
-    roles: Roles,
-    out: Path,
-    rows: int,
-    cut: int,
-    missing: int,
-    named: tuple[list[str], list[str]],
-    model: FirstModel,
-) -> str:
-    """The spec with comments."""
-    document = tomlkit.document()
-    document.add(tomlkit.comment(f"Written by orthaug init from {found.path.name}. Run: orthaug fit {out.name}"))
-    document.add(tomlkit.comment("Every key: orthaug schema keys. What is written here is a start, not a verdict."))
-    document.add("data", _data(found, roles, out, rows, cut, missing, named))
-    document.add(tomlkit.nl())
-    document.add(
-        tomlkit.comment(
-            "The physics: linear difference equations, to be replaced by what you know ([motion]: equations of motion)."
-        )
-    )
-    document.add("baseline", _baseline(named, model))
-    learner = tomlkit.table()
-    learner.add("kind", "mlp")
-    learner.add("hidden", [8])
-    learner["hidden"].comment("sees the lags that the physics reads; [lags] gives it more, `inputs` fewer")
-    document.add("learner", learner)
-    training = tomlkit.table()
-    training.add("restarts", 3)
-    training.add(
-        tomlkit.comment('focus = "simulation"  # trains on the free run: slower, better where noise is on the sensor')
-    )
-    document.add("training", training)
-    return tomlkit.dumps(document)
-
-
-def _data(
-    found: Survey, roles: Roles, out: Path, rows: int, cut: int, missing: int, named: tuple[list[str], list[str]]
-) -> Any:
-    file, clock = _relative(found.path, out), found.clock
-    data = tomlkit.table()
-    time = _time(found, roles)
-    if time is not None:
-        data.add("time", time)
-        data["time"].comment(f"instants in s, {'every' if clock.even else 'mostly every'} {clock.step:g}")
-    else:
-        data.add("sampling_time", _step(found, roles))
-        unknown = clock.step is None and not roles.sampling_time
-        data["sampling_time"].comment("s; no column tells it: change it" if unknown else "s")
-    for key, names in zip(("inputs", "outputs"), named, strict=True):
-        data.add(key, names)
-    uneven = time is not None and not clock.even
-    if missing or uneven:
-        data.add("missing", "skip")
-        data["missing"].comment(_lacking(missing) if missing else "nothing is interpolated across gaps")
-    for name, part in (("train", [0, cut]), ("tests", [cut, rows])):
-        if part[0] == part[1]:
-            continue
-        entry = tomlkit.inline_table()
-        entry.update({"files": [file], "rows": part})
-        if name == "train":
-            data.add("train", entry)
-        else:
-            data.add(tomlkit.key(["tests", "last"]), entry)
-    channels = tomlkit.table(is_super_table=True)
-    for column in (*roles.inputs, *roles.outputs):
-        entry = tomlkit.inline_table()
-        entry.update({"column": column.header} if column.header != column.name else {})
-        entry.update({"unit": column.unit} if column.unit else {})
-        if entry:
-            channels.add(tomlkit.key(column.name), entry)
-    if len(channels):
-        data.add("channels", channels)
-    steps = tomlkit.aot()
-    for kind, keys in _steps(found, roles):
-        step = tomlkit.table()
-        step.update({"step": kind, **keys})
-        steps.append(step)
-    if len(steps):
-        data.add("prepare", steps)
-    return data
-
-
-def _relative(path: Path, out: Path) -> str:
-    """The data file as the spec at `out` names it."""
-    try:
-        return Path(os.path.relpath(path.resolve(), out.resolve().parent)).as_posix()
-    except ValueError:  # on another drive
-        return path.resolve().as_posix()
-
-
-def _baseline(named: tuple[list[str], list[str]], model: FirstModel) -> Any:
-    inputs, outputs = named
-    terms, orders = [], model.orders
-    for output in outputs:
-        own = f"_{output}" if len(outputs) > 1 else ""
-        found = [(f"a{i}{own}", f"{output}[k-{i}]") for i in range(1, orders.na + 1)]
-        for name, nb, nk in zip(inputs, orders.nb, orders.nk, strict=True):
-            by = f"_{name}" if len(inputs) > 1 else ""
-            found += [(f"b{lag}{by}{own}", f"{name}[k-{lag}]" if lag else f"{name}[k]") for lag in range(nk, nk + nb)]
-        found += [(f"offset{own}", "1")] if model.offset else []
-        for parameter, regressor in found:
-            term = tomlkit.table()
-            term.add("parameter", f"{parameter}_" if parameter in (*inputs, *outputs) else parameter)
-            term.add("regressor", regressor)
-            if own:
-                term.add("output", output)
-            terms.append(term)
-    array = tomlkit.aot()
-    for term in terms:
-        array.append(term)
-    baseline = tomlkit.table(is_super_table=True)
-    baseline.add("terms", array)
-    return baseline

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import glob
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,9 +15,10 @@ from orthaug.commands.data_sections import PartSection
 from orthaug.commands.spec import Spec
 from orthaug.data.parquet_source import open_parquet
 from orthaug.data.preparation import warnings_of
-from orthaug.data.readers import read_record
+from orthaug.data.readers import DRIFT, read_record
 from orthaug.data.record import Record, same_step
 from orthaug.data.sources import Source, witness
+from orthaug.data.survey import told_clock
 from orthaug.data.tables import KNOWN
 from orthaug.reports.result import FileResult
 
@@ -176,6 +177,8 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
     told = tuple(replace(e, source=file) for e, file in zip(record.experiments, sources, strict=True))
     record = replace(record, experiments=told)
     warnings = (_thinned(name, part.every),) if part.every > 1 else ()
+    if spec.data.time is None:
+        warnings += _other_step(path, spec, files, name, part.columns)
     if name == "train":
         warnings += warnings_of(record.prepared, [c.name for c in record.channels])
     return Part(name, record, part.skip, tuple(results), warnings)
@@ -216,10 +219,31 @@ def _left(path: Path, spec: Spec, part: PartSection, name: str, files: Sequence[
     record = witness(source)
     record = replace(record, experiments=tuple(replace(e, source=names[e.source]) for e in record.experiments))
     total, warnings = sum(rows.values()), ()
+    if spec.data.time is None:
+        warnings = _other_step(path, spec, files, name, part.columns)
     if len(record) < total:
         told = f"{name}: findings and figures look at {len(record)} of {total} rows, in windows spread over them."
-        warnings = (Warning("witness", told),)
+        warnings += (Warning("witness", told),)
     return Part(name, record, part.skip, tuple(results), warnings, source)
+
+
+def _other_step(
+    path: Path, spec: Spec, files: Sequence[str], name: str, columns: Mapping[str, str]
+) -> tuple[Warning, ...]:
+    """A warning where a file tells another sampling time than the spec does."""
+    channels = [*spec.channels(spec.data.inputs), *spec.channels(spec.data.outputs)]
+    used = {columns.get(c.name, c.file_column) for c in channels} | {spec.data.experiment or ""}
+    step, given = spec.data.sampling_time or 1.0, spec.data.sampling_time is not None
+    for file in files:
+        clock = told_clock(path.parent / file, used)
+        if clock.column is None or clock.step is None or abs(clock.step - step) <= DRIFT * step:
+            continue
+        said = f"`sampling_time` is {step:g} s" if given else "the spec says no sampling time, so 1 s is taken"
+        header = clock.column.header
+        remedy = f'time = "{header}"' if clock.instants else f"sampling_time = {clock.step:g}"
+        text = f"{name}: {said}, but column '{header}' of {file} tells {clock.step:g} s; perhaps {remedy} is meant."
+        return (Warning("other_sampling_time", text),)
+    return ()
 
 
 def _thinned(name: str, every: int) -> Warning:

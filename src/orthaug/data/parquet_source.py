@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from orthaug._base.errors import InputError
+from orthaug.data.instants import in_seconds
 from orthaug.data.readers import DRIFT, JITTER
 from orthaug.data.record import Channel, Experiment, as_channels, check_channels, check_step, same_step
 from orthaug.data.sources import joined, stretches
@@ -203,7 +204,7 @@ def open_parquet(
         with parquet_file(path) as file:
             wanted = [*reading.distinct, *(name for name in (time, experiment) if name)]
             check_present(path, wanted, file.schema_arrow.names)
-            _check_types(path, file.schema_arrow, wanted, types)
+            _check_types(path, file.schema_arrow, wanted, types, time)
             groups = [file.metadata.row_group(i).num_rows for i in range(file.metadata.num_row_groups)]
             total = sum(groups)
             if not total:
@@ -240,11 +241,14 @@ def stamp_of(path: Path) -> Stamp:
     return Stamp(seen.st_size, seen.st_mtime_ns, zlib.crc32(footer))
 
 
-def _check_types(path: Path, schema: Any, names: Sequence[str], types: dict[str, tuple[Any, Path]]) -> None:
-    """Raise InputError for a column that holds no numbers, or other ones than in the files before."""
+def _check_types(
+    path: Path, schema: Any, names: Sequence[str], types: dict[str, tuple[Any, Path]], time: str | None
+) -> None:
+    """Raise InputError for a column that holds no numbers (or dates, in that of time), or others than before."""
     for name in names:
         found = schema.field(name).type
-        if not str(found).startswith(("int", "uint", "float", "double", "halffloat", "bool")):
+        known_kinds = ("int", "uint", "float", "double", "halffloat", "bool")
+        if not str(found).startswith((*known_kinds, "timestamp") if name == time else known_kinds):
             raise InputError(f"{path}: column '{name}' holds {found} values; expected numbers.")
         known, first = types.setdefault(name, (found, path))
         if found != known:
@@ -260,7 +264,8 @@ def _look(file: Any, path: Path, total: int, time: str | None, experiment: str |
     wanted = [name for name in (time, experiment) if name]
     found = _Look(path, time, experiment)
     for batch in file.iter_batches(batch_size=BATCH_ROWS, columns=wanted):
-        found.add(*(None if name is None else _numbers(batch, name) for name in (time, experiment)))
+        instants = None if time is None else found.seconds(batch.column(time).to_numpy(zero_copy_only=False))
+        found.add(instants, None if experiment is None else _numbers(batch, experiment))
     return found.ended()
 
 
@@ -275,6 +280,14 @@ class _Look:
         self.labels: set[float] = set()
         self.usual, self.steps, self.counted = np.nan, 0.0, 0
         self.rates: list[float] = []
+        self.origin: Any = None
+
+    def seconds(self, instants: np.ndarray) -> np.ndarray:
+        """A batch of the time column in s, dates since the first row of the file."""
+        if instants.dtype.kind != "M":
+            return in_seconds(np.asarray(instants, dtype=float), self.time or "")
+        self.origin = instants[0] if self.origin is None else self.origin
+        return (instants - self.origin) / np.timedelta64(1, "s")
 
     def add(self, instants: np.ndarray | None, labels: np.ndarray | None) -> None:
         instants, labels = (np.zeros(len(b if a is None else a)) if a is None else a  # type: ignore[arg-type]

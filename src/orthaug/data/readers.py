@@ -48,7 +48,8 @@ def read_record(
     Args:
         path: of a file that ends in .csv, .tsv, .parquet, .xlsx, .npz, .mat or .h5.
         inputs, outputs: channel names, or `Channel`s with column, unit, scale and offset.
-        sampling_time: seconds between rows; or `time`, the column that holds the instants.
+        sampling_time: seconds between rows; or `time`, the column that holds the instants: numbers in the unit of its
+            header (`t [ms]`; s without one), or dates, which count from the first row of the file.
         rows: half-open range `(start, stop)` of data rows, or several; None for all.
         every: keep each n-th row (no filter); the sampling time is multiplied.
         columns: this file's column for a channel, `{"position": "yVal"}`.
@@ -79,7 +80,7 @@ def read_record(
     wanted: list[str] = list(dict.fromkeys([*column_of.values(), *(name for name in (time, experiment) if name)]))
     if not column_of:
         raise InputError("no channels are asked for; name inputs, outputs or both.")
-    table = _trim(read_table(path, wanted), uneven=missing != "error")
+    table = _trim(read_table(path, wanted, time), uneven=missing != "error")
     needed = wanted
     if missing == "keep":
         needed = [*(column_of[c.name] for c in channels[0]), *([time] if time else [])]
@@ -311,7 +312,8 @@ def _check_cells(table: Table, columns: Sequence[str], start: int, stop: int) ->
             text = table.cell(name, row)
             what = f"found '{text}'" if text else "the cell is empty"
             error = MissingSampleError if text.strip().lower() in _MISSING else InputError
-            raise error(f"{table.path}: {table.where(row)}, column '{name}': {what}; expected a finite number.")
+            wanted = "a date, as in the other rows" if name == table.dated else "a finite number"
+            raise error(f"{table.path}: {table.where(row)}, column '{name}': {what}; expected {wanted}.")
 
 
 def _uniform_step(table: Table, time: str, start: int, stop: int) -> float:

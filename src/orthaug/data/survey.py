@@ -5,31 +5,28 @@ from __future__ import annotations
 import keyword
 import re
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from orthaug._base.checks import Vector
-from orthaug._base.errors import LONGEST, InputError
+from orthaug._base.checks import Vector, nearest
+from orthaug._base.errors import LONGEST, InputError, shown
 from orthaug.data.expressions import SAMPLING_TIME, is_name
+from orthaug.data.headers import is_time, last_part, split_header, step_of
+from orthaug.data.instants import in_seconds
 from orthaug.data.readers import JITTER
-from orthaug.data.runs import Run
+from orthaug.data.record import same_step
 from orthaug.data.steps import Outliers
-from orthaug.data.tables import column_names, read_table
+from orthaug.data.tables import column_names, read_table, reading_note
+from orthaug.data.text_files import numbers_only
+from orthaug.data.variables import ENDINGS, scalars
 
-_UNITS = re.compile(
-    r"A|mA|V|mV|kV|W|kW|N|kN|mN|Nm|m|mm|cm|km|um|s|ms|us|rad|mrad|deg|rpm|Hz|kHz|Pa|kPa|MPa|bar|mbar|K|degC|degF|kg|J|"
-    r"kJ|ohm|percent|m_s2?|rad_s2?|l_min|kg_s"
-)
-_BRACKETS = re.compile(r"^(.*?)\s*[\[(]\s*([^\[\]()]+?)\s*[\])]$")
-_TIME = re.compile(r"^(t|time|times|timestamp|time_?stamp|zeit|sec|seconds)$", re.IGNORECASE)
-_STEP = re.compile(r"^(ts|dt|t_s|sampling_?time|sample_?time)$", re.IGNORECASE)
 _INPUT = re.compile(r"^(u|u_?\d+|in|input|input_?\d+)$", re.IGNORECASE)
 _OUTPUT = re.compile(r"^(y|y_?\d+|out|output|output_?\d+)$", re.IGNORECASE)
-_SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 _HELD = 6  # rows at the largest or smallest value from which on it is suspected to be a limit
 _OFTEN = 5.0  # times the rows that a value usually has
 _LONGER = 3.0  # times the rows for which other values are usually held
@@ -43,6 +40,9 @@ _BEYOND = 0.5  # of that range
 _OUTSIDE = 2.5  # interquartile ranges from the middle
 _FEW = 0.01  # share of samples that spikes are at most
 _SAME = 1e-6  # relative
+_JITTERS = 0.02  # largest deviation of a step that is not told, relative
+_HEAD = 10_000  # rows of a text file that tell its step well enough
+_DATES = "dates"  # what a column of them is, no signal
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,13 +103,12 @@ class Column:
     @cached_property
     def _spiky(self) -> tuple[float, int]:
         x = self.values[: self.filled]
-        run = Run(x[:, None], np.arange(float(len(x))), (self.name,), 0, 1.0)
+        distance, deviation = Outliers().distances(x)
         usual = np.quantile(self.finite, [0.25, 0.75])
         far = np.abs(x - usual.mean()) > _OUTSIDE * np.ptp(usual)
         wild = {}
         for threshold in _LOWER:
-            marked = np.isfinite(x) & ~np.isfinite(Outliers(threshold=threshold).apply(run).values[:, 0])
-            wild[threshold] = marked & far
+            wild[threshold] = (distance > threshold * deviation) & far
         rest = x[np.isfinite(x) & ~wild[_LOWER[-1]]]
         beyond = _BEYOND * np.ptp(rest)
         alone = wild[_LOWER[-1]] & ((x > rest.max() + beyond) | (x < rest.min() - beyond))
@@ -119,19 +118,25 @@ class Column:
 
     @property
     def quantum(self) -> float | None:
-        """The step of which all values are multiples, where it is coarse beside the standard deviation."""
-        step = step_of(self.finite)
-        if step is None or step <= _COARSE * float(self.finite.std()):
+        """The step of which all values are multiples, where it is coarse beside deviation or movement of a sample."""
+        step = quantum_of(self.finite)
+        if step is None or step <= min(_COARSE * float(self.finite.std()), self.movement):
             return None
         return step if len(np.unique(self.finite)) < len(self.finite) / 2 else None
 
     @property
+    def movement(self) -> float:
+        """By how much the signal moves between two rows, on the average."""
+        return float(np.abs(np.diff(self.finite)).mean()) if len(self.finite) > 1 else 0.0
+
+    @property
     def kind(self) -> str:
         """'input' or 'output' where the name says so, otherwise ''."""
-        return "input" if _INPUT.match(self.name) else "output" if _OUTPUT.match(self.name) else ""
+        name = channel_name(last_part(split_header(self.header)[0]))
+        return "input" if _INPUT.match(name) else "output" if _OUTPUT.match(name) else ""
 
 
-def step_of(values: Vector) -> float | None:
+def quantum_of(values: Vector) -> float | None:
     """The step of which all differences between values are multiples, up to rounding; None where there is none."""
     levels = np.unique(values)
     if len(levels) < 3 or not np.isfinite(levels[[0, -1]]).all():
@@ -149,16 +154,33 @@ class Clock:
     step: float | None = None
     """In s."""
     column: Column | None = None
-    instants: bool = False
-    """Whether the column holds instants in seconds, as the spec's `time` takes them."""
+    seconds: Vector | None = None
+    """The instants in s, where the column holds them: it can be the spec's `time`."""
     even: bool = True
+
+    @property
+    def instants(self) -> bool:
+        """Whether the column holds instants."""
+        return self.seconds is not None
+
+    @property
+    def steady(self) -> bool:
+        """Whether parts of the file tell the same sampling time from their instants."""
+        seconds = np.zeros(0) if self.seconds is None else self.seconds[np.isfinite(self.seconds)]
+        means = [part.mean() for part in np.array_split(np.diff(seconds), 4) if len(part)]
+        return bool(means) and same_step(min(means), max(means))
 
     def __str__(self) -> str:
         if self.column is None or self.step is None:
             return "no column tells it"
         if not self.even:
-            return f"{self.step:g} s is usual in column '{self.column.header}', but the steps are uneven"
-        return f"{self.step:g} s, from column '{self.column.header}'"
+            text = f"{self.step:g} s is usual in column '{self.column.header}', but the steps are uneven"
+        else:
+            text = f"{self.step:g} s, from column '{self.column.header}'"
+        steps = np.diff(self.seconds[np.isfinite(self.seconds)]) if self.seconds is not None else np.zeros(0)
+        if len(steps) and np.abs(steps - self.step).max() > _JITTERS * self.step:
+            text += f"; single steps are {steps.min():.3g} to {steps.max():.3g} s"
+        return text
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,6 +190,8 @@ class Survey:
     path: Path
     columns: tuple[Column, ...]
     clock: Clock
+    note: str = ""
+    """What to know of how the file was read."""
 
     @property
     def signals(self) -> tuple[Column, ...]:
@@ -181,10 +205,13 @@ class Survey:
         Raises:
             InputError: no such column, one without numbers, or one that never changes.
         """
+        twice = [c.header for c in self.columns if c.header in (f"{name}.0", f"{name}.1")]
+        if len(twice) == 2 and not any(c.header == name for c in self.columns):
+            raise InputError(f"{self.path}: the name '{name}' stands twice; from the left: {', '.join(twice)}.")
         named = [c for c in self.columns if c.header == name] or [c for c in self.columns if c.name == name]
         if not named:
-            known = ", ".join(c.header for c in self.columns)
-            raise InputError(f"{self.path}: no column '{name}'; the file has {known}.")
+            known = [c.header for c in self.columns]
+            raise InputError(f"{self.path}: no column '{name}'{nearest(name, known)}; the file has {', '.join(known)}.")
         column = named[0]
         if column.unusable:
             raise InputError(f"{self.path}: column '{name}' cannot be a channel: {column.unusable}.")
@@ -209,6 +236,8 @@ def survey(path: Path) -> Survey:
     """
     columns: list[Column] = []
     every = list(column_names(path))
+    if numbers_only(every):
+        raise InputError(f"{path}: the first line holds numbers; a header with names is expected there. Write one.")
     headers = list(dict.fromkeys(every))
     try:
         table = read_table(path, headers).columns
@@ -219,24 +248,46 @@ def survey(path: Path) -> Survey:
         try:
             values = table[header] if table else read_table(path, [header]).columns[header]
             unusable = "" if np.isfinite(values).any() else "no numbers"
+            if unusable and len(values):
+                values, unusable = _as_dates(path, header)
         except InputError:  # text, complex numbers, or not known which
-            values, unusable = np.empty(0), "no numbers" if every.count(header) == 1 else "its name stands twice"
+            values, unusable = np.empty(0), "its name stands twice"
+            if every.count(header) == 1:
+                values, unusable = _as_dates(path, header)
         name = channel_name(base, [c.name for c in columns])
         columns.append(Column(header, name, unit, values, unusable))
     if all(c.unusable for c in columns):
-        raise InputError(f"{path}: no column holds numbers; expected one for each signal, under a header.")
-    return Survey(path, tuple(columns), _clock(columns))
+        raise InputError(
+            f"{path}: no column holds numbers; expected one for each signal, under a header. The names that were found "
+            f"are {shown(', '.join(every))}; a line above the header must begin with # or %."
+        )
+    clock = _clock(columns)
+    return Survey(path, tuple(columns), clock if clock.column else _by_single_number(path), reading_note(path))
 
 
-def split_header(header: str) -> tuple[str, str]:
-    """Name and unit of a header: `force [N]`, `force (N)`, `force_N`; an index, as in `U[2]`, is no unit."""
-    found = _BRACKETS.match(header)
-    if found and found[1] and not re.fullmatch(r"[\d:,\s]+", found[2]):
-        return found[1].strip(), found[2].strip()
-    for cut in (i for i, letter in enumerate(header) if letter == "_" and i):
-        if _UNITS.fullmatch(header[cut + 1 :]):
-            return header[:cut], header[cut + 1 :].replace("_s", "/s").replace("_min", "/min").replace("s2", "s^2")
-    return header, ""
+def told_clock(path: Path, apart: Collection[str] = ()) -> Clock:
+    """What a file tells of its sampling time by the names of its columns and their first rows.
+
+    Args:
+        apart: columns that are channels, whatever they are called.
+    """
+    columns = []
+    for header in column_names(path):
+        if header not in apart and (is_time(header) or step_of(header, 1.0)):
+            with suppress(InputError):
+                table = read_table(path, [header], header if is_time(header) else None, most=_HEAD)
+                columns.append(Column(header, header, "", table.columns[header], _DATES))  # in s, as dates are
+    clock = _clock(columns) if columns else Clock()
+    return clock if clock.column else _by_single_number(path)
+
+
+def _as_dates(path: Path, header: str) -> tuple[Vector, str]:
+    """Seconds since the first of them, and what a column holds that is not of numbers."""
+    with suppress(InputError):
+        table = read_table(path, [header], header)
+        if table.dated and np.isfinite(table.columns[header]).any():
+            return table.columns[header], _DATES
+    return np.empty(0), "no numbers"
 
 
 def channel_name(text: str, taken: Iterable[str] = ()) -> str:
@@ -253,17 +304,36 @@ def channel_name(text: str, taken: Iterable[str] = ()) -> str:
 
 def _clock(columns: Sequence[Column]) -> Clock:
     rows = max(column.filled for column in columns)
-    for column in columns:
-        base = split_header(column.header)[0]
-        values, scale = column.finite, _SECONDS.get(column.unit.lower())
-        if column.unusable or scale is None:
+    for column in sorted(columns, key=lambda c: not is_time(c.header)):  # dates without a name of time come last
+        values, dates = column.finite, column.unusable == _DATES
+        if column.unusable and not dates:
             continue
-        if _TIME.match(base) and len(values) > 1 and column.filled == rows and (np.diff(values) > 0).all():
-            steps = np.diff(values)
-            usual = float(np.median(steps))
-            even = column.missing > 0 or bool((np.abs(steps - usual) <= JITTER * usual).all())
-            step = float(steps.mean()) if even and not column.missing else usual
-            return Clock(float(f"{scale * step:.9g}"), column, instants=scale == 1, even=even)
-        if _STEP.match(base) and column.constant and values[0] > 0:
-            return Clock(scale * float(values[0]), column)
+        step = step_of(column.header, float(values[0])) if column.constant else None
+        if step is not None:
+            return Clock(step, column)
+        rising = len(values) > 1 and column.filled == rows and bool((np.diff(values) > 0).all())
+        if rising and (dates or is_time(column.header)):
+            return _ticking(column, column.values if dates else in_seconds(column.values, column.header))
     return Clock()
+
+
+def _by_single_number(path: Path) -> Clock:
+    """A clock of single numbers called `Ts` or `fs` beside the channels, where all that there are agree."""
+    if path.suffix.lower() not in ENDINGS:
+        return Clock()
+    found = scalars(path, lambda name: step_of(name, 1.0) is not None)
+    steps = {name: step_of(name, value) for name, value in found.items()}
+    told = {name: step for name, step in steps.items() if step is not None and np.isfinite(step)}
+    if not told or not same_step(min(told.values()), max(told.values())):
+        return Clock()
+    name, step = next(iter(told.items()))
+    return Clock(step, Column(name, name, "", np.array([found[name]])))
+
+
+def _ticking(column: Column, seconds: Vector) -> Clock:
+    """The clock of a column of rising instants."""
+    steps = np.diff(seconds[np.isfinite(seconds)])
+    usual = float(np.median(steps))
+    even = column.missing > 0 or bool((np.abs(steps - usual) <= JITTER * usual).all())
+    step = float(steps.mean()) if even and not column.missing else usual
+    return Clock(float(f"{step:.9g}"), column, seconds, even=even)

@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-import csv
 import re
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, nearest
 from orthaug._base.errors import InputError, MissingColumnError
+from orthaug._base.log import LOG
 from orthaug._base.memory import check_memory
+from orthaug.data.instants import dated, in_seconds
 from orthaug.data.spreadsheets import as_number, read_sheet, text_number
+from orthaug.data.text_files import Layout, layout, numbers_only
 from orthaug.data.variables import ENDINGS, foreign, read_variables, short, variable_names
 
 _SMALL = 4_000_000  # bytes of a text file that NumPy reads sooner than pandas is imported
 _NAMED = 30  # columns that a message lists
-_REMARK = ("#", "%")  # lines above the header that begin so
-_NUMBER = re.compile(r'[\s"]*[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?[\s"]*')
 _DECIMAL_COMMA = re.compile(r'(?:^|;)[ \t]*"?[ \t]*[+-]?(?:\d[\d.]*)?,\d+', re.MULTILINE)
 
 
@@ -31,7 +32,7 @@ class Table:
     """Columns of a file as floats, NaN where the cell is empty or no number. `where` and `cell` are for messages.
 
     `filled` counts the rows of each column up to its last cell that holds anything. In a text file `first_line` is
-    the line of row 0.
+    the line of row 0; `dated` is the column of time where it held dates.
     """
 
     path: Path
@@ -39,14 +40,19 @@ class Table:
     filled: Mapping[str, int]
     first_line: int | None = None
     cell: Callable[[str, int], str] = lambda column, row: "nan"
+    dated: str = ""
 
     def where(self, row: int) -> str:
         """`line 17 (row 15)` in a text file, `row 15` otherwise."""
         return f"row {row}" if self.first_line is None else f"line {self.first_line + row} (row {row})"
 
 
-def read_table(path: Path, columns: Sequence[str]) -> Table:
+def read_table(path: Path, columns: Sequence[str], time: str | None = None, *, most: int | None = None) -> Table:
     """The named columns of a file.
+
+    Args:
+        time: the one of them that holds instants, numbers in the unit of its header or dates: it comes in s.
+        most: rows that are enough, where a file can be read in part; None for all.
 
     Raises:
         InputError: no such file, an unknown ending, content that does not fit it, or missing columns.
@@ -56,7 +62,11 @@ def read_table(path: Path, columns: Sequence[str]) -> Table:
     if reader is None:
         raise InputError(f"{path}: unknown file type '{path.suffix}'; known are {', '.join(_READERS)}.")
     with foreign(path):
-        return reader(path, columns)
+        part = {"most": most} if reader is _read_text else {}
+        table = reader(path, columns, time, **part)
+    if time is None or table.dated:
+        return table
+    return replace(table, columns={**table.columns, time: in_seconds(table.columns[time], time)})
 
 
 def has_column(path: Path, name: str) -> bool:
@@ -92,8 +102,13 @@ def column_names(path: Path) -> list[str]:
         if ending == ".xlsx":
             read_sheet(path, lambda header: found.extend(header) or [])
         else:
-            found = _text_header(path)[0]
-    return [name for name in found if name]
+            found = layout(path).names
+    return [name for name in told_apart(found) if name]
+
+
+def reading_note(path: Path) -> str:
+    """What to know of how a file is read: an encoding that was guessed; mostly nothing."""
+    return layout(path).note if _READERS.get(path.suffix.lower()) is _read_text else ""
 
 
 def check_readable(path: Path) -> None:
@@ -115,14 +130,17 @@ def check_readable(path: Path) -> None:
         raise InputError(f"{path}: the file is empty (0 bytes).")
 
 
-def _read_text(path: Path, columns: Sequence[str]) -> Table:
+def _read_text(path: Path, columns: Sequence[str], time: str | None, most: int | None = None) -> Table:
     """CSV and TSV as they occur: byte-order mark, trailing separators, units in headers, decimal commas."""
-    header, header_line, separator = _text_header(path)
-    check_present(path, columns, header)
-    commas = separator == ";" and _DECIMAL_COMMA.search(path.read_text(encoding="utf-8-sig")) is not None
-    place = {name: str(header.index(name)) for name in columns}
+    found = layout(path)
+    header, header_line = found.names, found.header_line
+    if found.note:
+        LOG.info("%s: %s", path, found.note)
+    place = {name: str(index) for name, index in zip(columns, places(path, columns, header), strict=True)}
+    commas = found.separator == ";" and _DECIMAL_COMMA.search(path.read_text(encoding=found.encoding)) is not None
     beyond = str(len(header))  # a column that must stay empty: cells behind the last header
-    numbers, texts, held = _cells(path, header_line, len(header), separator, [*place.values(), beyond], commas)
+    apart = place[time] if time else None
+    numbers, texts, held = _cells(path, found, [*place.values(), beyond], commas, apart, most)
     extra = np.flatnonzero(np.asarray(held[beyond]))
     if extra.size:
         raise InputError(
@@ -131,19 +149,29 @@ def _read_text(path: Path, columns: Sequence[str]) -> Table:
         )
     values = {name: np.asarray(numbers[place[name]], dtype=float) for name in columns}
 
+    dates = None
+    if time and texts is not None and not np.isfinite(values[time]).any():
+        dates = dated(texts[apart].to_numpy(), f"{path}: column '{time}'")
+    values |= {time: dates} if time and dates is not None else {}
+
     def cell(column: str, row: int) -> str:
-        if texts is not None:
+        if texts is not None and place[column] in texts:
             return " ".join(str(texts.loc[row, place[column]]).split())
         value = values[column][row]
         return "" if np.isnan(value) else str(value)
 
     filled = {name: _up_to_last(np.asarray(held[place[name]])) for name in columns}
-    return Table(path, values, filled, header_line + 1, cell)
+    return Table(path, values, filled, header_line + 1, cell, time if time and dates is not None else "")
 
 
-def _cells(path: Path, skipped: int, count: int, separator: str, used: list[str], commas: bool) -> tuple[Any, Any, Any]:
-    """The used of `count` columns as numbers, as text (None where all are numbers or empty), and what is not empty."""
-    plain = None if commas else _plain_numbers(path, skipped, count, separator)
+def _cells(
+    path: Path, found: Layout, used: list[str], commas: bool, apart: str | None, most: int | None
+) -> tuple[Any, Any, Any]:
+    """The used columns as numbers, as text (None where all are numbers or empty), and what is not empty.
+
+    The one `apart` may hold text, so that it is looked at by itself.
+    """
+    plain = None if commas or most else _plain_numbers(path, found)
     if plain is not None:
         numbers = {str(i): column for i, column in enumerate(plain)}
         return numbers, None, {name: np.full(plain.shape[1], name in numbers) for name in used}
@@ -152,15 +180,16 @@ def _cells(path: Path, skipped: int, count: int, separator: str, used: list[str]
     def read(**options: Any) -> pd.DataFrame:
         return pd.read_csv(
             path,
-            sep=separator,
+            sep=found.separator,
             header=None,
-            names=[str(i) for i in range(count + 1)],
+            names=[str(i) for i in range(len(found.names) + 1)],
             index_col=False,
-            skiprows=skipped,
+            skiprows=found.header_line,
             skip_blank_lines=False,
             keep_default_na=False,
-            encoding="utf-8-sig",
+            encoding=found.encoding,
             low_memory=False,
+            nrows=most,
             **options,
         )[used]
 
@@ -168,6 +197,13 @@ def _cells(path: Path, skipped: int, count: int, separator: str, used: list[str]
         with suppress(ValueError):  # something is no number: read again as text, to be able to name it
             numbers = read(dtype=dict.fromkeys(used, np.float64), na_values=[""], float_precision="round_trip")
             return numbers, None, numbers.notna()
+    if not commas and apart is not None:
+        kinds: dict[str, Any] = {**dict.fromkeys(used, np.float64), apart: str}
+        with suppress(ValueError):
+            numbers = read(dtype=kinds, na_values=[""], float_precision="round_trip")
+            texts: Any = numbers[[apart]].fillna("").apply(lambda column: column.str.strip())
+            held = numbers.notna().assign(**{apart: texts[apart] != ""})
+            return numbers.assign(**{apart: texts[apart].map(text_number)}), texts, held
     try:
         texts = read(dtype=str).fillna("").apply(lambda column: column.str.strip())
     except ValueError as error:
@@ -177,12 +213,13 @@ def _cells(path: Path, skipped: int, count: int, separator: str, used: list[str]
     return texts.apply(lambda column: column.map(_comma_number if commas else text_number)), texts, texts != ""
 
 
-def _plain_numbers(path: Path, skipped: int, count: int, separator: str) -> Matrix | None:
+def _plain_numbers(path: Path, found: Layout) -> Matrix | None:
     """The columns (count, rows) of a small file with a finite number in every cell of every line; None for all others.
 
     NumPy reads it before pandas would be imported.
     """
-    if path.stat().st_size > _SMALL:
+    skipped, count = found.header_line, len(found.names)
+    if path.stat().st_size > _SMALL or found.encoding == "utf-16":
         return None
     text = path.read_bytes()
     lines = text.count(b"\n") + (not text.endswith(b"\n"))
@@ -191,19 +228,12 @@ def _plain_numbers(path: Path, skipped: int, count: int, separator: str) -> Matr
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # as where all lines are blank
-            options: dict[str, Any] = {"delimiter": separator, "skiprows": skipped, "comments": None}
-            numbers = np.loadtxt(path, **options, encoding="utf-8-sig", ndmin=2)
+            options: dict[str, Any] = {"delimiter": found.separator, "skiprows": skipped, "comments": None}
+            numbers = np.loadtxt(path, **options, encoding=found.encoding, ndmin=2)
     except (ValueError, UserWarning):
         return None
     plain = numbers.shape == (lines - skipped, count) and np.isfinite(numbers).all()
     return np.ascontiguousarray(numbers.T) if plain else None
-
-
-def _check_no_nul(path: Path) -> None:
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            if b"\0" in block:
-                raise csv.Error("NUL byte")
 
 
 def _comma_number(text: str) -> float:
@@ -211,58 +241,26 @@ def _comma_number(text: str) -> float:
     return np.nan if "." in text else text_number(text.replace(",", "."))
 
 
-def _text_header(path: Path) -> tuple[list[str], int, str]:
-    """`_header` of what is UTF-8 text."""
-    try:
-        _check_no_nul(path)
-        found = _header(path)
-        if found[2] == ";":
-            path.read_text(encoding="utf-8-sig")
-        return found
-    except (UnicodeDecodeError, csv.Error):
-        raise InputError(f"{path}: not a text table; expected UTF-8 text with a header row.") from None
-
-
-def _header(path: Path) -> tuple[list[str], int, str]:
-    """Column names, the number of lines up to and with the header, and the separator; remarks above it are skipped."""
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        line, number = _next_line(file, 0)
-        if not line:
-            raise InputError(f"{path}: the file holds only blank lines.")
-        while line.lstrip().startswith(_REMARK):
-            after, further = _next_line(file, number)
-            if not after or any(map(_NUMBER.fullmatch, re.split(r"[,;\t]", after))):
-                break  # the names themselves stand behind the sign, right above the numbers
-            line, number = after, further
-    if "\0" in line:
-        raise csv.Error("NUL byte")
-    tab = path.suffix.lower() == ".tsv"
-    bare = re.sub(r'"[^"]*"', "", line)  # separators inside quotes do not count
-    separator = "\t" if tab else ";" if ";" in bare and "," not in bare else ","
-    return [name.strip() for name in next(csv.reader([line], delimiter=separator))], number, separator
-
-
-def _next_line(file: TextIO, number: int) -> tuple[str, int]:
-    """The next line that is not blank, empty at the end of the file, and its number, after line `number`."""
-    for line in iter(file.readline, ""):
-        number += 1
-        if line.strip():
-            return line, number
-    return "", number
-
-
 def _up_to_last(held: np.ndarray) -> int:
     return int(np.flatnonzero(held)[-1]) + 1 if held.any() else 0
 
 
-def _read_parquet(path: Path, columns: Sequence[str]) -> Table:
+def _read_parquet(path: Path, columns: Sequence[str], time: str | None) -> Table:
     with parquet_file(path) as file:
         check_present(path, columns, file.schema_arrow.names)
         check_memory(16 * file.metadata.num_rows * len(columns), f"{path}: reading {file.metadata.num_rows} rows")
         table = file.read(columns=list(columns))
         table.validate(full=True)
-    return _full(
-        path, {name: _as_floats(table.column(name).to_numpy(zero_copy_only=False), name, path) for name in columns}
+    arrays = {name: table.column(name).to_numpy(zero_copy_only=False) for name in columns}
+    dates = None
+    if time and arrays[time].dtype.kind not in "fiub":
+        dates = dated(arrays.pop(time), f"{path}: column '{time}'")
+        if dates is None:
+            raise InputError(f"{path}: column '{time}' holds text; expected instants, numbers or dates.")
+    values = {name: _as_floats(array, name, path) for name, array in arrays.items()}
+    values |= {time: dates} if time and dates is not None else {}
+    return replace(
+        _full(path, {name: values[name] for name in columns}), dated=time if time and dates is not None else ""
     )
 
 
@@ -285,12 +283,11 @@ def parquet_file(path: Path) -> Iterator[Any]:
         raise InputError(f"{path}: not a readable Parquet file ({short(error)}).") from None
 
 
-def _read_excel(path: Path, columns: Sequence[str]) -> Table:
+def _read_excel(path: Path, columns: Sequence[str], time: str | None) -> Table:
     """The first worksheet."""
 
     def place(header: Sequence[str]) -> list[int]:
-        check_present(path, columns, header)
-        return [header.index(name) for name in columns]
+        return places(path, columns, header)
 
     top, found = read_sheet(path, place)
     cells = dict(zip(columns, found, strict=True))
@@ -300,10 +297,14 @@ def _read_excel(path: Path, columns: Sequence[str]) -> Table:
     def cell(column: str, row: int) -> str:
         return "" if cells[column][row] is None else str(cells[column][row])
 
-    return Table(path, values, filled, top + 1, cell)
+    dates = None
+    if time and not np.isfinite(values[time]).any():
+        dates = dated(np.array(cells[time], dtype=object), f"{path}: column '{time}'")
+    values |= {time: dates} if time and dates is not None else {}
+    return Table(path, values, filled, top + 1, cell, time if time and dates is not None else "")
 
 
-def _read_variables(path: Path, columns: Sequence[str]) -> Table:
+def _read_variables(path: Path, columns: Sequence[str], time: str | None) -> Table:
     return _full(path, read_variables(path, columns))
 
 
@@ -322,7 +323,7 @@ def _as_floats(array: np.ndarray, name: str, path: Path) -> Vector:
         raise InputError(f"{path}: column '{name}' holds {array.dtype} values; expected numbers.") from None
 
 
-_READERS: dict[str, Callable[[Path, Sequence[str]], Table]] = {
+_READERS: dict[str, Callable[..., Table]] = {
     ".csv": _read_text,
     ".tsv": _read_text,
     ".parquet": _read_parquet,
@@ -333,12 +334,41 @@ KNOWN = tuple(_READERS)
 """Endings of the files that can be read."""
 
 
-def check_present(path: Path, columns: Sequence[str], header: Sequence[str]) -> None:
+def check_present(path: Path, columns: Sequence[str], header: Sequence[str], *, named_apart: bool = False) -> None:
     """Raise InputError for a column that is not there, or stands twice."""
     for name in columns:
         if name not in header:
+            if numbers_only(list(header)):
+                raise MissingColumnError(
+                    f"{path}: no column '{name}': the first line holds numbers; a header with names is expected."
+                )
             known = ", ".join(f"'{h}'" for h in list(header)[:_NAMED] if h) or "no column names"
             known += f" and {len(header) - _NAMED} more" if len(header) > _NAMED else ""
             raise MissingColumnError(f"{path}: no column '{name}'{nearest(name, header)}; the file has {known}.")
         if list(header).count(name) > 1:
-            raise InputError(f"{path}: the column '{name}' stands {list(header).count(name)} times; names must differ.")
+            twice = f"the column '{name}' stands {list(header).count(name)} times; names must differ"
+            apart = f", or be told apart from the left as '{name}.0', '{name}.1'" if named_apart else ""
+            raise InputError(f"{path}: {twice}{apart}.")
+
+
+def places(path: Path, columns: Sequence[str], header: Sequence[str]) -> list[int]:
+    """Where the columns stand in a header; columns of one name are `name.0`, `name.1`, ... from the left.
+
+    Raises:
+        InputError: a column that is not there, or a name that stands twice.
+    """
+    apart = told_apart(header)
+    check_present(path, [name for name in columns if name not in apart], header, named_apart=True)
+    return [apart.index(name) for name in columns]
+
+
+def told_apart(header: Sequence[str]) -> list[str]:
+    """Names with a number behind those that stand more than once, as pandas counts them: `u.1` is the second `u`."""
+    often, seen, apart = Counter(header), Counter[str](), []
+    for name in header:
+        number = seen[name]
+        while often[name] > 1 and name and f"{name}.{number}" in often:  # a name of its own
+            number += 1
+        seen[name] = number + 1
+        apart.append(f"{name}.{number}" if often[name] > 1 and name else name)
+    return apart

@@ -22,6 +22,7 @@ from orthaug.data.matlab import Variable, read_mat5
 _NAMED = 30  # variables that a message lists
 _HDF5, _USERBLOCK = b"\x89HDF\r\n", 4096  # how such a file begins, and before which byte it does
 _DIGITS = 10  # of an index at most
+Wanted = Sequence[str] | Callable[[str], bool] | None  # names, a choice of single numbers, or all names
 _ROOT = re.compile(r"[./\[]")  # what follows the name of a variable in a path
 _ELEMENT = re.compile(r"[({]\s*(?::\s*,\s*)?([1-9]\d{0,8})\s*(,\s*:\s*)?[)}]")  # as MATLAB writes it
 
@@ -58,6 +59,16 @@ def variable_names(path: Path) -> list[str]:
         return list(_FORMATS[path.suffix.lower()](path, None))
 
 
+def scalars(path: Path, wanted: Callable[[str], bool]) -> dict[str, float]:
+    """Single numbers that a file holds beside its channels, by name, of the names that are wanted.
+
+    Raises:
+        InputError: a corrupt file.
+    """
+    with foreign(path):
+        return {name: float(value[0]) for name, value in _FORMATS[path.suffix.lower()](path, wanted).items()}
+
+
 @contextmanager
 def foreign(path: Path) -> Iterator[None]:
     """Inside, libraries read a file's bytes: what they raise is an InputError, and what they remark is not told."""
@@ -74,7 +85,7 @@ def foreign(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: cannot be read as {path.suffix.lower()} ({reason}); is it cut or corrupt?") from None
 
 
-def _from_npz(path: Path, names: Sequence[str] | None) -> dict[str, Vector]:
+def _from_npz(path: Path, names: Wanted) -> dict[str, Vector]:
     with zipfile.ZipFile(path) as archive:
         held: dict[str, Held] = {}
         for info in archive.infolist():
@@ -107,15 +118,16 @@ def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Held
     return _lazy(path, shape, kind.itemsize, load)
 
 
-def _from_mat(path: Path, names: Sequence[str] | None) -> dict[str, Vector]:
+def _from_mat(path: Path, names: Wanted) -> dict[str, Vector]:
     content = path.read_bytes()
     if _HDF5 in content[:_USERBLOCK] or content[124:126] in (b"\x00\x02", b"\x02\x00"):  # v7.3
         return _from_hdf5(path, names)
     variables = read_mat5(content, path)
-    roots = {_ROOT.split(name.lstrip("/"))[0] for name in names or ()}
+    asked = () if names is None or callable(names) else names
+    roots = {_ROOT.split(name.lstrip("/"))[0] for name in asked}
     held: dict[str, Held] = {}
     for name, variable in variables.items():
-        held |= _held(path, variable, deep=names is None or name in roots)
+        held |= _held(path, variable, deep=not asked or name in roots)
     return _taken(path, names, held)
 
 
@@ -129,7 +141,7 @@ def _held(path: Path, variable: Variable, *, deep: bool) -> dict[str, Held]:
     return held
 
 
-def _from_hdf5(path: Path, names: Sequence[str] | None) -> dict[str, Vector]:
+def _from_hdf5(path: Path, names: Wanted) -> dict[str, Vector]:
     """Datasets by their path; MATLAB's v7.3 files hold every matrix transposed."""
     try:
         import h5py
@@ -161,12 +173,14 @@ def _from_hdf5(path: Path, names: Sequence[str] | None) -> dict[str, Vector]:
                 held[key] = _lazy(path, shape, item.dtype.itemsize, lambda: item[()].T if matlab else item[()])
 
     with h5py.File(path, "r") as file:
-        _ = [name in file for name in names or ()]  # complains of broken tables on which a visit never ends
+        _ = [
+            name in file for name in (() if names is None or callable(names) else names)
+        ]  # complains of broken tables on which a visit never ends
         file.visititems(note)
         return _taken(path, names, held)
 
 
-_FORMATS: dict[str, Callable[[Path, Sequence[str] | None], dict[str, Vector]]] = {
+_FORMATS: dict[str, Callable[[Path, Wanted], dict[str, Vector]]] = {
     ".npz": _from_npz,
     ".mat": _from_mat,
     ".h5": _from_hdf5,
@@ -191,8 +205,12 @@ def _lazy(path: Path, shape: Sequence[int], itemsize: int, read: Callable[[], An
     return Held(what, fitting, tuple(shape))
 
 
-def _taken(path: Path, names: Sequence[str] | None, held: Mapping[str, Held]) -> dict[str, Vector]:
-    """The named channels; without names an empty one for each that could be named."""
+def _taken(path: Path, names: Wanted, held: Mapping[str, Held]) -> dict[str, Vector]:
+    """The named channels; without names an empty one for each that could be named; or the single numbers wanted."""
+    if callable(names):
+        single = {name: one for name, one in held.items() if one.read and math.prod(one.shape) == 1 and names(name)}
+        read = {name: np.asarray(one.read()).ravel() for name, one in single.items() if one.read}
+        return {name: value.astype(float) for name, value in read.items() if value.dtype.kind in "fiu"}
     if names is not None:
         return {name: _pick(path, name, held) for name in names}
     lines = {}

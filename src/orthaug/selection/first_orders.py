@@ -9,12 +9,16 @@ import numpy as np
 
 from orthaug._base.checks import Matrix
 from orthaug.data.record import Experiment, Record
+from orthaug.data.sources import RecordSource, witness
 from orthaug.selection.orders import Orders, correlated_delay
 
 _MOST = 4  # lags of a channel
-_LOOKED_AT = 40_000  # rows
+LOOKED_AT = 40_000
+"""Rows of a longer record that orders are found on, in windows spread over it."""
 _FITTED = 0.7  # share of the rows that a candidate is fitted to
 _AS_GOOD = 1.05  # free-run error over the best, up to which fewer lags are taken
+_BETTER = 1.2  # free-run error over that from another first lag, up to which the lag that a test found is kept
+_TELLS = 0.5  # error one step ahead with the other outputs' past over that without
 _RANK = 1e-9  # singular value over the largest
 PERSISTENCE = 20  # the highest order of excitation that is looked for
 _EXCITED = 1e-6  # singular value over the largest
@@ -36,41 +40,73 @@ class FirstModel:
     """Up to which order each input excites; `PERSISTENCE` stands for that or more."""
     free_run: tuple[float, ...]
     """Error of the free run on rows held out over the output's standard deviation, for each output."""
+    coupled: bool = False
+    """Whether the past of one output tells much of another, beside that one's own past and the inputs."""
 
 
 def first_model(record: Record) -> FirstModel | None:
     """Delays, excitation and orders for a record; None where it has too few rows for any model.
 
-    The orders are the smallest whose free run is within 5 % of the best of up to 4 lags a channel.
+    The orders are the smallest whose free run is within 5 % of the best of up to 4 lags a channel. The first lags are
+    the significant ones, unless from 1 or 0 on the best free run is clearly better.
     """
-    record = replace(record, experiments=_first_rows(record.experiments, _LOOKED_AT))
+    record = _spread(record)
     signals = np.concatenate([np.hstack([e.outputs, e.inputs]) for e in record.experiments])
     offset = bool((np.abs(signals.mean(axis=0)) > _LEVEL * signals.std(axis=0)).any())
     delays = tuple(_delay(record, i) for i in range(len(record.inputs)))
     excited = tuple(_persistence(record, i) for i in range(len(record.inputs)))
     usual = [tuple(late if delay is None else delay for delay in delays) for late in (1, 0)]
-    best: list[tuple[float, int, Orders, tuple[float, ...]]] = []
+    chosen: tuple[float, Orders, tuple[float, ...]] | None = None
     for nk in dict.fromkeys([*usual, *((late,) * len(delays) for late in (1, 0))]):  # a test may miss the first lags
-        for na, n in product(range(_MOST + 1), range(1, _MOST + 1) if record.inputs else [0]):
-            orders = Orders(na, tuple(max(1, min(n, order)) for order in excited), nk)
-            errors = _errors(record, orders, offset)
-            if errors is not None and orders.size:
-                best.append((float(np.mean(errors)), orders.size, orders, errors))
-    if not best:
+        found = _smallest(record, excited, nk, offset)
+        if found is not None and (chosen is None or found[0] * _BETTER < chosen[0]):
+            chosen = found
+    if chosen is None:
         return None
-    least = min(error for error, *_ in best)
-    near = [one for one in best if one[0] <= _AS_GOOD * least]
+    return FirstModel(chosen[1], offset, delays, excited, chosen[2], _coupled(record, chosen[1], offset))
+
+
+def _smallest(
+    record: Record, excited: tuple[int, ...], nk: tuple[int, ...], offset: bool
+) -> tuple[float, Orders, tuple[float, ...]] | None:
+    """From these first lags on: the least error of all orders, and the smallest that come near it with theirs."""
+    tried: list[tuple[float, int, Orders, tuple[float, ...]]] = []
+    for na, n in product(range(_MOST + 1), range(1, _MOST + 1) if record.inputs else [0]):
+        orders = Orders(na, tuple(max(1, min(n, order)) for order in excited), nk)
+        errors = _errors(record, orders, offset)
+        if errors is not None and orders.size:
+            tried.append((float(np.mean(errors)), orders.size, orders, errors))
+    if not tried:
+        return None
+    least = min(error for error, *_ in tried)
+    near = [one for one in tried if one[0] <= _AS_GOOD * least]
     _, _, orders, errors = min(near, key=lambda one: (one[1], one[0]))
-    return FirstModel(orders, offset, delays, excited, errors)
+    return least, orders, errors
 
 
-def _first_rows(experiments: tuple[Experiment, ...], most: int) -> tuple[Experiment, ...]:
-    found, left = [], most
-    for experiment in experiments:
-        if left > 0:
-            found.append(experiment.rows(0, left))
-        left -= len(experiment)
-    return tuple(found)
+def _coupled(record: Record, orders: Orders, offset: bool) -> bool:
+    """Whether the others' past lowers an output's error one step ahead to less than `_TELLS` of it."""
+    first = max([orders.na, *(nb + nk - 1 for nb, nk in zip(orders.nb, orders.nk, strict=True))])
+    usable = [e for e in record.experiments if len(e) > first]
+    names = range(len(record.outputs))
+    own = [np.concatenate([_rows(e, j, orders, first, offset) for e in usable]) for j in names]
+    for j in names if len(own) > 1 and orders.na else ():
+        y = np.concatenate([e.outputs[first:, j] for e in usable])
+        both = np.hstack([own[j], *(own[i][:, : orders.na] for i in names if i != j)])
+        left = []
+        for phi in (own[j], both):
+            scaled = phi / np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
+            left.append(np.linalg.norm(y - scaled @ np.linalg.lstsq(scaled, y, rcond=_RANK)[0]))
+        if len(y) > 2 * both.shape[1] and left[1] < _TELLS * left[0]:
+            return True
+    return False
+
+
+def _spread(record: Record) -> Record:
+    """The record, or windows that are spread over it where it is long."""
+    if len(record) <= LOOKED_AT:
+        return record
+    return witness(RecordSource(record, 0), LOOKED_AT)
 
 
 def _delay(record: Record, number: int) -> int | None:

@@ -123,8 +123,7 @@ def _curves(found: Survey) -> dict[str, Any]:
     curves = {}
     for column in found.signals[:_DRAWN]:
         values = column.values[: column.filled]
-        clock = found.clock.column
-        time = clock.values[: len(values)] if clock is not None and found.clock.instants else None
+        time = found.clock.seconds[: len(values)] if found.clock.seconds is not None else None
         if time is None or len(time) < len(values) or not np.isfinite(time).all():
             time = step * np.arange(len(values))
         curves[column.header] = thinned(time, values)
