@@ -378,8 +378,16 @@ def test_from_a_file_to_code_with_the_numbers_of_the_command_line(server, browse
     page.reload()
     page.wait_for_selector("text=iteration")
     assert page.get_by_role("tab", name="Training").get_attribute("aria-selected") == "true"
-    page.get_by_role("button", name="Stop").click()
+    page.get_by_role("button", name="Stop", exact=True).click()
     page.wait_for_selector("text=Training was stopped")
+
+    # or ended with what it has
+    page.get_by_role("button", name="Train").click()
+    page.wait_for_selector("text=iteration")
+    page.get_by_role("button", name="Stop and keep").click()
+    page.wait_for_selector("text=the best so far is kept")
+    kept = json.loads(tab.fetch("result.json"))
+    assert "stopped" in [warning["code"] for warning in kept["warnings"]]
 
     tab.go("Model")
     tab.write(lambda text: text.replace("restarts = 200\niterations = 4000", "restarts = 1\niterations = 20"))

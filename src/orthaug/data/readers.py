@@ -130,9 +130,9 @@ class _Uncut:
         runs = [self._run(begin, end, mends=mends, uneven=uneven) for begin, end in ranges]
         experiments, step, done, lost = prepared_experiments(runs, steps, keep=self.missing == "keep")
         if lost and self.missing == "error":
+            told = f"{counted(lost, 'row')} {'lacks' if lost == 1 else 'lack'} a sample after preparation"
             raise MissingSampleError(
-                f"{self.table.path}: {counted(lost, 'row')} {'lacks' if lost == 1 else 'lack'} a sample after preparation. Let `fill` reach over longer gaps, "
-                'or leave them out (missing = "skip").'
+                f'{self.table.path}: {told}. Let `fill` reach over longer gaps, or leave them out (missing = "skip").'
             )
         return Record(self.channels[0], self.channels[1], step, experiments, self.time, lost, done)
 

@@ -14,7 +14,7 @@ from orthaug.reports.result import CompareResult, FitResult, ParameterResult, Pa
 _GOOD, _POOR = 0.2, 0.5  # NRMSE of a free run up to which it is close, and from which it is far
 _ALIKE = 1.1  # ratio of errors up to which models are told to be as good as each other
 _SURE = 0.1  # standard error over value up to which a parameter is told to be known
-_STOPPED = ("iteration_limit", "no_descent")
+_STOPPED = ("iteration_limit", "no_descent", "stopped")
 _RAN_AWAY = ("free_run_diverged",)
 
 
@@ -193,6 +193,8 @@ def _then(result: FitResult) -> str:
         return 'Train on the free run (`focus = "simulation"`), or record data over the range that it leaves.'
     if not result.data.tests and not result.data.validation:
         return "Hold out a test part (`[data.tests.NAME]`), on which the model can be judged."
+    if result.status.code == "stopped":
+        return "Train it to the end, for it was stopped on request."
     if result.status.code == "iteration_limit":
         return "Give training more iterations (`training.iterations`)."
     if result.validation is not None and result.validation.extrapolation:

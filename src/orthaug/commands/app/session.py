@@ -260,6 +260,12 @@ class Session:
             self.running.stop()
             self.changed("work")
 
+    def finish(self) -> None:
+        """Let the training that goes on end with what it has reached."""
+        if self.running is not None:
+            self.running.finish()
+            self.changed("work")
+
     # What can be taken away
 
     def export(self, target: str, name: str) -> None:

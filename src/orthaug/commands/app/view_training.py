@@ -32,6 +32,7 @@ class TrainingView:
             with ui.element("div").classes("fields"):
                 self.begin = button("Train", lambda: self.session.train("fit"), main=True)
                 self.compare = button("Compare structures", lambda: self.session.train("compare"))
+                self.finish = button("Stop and keep the best so far", self.session.finish)
                 self.end = button("Stop", self.session.stop, classes="stop")
             self.state = ui.element("div")
             self.bar = ui.element("progress").props('max=1 value=0 aria-label="progress of training"')
@@ -52,6 +53,9 @@ class TrainingView:
         self.follow_check()
         self.end.set_visibility(running is not None)
         self.end.set_enabled(running is not None and not running.stopping)
+        able = running is not None and running.arguments[0] == "fit"  # half a comparison compares nothing
+        self.finish.set_visibility(able)
+        self.finish.set_enabled(running is not None and bool(running.progress) and not running.asked)
         shown = running or max(session.commands.values(), key=lambda c: c.began, default=None)
         with redrawn(self.state):
             if shown is None:
@@ -88,11 +92,15 @@ class TrainingView:
                 else "reading and compiling"
             )
             loss = f", loss {number(told['loss'], 4)}" if told else ""
-            ending = "stopping …" if command.stopping else f"{done}{loss}"
+            ending = f"{done}{loss}"
+            if command.stopping or command.ending:
+                ending = "stopping …" if command.stopping else "ending with the best so far …"
             text(f"{what}: {ending} · {command.seconds:.0f} s", "p", "note busy").props("role=status")
             self.bar.props(f"value={told.get('done', 0) if told else 0}")
         elif command.stopping and command.code != 0:
             note(f"{what} was stopped after {command.seconds:.0f} s; nothing was kept of it.", "care")
+        elif command.code == 0 and command.ending:
+            note(f"{what} was stopped after {command.seconds:.0f} s; the best so far is kept.", "care")
         elif command.code == 0:
             note(f"{what} is done, in {command.seconds:.1f} s.", "good")
         else:
