@@ -127,18 +127,7 @@ def train(
         estimate = _concluded(conclude, task, structure, _median(task, runs, members, best))
     else:
         estimate = concluded(best)
-    restarts = tuple(
-        Restart(
-            seed=starts[i].seed,
-            loss=finite_or_none(losses[i]),
-            iterations=runs[i].iterations,
-            code=runs[i].ending.code,
-            chosen=i in members,
-            regularization=starts[i].regularization,
-            validation=finite_or_none(errors[i]),
-        )
-        for i in shown
-    )
+    restarts = tuple(_restart(starts[i], runs[i], losses[i], errors[i], chosen=i in members) for i in shown)
     status = replace(
         estimate.status, seconds=task.seconds + sum(run.seconds for run in runs), start_loss=task.start_loss
     )
@@ -150,6 +139,18 @@ def train(
         *told,
     )
     return replace(estimate, restarts=restarts, status=status, held_out=held_out, warnings=warnings)
+
+
+def _restart(start: PlannedRun, run: Any, loss: float, error: float, *, chosen: bool) -> Restart:
+    return Restart(
+        seed=start.seed,
+        loss=finite_or_none(loss),
+        iterations=run.iterations,
+        code=run.ending.code,
+        chosen=chosen,
+        regularization=start.regularization,
+        validation=finite_or_none(error),
+    )
 
 
 def _cross_validation(task: Task, run: Any) -> float:
