@@ -135,6 +135,25 @@ def test_forms_change_a_spec_and_nothing_else(tmp_path):
         spec_text.plain("[data\n")
 
 
+def test_equations_of_motion_take_the_units_of_the_channels_and_leave_no_stale_comment(tmp_path):
+    u, y = signals(200, 1)
+    write_csv(tmp_path / "run.csv", **{"Force (N)": u, "Position (mm)": y})
+    assert run("init", tmp_path / "run.csv", "--inputs", "Force (N)", "--outputs", "Position (mm)",
+               "--out", tmp_path / "spec.toml").code == 0  # fmt: skip
+    moving = spec_text.as_motion((tmp_path / "spec.toml").read_text())
+    motion = tomllib.loads(moving)["motion"]
+    assert {name: row["unit"] for name, row in motion["parameters"].items()} == {
+        **{"m": "N s²/mm", "c": "N s/mm", "k": "N/mm"}
+    }
+    assert {name: row["unit"] for name, row in motion["states"].items()} == {"x": "mm", "v": "mm/s"}
+    for stale in ("difference equations", "lags", "trains on the free run"):
+        assert stale not in moving
+    assert "# Every key" in moving  # what is still true stays
+    metres = spec_text.as_motion((tmp_path / "spec.toml").read_text().replace('"mm"', '"m"'))
+    assert tomllib.loads(metres)["motion"]["parameters"]["m"]["unit"] == "kg"
+    assert "unit" not in spec_text.as_motion(SPEC)
+
+
 def test_a_file_whose_name_looks_like_a_pattern_is_found(tmp_path):
     (tmp_path / "run [1].csv").touch()
     assert expanded(tmp_path / "spec.toml", ["run [1].csv"], "train") == ["run [1].csv"]
@@ -280,8 +299,12 @@ class Tab:
         self.page.wait_for_selector(".note.good, .note.bad")
         return spec
 
+    def get(self, name: str) -> Any:
+        """The answer to a request for a file."""
+        return self.context.request.get(f"{self.page.url.partition('#')[0]}/get/{name}")
+
     def fetch(self, name: str) -> bytes:
-        return self.context.request.get(f"{self.page.url}/get/{name}").body()
+        return self.get(name).body()
 
     def check(self, *names: str) -> None:
         """axe finds nothing, and nothing is wider than the page."""
@@ -355,8 +378,16 @@ def test_from_a_file_to_code_with_the_numbers_of_the_command_line(server, browse
     page.reload()
     page.wait_for_selector("text=iteration")
     assert page.get_by_role("tab", name="Training").get_attribute("aria-selected") == "true"
-    page.get_by_role("button", name="Stop").click()
+    page.get_by_role("button", name="Stop", exact=True).click()
     page.wait_for_selector("text=Training was stopped")
+
+    # or ended with what it has
+    page.get_by_role("button", name="Train").click()
+    page.wait_for_selector("text=iteration")
+    page.get_by_role("button", name="Stop and keep").click()
+    page.wait_for_selector("text=the best so far is kept")
+    kept = json.loads(tab.fetch("result.json"))
+    assert "stopped" in [warning["code"] for warning in kept["warnings"]]
 
     tab.go("Model")
     tab.write(lambda text: text.replace("restarts = 200\niterations = 4000", "restarts = 1\niterations = 20"))
@@ -433,11 +464,42 @@ def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
     page.wait_for_selector("text=tests.own")
     added = tab.fetch("spec.toml").decode()
     assert tomllib.loads(added)["data"]["tests"].pop("own") == {"files": ["own.csv"]} and kept.splitlines()[0] in added
-    assert (
-        tab.context.request.get(f"{page.url}/get/spec.toml?show=true").headers["content-disposition"][:10]
-        == "attachment"
-    )
-    assert tab.fetch("../x") and tab.context.request.get(f"{page.url}/get/result.zip").status == 404
+    assert tab.get("spec.toml?show=true").headers["content-disposition"][:10] == "attachment"
+    assert tab.fetch("../x") and tab.get("result.zip").status == 404
+    tab.close()
+
+
+@browsed
+def test_a_wrong_sampling_time_is_told_under_it_and_takes_nothing_away(server, browser, csv, tmp_path):
+    tab = Tab(browser, server)
+    page = tab.page
+    (tmp_path / "rig.csv").write_text(csv.read_text().replace("u,y", "left,right"))
+    tab.drop(tmp_path / "rig.csv")
+    tab.go("Model")
+    page.wait_for_selector("text=Choose the channels in Data first")
+    tab.go("Data")
+    page.get_by_label("use of left").select_option("input")
+    page.get_by_label("use of right").select_option("output")
+    for wrong, told in (("-1", "must be a positive number of seconds"), ("ten", "a number of seconds, such as 0.01")):
+        page.get_by_label("sampling time").fill(wrong)
+        page.get_by_role("button", name="Begin with these").click()
+        assert told in page.locator(".q-field__messages").inner_text()
+    page.get_by_label("sampling time").fill("0.5")
+    page.get_by_role("button", name="Begin with these").click()
+    page.wait_for_selector("text=first physics")
+    assert [page.get_by_label(f"use of {name}").input_value() for name in ("left", "right")] == ["input", "output"]
+    assert page.get_by_label("sampling time").input_value() == "0.5"
+    assert tomllib.loads(tab.fetch("spec.toml").decode())["data"]["sampling_time"] == 0.5
+
+    # the parts stand in the history of the browser
+    tab.go("Model")
+    page.wait_for_function("location.hash === '#Model'")
+    page.get_by_role("button", name="Write equations").click()
+    page.wait_for_selector("text=No unit is given for m, c, k")
+    page.go_back()
+    page.wait_for_selector("[role=tab][aria-selected=true]:has-text('Data')")
+    page.go_forward()
+    page.wait_for_selector("[role=tab][aria-selected=true]:has-text('Model')")
     tab.close()
 
 

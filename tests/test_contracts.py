@@ -190,7 +190,7 @@ def test_every_combination(structure, regularization, ny, learner):
     )
     codes = {ending.code for ending in Ending}
     assert first.status.code in codes
-    assert codes == {"converged", "iteration_limit", "no_descent", "non_finite", "exact"}
+    assert codes == {"converged", "iteration_limit", "no_descent", "non_finite", "exact", "stopped"}
     assert (first.status.code == "exact") == (learner == "none")
     assert np.isfinite(first.status.loss) and 0 <= first.status.loss < 1
     assert np.isfinite(first.theta).all() and np.isfinite(first.model.numbers.weights).all()

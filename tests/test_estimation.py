@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import naive
 import numpy as np
 import pytest
@@ -9,10 +11,12 @@ from helpers import unfolded
 
 from orthaug._base.errors import InputError, RankError
 from orthaug._base.jax import jax, jnp
+from orthaug._base.progress import Enough
 from orthaug.data.record import Channel, Record
 from orthaug.data.regressors import Lags
 from orthaug.fitting.elsewhere import orthogonalize
 from orthaug.fitting.estimation import estimate
+from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive, Orthogonal
 from orthaug.models.learners import MLP, Function
@@ -342,6 +346,18 @@ def test_iteration_limit(short):
     assert (short.status.code, short.status.iterations) == ("iteration_limit", 6)
     assert short.status.ok and "more iterations may improve it" in short.status.message
     assert short.status.message in unfolded(short.summary())
+
+
+@pytest.mark.parametrize("solver", [LevenbergMarquardt(iterations=60), AdamLBFGS(40, 40)], ids=["lm", "paper"])
+def test_who_is_told_can_say_that_it_is_enough(record, solver):
+    def enough(run, iteration, loss):
+        raise Enough
+
+    found = estimate(record, PHYSICS, learner=NETWORK, solver=solver, restarts=2, progress=enough)
+    assert found.status.code == "stopped" and found.status.ok and found.status.iterations == 1
+    assert found.status.loss <= found.status.start_loss or not solver.gauss_newton
+    told = next(warning.text for warning in found.warnings if warning.code == "stopped")
+    assert re.match(r"training was stopped on request: (\d) of \1 runs had not ended", told), told
 
 
 def test_converged(record):

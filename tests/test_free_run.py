@@ -11,6 +11,7 @@ import scipy.signal
 
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jax, jnp
+from orthaug._base.progress import Enough
 from orthaug.data.record import Record
 from orthaug.fitting.criteria import Prediction, Simulation
 from orthaug.fitting.estimation import estimate as choosing
@@ -612,3 +613,14 @@ def test_evidence_keeps_a_learner_that_the_data_need():
     options = {"learner": MLP((8,)), "criterion": Simulation(), "solver": LevenbergMarquardt(80)}
     found, ridge = (estimate(given, FIRST, regularization=r, **options) for r in ("evidence", 1.0))
     assert found.effective_weights > 3 and found.status.loss < 2 * ridge.status.loss
+
+
+def test_a_run_that_is_stopped_is_kept_and_tried_on_no_block():
+    def enough_after_physics(run, iteration, loss):
+        if iteration > 12:
+            raise Enough
+
+    found = choosing(record(), PHYSICS, learner=NETWORK, solver=LM, criterion=FREE, progress=enough_after_physics)
+    assert found.status.code == "stopped" and found.held_out is None
+    assert found.status.loss < found.status.start_loss and found.model.form.bound is not None
+    assert any("none was tried on held-out blocks" in w.text for w in found.warnings if w.code == "stopped")

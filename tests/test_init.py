@@ -206,6 +206,13 @@ def test_uneven_instants_are_resampled(tmp_path):
     assert data["prepare"][-1]["sampling_time"] == 0.1 and "1 sample far from all neighbours" in done.out
 
 
+def test_an_output_without_inputs_and_level_gets_its_own_past(tmp_path):
+    y = scipy.signal.lfilter([1.0], [1, -1.5, 0.8], np.random.default_rng(0).normal(size=400))
+    pd.DataFrame({"y": y - y.mean()}).to_csv(tmp_path / "a.csv", index=False)
+    done = run("init", tmp_path / "a.csv", "--inputs", "", "--outputs", "y", "--out", tmp_path / "spec.toml")
+    assert done.code == 0 and 'regressor = "y[k-2]"' in (tmp_path / "spec.toml").read_text(), done.err
+
+
 def test_columns_of_one_name_are_told_apart(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.StringIO())
     u, y = plant(300)

@@ -133,6 +133,19 @@ def test_uneven_time_stamps_get_an_even_grid(tmp_path):
         oa.read_record(tmp_path / "a.csv", **options, prepare=steps[::-1])
 
 
+def test_an_even_grid_keeps_every_sample_in_spite_of_rounding(tmp_path):
+    t = [f"{0.01 * k:.2f}" for k in range(3000)]
+    y = np.sin(0.01 * np.arange(3000.0))
+    y[1500] = np.nan
+    pd.DataFrame({"t": t, "u": np.arange(3000.0), "y": y}).to_csv(tmp_path / "a.csv", index=False)
+    options = {"inputs": ["u"], "outputs": ["y"], "time": "t"}
+    for method in ("linear", "pchip"):
+        steps = [oa.Resample(method=method), oa.Fill()]
+        done = oa.read_record(tmp_path / "a.csv", **options, prepare=steps)
+        assert len(done) == 3000 and done.missing == 0, method
+        assert np.array_equal(done.experiments[0].inputs[:, 0], np.arange(3000.0)), method
+
+
 def test_empty_cells_are_filled_when_they_are_read(tmp_path):
     frame = pd.DataFrame({"u": SLOW, "y": SLOW})
     frame.loc[[50, 51, 300], "y"] = np.nan

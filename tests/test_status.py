@@ -17,6 +17,10 @@ MESSAGES = {
         "training stopped at its limit of iterations while the loss was still falling; "
         "the model is usable, more iterations may improve it"
     ),
+    "stopped": (
+        "training was stopped on request while the loss was still falling; "
+        "the model is usable, more iterations may improve it"
+    ),
     "no_descent": (
         "no step lowered the loss; the start is already a minimum, or the learner's gradient is wrong. "
         "Try another seed or another activation"

@@ -6,11 +6,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 Tell = Callable[[int, int, float], None]
-"""Called now and then with the number of the run, its iteration and the loss; it may raise to stop the training."""
+"""Called now and then with the number of the run, its iteration and the loss; it may raise to stop the training.
+
+What it raises ends it without a result, but for `Enough`.
+"""
 
 
 RunTell = Callable[[int, float], None]
 """The same of one run: called with its iteration and the loss."""
+
+
+class Enough(Exception):
+    """Raised by whoever is told: end this run with what it has reached, as its result."""
 
 
 def quiet(iteration: int, loss: float) -> None:

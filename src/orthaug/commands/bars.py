@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from orthaug._base.progress import SILENT, Progress
+from orthaug._base.progress import SILENT, Enough, Progress
 from orthaug.commands import streams
 from orthaug.commands.signals import WATCH
 from orthaug.commands.streams import say
@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 
 TOLD_AS = "ORTHAUG_PROGRESS"
 """Variable of the environment; where it is `json`, training tells of itself by lines of JSON on standard error."""
+ENOUGH = threading.Event()
+"""Of the process: once it is set, training ends with what it has reached, as a result with the warning `stopped`."""
+ENOUGH_LINE = b"enough\n"
+"""What sets it, on the standard input of a child of the page."""
 _OFTEN = 0.02  # s between such lines
 _MANY = 1_000_000  # rows from which the rate is told
 _LONG = 5.0  # s of a search that are told beforehand
@@ -77,6 +81,8 @@ def training_bar(runs: int, iterations: int, wanted: bool = True, rows: int = 0)
             line(run, iteration, loss, passes)
             if interrupted.is_set():
                 raise KeyboardInterrupt(reached)
+            if ENOUGH.is_set():
+                raise Enough
 
         try:
             yield Progress(tell)

@@ -78,10 +78,8 @@ def judged(fitted: Fitted) -> Fitted:
     warnings += failed
     asked = fit.model.form.bound is not None and job.spec.validation.blocks != 0
     if verdict is None and asked and not failed:
-        told = (
-            "whether the learner helps is not judged: no part is held out, and the training data have too few "
-            "rows for cross-validation in so many blocks."
-        )
+        why = "training was stopped too early" if _stopped(fit) else "the training data have too few rows"
+        told = f"whether the learner helps is not judged: no part is held out, and {why} for cross-validation."
         warnings.append(WarningResult(code="not_judged", text=told))
     if verdict is not None and fit.model.form.bound is not None:
         warnings += [WarningResult.model_validate(warning) for warning in verdict.warnings]
@@ -178,7 +176,7 @@ def judge_fit(fitted: Fitted, blocks: Sequence[Trial] | None = None, alone: Fitt
         if wanted and simulated and chosen_by is not None and job.validation is None:
             blocks = trials_of(chosen_by)
         else:
-            blocks = cross_validated(job, wanted, [AS_DECLARED])[0] if wanted else ()
+            blocks = cross_validated(job, wanted, [AS_DECLARED])[0] if wanted and not _stopped(fitted.fit) else ()
     physics = job.run(Variant(ALONE)).model if alone is None else alone.fit.model
     trials, beyond = list(blocks), []
     for part in held_out:
@@ -189,6 +187,11 @@ def judge_fit(fitted: Fitted, blocks: Sequence[Trial] | None = None, alone: Fitt
         )
         beyond += extrapolation(part.name, job.reach(model, part.record)[0], *job.reach(model, job.train.record))
     return judge(trials, beyond)
+
+
+def _stopped(fit: Any) -> bool:
+    """Whether training was asked to end with what it had: then nobody waits for cross-validation either."""
+    return any(warning.code == "stopped" for warning in fit.warnings)
 
 
 def wanted_blocks(job: Job) -> int:

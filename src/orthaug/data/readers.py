@@ -15,6 +15,7 @@ import numpy as np
 
 from orthaug._base.checks import Vector, check_choice, check_count, check_type
 from orthaug._base.errors import InputError, MissingSampleError, shown
+from orthaug._base.lines import counted
 from orthaug.data.preparation import check_steps, prepared_experiments
 from orthaug.data.record import Channel, Experiment, Record, as_channels, check_step, same_step
 from orthaug.data.runs import Run
@@ -139,9 +140,9 @@ class _Uncut:
         runs = [self._run(begin, end, mends=mends, uneven=uneven) for begin, end in ranges]
         experiments, step, done, lost = prepared_experiments(runs, steps, keep=self.missing == "keep")
         if lost and self.missing == "error":
+            told = f"{counted(lost, 'row')} {'lacks' if lost == 1 else 'lack'} a sample after preparation"
             raise MissingSampleError(
-                f"{self.table.path}: {lost} rows lack a sample after preparation. Let `fill` reach over longer gaps, "
-                'or leave them out (missing = "skip").'
+                f'{self.table.path}: {told}. Let `fill` reach over longer gaps, or leave them out (missing = "skip").'
             )
         return Record(self.channels[0], self.channels[1], step, experiments, self.time, lost, done)
 

@@ -17,6 +17,7 @@ from orthaug.data.runs import Channels, Run
 _MAD = 1.4826  # standard deviations of a normal variable in its median absolute deviation
 _FLOOR = 0.1  # of the usual local deviation: the least that a window is taken to have
 _APART = 3.0  # steps between instants from which on nothing is interpolated
+_SAME = 1e-6  # of a step: instants that lie nearer are one, up to rounding
 _CHUNK = 100_000  # rows of windows at once
 
 Method = Annotated[str, OneOf(("linear", "pchip"))]
@@ -78,13 +79,21 @@ class Resample:
         step, t = self.sampling_time or run.step, run.instants
         if len(t) < 2 or not (np.diff(t) > 0).all():
             raise InputError("`resample` needs at least two instants, each later than the one before it.")
-        count = np.floor((t[-1] - t[0]) / step * (1 + 1e-12)) + 1
+        count = np.floor((t[-1] - t[0]) / step + _SAME) + 1
         if count > 100 * len(t):
             raise InputError(f"`resample`: {step:g} s would make {count:.3g} samples of {len(t)}; take a longer one.")
         grid = t[0] + step * np.arange(int(count))
         most = _APART * max(step, run.step)
-        values = np.column_stack([_between(t, column, grid, self.method, most) for column in run.values.T])
+        at = _measured(t, grid, _SAME * step)
+        values = np.column_stack([_between(t, column, at, self.method, most) for column in run.values.T])
         return replace(run, values=values, instants=grid, step=step, even=True, first=0, stride=1, moved=True)
+
+
+def _measured(t: Vector, grid: Vector, near: float) -> Vector:
+    """The grid, with the measured instant itself where one lies that near: a sample is not lost by rounding."""
+    after = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
+    closest = np.where(grid - t[after - 1] < t[after] - grid, t[after - 1], t[after])
+    return np.where(np.abs(closest - grid) <= near, closest, grid)
 
 
 def _between(t: Vector, column: Vector, grid: Vector, method: str, most: float) -> Vector:

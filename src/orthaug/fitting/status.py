@@ -43,6 +43,13 @@ class Ending(IntEnum):
     EXACT = 5, "exact"
     """No learner, no iteration."""
 
+    STOPPED = (
+        6,
+        "stopped",
+        "training was stopped on request while the loss was still falling",
+        "the model is usable, more iterations may improve it",
+    )
+
     @property
     def message(self) -> str:
         """Cause and remedy as one text; empty where there is nothing to say."""

@@ -13,7 +13,7 @@ import numpy as np
 from orthaug._base.checks import finite_or_none
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jax
-from orthaug._base.lines import percent
+from orthaug._base.lines import counted, percent
 from orthaug._base.log import LOG
 from orthaug._base.parallel import Threads, one_blas_thread
 from orthaug._base.progress import Tell
@@ -25,6 +25,7 @@ from orthaug.fitting.held_out import HeldOut, Pieces, blocked, mean_square, squa
 from orthaug.fitting.learned import Learned, Task
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.solvers.solver import Solver
+from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Structure
 
 _INFLATION = 1.4  # of the effective weights in cross-validation, against what follows the noise (Kim and Gu 2004)
@@ -98,6 +99,10 @@ def train(
     starts, runs = _run(task, starts, structure, solver, progress, runner)
     losses = [task.loss(run) for run in runs]
     concluded = cache(lambda i: _concluded(conclude, task, structure, task.learned(runs[i])))
+    stopped = sum(run.ending is Ending.STOPPED for run in runs)
+    untried = bool(stopped and choice.validation is None and choice.blocks and choice.compares(task, starts))
+    if untried:  # who asks to end does not wait for runs on held-out blocks
+        choice = replace(choice, blocks=0)
     held_out = _held_out(task, starts, concluded, structure, solver, choice, conclude, runner)
     errors = [math.nan] * len(runs) if held_out is None else [mean_square(run) for run in held_out.runs]
     ranking = choice.ranking(task, runs, errors)
@@ -122,23 +127,30 @@ def train(
         estimate = _concluded(conclude, task, structure, _median(task, runs, members, best))
     else:
         estimate = concluded(best)
-    restarts = tuple(
-        Restart(
-            seed=starts[i].seed,
-            loss=finite_or_none(losses[i]),
-            iterations=runs[i].iterations,
-            code=runs[i].ending.code,
-            chosen=i in members,
-            regularization=starts[i].regularization,
-            validation=finite_or_none(errors[i]),
-        )
-        for i in shown
-    )
+    restarts = tuple(_restart(starts[i], runs[i], losses[i], errors[i], chosen=i in members) for i in shown)
     status = replace(
         estimate.status, seconds=task.seconds + sum(run.seconds for run in runs), start_loss=task.start_loss
     )
-    warnings = (*estimate.warnings, *task.warnings, *_replaced(starts, runs), *told)
+    warnings = (
+        *estimate.warnings,
+        *task.warnings,
+        *_replaced(starts, runs),
+        *_stopped(stopped, len(runs), untried),
+        *told,
+    )
     return replace(estimate, restarts=restarts, status=status, held_out=held_out, warnings=warnings)
+
+
+def _restart(start: PlannedRun, run: Any, loss: float, error: float, *, chosen: bool) -> Restart:
+    return Restart(
+        seed=start.seed,
+        loss=finite_or_none(loss),
+        iterations=run.iterations,
+        code=run.ending.code,
+        chosen=chosen,
+        regularization=start.regularization,
+        validation=finite_or_none(error),
+    )
 
 
 def _cross_validation(task: Task, run: Any) -> float:
@@ -195,6 +207,14 @@ def _replaced(starts: Sequence[PlannedRun], runs: Sequence[Any]) -> list[Warning
         return []
     text = f"training failed from seed {', '.join(failed)} and was made again from the seeds after the last one."
     return [Warning("start_replaced", text)]
+
+
+def _stopped(count: int, runs: int, untried: bool) -> list[Warning]:
+    if not count:
+        return []
+    text = f"training was stopped on request: {count} of {counted(runs, 'run')} had not ended"
+    text += ", and none was tried on held-out blocks" if untried else ""
+    return [Warning("stopped", f"{text}; the best so far is kept, which training to the end may better.")]
 
 
 def _held_out(

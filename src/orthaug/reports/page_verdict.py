@@ -26,7 +26,7 @@ _SURE = 0.1  # standard error over value up to which a parameter is told to be k
 _NAMED = 0.5  # share of what was learned from which its cause is what to do first
 _MOST_DOUBTS = 3  # that are told in the first sentence
 _WORSE = 1.5  # times the error on the training data: a Gaussian error then leaves the 95 % band on a fifth of the rows
-_STOPPED = ("iteration_limit", "no_descent")
+_STOPPED = ("iteration_limit", "no_descent", "stopped")
 _RAN_AWAY = ("free_run_diverged",)
 _TIED = ("orthogonal", "physics alone")  # of models that are as good as each other these are taken first
 
@@ -289,6 +289,8 @@ def _then(result: FitResult) -> str:
         return 'Train on the free run (`focus = "simulation"`), or record data over the range that it leaves.'
     if not result.data.tests and not result.data.validation:
         return "Hold out a test part (`[data.tests.NAME]`), on which the model can be judged."
+    if result.status.code == "stopped":
+        return "Train it to the end, for it was stopped on request."
     if result.status.code == "iteration_limit":
         return "Give training more iterations (`training.iterations`)."
     if result.validation is not None and result.validation.extrapolation:

@@ -161,7 +161,7 @@ def _errors(record: Record, orders: Orders, offset: bool) -> tuple[float, ...] |
     cut, found = int(_FITTED * rows), []
     for j in range(len(record.outputs)):
         columns = orders.size + offset
-        if cut < 2 * columns or rows - cut < 2:
+        if not columns or cut < 2 * columns or rows - cut < 2:
             return None
         phi = np.concatenate([_rows(e, j, orders, first, offset) for e in usable])
         y = np.concatenate([e.outputs[first:, j] for e in usable])

@@ -1,7 +1,8 @@
 """The command line as a child of the page: it ends with whoever started it, however that ended.
 
 Whoever started it holds its standard input open. Where that is closed, the child is interrupted as by Ctrl-C, which
-keeps or removes what is partial; that is also how the page stops it.
+keeps or removes what is partial; that is also how the page stops it. A line `enough` on it ends training with what
+it has reached.
 """
 
 from __future__ import annotations
@@ -29,8 +30,11 @@ def watched() -> None:
 
 
 def _wait() -> None:
-    while os.read(0, 4096):
-        pass
+    while told := os.read(0, 4096):
+        from orthaug.commands.bars import ENOUGH, ENOUGH_LINE
+
+        if ENOUGH_LINE in told:
+            ENOUGH.set()
     if os.name == "posix":
         os.kill(os.getpid(), signal.SIGINT)
     else:

@@ -40,7 +40,17 @@ function take(file) {
 
 // Plots take the width that there is, once they have one.
 const widths = new ResizeObserver((entries) => entries.forEach((entry) => fit(entry.target)));
+// A report is laid out once, so it is loaded when its frame has the width that it keeps.
+const frames = new ResizeObserver((entries) => entries.forEach(({ target }) => {
+  if (target.offsetWidth < 0.8 * target.parentElement.parentElement.offsetWidth || !target.offsetWidth) return;
+  frames.unobserve(target);
+  requestAnimationFrame(() => requestAnimationFrame(() => (target.src = target.dataset.src)));
+}));
 new MutationObserver(() => {
+  for (const frame of document.querySelectorAll("iframe[data-src]:not([data-seen])")) {
+    frame.dataset.seen = "";
+    frames.observe(frame);
+  }
   for (const plot of document.querySelectorAll(".plot:not([data-fit])")) {
     plot.dataset.fit = "";
     widths.observe(plot);
@@ -53,3 +63,12 @@ async function fit(plot) {
   const width = plot.isConnected && plot._fullLayout ? plot.offsetWidth : 0;
   if (width && Math.abs(plot._fullLayout.width - width) > 1) Plotly.relayout(plot, { autosize: true, width });
 }
+
+// The part that is shown stands behind # in the address, so that Back and Forward go through the parts.
+function shown(part, first) {
+  if (location.hash === `#${part}`) return;
+  history[first ? "replaceState" : "pushState"](history.state, "", `#${part}`);
+}
+addEventListener("popstate", () => {
+  if (location.hash) emitEvent("part", location.hash.slice(1));
+});

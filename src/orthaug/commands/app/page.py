@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from html import escape
 from importlib.resources import files
+from typing import Any
 
 from nicegui import ui
 
@@ -52,6 +54,7 @@ class Page:
         with ui.tabs().props("no-caps align=left active-color=tab indicator-color=tab dense").classes("tabs") as tabs:
             made = {name: ui.tab(name) for name in _PARTS}
         start = "Training" if self.session.commands else "Data"
+        self._keep_history(tabs, start)
         panels = ui.tab_panels(tabs, value=made[start]).props("id=parts animated=false").classes("parts")
         parts = (self.data, self.model, self.training, self.report, self.export)
         with panels:
@@ -60,6 +63,18 @@ class Page:
                     part.draw()
         self._name()
         ui.timer(_OFTEN, self.follow)
+
+    def _keep_history(self, tabs: ui.tabs, start: str) -> None:
+        """Let Back and Forward of the browser go through the parts, and a reload show the same one."""
+
+        def go(event: Any) -> None:
+            if event.args in _PARTS:
+                tabs.set_value(event.args)
+
+        ui.on("part", go)
+        tabs.on_value_change(lambda event: ui.run_javascript(f"shown({json.dumps(str(event.value))}, false)"))
+        opened = "location.hash ? emitEvent('part', location.hash.slice(1)) : shown({}, true)"
+        ui.timer(_OFTEN, lambda: ui.run_javascript(opened.format(json.dumps(start))), once=True)
 
     def follow(self) -> None:
         """Let each part see what has changed since the last look."""
@@ -71,6 +86,7 @@ class Page:
 
         if moved("data"):
             self.data.follow_data()
+            self.model.follow_data()
         if moved("spec"):
             authors = set(self.session.authors[seen.get("spec", 0) :])
             author = authors.pop() if len(authors) == 1 else ""
@@ -79,7 +95,7 @@ class Page:
         if moved("check"):
             self.data.follow_check()
             self.model.follow_check()
-        if moved("work") or moved("spec") or self.session.running is not None:
+        if moved("work") or moved("spec") or moved("data") or self.session.running is not None:
             self.training.follow_work()
         elif moved("check"):
             self.training.follow_check()

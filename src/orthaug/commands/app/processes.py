@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from orthaug._base.errors import InputError
-from orthaug.commands.bars import TOLD_AS
+from orthaug.commands.bars import ENOUGH_LINE, TOLD_AS
 
 _LONGEST = 2**26  # bytes of a line of an answer
 _LINES = 400  # of a command that are kept
@@ -38,12 +38,19 @@ class Command:
     ended: float | None = None
     code: int | None = None
     stopping: bool = False
+    ending: bool = False
+    """Whether it was asked to end with what it has."""
     process: asyncio.subprocess.Process | None = None
 
     @property
     def running(self) -> bool:
         """Whether it has not ended yet."""
         return self.code is None
+
+    @property
+    def asked(self) -> bool:
+        """Whether it was asked to end, in one way or the other."""
+        return self.stopping or self.ending
 
     @property
     def seconds(self) -> float:
@@ -82,6 +89,8 @@ class Command:
         assert self.process.stdout is not None
         if self.stopping:
             self.stop()
+        elif self.ending:
+            self.finish()
         output, _ = await asyncio.gather(self.process.stdout.read(), self._told())
         return output.decode("utf-8", "replace"), await self.process.wait()
 
@@ -102,6 +111,12 @@ class Command:
         self.stopping = True
         if self.process is not None and self.process.stdin is not None:
             self.process.stdin.close()
+
+    def finish(self) -> None:
+        """Ask training to end with what it has reached."""
+        self.ending = True
+        if self.process is not None and self.process.stdin is not None:
+            self.process.stdin.write(ENOUGH_LINE)
 
     async def end(self) -> None:
         """Stop it, and wait until it has ended."""

@@ -35,6 +35,8 @@ class Session:
         self.looking = ""
         self.trouble = ""
         """What is wrong with the data, in words."""
+        self.unfit = ""
+        """Why the chosen channels make no spec, in words."""
         self.kept = False
         """Whether a file was looked at that the spec, which a person has worked on, was not begun anew for."""
         self.spec = ""
@@ -50,6 +52,8 @@ class Session:
         self.trained: dict[str, str] = {}
         """The spec of each result."""
         self.results: dict[str, dict[str, Any]] = {}
+        self.verdicts: dict[str, dict[str, Any]] = {}
+        """Of each result: `level` and `sentences`, as its report begins."""
         self.exports: dict[str, str] = {}
         """By target, why there is none; empty where there is."""
         self._tasks: set[asyncio.Task[Any]] = set()
@@ -72,6 +76,11 @@ class Session:
         task.add_done_callback(self._tasks.discard)
         return task
 
+    @property
+    def first_step(self) -> str:
+        """What begins the work, where there is no spec yet."""
+        return "It begins with a data file." if self.found is None else "Choose the channels in Data first."
+
     # Data
 
     def place_for(self, name: str) -> Path:
@@ -88,7 +97,7 @@ class Session:
 
     def open_file(self, path: Path) -> None:
         """Look at a data file, and begin a spec for it where its columns tell what they are."""
-        self.data, self.found, self.trouble, self.title = path, None, "", path.name
+        self.data, self.found, self.title = path, None, path.name
         self._look_again(None, None, None)
 
     def choose(self, inputs: Sequence[str], outputs: Sequence[str], step: float | None) -> None:
@@ -102,13 +111,13 @@ class Session:
 
     async def _looked(self, inputs: str | None, outputs: str | None, step: float | None) -> None:
         assert self.data is not None
-        self.looking, self.trouble = f"Looking at {self.data.name} …", ""
+        self.looking, self.trouble, self.unfit = f"Looking at {self.data.name} …", "", ""
         self.changed("data")
         given: dict[str, Any] = {"path": self.data, "out": self.folder / "spec.toml"}
         try:
             found = await self.desk.ask("look", **given, inputs=inputs, outputs=outputs, step=step)
             if self.found is not None and found["spec"] is None:
-                self.trouble = found["open"]
+                self.unfit = found["open"]
             else:
                 self.found = found
             self.kept = inputs is None and self.edited
@@ -116,7 +125,10 @@ class Session:
                 own = self.data.parent == self.folder  # a file that was dropped stands beside the spec
                 self.write(found["spec"] if own else absolute(found["spec"], self.folder), "look")
         except InputError as error:
-            self.trouble = self.worded(error)
+            if self.found is None:
+                self.trouble = self.worded(error)
+            else:
+                self.unfit = self.worded(error)
         finally:
             self.looking = ""
             self.changed("data")
@@ -188,6 +200,13 @@ class Session:
         self.checking = False
         self.changed("check")
 
+    @property
+    def units(self) -> dict[str, str]:
+        """What the channels ask for as units of parameters, of the spec as it is; nothing until it is checked."""
+        if self.checked is None or self.checking or self.stale:
+            return {}
+        return {name: asked or "1" for name, _, asked in self.checked["units"] if asked is not None}
+
     def content(self) -> dict[str, Any]:
         """The spec as dictionaries; empty while its TOML is broken."""
         try:
@@ -224,15 +243,27 @@ class Session:
         await command.run()
         if command.code == 0:
             self.trained[kind] = spec
-            with suppress(OSError, ValueError):
-                text = (self.folder / kind / "result.json").read_text(encoding="utf-8")
-                self.results[kind] = json.loads(text)
+            await self._read_result(kind)
         self.changed("work")
+
+    async def _read_result(self, kind: str) -> None:
+        """The result that lies in the folder, and the verdict that its report begins with."""
+        place = self.folder / kind / "result.json"
+        self.verdicts.pop(kind, None)
+        with suppress(OSError, ValueError):  # InputError among them
+            self.results[kind] = json.loads(place.read_text(encoding="utf-8"))
+            self.verdicts[kind] = await self.desk.ask("verdict", path=place, kind=kind)
 
     def stop(self) -> None:
         """Interrupt the training that goes on."""
         if self.running is not None:
             self.running.stop()
+            self.changed("work")
+
+    def finish(self) -> None:
+        """Let the training that goes on end with what it has reached."""
+        if self.running is not None:
+            self.running.finish()
             self.changed("work")
 
     # What can be taken away

@@ -190,29 +190,59 @@ def _list(document: Any, path: Sequence[str]) -> Any:
     return document
 
 
+_OF_TERMS = ("linear difference equations", "sees the lags that the physics reads", 'focus = "simulation"')
+"""What comments of `orthaug init` that equations of motion make untrue have in them."""
 MOTION = """
 [motion]
 [motion.states]
-x = {{ derivative = "v", start = "{output}" }}
-v = {{ derivative = "({force} - c*v - k*x)/m", start = "derivative of {output}", learned = true }}
+x = {{ derivative = "v", start = "{output}"{x} }}
+v = {{ derivative = "({force} - c*v - k*x)/m", start = "derivative of {output}", learned = true{v} }}
 [motion.outputs]
 {output} = "x"
 [motion.parameters]
-m = {{ initial = 1.0, min = 0 }}
-c = {{ initial = 1.0, min = 0 }}
-k = {{ initial = 1.0, min = 0 }}
+m = {{ initial = 1.0{m}, min = 0 }}
+c = {{ initial = 1.0{c}, min = 0 }}
+k = {{ initial = 1.0{k}, min = 0 }}
 """
 
 
 def as_motion(text: str) -> str:
-    """With the equations of a mass, a spring and a damper in place of the baseline, for a person to change."""
+    """With the equations of a mass, a spring and a damper in place of the baseline, for a person to change.
+
+    Comments about the baseline go with it; the parameters get units where force and output have theirs.
+    """
     data = section(plain(text), "data")
     inputs, outputs = names(data, "inputs") or ["0"], names(data, "outputs") or ["y"]
+    force, output = (section(data, "channels", name).get("unit") for name in (inputs[0], outputs[0]))
+    units = _motion_units(force, output) if isinstance(force, str) and isinstance(output, str) else {}
+    given = {name: f', unit = "{units[name]}"' if name in units else "" for name in "xvmck"}
 
     def change(document: Any) -> None:
         for key in ("baseline", "lags", "physics", "motion", "suspects"):
             document.pop(key, None)
-        document["motion"] = tomlkit.parse(MOTION.format(output=outputs[0], force=inputs[0]))["motion"]
+        document["motion"] = tomlkit.parse(MOTION.format(output=outputs[0], force=inputs[0], **given))["motion"]
         _made(document, "learner")["inputs"] = ["v"]
 
-    return changed(text, change)
+    return changed(_without_comments(text, _OF_TERMS), change)
+
+
+def _without_comments(text: str, told: Sequence[str]) -> str:
+    """Without the comments that have one of these in them; a line that holds nothing else goes too."""
+    kept = []
+    for line in text.splitlines(keepends=True):
+        before, mark, comment = line.partition("# ")
+        if mark and any(one in comment for one in told):
+            if not before.strip():
+                continue
+            line = before.rstrip() + "\n"
+        kept.append(line)
+    return "".join(kept)
+
+
+def _motion_units(force: str, output: str) -> dict[str, str]:
+    """Of states and parameters in `force = m dv/dt + c v + k x`, x in the unit of the output."""
+    if not force or not output or set('"\\') & {*force, *output}:
+        return {}
+    own = f"({output})" if set(" */") & set(output) else output
+    mass = "kg" if (force, output) == ("N", "m") else f"{force} s²/{own}"
+    return {"x": output, "v": f"{own}/s", "m": mass, "c": f"{force} s/{own}", "k": f"{force}/{own}"}

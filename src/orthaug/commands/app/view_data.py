@@ -22,10 +22,12 @@ from orthaug.commands.app.widgets import (
     note,
     plot,
     redrawn,
+    refuse,
     sentence,
     table,
     text,
 )
+from orthaug.data.record import check_step
 from orthaug.data.steps import STEPS
 
 _STEPS = ("data", "prepare")
@@ -63,6 +65,7 @@ class DataView:
         self.uses: dict[str, str] = {}
         self.step = ""
         self._curves: Any = None
+        self._drawn: tuple[Any, Any, bool] = (None, None, False)
 
     def draw(self) -> None:
         """The places; their content follows."""
@@ -81,6 +84,7 @@ class DataView:
                 self.cleaning = card("Preparation", "Every part of the data goes through these steps, in this order.")
                 with self.columns:
                     self.column_rows = ui.element("div")
+                    self.unfit = ui.element("div")
                 with self.cleaning:
                     self.step_rows = ui.element("div")
                     self.refusal = ui.element("div")
@@ -114,16 +118,30 @@ class DataView:
                     note("The spec is kept as it is. Take this file as a test of it, or begin anew below.", "care")
                     button("Take it as a test", session.add_test)
         self.columns.set_visibility(found is not None)
-        if found is not None:
+        state = (session.data, found, bool(session.spec))
+        if found is not None and any(a is not b for a, b in zip(state, self._drawn, strict=True)):
+            self._take_uses(found)
+            self._drawn = state
             self._draw_columns(found)
+        with redrawn(self.unfit):
+            if session.unfit:
+                note(sentence(session.unfit), "bad")
         self.follow_check()
+
+    def _take_uses(self, found: Mapping[str, Any]) -> None:
+        """The use of each column: of a further look at the same file what was chosen for it, otherwise what it says."""
+        data, before, _ = self._drawn
+        if found is before:
+            return
+        if data is not self.session.data:
+            self.step = ""
+        inputs, outputs = found.get("inputs"), found.get("outputs")
+        self.uses = {column["header"]: column["kind"] for column in found["columns"] if column["usable"]}
+        if inputs is not None and outputs is not None:
+            self.uses = {h: "input" if h in inputs else "output" if h in outputs else "" for h in self.uses}
 
     def _draw_columns(self, found: Mapping[str, Any]) -> None:
         usable = [column for column in found["columns"] if column["usable"]]
-        inputs, outputs = found.get("inputs"), found.get("outputs")
-        self.uses = {column["header"]: column["kind"] for column in usable}
-        if inputs is not None and outputs is not None:
-            self.uses = {h: "input" if h in inputs else "output" if h in outputs else "" for h in self.uses}
         with redrawn(self.column_rows):
             for column in usable[:_LISTED]:
                 with ui.element("div").classes("entry"):
@@ -131,7 +149,9 @@ class DataView:
                         text(column["header"], "p", "strong")
                         text(column["told"], "p", "hint")
                     self._choose_use(column["header"])
-            left = [c for c in found["columns"] if not c["usable"]]
+            if found["timed"]:
+                text(found["timed"], "p", "hint")
+            left = [c for c in found["columns"] if not c["usable"] and not c["timed"]]
             if left:
                 text("Not usable: " + ", ".join(f"{c['header']} ({c['told']})" for c in left[:_LISTED]), "p", "hint")
             if not usable:
@@ -142,8 +162,8 @@ class DataView:
                 note(found["open"] or names, "care")
             with ui.element("div").classes("fields"):
                 step = "" if found["step"] is None else f"{found['step']:g}"
-                own = "" if found["step"] is not None and "column" in found["clock"] else step
-                field("sampling time in s", own, self._set_step, classes="medium", hint=step or "1")
+                label = "sampling time in s"
+                self.step_field = field(label, self.step, self._set_step, classes="medium", hint=step or "1")
                 label = (
                     "Begin with these channels"
                     if found["spec"] is None and not self.session.spec
@@ -164,10 +184,11 @@ class DataView:
         """Begin the spec with the columns as they are chosen."""
         chosen = {kind: [h for h, use in self.uses.items() if use == kind] for kind in ("input", "output")}
         try:
-            step = float(self.step) if self.step.strip() else None
-        except ValueError:
-            ui.notify("The sampling time must be a number of seconds, such as 0.01.", type="warning")
+            step = _seconds(self.step)
+        except InputError as error:
+            refuse(self.step_field, sentence(str(error)))
             return
+        refuse(self.step_field, "")
         if not chosen["output"]:
             ui.notify("Choose at least one output.", type="warning")
             return
@@ -274,3 +295,20 @@ class DataView:
                 table(
                     ("part", "rows"), [(part, count) for part, count in checked["rows"].items()], "Rows that are used"
                 )
+
+
+def _seconds(told: str) -> float | None:
+    """A sampling time; None where nothing is told.
+
+    Raises:
+        InputError: no positive number.
+    """
+    told = told.strip()
+    if not told:
+        return None
+    try:
+        return check_step(float(told))
+    except InputError:
+        raise
+    except ValueError:
+        raise InputError(f"it must be a number of seconds, such as 0.01; got {told}.") from None

@@ -7,6 +7,7 @@ from typing import Any
 
 from nicegui import ui
 
+from orthaug._base.lines import percent
 from orthaug.commands.app import spec_text
 from orthaug.commands.app.session import Session
 from orthaug.commands.app.widgets import (
@@ -26,6 +27,8 @@ from orthaug.commands.app.widgets import (
 _TERMS = ("baseline", "terms")
 _LEARNERS = {"mlp": "a network", "terms": "a sum of terms", "none": "none: physics alone"}
 _FOCUS = {"prediction": "one step ahead", "simulation": "the free run"}
+_MULTIPLE = 1e5  # % from which a change is told in words
+_ROUNDING = 1e-7  # % below which it is none
 _STRUCTURES = {
     "orthogonal": "orthogonal",
     "additive": "additive",
@@ -68,13 +71,19 @@ class ModelView:
                 self._draw_physics(content)
                 self._draw_learner(content)
 
+    def follow_data(self) -> None:
+        """What comes first, while there is no spec."""
+        if not self.session.spec.strip():
+            self._draw_physics({})
+
     def _write(self, spec: str, author: str = "form") -> None:
         self.session.write(spec, author)
 
     def _draw_physics(self, content: Mapping[str, Any]) -> None:
         with redrawn(self.physics):
             if not content:
-                text("It begins with a data file, or with a spec in the field below.", "p", "hint")
+                begin = self.session.first_step.removesuffix(".")
+                text(f"{begin}, or write a spec in the field below.", "p", "hint")
                 return
             if "motion" in content:
                 self._draw_motion(content)
@@ -209,7 +218,7 @@ class ModelView:
                 if stale:
                     text("As the spec was before:", "p", "hint")
                 with ui.element("div").classes("stale" if stale else ""):
-                    _units((session.checked or {})["units"])
+                    _units((session.checked or {})["units"], moves=bool(told.get("motion")))
                     _findings(told, (session.checked or {})["bias"])
             elif session.checking and session.checked is not None:
                 text("The equations are run to see what they determine; that takes a while.", "p", "hint")
@@ -243,19 +252,15 @@ def _findings(told: Mapping[str, Any], bias: Sequence[Mapping[str, Any]]) -> Non
             table(("if it sees only", "shared", "determined"), rows)
     if bias:
         text("What would bias the parameters", "h3")
-        text(
-            "If such a term is missing from the physics; its size 1 % of the output's, or as the spec says.",
-            "p",
-            "hint",
-        )
-        names = list(bias[0]["percent"])
-        rows = [(b["name"], *(_percent(b["percent"].get(n)) for n in names), b["removed_by"] or "–") for b in bias]
-        table(("missing term", *names, "removed by"), rows)
+        hint = "If such a term is missing from the physics; its size 1 % of the output's, or as the spec says."
+        text(hint, "p", "hint")
+        rows = [(one["name"], _biases(one["percent"]), one["removed_by"] or "–") for one in bias]
+        table(("missing term", "change of each parameter", "removed by"), rows)
     for warning in told["warnings"]:
         note(warning["text"], "care")
 
 
-def _units(units: Sequence[tuple[str, str, str | None]]) -> None:
+def _units(units: Sequence[tuple[str, str, str | None]], *, moves: bool) -> None:
     """What the spec says of units, where it is not what the regressors ask for; both are written in one way here."""
     for name, given, asked in units:
         if asked is not None and given not in (asked, ""):
@@ -263,7 +268,20 @@ def _units(units: Sequence[tuple[str, str, str | None]]) -> None:
     wanted = [f"{name} in {asked}" for name, given, asked in units if asked not in (None, "1") and not given]
     if wanted:
         text(f"Units, from those of the channels: {', '.join(wanted)}.", "p", "hint")
+    bare = [name for name, given, _ in units if moves and not given]
+    if bare:
+        text(f"No unit is given for {', '.join(bare)}, and none can be told from the channels.", "p", "hint")
+
+
+def _biases(percents: Mapping[str, float | None]) -> str:
+    """All on a line that breaks between the parameters only."""
+    return ", ".join(f"{name}\u00a0{_percent(value)}" for name, value in percents.items())
 
 
 def _percent(value: float | None) -> str:
-    return "–" if value is None else f"{0.0 if abs(value) < 1e-9 else value:+.2g}\u00a0%"
+    """A change in per cent; of a parameter near zero no number says more than that it is a multiple."""
+    if value is None:
+        return "–"
+    if abs(value) >= _MULTIPLE:
+        return f"{'+' if value > 0 else '−'}\u00a0many\u00a0times"
+    return percent(0.0 if abs(value) < _ROUNDING else value / 100, sign="+").replace(" ", "\u00a0")

@@ -55,7 +55,8 @@ class ReportView:
                     choice("report", {name: _REPORTS[name] for name in there}, self.shown, self._show, "bare")
                 link("Download the report", f"/session/{session.key}/get/{self.shown}")
             frame = ui.element("iframe").classes("report").props('sandbox="allow-scripts" title="report"')
-            frame.props(f'src="/session/{session.key}/get/{self.shown}?show=true&n={session.versions["work"]}"')
+            place = f"/session/{session.key}/get/{self.shown}?show=true&n={session.versions['work']}"
+            frame.props(f'data-src="{place}"')  # page.js loads it once the frame has its width
 
     def _show(self, name: str) -> None:
         self.shown, self._state = name, None

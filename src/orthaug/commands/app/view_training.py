@@ -9,6 +9,7 @@ from nicegui import ui
 
 from orthaug.commands.app.processes import Command
 from orthaug.commands.app.session import Session
+from orthaug.commands.app.spec_text import names, section
 from orthaug.commands.app.widgets import button, card, loss_figure, note, number, plot, redrawn, table, text
 
 _MOST = 1500  # points of a curve of the loss
@@ -31,6 +32,7 @@ class TrainingView:
             with ui.element("div").classes("fields"):
                 self.begin = button("Train", lambda: self.session.train("fit"), main=True)
                 self.compare = button("Compare structures", lambda: self.session.train("compare"))
+                self.finish = button("Stop and keep the best so far", self.session.finish)
                 self.end = button("Stop", self.session.stop, classes="stop")
             self.state = ui.element("div")
             self.bar = ui.element("progress").props('max=1 value=0 aria-label="progress of training"')
@@ -51,15 +53,19 @@ class TrainingView:
         self.follow_check()
         self.end.set_visibility(running is not None)
         self.end.set_enabled(running is not None and not running.stopping)
+        able = running is not None and running.arguments[0] == "fit"  # half a comparison compares nothing
+        self.finish.set_visibility(able)
+        self.finish.set_enabled(running is not None and bool(running.progress) and not running.asked)
         shown = running or max(session.commands.values(), key=lambda c: c.began, default=None)
         with redrawn(self.state):
             if shown is None:
-                text("Nothing has been trained yet." if session.spec else "It begins with a data file.", "p", "hint")
+                text("Nothing has been trained yet." if session.spec else session.first_step, "p", "hint")
             else:
                 self._tell(shown)
         self.bar.set_visibility(running is not None)
         self._draw_losses([] if shown is None else shown.losses)
-        state = (running is None, *(session.trained.get(kind) for kind in _TITLES), session.spec)
+        trained = [session.trained.get(kind) for kind in _TITLES]
+        state = (running is None, *trained, session.spec, session.units, *session.verdicts.values())
         if state != self._state:
             self._state = state
             self._draw_results()
@@ -86,11 +92,15 @@ class TrainingView:
                 else "reading and compiling"
             )
             loss = f", loss {number(told['loss'], 4)}" if told else ""
-            ending = "stopping …" if command.stopping else f"{done}{loss}"
+            ending = f"{done}{loss}"
+            if command.stopping or command.ending:
+                ending = "stopping …" if command.stopping else "ending with the best so far …"
             text(f"{what}: {ending} · {command.seconds:.0f} s", "p", "note busy").props("role=status")
             self.bar.props(f"value={told.get('done', 0) if told else 0}")
         elif command.stopping and command.code != 0:
             note(f"{what} was stopped after {command.seconds:.0f} s; nothing was kept of it.", "care")
+        elif command.code == 0 and command.ending:
+            note(f"{what} was stopped after {command.seconds:.0f} s; the best so far is kept.", "care")
         elif command.code == 0:
             note(f"{what} is done, in {command.seconds:.1f} s.", "good")
         else:
@@ -103,45 +113,60 @@ class TrainingView:
                 with card("Result"):
                     if session.trained["fit"] != session.spec:
                         note("The spec has changed since this was trained.", "care")
-                    _fit(result)
+                    _sentences(session.verdicts.get("fit"))
+                    _fit(result, session.units if session.trained["fit"] == session.spec else {})
         with redrawn(self.comparison):
             if (result := session.results.get("compare")) is not None:
                 with card("Comparison"):
                     if session.trained["compare"] != session.spec:
                         note("The spec has changed since this was compared.", "care")
-                    _compare(result)
+                    _sentences(session.verdicts.get("compare"))
+                    _compare(result, session.units if session.trained["compare"] == session.spec else {})
 
 
-def _fit(result: Mapping[str, Any]) -> None:
+def _sentences(verdict: Mapping[str, Any] | None) -> None:
+    """The verdict that the report begins with."""
+    if verdict is not None:
+        note(" ".join(verdict["sentences"]), verdict["level"])
+
+
+def _fit(result: Mapping[str, Any], units: Mapping[str, str]) -> None:
     if result["validation"]:
         text(result["validation"]["text"], "p", "strong")
-    _parameters("Parameters", result["parameters"])
+    _parameters("Parameters", [("", result["parameters"])], units)
     if result["physical_parameters"]:
-        _parameters("Physical parameters", result["physical_parameters"])
-    _scores([("", result["scores"])])
+        _parameters("Physical parameters", [("", result["physical_parameters"])], units)
+    _scores([("", result["scores"])], _output_units(result))
     if result["residuals"]:
         text(result["residuals"]["text"], "p", "small")
     for warning in result["warnings"]:
         note(warning["text"], "care")
 
 
-def _parameters(caption: str, rows: Sequence[Mapping[str, Any]]) -> None:
-    cells = []
-    for row in rows:
-        low, high = row["ci95"] or (None, None)
-        cells.append(
-            (
-                row["name"],
-                number(row["value"], 6),
-                number(row["std"], 3),
-                f"{number(low)} … {number(high)}",
-                row["unit"] or "–",
-            )
-        )
-    table(("parameter", "value", "standard error", "95 % interval", "unit"), cells, caption)
+def _parameters(
+    caption: str, models: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], units: Mapping[str, str]
+) -> None:
+    """Of one model, or of several that are named; `units` are those that the channels ask for."""
+    named, cells = any(name for name, _ in models), []
+    for name, rows in models:
+        for row in rows:
+            low, high = row["ci95"] or (None, None)
+            reach = "–" if low is None and high is None else f"{number(low)} … {number(high)}"
+            own = (number(row["value"], 6), number(row["std"], 3), reach)
+            unit = row["unit"] or units.get(row["name"]) or "–"
+            cells.append((*([name] if named else []), row["name"], *own, unit))
+    head = (*(["model"] if named else []), "parameter", "value", "standard error", "95 % interval", "unit")
+    table(head, cells, caption)
 
 
-def _scores(models: Sequence[tuple[str, Mapping[str, Any]]]) -> None:
+def _output_units(result: Mapping[str, Any]) -> str:
+    """The units of the outputs behind `RMSE`, in brackets; nothing where none has one."""
+    data = section(result["spec"], "data")
+    units = [str(section(data, "channels", name).get("unit") or "–") for name in names(data, "outputs")]
+    return f" [{', '.join(units)}]" if set(units) - {"–"} else ""
+
+
+def _scores(models: Sequence[tuple[str, Mapping[str, Any]]], unit: str) -> None:
     rows = []
     for name, scores in models:
         for part, kinds in scores.items():
@@ -149,24 +174,27 @@ def _scores(models: Sequence[tuple[str, Mapping[str, Any]]]) -> None:
             own = [_numbers(one["nrmse"]), _numbers(free["nrmse"]), _numbers(free["rmse"]), _numbers(free["fit"], 4)]
             rows.append((name or part, *([part] if name else []), *own))
     head = (*(("model", "part") if models and models[0][0] else ("part",)), "NRMSE, one step")
-    table((*head, "NRMSE, free run", "RMSE, free run", "FIT %, free run"), rows, "Scores")
+    table((*head, "NRMSE, free run", f"RMSE, free run{unit}", "FIT %, free run"), rows, "Scores")
 
 
 def _numbers(values: Sequence[float | None] | None, digits: int = 4) -> str:
     return "–" if values is None else ", ".join(number(value, digits) for value in values)
 
 
-def _compare(result: Mapping[str, Any]) -> None:
+def _compare(result: Mapping[str, Any], units: Mapping[str, str]) -> None:
     if result["chosen"]:
         text(f"Chosen on the validation part: {result['chosen']}.", "p", "strong")
-    _scores([(row["name"], row["scores"]) for row in result["comparison"]])
-    rows = [
-        (row["name"], ", ".join(f"{p['name']} = {number(p['value'])}" for p in row["parameters"]), row["weights"])
-        for row in result["comparison"]
-    ]
-    table(("model", "parameters", "weights"), rows, "Parameters")
-    for row in result["comparison"]:
+    models = result["comparison"]
+    _scores([(row["name"], row["scores"]) for row in models], _output_units(result))
+    _parameters("Parameters", [(row["name"], row["parameters"]) for row in models], units)
+    weights = [f"{row['name']} {row['weights']}" for row in models]
+    text(f"Weights of the learner: {', '.join(weights)}.", "p", "hint")
+    for row in models:
         if row["validation"]:
             text(f"{row['name']}: {row['validation']['text']}", "p", "small")
-    for warning in result["warnings"]:
-        note(warning["text"], "care")
+    for kind, why in result["left_out"].items():
+        text(f"Left out: {kind}: {why}", "p", "small")
+    told = [warning["text"] for warning in result["warnings"]]
+    told += [f"{row['name']}: {warning['text']}" for row in models for warning in row["warnings"]]
+    for one in dict.fromkeys(told):
+        note(one, "care")

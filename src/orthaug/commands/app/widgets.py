@@ -61,6 +61,12 @@ def field(label: str, value: Any, changed: Callable[[str], None], *, classes: st
     return made
 
 
+def refuse(made: ui.input, why: str) -> None:
+    """Say under a field what is wrong with it; nothing takes that back."""
+    made.props["error"], made.props["error-message"] = bool(why), why
+    made.update()
+
+
 def choice(
     label: str, options: Mapping[str, str], value: str, changed: Callable[[str], None], classes: str = ""
 ) -> ui.element:

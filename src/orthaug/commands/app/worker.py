@@ -92,7 +92,7 @@ def look(path: str, out: str, inputs: str | None, outputs: str | None, step: flo
     answer: dict[str, Any] = {
         "columns": [_column(found, column) for column in found.columns],
         "rows": max(column.filled for column in found.columns),
-        "clock": str(found.clock),
+        "timed": _timed(found),
         "step": found.clock.step,
         "spec": None,
         "account": "",
@@ -109,13 +109,23 @@ def look(path: str, out: str, inputs: str | None, outputs: str | None, step: flo
     return answer | {"curves": _curves(found)}
 
 
+def _timed(found: Survey) -> str:
+    """Which column gives the time, in words; nothing where none does."""
+    clock = found.clock
+    if clock.column is None or clock.step is None:
+        return ""
+    if not clock.instants:
+        return f"{clock.column.header} gives the sampling time, {clock.step:g} s."
+    return f"{clock.column.header} gives the instants, {'every' if clock.even else 'mostly every'} {clock.step:g} s."
+
+
 def _column(found: Survey, column: Column) -> dict[str, Any]:
     usable = column in found.signals
-    why = "time" if column is found.clock.column else column.unusable or "constant"
-    told = starting.as_seen(column, spikes=column.kind != "input") if usable else why
+    timed = column is found.clock.column
+    told = starting.as_seen(column, spikes=column.kind != "input") if usable else column.unusable or "constant"
     own = {"header": column.header, "name": column.name, "unit": column.unit, "kind": column.kind}
     head = f"{column.name}" + (f" = column '{column.header}'" if column.header != column.name else "")
-    return own | {"usable": usable, "told": told.removeprefix(f"{head}: ")}
+    return own | {"usable": usable, "timed": timed, "told": told.removeprefix(f"{head}: ")}
 
 
 def _curves(found: Survey) -> dict[str, Any]:
@@ -160,8 +170,27 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
     }
 
 
+def verdict(path: str, kind: str) -> dict[str, Any]:
+    """What the report of a result begins with: `level`, and three `sentences`.
+
+    Args:
+        kind: fit or compare, of which `path` is the result.json.
+    """
+    from orthaug.reports.page_verdict import compare_verdict, fit_verdict
+    from orthaug.reports.result import CompareResult, FitResult
+
+    text = Path(path).read_text(encoding="utf-8")
+    if kind == "fit":
+        told = fit_verdict(FitResult.model_validate_json(text))
+    else:
+        told = compare_verdict(CompareResult.model_validate_json(text))
+    return {"level": told.level, "sentences": told.sentences}
+
+
 def _units(job: Job) -> list[tuple[str, str, str | None]]:
-    """Of each parameter of a baseline: its name, the unit that the spec gives, and what its regressor asks for."""
+    """Of each parameter: its name, the unit that the spec gives, and what its regressor asks for if it has one."""
+    if job.spec.motion is not None:
+        return [(name, entry.unit or "", None) for name, entry in job.spec.motion.parameters.items()]
     if job.spec.baseline is None:
         return []
     record, baseline = job.train.record, job.problem.baseline
@@ -211,7 +240,7 @@ def _plain(values: Vector) -> list[float | None]:
     return [float(f"{v:.7g}") if np.isfinite(v) else None for v in values]
 
 
-QUESTIONS: dict[str, Callable[..., dict[str, Any]]] = {"look": look, "examine": examine}
+QUESTIONS: dict[str, Callable[..., dict[str, Any]]] = {"look": look, "examine": examine, "verdict": verdict}
 
 if __name__ == "__main__":
     main()

@@ -14,7 +14,7 @@ from annotated_types import Ge, Gt
 from jaxtyping import Float
 
 from orthaug._base.jax import Array, jax, jnp, training_clock
-from orthaug._base.progress import RunTell, quiet
+from orthaug._base.progress import Enough, RunTell, quiet
 from orthaug._base.registry import check_fields
 from orthaug.fitting.paper_criterion import PaperCriterion, Physics
 from orthaug.fitting.solvers.compiled import burst_length
@@ -86,6 +86,7 @@ class AdamLBFGS:
         began = training_clock()
         unknowns = (jnp.zeros_like(physics.start), w)
         loss = _value(criterion, unknowns, chunks, physics)
+        enough = False
         done, state = 0, _GradientState(unknowns, None, loss, jnp.asarray(0), jnp.asarray(0))
         phases = (
             (self.adam_iterations, optax.adam(self.learning_rate)),
@@ -96,16 +97,20 @@ class AdamLBFGS:
                 state.unknowns, optimizer.init(state.unknowns), state.loss, jnp.asarray(0), jnp.asarray(0)
             )
             burst, second = 1, optimizer is phases[1][1]
-            while int(state.iteration) < limit and bool(_going(state)):
+            while int(state.iteration) < limit and bool(_going(state)) and not enough:
                 tick = training_clock()
                 stop = jnp.asarray(min(int(state.iteration) + burst, limit))
                 advance = _lbfgs if second else _adam
                 state = jax.block_until_ready(advance(criterion, state, chunks, physics, self.learning_rate, stop))
                 burst = burst_length(burst, training_clock() - tick)
-                progress(done + int(state.iteration), float(state.loss) * float(physics.samples))
+                try:
+                    progress(done + int(state.iteration), float(state.loss) * float(physics.samples))
+                except Enough:
+                    enough = True
             done += int(state.iteration)
         finite = bool(jnp.isfinite(state.loss))
-        ending = Ending.NON_FINITE if not finite else Ending.CONVERGED if int(state.small) >= 5 else Ending.RUNNING
+        still = Ending.STOPPED if enough else Ending.RUNNING
+        ending = Ending.NON_FINITE if not finite else Ending.CONVERGED if int(state.small) >= 5 else still
         v, w = state.unknowns
         return GradientRun(v, w, done, ending, training_clock() - began)
 

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 
 from orthaug._base.checks import Vector
 from orthaug._base.jax import Array, jax, jnp, training_clock
-from orthaug._base.progress import RunTell, quiet
+from orthaug._base.progress import Enough, RunTell, quiet
 from orthaug.fitting.normal_equations import Normal, linearise, one_pass
 from orthaug.fitting.solvers.descent import IDENTITY
 from orthaug.fitting.status import Ending
@@ -119,14 +119,18 @@ class Settings:
         """Whether there is a step to take."""
         return int(state.code) == Ending.RUNNING and int(state.iteration) < self.iterations
 
-    def tell(self, state: State) -> None:
-        """Whoever listens, and whoever keeps states."""
-        self.progress(int(state.iteration), float(state.normal.loss))
+    def tell(self, state: State) -> bool:
+        """Whoever listens, and whoever keeps states; whether a listener says that it is enough."""
+        try:
+            self.progress(int(state.iteration), float(state.normal.loss))
+        except Enough:
+            return True
         if self.kept is not None:
             self.kept.keep(state, ended=int(state.code) != Ending.RUNNING)
+        return False
 
-    def ended(self, state: State, seconds: float) -> TrainingRun:
-        """The run, from its last state."""
+    def ended(self, state: State, seconds: float, *, enough: bool = False) -> TrainingRun:
+        """The run, from its last state; `enough` where it was asked to end with that."""
         held: Any = (
             np.asarray(state.ridge)
             if self.groups is not None
@@ -135,6 +139,7 @@ class Settings:
         ridge = held if self.groups is not None else float(held)
         effective = float(effective_weights(state.normal, held))
         ending, done = Ending(int(state.code)), int(state.iteration)
+        ending = Ending.STOPPED if enough and ending is Ending.RUNNING else ending
         return TrainingRun(state.w, state.normal, ridge, effective, done, ending, seconds)
 
 
@@ -156,14 +161,14 @@ def minimise(
     if settings.runs(state):  # a run beside this one may be compiling: no time of this one
         jax.block_until_ready(_advance(criterion, state, arguments, options, np.int64(0)))
     began = training_clock()
-    burst = 1
-    while settings.runs(state):
+    burst, enough = 1, False
+    while settings.runs(state) and not enough:
         tick = training_clock()
         stop = min(int(state.iteration) + burst, settings.iterations)
         state = jax.block_until_ready(_advance(criterion, state, arguments, options, np.int64(stop)))
         burst = burst_length(burst, training_clock() - tick)
-        settings.tell(state)
-    return settings.ended(state, training_clock() - began)
+        enough = settings.tell(state)
+    return settings.ended(state, training_clock() - began, enough=enough)
 
 
 def driven(
@@ -183,11 +188,12 @@ def driven(
     if first is not None:
         state = _begun(w, normal_at(w, first.overlap), start)  # less what rounding left of J in the physics
     assert state is not None
-    while settings.runs(state):
+    enough = False
+    while settings.runs(state) and not enough:
         step = _proposed(state)
         state = _judged(state, step, normal_at(state.w + step, state.normal.overlap), options)
-        settings.tell(state)
-    return settings.ended(state, training_clock() - began)
+        enough = settings.tell(state)
+    return settings.ended(state, training_clock() - began, enough=enough)
 
 
 def burst_length(burst: int, spent: float) -> int:

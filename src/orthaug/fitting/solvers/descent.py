@@ -19,7 +19,7 @@ from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import training_clock
-from orthaug._base.progress import RunTell, quiet
+from orthaug._base.progress import Enough, RunTell, quiet
 from orthaug.fitting.status import Ending
 
 _SETTLED = 0.1  # of the objective: a step that lowers it by less belongs to the end of a run
@@ -207,7 +207,11 @@ def descend(
             iterate = iterate._replace(ridge=_next_ridge(objective, iterate))
         taken = len(iterate.path)
         done += 1
-        progress(done, iterate.flown.loss)
+        try:
+            progress(done, iterate.flown.loss)
+        except Enough:
+            ending = Ending.STOPPED if ending is Ending.RUNNING else ending
+            break
         if kept is not None:
             counts = _Counts(done, taken, begun, first_loss)
             kept.keep(partial(_paused, objective, iterate, counts, ending), ended=ending is not Ending.RUNNING)
