@@ -78,8 +78,9 @@ def judged(fitted: Fitted) -> Fitted:
     warnings += failed
     asked = fit.model.form.bound is not None and job.spec.validation.blocks != 0
     if verdict is None and asked and not failed:
-        why = "training was stopped too early" if _stopped(fit) else "the training data have too few rows"
-        told = f"whether the learner helps is not judged: no part is held out, and {why} for cross-validation."
+        short = "the training data have too few rows for cross-validation in so many blocks"
+        why = "training was stopped too early for cross-validation" if _stopped(fit) else short
+        told = f"whether the learner helps is not judged: no part is held out, and {why}."
         warnings.append(WarningResult(code="not_judged", text=told))
     if verdict is not None and fit.model.form.bound is not None:
         warnings += [WarningResult.model_validate(warning) for warning in verdict.warnings]

@@ -68,7 +68,7 @@ def read_record(
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     file = Path(folder, "run.csv")
-        ...     _ = file.write_text("force,position\\n0,0\\n1,0.5\\n2,1.5\\n", encoding="utf-8")
+        ...     _ = file.write_text("force,position\n0,0\n1,0.5\n2,1.5\n", encoding="utf-8")
         ...     read_record(file, inputs=["force"], outputs=["position"], sampling_time=0.01)
         Record(1 experiment, 3 samples, Ts = 0.01 s, inputs: force; outputs: position)
     """
@@ -81,7 +81,7 @@ def read_record(
     wanted: list[str] = list(dict.fromkeys([*column_of.values(), *(name for name in (time, experiment) if name)]))
     if not column_of:
         raise InputError("no channels are asked for; name inputs, outputs or both.")
-    table = _trim(read_table(path, wanted, time), uneven=missing != "error")
+    table = _trim(read_table(path, wanted, time or None), uneven=missing != "error")
     needed = wanted
     if missing == "keep":
         needed = [*(column_of[c.name] for c in channels[0]), *([time] if time else [])]

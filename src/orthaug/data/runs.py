@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -55,6 +55,7 @@ class Run:
             raise InputError(f"{what} needs even sampling; put a step `resample` before it.")
 
 
+@runtime_checkable
 class Step(Protocol):
     """A step of preparation: a frozen declaration."""
 
