@@ -21,6 +21,7 @@ import orthaug as oa
 from orthaug.commands.reporting import compare_report, fit_report, origin_of
 from orthaug.data.record import Channel
 from orthaug.models.response import Response, Trajectory
+from orthaug.reports.learned_part import Curve, curve_limits
 from orthaug.reports.page import fit_page
 from orthaug.reports.page_blocks import interval, number, percent
 from orthaug.reports.page_fit import FitPage
@@ -409,3 +410,12 @@ def test_the_page_does_not_import_plotly_nor_does_help():
     program += "try: main()\nexcept SystemExit: print('reports.page' in str(sorted(sys.modules)), file=sys.stderr)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stderr.strip().endswith("False")
+
+
+def test_a_learned_curve_fills_its_panel_where_data_are():
+    """Beyond them it may go anywhere: a tank's went to thirty times what it learned."""
+    along = np.linspace(-2, 2, 41)
+    inside = np.abs(along) <= 1
+    curve = Curve(along, inside, np.where(inside, along, 30 * along)[:, None], None)
+    low, high = curve_limits(curve, 0, np.array([-1.1, 0.9]))
+    assert -1.6 < low < -1.1 and 1.0 < high < 1.5

@@ -123,7 +123,7 @@ class FitPlots:
             if curve.half is not None:
                 half = curve.half[:, i]
                 axis.fill_between(curve.along, values - half, values + half, color=GREEN, alpha=0.2, linewidth=0)
-            axis.set_ylim(*curve_limits(values, part.values[:, i]))
+            axis.set_ylim(*curve_limits(curve, i, part.values[:, i]))
         unit = part.units[part.features.index(feature)]
         axis.set(xlabel=f"{feature} [{unit}]" if unit else feature, ylabel=f"learned part of {part.names[i]}")
         axis.legend(fontsize="small", frameon=False)

@@ -260,9 +260,9 @@ def units_of(model: MotionModel) -> dict[str, str]:
     return {s.name: s.unit for s in model.form.motion.states} | {c.name: c.unit for c in model.inputs}
 
 
-def curve_limits(curve: Vector, cloud: Vector) -> tuple[float, float]:
-    """What a panel of a curve shows: the curve and the cloud, not all of a band that widens where there are no data."""
-    both = np.concatenate([curve, cloud])
+def curve_limits(curve: Curve, k: int, cloud: Vector) -> tuple[float, float]:
+    """What a panel of a curve's output k shows: the cloud and the curve within reach, not all that it is beyond."""
+    both = np.concatenate([curve.learned[curve.inside, k], cloud])
     low, high = float(np.nanmin(both)), float(np.nanmax(both))
     margin = 0.15 * max(high - low, 1e-12)
     return low - margin, high + margin

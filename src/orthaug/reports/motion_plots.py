@@ -118,7 +118,7 @@ def learner_figure(part: LearnedPart, title: str) -> Figure:
                     half = curve.half[:, k]
                     band = learned - half, learned + half
                     axis.fill_between(along, *band, color=GREEN, alpha=0.2, linewidth=0, label="95 % interval")
-                    axis.set_ylim(*curve_limits(learned, values[:, k]))
+                axis.set_ylim(*curve_limits(curve, k, values[:, k]))
                 axis.axvspan(along[inside][0], along[inside][-1], color=GREY, alpha=0.15, linewidth=0, zorder=0)
                 axis.plot(along, learned, "--", color=GREEN, linewidth=1.0)
                 axis.plot(along[inside], learned[inside], color=GREEN, linewidth=1.2, label="learner")

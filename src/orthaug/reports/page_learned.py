@@ -68,7 +68,7 @@ def _curve_plot(part: LearnedPart, k: int, feature: str, share: float) -> Plot:
     told, one = f"Over {feature}", len(part.features) == 1
     if curve is not None:
         traces += _curve_traces(curve, k)
-        layout["yaxis"]["range"] = list(curve_limits(curve.learned[:, k], cloud[1]))
+        layout["yaxis"]["range"] = list(curve_limits(curve, k, cloud[1]))
         reach = curve.along[curve.inside]
         layout["shapes"].append(_stripe(float(reach[0]), float(reach[-1])))
         told += (", the one input of the learner" if one else ", all else at its median") + ": solid within the shaded"
