@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from orthaug._base.lines import fold, percent, table
+from orthaug._base.lines import fold, percent, plain_number, table
 from orthaug.analysis.budget import SURE_SHARE
 from orthaug.reports.fields import WarningResult
 from orthaug.reports.findings import SharedResult, SuspectResult
@@ -195,7 +195,7 @@ def _bias_lines(result: FitResult) -> list[str]:
         bias = row.bias.value if row.bias else None
         bias = None if bias is None else _rounded(bias / (row.value or 1.0)) * (row.value or 1.0)
         if bias is not None and row.value is not None:
-            errors = f"{abs(bias) / row.std:7.2g}" if row.std else f"{'–':>7}"
+            errors = f"{plain_number(abs(bias) / row.std) if row.std else '–':>7}"
             part = f"{percent(_rounded(bias / row.value), sign='+') if row.value else '–':>9}"
             reach = row.ci95_with_bias
             limits = f"[{_limit(reach[0])}, {_limit(reach[1])}]" if reach else f"{'–':^29}"
