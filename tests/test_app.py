@@ -294,9 +294,9 @@ class Tab:
         """Change the spec in the editor, and wait until it was checked."""
         editor = self.page.get_by_label("spec in TOML")
         spec = change(editor.input_value())
-        editor.fill(spec)
-        self.page.wait_for_selector("text=Checking …")
-        self.page.wait_for_selector(".note.good, .note.bad")
+        self.page.evaluate("document.querySelectorAll('.note').forEach(note => note.dataset.old = '1')")
+        editor.fill(spec)  # "Checking …" may be gone before it is seen
+        self.page.wait_for_selector(".note.good:not([data-old]), .note.bad:not([data-old])")
         return spec
 
     def get(self, name: str) -> Any:
