@@ -12,7 +12,7 @@ import tempfile
 import time
 from pathlib import Path
 
-WHEEL_LIMIT = 2**20  # bytes: 1 MiB
+WHEEL_LIMIT = 1_000_000  # bytes
 IMPORT_LIMIT = 0.1  # s, the best of three processes
 IMPORT = "import time; t = time.perf_counter(); import orthaug; print(time.perf_counter() - t)"
 
