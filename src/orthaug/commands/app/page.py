@@ -46,7 +46,6 @@ class Page:
         """All of it."""
         _dress()
         ui.context.client.on_exception(self._complain)
-        text("Skip to the content", "a", "skip").props('href="#parts"')
         with ui.element("div").classes("head"):
             ui.html(_LOGO, sanitize=False, tag="span").classes("logo")
             text("orthaug", "h1")
@@ -55,7 +54,7 @@ class Page:
             made = {name: ui.tab(name) for name in _PARTS}
         start = "Training" if self.session.commands else "Data"
         self._keep_history(tabs, start)
-        panels = ui.tab_panels(tabs, value=made[start]).props("id=parts animated=false").classes("parts")
+        panels = ui.tab_panels(tabs, value=made[start]).props("animated=false").classes("parts")
         parts = (self.data, self.model, self.training, self.report, self.export)
         with panels:
             for name, part in zip(_PARTS, parts, strict=True):

@@ -64,6 +64,7 @@ class DataView:
         self.session = session
         self.uses: dict[str, str] = {}
         self.step = ""
+        self.kind = next(iter(STEPS))
         self._curves: Any = None
         self._drawn: tuple[Any, Any, bool] = (None, None, False)
 
@@ -169,7 +170,7 @@ class DataView:
                     if found["spec"] is None and not self.session.spec
                     else "Begin anew with these channels"
                 )
-                button(label, self.choose, main=found["spec"] is None)
+                button(label, self.choose, main=found["spec"] is None).props("data-place=begin")
 
     def _choose_use(self, header: str) -> None:
         def use(value: str) -> None:
@@ -208,12 +209,14 @@ class DataView:
                 self._draw_step(i, step)
             if not steps:
                 text("None yet.", "p", "hint")
-            options = {"": "add a step …"} | {kind: f"{kind}: {_SUMMARIES.get(kind, kind)}" for kind in STEPS}
-            choice("add a step", options, "", self._add, "bare")
+            options = {kind: f"{kind}: {_SUMMARIES.get(kind, kind)}" for kind in STEPS}
+            with ui.element("div").classes("fields"):
+                choice("step to add", options, self.kind, self._choose_kind, "bare")
+                button("Add", self._add)
 
     def _draw_step(self, index: int, step: Mapping[str, Any]) -> None:
         kind = str(step.get("step"))
-        with ui.element("div").classes("entry step"):
+        with named(ui.element("div").classes("entry step").props("role=group"), f"step {index + 1}"):
             with ui.element("div").classes("grow"):
                 text(f"{index + 1}. {_SUMMARIES.get(kind, kind)}", "p", "strong")
                 with ui.element("div").classes("fields"):
@@ -234,9 +237,11 @@ class DataView:
 
         return change
 
-    def _add(self, kind: str) -> None:
-        if kind not in STEPS:
-            return
+    def _choose_kind(self, kind: str) -> None:
+        self.kind = kind
+
+    def _add(self) -> None:
+        kind = self.kind
         needed = [own.name for own in fields(STEPS[kind]) if own.default is MISSING]
         first: dict[str, Any] = {name: _FIRST[name] for name in needed if name in _FIRST}
         if "cutoff" in needed:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from functools import partial
 
 from nicegui import ui
 
@@ -53,7 +53,7 @@ class ReportView:
             with ui.element("div").classes("fields report-line"):
                 if len(there) > 1:
                     choice("report", {name: _REPORTS[name] for name in there}, self.shown, self._show, "bare")
-                link("Download the report", f"/session/{session.key}/get/{self.shown}")
+                link("Download", f"/session/{session.key}/get/{self.shown}")
             frame = ui.element("iframe").classes("report").props('sandbox="allow-scripts" title="report"')
             place = f"/session/{session.key}/get/{self.shown}?show=true&n={session.versions['work']}"
             frame.props(f'data-src="{place}"')  # page.js loads it once the frame has its width
@@ -129,18 +129,14 @@ class ExportView:
             with ui.element("div").classes("entry"):
                 with ui.element("div").classes("grow"):
                     text(summary, "p", "strong")
-                    if why and why != "…":
-                        note(why, "bad")
+                    if why:
+                        note("Writing …" if why == "…" else why, "busy" if why == "…" else "bad")
                 if why == "":
-                    link(f"{target}.zip", f"/session/{session.key}/get/{target}.zip")
-                elif why == "…":
-                    text("writing …", "p", "note busy").props("role=status")
+                    made = link(f"{target}.zip", f"/session/{session.key}/get/{target}.zip")
                 else:
-                    made = button("Write", self._exporting(target))
-                    named(made, f"Write {target}")
-
-    def _exporting(self, target: str) -> Callable[[], None]:
-        return lambda: self.session.export(target, self.name)
+                    made = named(button("Write", partial(session.export, target, self.name)), f"Write {target}")
+                    made.props("loading" if why == "…" else "")
+                made.props(f"data-place={target}")
 
     def _rename(self, value: str) -> None:
         if re.fullmatch(r"[A-Za-z]\w{0,39}", value.strip(), re.ASCII):

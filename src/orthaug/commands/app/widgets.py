@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import contextmanager
 from html import escape
@@ -22,7 +23,12 @@ def named(element: Drawn, label: str) -> Drawn:
 
 def text(what: Any, tag: str = "p", classes: str = "") -> ui.html:
     """Text in an element; never read as HTML."""
-    return ui.html(escape(str(what)), sanitize=False, tag=tag).classes(classes)
+    return ui.html(_whole(what), sanitize=False, tag=tag).classes(classes)
+
+
+def _whole(what: Any) -> str:
+    """Escaped, with lags that no line breaks at their minus."""
+    return re.sub(r"\[k-\d+\]", r"<span class='n'>\g<0></span>", escape(str(what)))
 
 
 def sentence(told: str) -> str:
@@ -89,21 +95,21 @@ def choice(
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "") -> None:
-    """A table; on a phone each row is a block with the heads beside its cells."""
+    """A table; on a phone each row of more than two cells is a block with the heads beside them."""
+    kinds = ["w" if any(str(row[i])[:1].isalpha() for row in rows) else "" for i in range(len(head))]  # words, numbers
     lines = ["<table>", f"<caption>{escape(caption)}</caption>" if caption else "", "<thead><tr>"]
-    lines += [f"<th scope='col'>{escape(name)}</th>" for name in head]
+    lines += [f"<th scope='col' class='{kind}'>{escape(name)}</th>" for name, kind in zip(head, kinds, strict=True)]
     lines.append("</tr></thead><tbody>")
     for row in rows:
-        cells = [_cell(name, str(value)) for name, value in zip(head[1:], row[1:], strict=True)]
-        lines.append(f"<tr><th scope='row'>{escape(str(row[0]))}</th>{''.join(cells)}</tr>")
+        lines.append(f"<tr><th scope='row'>{_whole(row[0])}</th>")
+        for name, value, kind in zip(head[1:], map(str, row[1:]), kinds[1:], strict=True):
+            kind += " n" if len(value) <= _SHORT else ""
+            lines.append(f"<td class='{kind}' data-label='{escape(name, True)}'>{_whole(value)}</td>")
+        lines.append("</tr>")
     made = ui.html("".join([*lines, "</tbody></table>"]), sanitize=False).classes("table")
+    made.classes("cards" if len(head) > 2 else "")
     if len(head) >= _WIDE:  # it may scroll, by keys too
         named(made.props("tabindex=0 role=region"), caption or head[0])
-
-
-def _cell(head: str, value: str) -> str:
-    short = " class='n'" if len(value) <= _SHORT else ""
-    return f"<td{short} data-label='{escape(head, True)}'>{escape(value)}</td>"
 
 
 def number(value: Any, digits: int = 5) -> str:
