@@ -430,7 +430,8 @@ class Keys:
 
     NOW = """() => {
       const now = document.activeElement, box = now.getBoundingClientRect(), style = getComputedStyle(now);
-      const top = document.querySelector(".tabs").getBoundingClientRect().bottom, frame = now.closest(".q-field__control");
+      const top = document.querySelector(".tabs").getBoundingClientRect().bottom;
+      const frame = now.closest(".q-field__control");
       return {
         name: now.ariaLabel ?? (now.closest(".card") === now ? now.querySelector("h2").innerText : now.innerText),
         group: now.closest("[role=group]")?.ariaLabel ?? "",
