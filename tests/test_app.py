@@ -23,7 +23,7 @@ import pytest
 from test_cli import run, signals, write_csv
 
 from orthaug._base.errors import InputError
-from orthaug.commands.app import spec_text
+from orthaug.commands.app import kept_specs, spec_text
 from orthaug.commands.app.gate import Gate
 from orthaug.commands.app.processes import Command, Desk
 from orthaug.commands.app.session import Session
@@ -219,6 +219,7 @@ class Server:
 
     def __init__(self, folder: Path, *arguments: object) -> None:
         setting = {k: v for k, v in os.environ.items() if k != "PYTEST_CURRENT_TEST"} | {"TMPDIR": str(folder)}
+        setting |= {"XDG_STATE_HOME": str(folder / "state")}
         program = [sys.executable, "-c", MAIN, "app", "--no-browser", *map(str, arguments)]
         pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
         self.process = subprocess.Popen(program, cwd=folder, env=setting, **pipes)
@@ -655,6 +656,49 @@ def test_a_wrong_sampling_time_is_told_under_it_and_takes_nothing_away(server, b
     page.go_forward()
     page.wait_for_selector("[role=tab][aria-selected=true]:has-text('Model')")
     tab.close()
+
+
+def test_the_latest_specs_are_kept_whole(tmp_path, monkeypatch):
+    monkeypatch.setattr("platformdirs.user_state_path", lambda name: tmp_path / name)
+    for i in range(25):
+        kept_specs.keep("rig.csv", f"{i:012d}"[::-1], f"restarts = {i}")
+        os.utime(kept_specs.earlier()[0], (i, i))
+    kept_specs.keep("rig.csv", f"{24:012d}"[::-1], "restarts = 99")
+    kept = kept_specs.earlier()
+    assert len(kept) == 20 and kept[0].read_text() == "restarts = 99"
+    assert {kept_specs.title(place) for place in kept} == {"rig.csv"}
+    assert [file.suffix for file in kept[0].parent.iterdir()] == [".toml"] * 20
+    monkeypatch.setattr("platformdirs.user_state_path", lambda name: kept[0])  # no folder
+    kept_specs.keep("rig.csv", "key", "restarts = 1")
+    assert kept_specs.earlier() == []
+
+
+@browsed
+def test_the_spec_of_a_server_that_was_killed_is_offered_by_the_next(browser, csv, tmp_path):
+    killed = Server(tmp_path)
+    tab = Tab(browser, killed)
+    assert "earlier work" not in tab.page.inner_text("body")
+    tab.drop(csv)
+    tab.go("Model")
+    spec = tab.write(lambda text: text.replace("restarts = 3", "restarts = 7"))
+    assert '"plant.csv"' in spec
+    killed.process.kill()
+    killed.process.communicate()
+    tab.context.close()
+    assert [p.stat().st_mode & 0o77 for p in (tmp_path / "state").rglob("*")] == [0, 0, 0]
+
+    server = Server(tmp_path)
+    tab = Tab(browser, server)
+    tab.page.get_by_role("button", name="plant.csv, 20").click()
+    tab.go("Model")
+    tab.page.wait_for_selector("text=plant.csv: no such file")  # what was dropped is dropped again
+    assert tab.page.get_by_label("spec in TOML").input_value() == spec
+    tab.go("Data")
+    tab.drop(csv)
+    tab.go("Model")
+    tab.page.wait_for_selector(".note.good")
+    tab.close()
+    server.end()
 
 
 @browsed

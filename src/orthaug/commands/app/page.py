@@ -39,7 +39,7 @@ class Page:
         """A session that is not open any more."""
         _dress()
         text("This work is not open any more", "h1")
-        text("orthaug app was ended since, and what was not taken away went with it.")
+        text("orthaug app was ended since; its spec is offered where something new begins.")
         text("Begin anew", "a").props('href="/"')
 
     def draw(self) -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from orthaug._base.errors import InputError
+from orthaug.commands.app import kept_specs
 from orthaug.commands.app.processes import Command, Desk
 from orthaug.commands.app.spec_text import absolute, plain, with_value
 from orthaug.data.tables import KNOWN
@@ -40,6 +41,8 @@ class Session:
         self.kept = False
         """Whether a file was looked at that the spec, which a person has worked on, was not begun anew for."""
         self.spec = ""
+        self.kept_as = ""
+        """The title under which its spec is kept when the server ends; empty until there is something to keep."""
         self.authors: list[str] = []
         """Who made each change of the spec: a part of a page, which need not be told of its own."""
         self.checked: dict[str, Any] | None = None
@@ -89,7 +92,7 @@ class Session:
         Raises:
             InputError: an ending of no data file.
         """
-        plain_name = re.sub(r"[^\w. -]", "_", re.split(r"[/\\]", name)[-1]).strip(" .")[-60:]
+        plain_name = _as_name(re.split(r"[/\\]", name)[-1])
         ending = Path(plain_name).suffix.lower()
         if ending not in KNOWN or not Path(plain_name).stem:
             raise InputError(f"'{plain_name}': no data file that is known; known are {', '.join(KNOWN)}.")
@@ -99,6 +102,8 @@ class Session:
         """Look at a data file, and begin a spec for it where its columns tell what they are."""
         self.data, self.found, self.title = path, None, path.name
         self._look_again(None, None, None)
+        if self.edited:  # it may name this file
+            self._check_soon()
 
     def choose(self, inputs: Sequence[str], outputs: Sequence[str], step: float | None) -> None:
         """Begin the spec anew with these columns."""
@@ -147,8 +152,8 @@ class Session:
         self.kept = False
         self.changed("data")
 
-    def open_spec(self, path: Path) -> None:
-        """Take a spec that stands somewhere; it is read, and never written.
+    def open_spec(self, path: Path, *, kept: bool = False) -> None:
+        """Take a spec that stands somewhere, or one of earlier work that was kept; it is read, and never written.
 
         Raises:
             InputError: a file that cannot be read, or broken TOML.
@@ -160,8 +165,9 @@ class Session:
         except UnicodeDecodeError:
             raise InputError(f"{path}: not a text file; expected TOML in UTF-8.") from None
         try:
-            self.write(absolute(text, path.absolute().parent), "file")
-            self.title = path.name
+            self.title = kept_specs.title(path) if kept else path.name
+            self.write(text if kept else absolute(text, path.absolute().parent), "file")
+            self.changed("data")
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
 
@@ -174,9 +180,15 @@ class Session:
         self.spec = text
         self.authors.append(author)
         self.changed("spec")
+        if author != "file" and text.strip():
+            self.kept_as = self.kept_as or _as_name(self.title) or "spec"
+            kept_specs.keep(self.kept_as, self.key, text)
+        self._check_soon()
+
+    def _check_soon(self) -> None:
         if self._check is not None:
             self._check.cancel()
-        self.checking = bool(text.strip())
+        self.checking = bool(self.spec.strip())
         self.changed("check")
         self._check = self.start(self._checked())
 
@@ -312,6 +324,11 @@ class Session:
             if task is self._check or task is self._look:
                 task.cancel()
         await asyncio.gather(*(command.end() for command in self.commands.values()))
+
+
+def _as_name(text: str) -> str:
+    """What any system takes as the name of a file."""
+    return re.sub(r"[^\w. -]", "_", text).strip(" .")[-60:]
 
 
 def _zipped(folder: Path, place: Path) -> Path:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import MISSING, fields
+from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from nicegui import ui
 
 from orthaug._base.errors import InputError
-from orthaug.commands.app import spec_text
+from orthaug.commands.app import kept_specs, spec_text
 from orthaug.commands.app.session import Session
 from orthaug.commands.app.widgets import (
     button,
@@ -32,6 +34,7 @@ from orthaug.data.steps import STEPS
 
 _STEPS = ("data", "prepare")
 _LISTED = 40  # columns
+_OFFERED = 5  # specs of earlier work
 _USES = {"": "leave out", "input": "input", "output": "output"}
 _SUMMARIES = {
     "detrend": "take out mean or trend",
@@ -118,6 +121,13 @@ class DataView:
                 if session.kept:
                     note("The spec is kept as it is. Take this file as a test of it, or begin anew below.", "care")
                     button("Take it as a test", session.add_test)
+            elif not session.spec and (kept := kept_specs.earlier()[:_OFFERED]):
+                text("Or go on with the spec of earlier work:", "p", "hint")
+                with ui.element("div").classes("fields"):
+                    for place in kept:
+                        when = datetime.fromtimestamp(place.stat().st_mtime)
+                        label = f"{kept_specs.title(place)}, {when:%Y-%m-%d %H:%M}"
+                        button(label, partial(session.open_spec, place, kept=True))
         self.columns.set_visibility(found is not None)
         state = (session.data, found, bool(session.spec))
         if found is not None and any(a is not b for a, b in zip(state, self._drawn, strict=True)):
