@@ -26,8 +26,7 @@ from orthaug._base.errors import InputError
 from orthaug.commands.app import kept_specs, spec_text
 from orthaug.commands.app.gate import Gate
 from orthaug.commands.app.processes import Command, Desk
-from orthaug.commands.app.session import Session
-from orthaug.commands.app.sessions import Sessions
+from orthaug.commands.app.session import Session, Sessions
 from orthaug.commands.app.worker import thinned
 from orthaug.commands.parts import expanded
 
@@ -114,7 +113,7 @@ def test_forms_change_a_spec_and_nothing_else(tmp_path):
     steps = ("data", "prepare")
     spec = spec_text.with_row(SPEC, steps, {"step": "detrend"})
     spec = spec_text.with_row(spec, steps, {"step": "lowpass", "cutoff": 2.0})
-    spec = spec_text.with_cell(spec, steps, 1, "order", 2)
+    spec = spec_text.with_told(spec, steps, 1, "order", "2")
     assert spec_text.rows_of(spec, steps) == [{"step": "detrend"}, {"step": "lowpass", "cutoff": 2.0, "order": 2}]
     spec = spec_text.without_row(spec_text.without_row(spec, steps, 0), steps, 0)
     assert tomllib.loads(spec) == tomllib.loads(SPEC) and "# kept too" in spec

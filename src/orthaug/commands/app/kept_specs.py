@@ -9,7 +9,7 @@ from pathlib import Path
 import platformdirs
 
 _MOST = 20  # that are kept
-_MARK = 7  # letters behind the title in a file's name, which tell pieces of work apart
+_MARK = 7  # letters behind the title in a file's name
 
 
 def keep(title: str, key: str, spec: str) -> None:

@@ -19,10 +19,12 @@ from orthaug.commands.app.widgets import sentence, text
 
 _OFTEN = 0.25  # s between looks at what has changed
 _PARTS = ("Data", "Model", "Training", "Report", "Export")
-_LOGO = (
-    "<svg viewBox='0 0 32 32' aria-hidden='true'><rect width='32' height='32' rx='7' fill='currentColor'/>"
-    "<path d='M9 7v16h16' class='axes'/><path d='M9 17h6v6' class='angle'/></svg>"
+MARK = (
+    "<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'><rect width='32' height='32' rx='7' fill='#0550ae'/>"
+    "<path d='M9 7v16h16' stroke='#fff' stroke-width='3.4' fill='none' stroke-linecap='round'/>"
+    "<path d='M9 17h6v6' stroke='#9cc8ff' stroke-width='2.2' fill='none'/></svg>"
 )
+"""The mark of the program, as a picture."""
 
 
 class Page:
@@ -36,18 +38,16 @@ class Page:
 
     @staticmethod
     def gone() -> None:
-        """A session that is not open any more."""
         _dress()
         text("This work is not open any more", "h1")
         text("orthaug app was ended since; its spec is offered where something new begins.")
         text("Begin anew", "a").props('href="/"')
 
     def draw(self) -> None:
-        """All of it."""
         _dress()
         ui.context.client.on_exception(self._complain)
         with ui.element("div").classes("head"):
-            ui.html(_LOGO, sanitize=False, tag="span").classes("logo")
+            ui.html(MARK, sanitize=False, tag="span").classes("logo").props("aria-hidden=true")
             text("orthaug", "h1")
             self.title = text("", "p", "hint")
         with ui.tabs().props("no-caps align=left active-color=tab indicator-color=tab dense").classes("tabs") as tabs:

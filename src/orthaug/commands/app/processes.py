@@ -32,7 +32,6 @@ class Command:
     """The last that was told: `run`, `runs`, `iteration`, `loss`, `done` (share)."""
     losses: list[tuple[int, int, float]] = field(default_factory=list)
     """(run, iteration, loss) as told."""
-    output: str = ""
     lines: list[str] = field(default_factory=list)
     began: float = 0.0
     ended: float | None = None
@@ -46,11 +45,6 @@ class Command:
     def running(self) -> bool:
         """Whether it has not ended yet."""
         return self.code is None
-
-    @property
-    def asked(self) -> bool:
-        """Whether it was asked to end, in one way or the other."""
-        return self.stopping or self.ending
 
     @property
     def seconds(self) -> float:
@@ -69,33 +63,28 @@ class Command:
         """Start it and follow it to its end; one that cannot start has failed."""
         self.began = time.monotonic()
         try:
-            self.output, self.code = await self._followed()
+            self.code = await self._followed()
         except OSError as error:
             self.lines, self.code = [f"error: the command cannot start ({error.strerror})."], 2
         self.ended = time.monotonic()
         self.changed()
 
-    async def _followed(self) -> tuple[str, int]:
-        """What it wrote to standard output, and the code that it ended with."""
+    async def _followed(self) -> int:
+        """The code that it ended with."""
         program = [sys.executable, "-m", "orthaug.commands.app.child", *self.arguments]
         self.process = await asyncio.create_subprocess_exec(
             *program,
             stdin=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.PIPE,
             limit=_LONGEST,
             env={**os.environ, TOLD_AS: "json", "PYTHONIOENCODING": "utf-8", "NO_COLOR": "1"},
         )
-        assert self.process.stdout is not None
+        assert self.process.stderr is not None
         if self.stopping:
             self.stop()
         elif self.ending:
             self.finish()
-        output, _ = await asyncio.gather(self.process.stdout.read(), self._told())
-        return output.decode("utf-8", "replace"), await self.process.wait()
-
-    async def _told(self) -> None:
-        assert self.process is not None and self.process.stderr is not None
         async for raw in self.process.stderr:
             line = raw.decode("utf-8", "replace").rstrip()
             told = _progress(line)
@@ -105,6 +94,7 @@ class Command:
                 self.progress = told
                 self.losses.append((told["run"], told["iteration"], told["loss"]))
             self.changed()
+        return await self.process.wait()
 
     def stop(self) -> None:
         """Interrupt it: it keeps or removes what is partial, and ends."""
@@ -130,11 +120,8 @@ class Command:
 
 
 def _progress(line: str) -> dict[str, Any] | None:
-    if not line.startswith('{"run"'):
-        return None
     with suppress(ValueError):
-        told = json.loads(line)
-        return told if isinstance(told, dict) else None
+        return json.loads(line) if line.startswith('{"run"') else None
     return None
 
 
@@ -187,7 +174,6 @@ class Desk:
         return await (_started() if coming is None else asyncio.shield(coming))
 
     async def close(self) -> None:
-        """End all of them."""
         coming = [] if self._coming is None else [await self._coming]
         for process in (*self._busy, *self._idle, *coming):
             _kill(process)

@@ -13,14 +13,8 @@ from nicegui import ui
 from starlette.requests import ClientDisconnect
 
 from orthaug._base.errors import InputError
-from orthaug.commands.app.page import Page
-from orthaug.commands.app.sessions import Sessions
-
-_ICON = (
-    "<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'><rect width='32' height='32' rx='7' fill='#0550ae'/>"
-    "<path d='M9 7v16h16' stroke='#fff' stroke-width='3.4' fill='none' stroke-linecap='round'/>"
-    "<path d='M9 17h6v6' stroke='#9cc8ff' stroke-width='2.2' fill='none'/></svg>"
-)
+from orthaug.commands.app.page import MARK, Page
+from orthaug.commands.app.session import Sessions
 
 
 def application(sessions: Sessions, spec: Path | None) -> FastAPI:
@@ -61,7 +55,7 @@ def application(sessions: Sessions, spec: Path | None) -> FastAPI:
     ui.run_with(
         app,
         title="orthaug",
-        favicon=_ICON,
+        favicon=MARK,
         dark=None,
         language="en-US",
         tailwind=False,

@@ -1,14 +1,15 @@
-"""One person's work on the page: file, spec, check, training, results. It lives on the server; a page only shows it."""
+"""Work on the page: file, spec, check, training, results. It lives on the server; a page only shows it."""
 
 from __future__ import annotations
 
 import asyncio
 import json
 import re
+import secrets
 import shutil
 import zipfile
 from collections import Counter
-from collections.abc import Awaitable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,10 @@ from typing import Any
 from orthaug._base.errors import InputError
 from orthaug.commands.app import kept_specs
 from orthaug.commands.app.processes import Command, Desk
-from orthaug.commands.app.spec_text import absolute, plain, with_value
+from orthaug.commands.app.spec_text import absolute, in_file, plain, with_value
 from orthaug.data.tables import KNOWN
 
+_SESSIONS = 50  # that are kept at once
 _PAUSE = 0.6  # s without a change until a spec is checked
 KINDS = ("fit", "compare")
 
@@ -148,7 +150,7 @@ class Session:
         assert self.data is not None
         file = self.data.name if self.data.parent == self.folder else self.data.as_posix()
         name = re.sub(r"\W", "_", self.data.stem)
-        self.write(with_value(self.spec, ("data", "tests", name), {"files": [file]}), "test")
+        self.edit("test", with_value, ("data", "tests", name), {"files": [file]})
         self.kept = False
         self.changed("data")
 
@@ -158,18 +160,10 @@ class Session:
         Raises:
             InputError: a file that cannot be read, or broken TOML.
         """
-        try:
-            text = path.read_text(encoding="utf-8-sig")
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
-        except UnicodeDecodeError:
-            raise InputError(f"{path}: not a text file; expected TOML in UTF-8.") from None
-        try:
-            self.title = kept_specs.title(path) if kept else path.name
-            self.write(text if kept else absolute(text, path.absolute().parent), "file")
-            self.changed("data")
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
+        text = in_file(path)
+        self.title = kept_specs.title(path) if kept else path.name
+        self.write(text if kept else absolute(text, path.absolute().parent), "file")
+        self.changed("data")
 
     # Spec
 
@@ -184,6 +178,10 @@ class Session:
             self.kept_as = self.kept_as or _as_name(self.title) or "spec"
             kept_specs.keep(self.kept_as, self.key, text)
         self._check_soon()
+
+    def edit(self, author: str, change: Callable[..., str], *given: Any) -> None:
+        """Take the spec after a change of `spec_text`, which is given the rest."""
+        self.write(change(self.spec, *given), author)
 
     def _check_soon(self) -> None:
         if self._check is not None:
@@ -319,11 +317,45 @@ class Session:
         raise InputError("there is nothing of that name yet.")
 
     async def close(self) -> None:
-        """End all that runs."""
         for task in list(self._tasks):
             if task is self._check or task is self._look:
                 task.cancel()
         await asyncio.gather(*(command.end() for command in self.commands.values()))
+
+
+class Sessions:
+    """All work that goes on, by keys that cannot be guessed."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.desk = folder, Desk()
+        self._open: dict[str, Session] = {}
+        self._made = 0
+
+    def new(self, spec: Path | None = None) -> Session:
+        """A session in a folder of its own, which nobody else may read.
+
+        Raises:
+            InputError: too many sessions, or a spec that cannot be read.
+        """
+        untouched = [session for session in self._open.values() if session.untouched]
+        if len(self._open) >= _SESSIONS and untouched:
+            del self._open[untouched[0].key]
+        if len(self._open) >= _SESSIONS:
+            raise InputError(f"{_SESSIONS} pieces of work are open; end orthaug app, and start it again.")
+        key = secrets.token_urlsafe(12)
+        self._made += 1
+        folder = self.folder / f"work-{self._made}"
+        folder.mkdir(mode=0o700)
+        session = self._open[key] = Session(key, folder, self.desk)
+        if spec is not None:
+            session.open_spec(spec)
+        return session
+
+    def find(self, key: str) -> Session | None:
+        return self._open.get(key)
+
+    async def close(self) -> None:
+        await asyncio.gather(self.desk.close(), *(session.close() for session in self._open.values()))
 
 
 def _as_name(text: str) -> str:

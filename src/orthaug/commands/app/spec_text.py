@@ -12,6 +12,7 @@ from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT
 
 from orthaug._base.errors import InputError
+from orthaug.data.tables import check_readable
 
 _WORDS = ("parameter", "regressor", "output", "unit", "channel")  # keys whose values are text, digits or not
 
@@ -26,6 +27,25 @@ def opened(text: str) -> tomlkit.TOMLDocument:
         return tomlkit.parse(text)
     except (TOMLKitError, RecursionError) as error:
         raise InputError(f"broken TOML: {' '.join(str(error).split())}.") from None
+
+
+def in_file(path: Path) -> str:
+    """The text of a spec that stands somewhere.
+
+    Raises:
+        InputError: a file that cannot be read, or broken TOML.
+    """
+    check_readable(path)
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        opened(text)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file; expected TOML in UTF-8.") from None
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return text
 
 
 def absolute(text: str, folder: Path) -> str:
@@ -73,8 +93,8 @@ def read(key: str, value: str) -> Any:
     value = value.strip()
     if not value:
         return None
-    if key == "channels":
-        return [name.strip() for name in value.split(",") if name.strip()]
+    if key in ("channels", "inputs"):
+        return [name.strip() for name in value.split(",") if name.strip()] or None
     for kind in (int, float) if key not in _WORDS else ():
         try:
             return kind(value)
@@ -83,10 +103,13 @@ def read(key: str, value: str) -> Any:
     return value
 
 
-def _made(document: Any, key: str) -> Any:
-    if not isinstance(document.get(key), Mapping):
-        document[key] = tomlkit.table()
-    return document[key]
+def _made(document: Any, path: Sequence[str]) -> Any:
+    """The table at the end of the path, made where there is none."""
+    for key in path:
+        if not isinstance(document.get(key), Mapping):
+            document[key] = tomlkit.table()
+        document = document[key]
+    return document
 
 
 def plain(text: str) -> dict[str, Any]:
@@ -116,9 +139,7 @@ def with_value(text: str, path: Sequence[str], value: Any) -> str:
     """With a key of a table set, or without it where the value is None; tables on the way are made."""
 
     def change(document: Any) -> None:
-        table = document
-        for key in path[:-1]:
-            table = _made(table, key)
+        table = _made(document, path[:-1])
         if value is None:
             table.pop(path[-1], None)
         elif isinstance(value, Mapping):  # inline: a table of its own would land elsewhere beside dotted keys
@@ -140,9 +161,7 @@ def with_row(text: str, path: Sequence[str], row: Mapping[str, Any]) -> str:
     """With a table more at the end of a list of tables."""
 
     def change(document: Any) -> None:
-        table = document
-        for key in path[:-1]:
-            table = _made(table, key)
+        table = _made(document, path[:-1])
         rows = table.get(path[-1])
         if not isinstance(rows, list) or (not rows and not isinstance(rows, AoT)):
             table[path[-1]] = tomlkit.aot()
@@ -156,11 +175,11 @@ def with_row(text: str, path: Sequence[str], row: Mapping[str, Any]) -> str:
     return changed(text, change)
 
 
-def with_cell(text: str, path: Sequence[str], index: int, key: str, value: Any) -> str:
-    """With a key of one table of a list set, or without it where the value is None."""
+def with_told(text: str, path: Sequence[str], index: int, key: str, told: str) -> str:
+    """With a key of one table of a list as a field says it, or without it where that says nothing."""
 
     def change(document: Any) -> None:
-        row = _list(document, path)[index]
+        row, value = _at(document, path)[index], read(key, told)
         if value is None:
             row.pop(key, None)
         else:
@@ -173,18 +192,15 @@ def without_row(text: str, path: Sequence[str], index: int) -> str:
     """Without one table of a list."""
 
     def change(document: Any) -> None:
-        rows = _list(document, path)
+        rows = _at(document, path)
         del rows[index]
         if not rows:
-            table = document
-            for key in path[:-1]:
-                table = table[key]
-            del table[path[-1]]
+            del _at(document, path[:-1])[path[-1]]
 
     return changed(text, change)
 
 
-def _list(document: Any, path: Sequence[str]) -> Any:
+def _at(document: Any, path: Sequence[str]) -> Any:
     for key in path:
         document = document[key]
     return document
@@ -221,7 +237,7 @@ def as_motion(text: str) -> str:
         for key in ("baseline", "lags", "physics", "motion", "suspects"):
             document.pop(key, None)
         document["motion"] = tomlkit.parse(MOTION.format(output=outputs[0], force=inputs[0], **given))["motion"]
-        _made(document, "learner")["inputs"] = ["v"]
+        _made(document, ["learner"])["inputs"] = ["v"]
 
     return changed(_without_comments(text, _OF_TERMS), change)
 

@@ -123,11 +123,11 @@ def button(label: str, clicked: Callable[[], Any], *, main: bool = False, classe
     return made.classes(("main " if main else "plain ") + classes)
 
 
-def link(label: str, place: str, *, download: bool = True) -> ui.element:
-    """A link that looks like a button."""
-    made = text(label, "a", "download")
+def link(label: str, place: str) -> ui.element:
+    """A file to take, as a link that looks like a button."""
+    made = text(label, "a", "download").props("download")
     made.props["href"] = place
-    return made.props("download") if download else made
+    return made
 
 
 def note(what: str, kind: str = "") -> ui.html:
@@ -142,17 +142,13 @@ def curves_figure(rows: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], unit:
     """Curves below one another on one axis of time: of each row a label, and traces `x`, `y`, `name`, `raw`."""
     traces: list[dict[str, Any]] = []
     layout = _layout(70 + 130 * len(rows))
-    layout["xaxis"] |= {
-        "title": {"text": unit, "font": {"size": 12}},
-        "anchor": f"y{len(rows)}" if len(rows) > 1 else "y",
-    }
+    layout["xaxis"] |= {"title": _small(unit), "anchor": f"y{len(rows)}" if len(rows) > 1 else "y"}
     gap = 0.12 / max(len(rows), 1)
     for i, (label, drawn) in enumerate(rows):
         axis, top = (f"y{i + 1}" if i else "y"), 1 - i / len(rows)
-        title = {"text": label, "font": {"size": 12}}
         layout[f"yaxis{i + 1 if i else ''}"] = {
             **{"domain": [max(0.0, top - 1 / len(rows) + gap), top - gap / 2], "zeroline": False, "automargin": True},
-            **{"title": title, "nticks": 5, "anchor": "x"},
+            **{"title": _small(label), "nticks": 5, "anchor": "x"},
         }
         for curve in drawn:
             raw = curve.get("raw", False)
@@ -170,9 +166,8 @@ def loss_figure(losses: Sequence[tuple[int, int, float | None]]) -> dict[str, An
         x.append(iteration)
         y.append(loss)
     layout = _layout(260)
-    layout["xaxis"] |= {"title": {"text": "iteration", "font": {"size": 12}}}
-    title = {"text": "loss", "font": {"size": 12}}
-    layout["yaxis"] = {"type": "log", "title": title, "automargin": True, "exponentformat": "e", "nticks": 5}
+    layout["xaxis"] |= {"title": _small("iteration")}
+    layout["yaxis"] = {"type": "log", "title": _small("loss"), "automargin": True, "exponentformat": "e", "nticks": 5}
     own = {"type": "scatter", "mode": "lines+markers", "marker": {"size": 4}, "showlegend": 1 < len(runs) <= 6}
     traces = [
         {**own, "name": f"run {run}", "x": x, "y": y, "line": {"width": 1.5, "color": _COLORS[i % len(_COLORS)]}}
@@ -182,6 +177,10 @@ def loss_figure(losses: Sequence[tuple[int, int, float | None]]) -> dict[str, An
 
 
 _CONFIG = {"displayModeBar": False, "responsive": False, "displaylogo": False}
+
+
+def _small(title: str) -> dict[str, Any]:
+    return {"text": title, "font": {"size": 12}}
 
 
 def _layout(height: int) -> dict[str, Any]:

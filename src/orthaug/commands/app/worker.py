@@ -26,7 +26,6 @@ from orthaug.commands.opening import open_job
 from orthaug.data.record import Channel, check_step
 from orthaug.data.survey import Column, Survey
 from orthaug.physics.derived_units import derived_units
-from orthaug.reports.text import check_text
 
 MOST = 3000
 """Points of a curve that are drawn."""
@@ -148,7 +147,7 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
     """
     job = open_job(Path(path), require_full_rank=False)
     moves = job.spec.motion is not None
-    told: dict[str, Any] = {"check": None, "text": "", "refusal": None, "bias": []}
+    told: dict[str, Any] = {"check": None, "refusal": None, "bias": []}
     if whole or not moves:
         if moves:
             from orthaug._base.jax import use_compilation_cache
@@ -156,11 +155,9 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
             use_compilation_cache()
         result = checking.check_job(job)
         refused = checking.refusal(job, result)
-        told = {"check": json.loads(result.to_json()), "text": check_text(result)}
-        told |= {"refusal": None if refused is None else str(refused)}
-        told["bias"] = [
-            {"name": one.name, "removed_by": one.removed_by, "percent": one.percent} for one in result.bias or ()
-        ]
+        bias = [{"name": one.name, "removed_by": one.removed_by, "percent": one.percent} for one in result.bias or ()]
+        told = {"check": json.loads(result.to_json()), "bias": bias}
+        told["refusal"] = None if refused is None else str(refused)
     return told | {
         "rows": {part.name: len(part.record) for part in job.parts},
         "step": job.train.record.sampling_time,
