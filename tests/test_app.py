@@ -23,7 +23,7 @@ import pytest
 from test_cli import run, signals, write_csv
 
 from orthaug._base.errors import InputError
-from orthaug.commands.app import kept_specs, spec_text
+from orthaug.commands.app import spec_text
 from orthaug.commands.app.gate import Gate
 from orthaug.commands.app.processes import Command, Desk
 from orthaug.commands.app.session import Session, Sessions
@@ -620,6 +620,8 @@ def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
     assert tomllib.loads(added)["data"]["tests"].pop("own") == {"files": ["own.csv"]} and kept.splitlines()[0] in added
     assert tab.get("spec.toml?show=true").headers["content-disposition"][:10] == "attachment"
     assert tab.fetch("../x") and tab.get("result.zip").status == 404
+    gone = tab.context.request.get(f"{server.base}session/absent")
+    assert gone.status == 404 and "not open any more" in gone.text()
     tab.close()
 
 
@@ -660,16 +662,16 @@ def test_a_wrong_sampling_time_is_told_under_it_and_takes_nothing_away(server, b
 def test_the_latest_specs_are_kept_whole(tmp_path, monkeypatch):
     monkeypatch.setattr("platformdirs.user_state_path", lambda name: tmp_path / name)
     for i in range(25):
-        kept_specs.keep("rig.csv", f"{i:012d}"[::-1], f"restarts = {i}")
-        os.utime(kept_specs.earlier()[0], (i, i))
-    kept_specs.keep("rig.csv", f"{24:012d}"[::-1], "restarts = 99")
-    kept = kept_specs.earlier()
+        spec_text.keep("rig.csv", f"{i:012d}"[::-1], f"restarts = {i}")
+        os.utime(spec_text.earlier()[0], (i, i))
+    spec_text.keep("rig.csv", f"{24:012d}"[::-1], "restarts = 99")
+    kept = spec_text.earlier()
     assert len(kept) == 20 and kept[0].read_text() == "restarts = 99"
-    assert {kept_specs.title(place) for place in kept} == {"rig.csv"}
+    assert {spec_text.kept_title(place) for place in kept} == {"rig.csv"}
     assert [file.suffix for file in kept[0].parent.iterdir()] == [".toml"] * 20
     monkeypatch.setattr("platformdirs.user_state_path", lambda name: kept[0])  # no folder
-    kept_specs.keep("rig.csv", "key", "restarts = 1")
-    assert kept_specs.earlier() == []
+    spec_text.keep("rig.csv", "key", "restarts = 1")
+    assert spec_text.earlier() == []
 
 
 @browsed
@@ -679,8 +681,8 @@ def test_the_spec_of_a_server_that_was_killed_is_offered_by_the_next(browser, cs
     assert "earlier work" not in tab.page.inner_text("body")
     tab.drop(csv)
     tab.go("Model")
-    spec = tab.write(lambda text: text.replace("restarts = 3", "restarts = 7"))
-    assert '"plant.csv"' in spec
+    spec = tab.write(lambda text: text.replace("restarts = 3", "restarts = 7").replace("[learner]", "[learner"))
+    assert '"plant.csv"' in spec and "Broken TOML" in tab.page.inner_text(".note.bad")
     killed.process.kill()
     killed.process.communicate()
     tab.context.close()
@@ -690,8 +692,10 @@ def test_the_spec_of_a_server_that_was_killed_is_offered_by_the_next(browser, cs
     tab = Tab(browser, server)
     tab.page.get_by_role("button", name="plant.csv, 20").click()
     tab.go("Model")
-    tab.page.wait_for_selector("text=plant.csv: no such file")  # what was dropped is dropped again
+    tab.page.wait_for_selector("text=Broken TOML")
     assert tab.page.get_by_label("spec in TOML").input_value() == spec
+    tab.write(lambda text: text.replace("[learner", "[learner]"))
+    assert "plant.csv: no such file" in tab.page.inner_text(".note.bad")  # what was dropped is dropped again
     tab.go("Data")
     tab.drop(csv)
     tab.go("Model")

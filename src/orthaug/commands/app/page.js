@@ -69,18 +69,19 @@ let held = null;
 const called = (control) =>
   `${control.closest("[role=group]")?.ariaLabel} ${control.dataset.place ?? control.ariaLabel ?? control.innerText}`;
 const alive = (control) => control.isConnected && !control.disabled && control.getClientRects().length;
+const CONTROLS = "a, button, input, select, textarea";
 addEventListener("focusin", (event) => {
-  const target = event.target.closest("a, button, input, select, textarea");
+  const target = event.target.closest(CONTROLS);
   held = target && { target, name: called(target), card: target.closest(".card") };
 });
 setInterval(() => {
   if (!held || document.activeElement !== document.body || alive(held.target)) return;
   const { name, card } = held;
-  const same = [...document.querySelectorAll(".parts :is(a, button, input, select, textarea)")];
-  const next = same.find((control) => called(control) === name && alive(control));
+  const all = [...document.querySelectorAll(CONTROLS)];
+  const next = all.find((control) => called(control) === name && alive(control));
   if (next) return next.focus();
   const place = card?.isConnected ? card : document.querySelector("[role=tab][aria-selected=true]");
-  if (!place.hasAttribute("tabindex")) place.tabIndex = -1;
+  if (place.tabIndex < 0) place.tabIndex = -1;
   place.focus({ preventScroll: true });
 }, 100);
 

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from orthaug._base.errors import InputError
@@ -115,8 +114,7 @@ class Command:
             try:
                 await asyncio.wait_for(self.process.wait(), _GRACE)
             except TimeoutError:
-                with suppress(ProcessLookupError):
-                    self.process.kill()
+                _kill(self.process)
 
 
 def _progress(line: str) -> dict[str, Any] | None:
@@ -195,17 +193,12 @@ async def _started() -> asyncio.subprocess.Process:
 async def _answered(process: asyncio.subprocess.Process, question: dict[str, Any]) -> dict[str, Any]:
     assert process.stdin is not None and process.stdout is not None
     try:
-        process.stdin.write(json.dumps(question, default=_path).encode() + b"\n")
+        process.stdin.write(json.dumps(question, default=str).encode() + b"\n")
         await process.stdin.drain()
         line = await process.stdout.readline()
         return json.loads(line)
     except (OSError, ValueError):
         raise InputError("the data could not be looked at: the process ended early. Is there enough memory?") from None
-
-
-def _path(value: Any) -> str:
-    assert isinstance(value, Path)
-    return str(value)
 
 
 def _kill(process: asyncio.subprocess.Process) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
+from html import escape
 from pathlib import Path
 
 from fastapi import FastAPI, Request
@@ -13,6 +14,7 @@ from nicegui import ui
 from starlette.requests import ClientDisconnect
 
 from orthaug._base.errors import InputError
+from orthaug.commands.app.gate import PLAIN
 from orthaug.commands.app.page import MARK, Page
 from orthaug.commands.app.session import Sessions
 
@@ -47,9 +49,11 @@ def application(sessions: Sessions, spec: Path | None) -> FastAPI:
         return FileResponse(file, filename=what, headers={"cache-control": "no-store"})
 
     @ui.page("/session/{key}", title="orthaug", response_timeout=20)
-    def work(key: str) -> None:
+    def work(key: str) -> Response | None:
         session = sessions.find(key)
-        Page(session).draw() if session is not None else Page.gone()
+        if session is None:
+            return _told("This work is not open any more. Its spec is offered where something new begins.", 404)
+        Page(session).draw()
 
     pages.on_exception(lambda error: None)  # each page tells of its own
     ui.run_with(
@@ -98,7 +102,4 @@ def _refused(text: str, code: int) -> Response:
 
 
 def _told(text: str, code: int) -> Response:
-    from html import escape
-
-    body = "<!doctype html><html lang='en'><title>orthaug</title><body style='font:1rem system-ui;margin:3rem'><p>"
-    return HTMLResponse(f"{body}{escape(text)}</p><p><a href='/'>Begin anew</a></p></body></html>", code)
+    return HTMLResponse(f"{PLAIN}<p>{escape(text)}</p><p><a href='/'>Begin anew</a></p></body></html>", code)

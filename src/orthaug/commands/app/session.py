@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from orthaug._base.errors import InputError
-from orthaug.commands.app import kept_specs
 from orthaug.commands.app.processes import Command, Desk
-from orthaug.commands.app.spec_text import absolute, in_file, plain, with_value
+from orthaug.commands.app.spec_text import absolute, in_file, keep, kept_title, plain, with_value
 from orthaug.data.tables import KNOWN
 
 _SESSIONS = 50  # that are kept at once
@@ -37,9 +36,9 @@ class Session:
         self.found: dict[str, Any] | None = None
         self.looking = ""
         self.trouble = ""
-        """What is wrong with the data, in words."""
+        """What is wrong with the data."""
         self.unfit = ""
-        """Why the chosen channels make no spec, in words."""
+        """Why the chosen channels make no spec."""
         self.kept = False
         """Whether a file was looked at that the spec, which a person has worked on, was not begun anew for."""
         self.spec = ""
@@ -49,7 +48,7 @@ class Session:
         """Who made each change of the spec: a part of a page, which need not be told of its own."""
         self.checked: dict[str, Any] | None = None
         self.refused = ""
-        """Why the spec cannot be trained, in words."""
+        """Why the spec cannot be trained."""
         self.stale = False
         """Whether `checked` is of an earlier spec: this one could not be opened."""
         self.checking = False
@@ -120,9 +119,9 @@ class Session:
         assert self.data is not None
         self.looking, self.trouble, self.unfit = f"Looking at {self.data.name} …", "", ""
         self.changed("data")
-        given: dict[str, Any] = {"path": self.data, "out": self.folder / "spec.toml"}
+        place = self.folder / "spec.toml"
         try:
-            found = await self.desk.ask("look", **given, inputs=inputs, outputs=outputs, step=step)
+            found = await self.desk.ask("look", path=self.data, out=place, inputs=inputs, outputs=outputs, step=step)
             if self.found is not None and found["spec"] is None:
                 self.unfit = found["open"]
             else:
@@ -160,9 +159,9 @@ class Session:
         Raises:
             InputError: a file that cannot be read, or broken TOML.
         """
-        text = in_file(path)
-        self.title = kept_specs.title(path) if kept else path.name
-        self.write(text if kept else absolute(text, path.absolute().parent), "file")
+        self.title = kept_title(path) if kept else path.name
+        text = path.read_text(encoding="utf-8") if kept else absolute(in_file(path), path.absolute().parent)
+        self.write(text, "file")
         self.changed("data")
 
     # Spec
@@ -176,7 +175,7 @@ class Session:
         self.changed("spec")
         if author != "file" and text.strip():
             self.kept_as = self.kept_as or _as_name(self.title) or "spec"
-            kept_specs.keep(self.kept_as, self.key, text)
+            keep(self.kept_as, self.key, text)
         self._check_soon()
 
     def edit(self, author: str, change: Callable[..., str], *given: Any) -> None:

@@ -1,12 +1,14 @@
-"""A spec as text that forms change: one key or table at a time, comments and order kept."""
+"""A spec as text that forms change, one key or table at a time, comments and order kept; and where it stands."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import platformdirs
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT
@@ -15,6 +17,8 @@ from orthaug._base.errors import InputError
 from orthaug.data.tables import check_readable
 
 _WORDS = ("parameter", "regressor", "output", "unit", "channel")  # keys whose values are text, digits or not
+_KEPT = 20  # specs of earlier work
+_MARK = 7  # letters behind the title in the name of one
 
 
 def opened(text: str) -> tomlkit.TOMLDocument:
@@ -46,6 +50,34 @@ def in_file(path: Path) -> str:
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return text
+
+
+def keep(title: str, key: str, spec: str) -> None:
+    """Write the spec of a piece of work anew, whole or not at all; nothing where the folder cannot be written."""
+    place = _folder() / f"{title}-{key[: _MARK - 1]}.toml"
+    with suppress(OSError):
+        place.parent.mkdir(parents=True, exist_ok=True)
+        partial = place.with_suffix(".partial")
+        partial.write_text(spec, encoding="utf-8")
+        os.replace(partial, place)
+        for old in earlier()[_KEPT:]:
+            old.unlink(missing_ok=True)
+
+
+def earlier() -> list[Path]:
+    """The specs that are kept, the latest first."""
+    with suppress(OSError):
+        return sorted(_folder().glob("*.toml"), key=lambda place: place.stat().st_mtime, reverse=True)
+    return []
+
+
+def kept_title(place: Path) -> str:
+    """What it was called."""
+    return place.stem[:-_MARK]
+
+
+def _folder() -> Path:
+    return platformdirs.user_state_path("orthaug") / "app"
 
 
 def absolute(text: str, folder: Path) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 from nicegui import ui
 
 from orthaug._base.errors import InputError
-from orthaug.commands.app import kept_specs, spec_text
+from orthaug.commands.app import spec_text
 from orthaug.commands.app.session import Session
 from orthaug.commands.app.widgets import (
     button,
@@ -118,12 +118,12 @@ class DataView:
                 if session.kept:
                     note("The spec is kept as it is. Take this file as a test of it, or begin anew below.", "care")
                     button("Take it as a test", session.add_test)
-            elif not session.spec and (kept := kept_specs.earlier()[:_OFFERED]):
+            elif not session.spec and (kept := spec_text.earlier()[:_OFFERED]):
                 text("Or go on with the spec of earlier work:", "p", "hint")
                 with ui.element("div").classes("fields"):
                     for place in kept:
                         when = datetime.fromtimestamp(place.stat().st_mtime)
-                        label = f"{kept_specs.title(place)}, {when:%Y-%m-%d %H:%M}"
+                        label = f"{spec_text.kept_title(place)}, {when:%Y-%m-%d %H:%M}"
                         button(label, partial(session.open_spec, place, kept=True))
         self.columns.set_visibility(found is not None)
         state = (session.data, found, bool(session.spec))

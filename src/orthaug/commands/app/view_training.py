@@ -106,10 +106,8 @@ class TrainingView:
     def _draw_results(self) -> None:
         session = self.session
         with redrawn(self.results):
-            for kind, title, done, draw in (
-                ("fit", "Result", "trained", _fit),
-                ("compare", "Comparison", "compared", _compare),
-            ):
+            kinds = (("fit", "Result", "trained", _fit), ("compare", "Comparison", "compared", _compare))
+            for kind, title, done, draw in kinds:
                 if (result := session.results.get(kind)) is None:
                     continue
                 with card(title):

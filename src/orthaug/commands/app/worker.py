@@ -120,11 +120,10 @@ def _timed(found: Survey) -> str:
 
 def _column(found: Survey, column: Column) -> dict[str, Any]:
     usable = column in found.signals
-    timed = column is found.clock.column
     told = starting.as_seen(column, spikes=column.kind != "input") if usable else column.unusable or "constant"
-    own = {"header": column.header, "name": column.name, "unit": column.unit, "kind": column.kind}
-    head = f"{column.name}" + (f" = column '{column.header}'" if column.header != column.name else "")
-    return own | {"usable": usable, "timed": timed, "told": told.removeprefix(f"{head}: ")}
+    head = column.name + (f" = column '{column.header}'" if column.header != column.name else "")
+    own = {"header": column.header, "kind": column.kind, "usable": usable, "timed": column is found.clock.column}
+    return own | {"told": told.removeprefix(f"{head}: ")}
 
 
 def _curves(found: Survey) -> dict[str, Any]:
