@@ -74,7 +74,7 @@ class Session:
         self.versions[what] += 1
 
     def start(self, work: Awaitable[Any]) -> asyncio.Task[Any]:
-        """Let something run; it is not lost, and not awaited."""
+        """Let something run without waiting for it."""
         task = asyncio.ensure_future(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
