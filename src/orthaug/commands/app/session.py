@@ -159,8 +159,8 @@ class Session:
         Raises:
             InputError: a file that cannot be read, or broken TOML.
         """
-        self.title = kept_title(path) if kept else path.name
         text = path.read_text(encoding="utf-8") if kept else absolute(in_file(path), path.absolute().parent)
+        self.title = kept_title(path) if kept else path.name
         self.write(text, "file")
         self.changed("data")
 
