@@ -324,6 +324,20 @@ def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(fitted:
     assert (robust.std > 1.2 * alone.std).all() and robust.freedom < 31
 
 
+@pytest.mark.parametrize("samples", [0, 5])
+def test_an_input_that_acts_late_is_named_with_its_delay(samples: int) -> None:
+    """Friction is missing in both; it is not taken for a dead time."""
+    record = data()
+    (e,) = record.experiments
+    early = np.concatenate([e.inputs[samples:, 0], np.zeros(samples)])
+    record = oa.Record.from_arrays(u=early, y=e.outputs[:, 0], sampling_time=TS)
+    found = oa.diagnose(oa.estimate(record, spring(), learner=None, criterion=WHOLE))
+    assert found is not None and found.verdict == "unmodelled"
+    texts = [warning.text for warning in found.warnings if warning.code == "dead_time"]
+    assert len(texts) == (samples > 0) and ("Most likely u acts later" in found.text) == bool(samples)
+    assert all('channel = "u", samples = 5;' in text for text in texts)
+
+
 @pytest.mark.parametrize(
     ("own", "words"), [(0.0, "too little to predict it from its"), (0.2, "and 20 % of it follows")]
 )

@@ -15,7 +15,7 @@ from orthaug.fitting.motion_course import MotionCourse
 from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.structures import Structure
 from orthaug.models.learners import Learner
-from orthaug.physics.motion import HOLDS
+from orthaug.physics.motion import HOLDS, Motion
 from orthaug.physics.motion_problem import MotionProblem
 
 ROWS = 4000  # at most
@@ -65,39 +65,62 @@ def try_holds(
     Args:
         learner: what the trial's task has beside the physics; it is not trained.
     """
-    longest = max(problem.record.experiments, key=len)
-    record = replace(problem.record, experiments=(longest.rows(0, ROWS),))
-    task = MotionTask.of(problem.on(record), learner, criterion).prepared(solver, structure)
+    task = on_longest(problem, criterion, solver, structure, learner)
     motion, flight = problem.motion, task.physics
     found = [_held(task.plan, flight, declared=True)]
     several = motion.integrator != "discrete" and bool(motion.inputs) and flight is not None
     for hold in HOLDS if several else ():
         if hold != motion.hold:
-            found.append(_refitted(task, record, hold, solver))
+            found.append(_under(hold, task, solver))
     substeps = None if flight is None else task.plan.dynamics.substeps
-    return Trial(len(longest.rows(0, ROWS)), substeps, tuple(found), task)
+    return Trial(len(task.problem.record), substeps, tuple(found), task)
 
 
-def _refitted(task: MotionTask, record: Record, hold: str, solver: Any) -> Held:
-    flight, plan = task.physics, task.plan
-    assert flight is not None
-    motion = replace(plan.problem.motion, hold=hold, substeps=plan.dynamics.substeps)
+def on_longest(
+    problem: MotionProblem, criterion: Criterion, solver: Any, structure: Structure, learner: Learner | None = None
+) -> MotionTask:
+    """Physics alone trained on the first rows of the longest experiment; arguments as in `try_holds`."""
+    longest = max(problem.record.experiments, key=len)
+    record = replace(problem.record, experiments=(longest.rows(0, ROWS),))
+    return MotionTask.of(problem.on(record), learner, criterion).prepared(solver, structure)
+
+
+def _under(hold: str, task: MotionTask, solver: Any) -> Held:
+    assert task.physics is not None
     try:
-        course = MotionCourse.of(replace(plan.problem, motion=motion, record=record), None, plan.criterion)
+        motion = replace(task.problem.motion, hold=hold)
+        return _held(*refitted(task, task.physics, motion, task.problem.record, solver), declared=False)
     except InputError:
         return Held(hold, None, False)
+
+
+def refitted(
+    task: MotionTask, flight: Flight, motion: Motion, record: Record, solver: Any
+) -> tuple[MotionCourse, Flight | None]:
+    """Physics alone, trained on from where a flight ended, with another motion or record; None without a usable end.
+
+    Raises:
+        InputError: the motion does not take the record.
+    """
+    plan = task.plan
+    motion = replace(motion, substeps=plan.dynamics.substeps)
+    course = MotionCourse.of(replace(plan.problem, motion=motion, record=record), None, plan.criterion)
     course = course.from_states(flight.end.flown.states)
     again = course.descend(course.objective(), flight.end.flown.theta, solver.at_most(_REFITTED))
-    return _held(course, again if again.ending.usable else None, declared=False)
+    return course, again if again.ending.usable else None
+
+
+def residual_of(course: MotionCourse, flight: Flight | None) -> float:
+    """RMS of what a flight leaves, in deviations of the outputs; inf without a flight."""
+    if flight is None:
+        return float("inf")
+    value = float(np.sqrt(np.sum((flight.end.flown.errors / course.deviation[:, None]) ** 2) / course.residuals))
+    return value if np.isfinite(value) else float("inf")
 
 
 def _held(course: MotionCourse, flight: Flight | None, *, declared: bool) -> Held:
-    """The residual of a flight, RMS in deviations of the outputs, and its parameters."""
-    motion = course.problem.motion
-    if flight is None:
+    motion, value = course.problem.motion, residual_of(course, flight)
+    if flight is None or value == float("inf"):
         return Held(motion.hold, None, declared)
-    scaled = flight.end.flown.errors / course.deviation[:, None]
-    value = float(np.sqrt(np.sum(scaled**2) / course.residuals))
     p = motion.coordinates.physical(flight.end.flown.theta)
-    named = dict(zip(motion.names, map(float, p), strict=True))
-    return Held(motion.hold, value, declared, named) if np.isfinite(value) else Held(motion.hold, None, declared)
+    return Held(motion.hold, value, declared, dict(zip(motion.names, map(float, p), strict=True)))

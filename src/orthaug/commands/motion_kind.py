@@ -37,6 +37,7 @@ _NOT_RICH = Warning(
 
 def checked(job: MotionJob) -> CheckResult:
     """What the outputs tell apart, what the learner could imitate, substeps and holds."""
+    from orthaug.analysis.dead_time import dead_times
     from orthaug.analysis.holds import try_holds
     from orthaug.analysis.motion_identifiability import identified
     from orthaug.analysis.motion_imitation import imitation_before
@@ -58,6 +59,7 @@ def checked(job: MotionJob) -> CheckResult:
     posed, waves = (problem, Waves()) if spec.declared_learner() is not None else (without_learner(problem), None)
     trial = try_holds(posed, criterion, spec.declared_solver(), job.structure, waves)
     text, warnings = _about_steps(job, trial)
+    warnings += [late.warning for late in dead_times(trial.task, spec.declared_solver())]
     if told.by_any is None:
         warnings.append(_NOT_RICH)
     return CheckResult.model_validate(
