@@ -12,8 +12,8 @@ import orthaug as oa
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jnp
 from orthaug.analysis.budget import AS_MUCH
+from orthaug.analysis.motion_bias import softened_bias
 from orthaug.analysis.motion_budget import motion_budget, rivals_of
-from orthaug.analysis.motion_ground import softened_bias
 from orthaug.analysis.motion_suspects import check_motion_suspects, usual_motion_suspects
 from orthaug.physics.motion_problem import pose_motion
 

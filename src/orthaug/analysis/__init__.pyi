@@ -5,11 +5,11 @@ from .free_run_stability import stability as stability
 from .linear_view import Linearization as Linearization
 from .linear_view import LinearView as LinearView
 from .linearization import linearize as linearize
+from .motion_bias import suspected_bias as suspected_bias
 from .motion_design import design_motion_input as design_motion_input
-from .motion_ground import suspected_bias as suspected_bias
 from .motion_substeps import substep_bias as substep_bias
 from .motion_suspects import MotionSuspect as MotionSuspect
 from .observer import Observer as Observer
 from .suspects import Suspect as Suspect
-from .verdict_on_parts import verdict as verdict
+from .validation import verdict as verdict
 from .verdict_on_residuals import diagnose as diagnose

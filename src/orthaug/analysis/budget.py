@@ -9,10 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
-import scipy.special
 from jaxtyping import Float
 
 from orthaug._base.checks import Vector
@@ -20,13 +18,12 @@ from orthaug._base.errors import InputError
 from orthaug._base.lines import percent, plain_number
 from orthaug._base.warning import Warning
 from orthaug.analysis.bias import SuspectedBias
-from orthaug.analysis.measure_bias import Ground
+from orthaug.analysis.measure_bias import Ground, physical_of
 from orthaug.analysis.remedies import remedies
 from orthaug.analysis.suspects import Suspect, usual_suspects, usual_terms
 from orthaug.fitting.estimates import Estimate
-from orthaug.inference.measures import Measure, Training
-from orthaug.inference.physical import solve
-from orthaug.inference.weighed import weigh_problem
+from orthaug.inference.covariance import interval
+from orthaug.inference.measures import Measure, Training, weigh_problem
 from orthaug.physics.parameters import PhysicsMap
 
 LEAST_SHARE = 0.5  # of the learner's energy that a cause must explain to be named
@@ -128,10 +125,14 @@ def budget_on(ground: Ground, fit: Estimate, suspects: Sequence[Suspect]) -> Bud
     if cause is None or cause.explained is None or cause.coefficient_found is None:
         return None
     share, coefficient = cause.explained, cause.coefficient_found
-    told = partial(_rows, freedom=fit.freedom, cause=cause.suspect.name, share=share)
     rest, bias = left_over(ground, cause, suspects), coefficient * np.array(cause.bias)
     std = np.full(len(bias), np.nan) if fit.std is None else fit.std
     names, rows = ground.problem.baseline.names, ()
+
+    def told(names: Sequence[str], value: Vector, std: Vector, bias: Vector, rest: Vector) -> tuple[ParameterBias, ...]:
+        ends = with_bias(value, std, fit.freedom, bias, rest)
+        return parameter_biases(names, value, std, bias, ends, cause.suspect.name, share)
+
     parameters = told(names, fit.theta, std, bias, rest[: len(names)])
     if ground.physics is not None:
         physical = fit.physical(ground.physics)
@@ -222,23 +223,21 @@ def with_bias(value: Vector, std: Vector, freedom: float, bias: Vector, rest: Ve
     Args:
         rest: standard deviation of the bias that its cause does not tell, as `left_over` gives it.
     """
-    reach = scipy.special.stdtrit(max(freedom, 1.0), 0.975) * np.sqrt(std**2 + rest**2)
-    return np.stack([value - bias - reach, value - bias + reach], axis=-1)
+    return interval(value - bias, np.sqrt(std**2 + rest**2), freedom)
 
 
-def _rows(
+def parameter_biases(
     names: Sequence[str],
     value: Vector,
     std: Vector,
     bias: Vector,
-    rest: Vector,
-    *,
-    freedom: float,
+    ends: Float[np.ndarray, "n 2"],
     cause: str,
     share: float,
 ) -> tuple[ParameterBias, ...]:
+    """A row for each parameter whose bias is known; `ends` are those of its interval."""
     found = []
-    for name, v, s, b, ci in zip(names, value, std, bias, with_bias(value, std, freedom, bias, rest), strict=True):
+    for name, v, s, b, ci in zip(names, value, std, bias, ends, strict=True):
         if np.isfinite(b):
             errors, relative = float(abs(b) / s) if s > 0 else None, float(b / v) if v else None
             limits = (float(ci[0]), float(ci[1])) if np.isfinite(ci).all() else None
@@ -248,16 +247,11 @@ def _rows(
 
 def _physical(physics: PhysicsMap, fit: Estimate, bias: Vector) -> Vector:
     """p of θ̂ less p of θ̂ without the bias; NaN where that has no p."""
-    names = fit.problem.baseline.names
-    order = [names.index(name) for name in physics.theta_names]
-    covariance = None if fit.covariance is None else fit.covariance[np.ix_(order, order)]
     try:
-        biased, free = (
-            solve(physics, theta[order], covariance, freedom=np.inf).value for theta in (fit.theta, fit.theta - bias)
-        )
+        biased, free = (physical_of(physics, fit.problem, t, fit.covariance) for t in (fit.theta, fit.theta - bias))
     except InputError:
         return np.full(len(physics.names), np.nan)
-    return np.asarray(biased) - np.asarray(free)
+    return biased - free
 
 
 def _warning(
@@ -268,9 +262,7 @@ def _warning(
     large = [entry for entry in every if (entry.errors or 0.0) > 1 and abs(entry.relative or 1.0) > _ROUNDING]
     if not large:
         return None
-    shown = sorted(large, key=lambda entry: -(entry.errors or 0.0))[:_TOLD]
-    listed = ", ".join(told_bias(entry) for entry in shown)
-    more = f" and {len(large) - len(shown)} more" if len(large) > len(shown) else ""
+    listed = told_biases(large)
     cures = remedies(ground, budget.cause, [entry.name for entry in large])
     other = "" if rival is None else f" ({rival.suspect.name} explains as much and would move them elsewhere)"
     if budget.share < SURE_SHARE:
@@ -279,17 +271,23 @@ def _warning(
         return Warning(
             "biased",
             f"what the learner found looks most like {budget.cause.suspect.name} ({percent(budget.share)} of it"
-            f"{beside}), which would move {listed}{more}, and the standard errors do not cover that{other}: if it is "
+            f"{beside}), which would move {listed}, and the standard errors do not cover that{other}: if it is "
             f"that term, {' or '.join(cures)}.",
         )
     return Warning(
         "biased",
-        f"{budget.cause.suspect.name} explains {100 * budget.share:.0f} % of the learner and moves {listed}{more}, "
+        f"{budget.cause.suspect.name} explains {100 * budget.share:.0f} % of the learner and moves {listed}, "
         f"which the standard errors do not cover{other}: {' or '.join(cures)}.",
     )
 
 
-def told_bias(entry: ParameterBias) -> str:
-    """A bias in words."""
+def told_biases(large: Sequence[ParameterBias]) -> str:
+    """The largest biases in words."""
+    shown = sorted(large, key=lambda entry: -(entry.errors or 0.0))[:_TOLD]
+    more = f" and {len(large) - len(shown)} more" if len(large) > len(shown) else ""
+    return f"{', '.join(map(_told_bias, shown))}{more}"
+
+
+def _told_bias(entry: ParameterBias) -> str:
     share = "" if entry.relative is None else f", {percent(entry.relative, sign='+')}"
     return f"{entry.name} by {entry.value:+.2g} ({plain_number(entry.errors or 0.0)} standard errors{share})"

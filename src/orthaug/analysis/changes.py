@@ -16,10 +16,9 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.lines import percent
 from orthaug._base.parallel import one_blas_thread
-from orthaug.analysis.local_dynamics import transitions
-from orthaug.analysis.predictability import BlockSums, Share
+from orthaug.analysis.feedback import transitions
+from orthaug.analysis.predictability import BlockSums, Share, SimpleFunctions
 from orthaug.analysis.residuals import rms_errors
-from orthaug.analysis.simple_functions import SimpleFunctions
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Experiment, Record
 from orthaug.data.regressors import lag_matrix

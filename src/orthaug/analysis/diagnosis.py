@@ -7,19 +7,20 @@ With many rows every test rejects; so effects are measured, as shares of varianc
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from orthaug._base.lines import counted, percent
 from orthaug._base.parallel import one_blas_thread
 from orthaug._base.warning import Warning
 from orthaug.analysis.changes import Change, fall_of, model_changes, own_share
 from orthaug.analysis.missing_terms import MissingTest
 from orthaug.analysis.predictability import Predictable, predictable
-from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, rms_errors
+from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, errors_of, rms_errors
 from orthaug.analysis.verdict_text import SHARE, Finding, words
-from orthaug.analysis.wild_rows import wild_rows
+from orthaug.data.record import Experiment
 from orthaug.data.regressors import Lags
 from orthaug.data.survey import quantum_of
 from orthaug.fitting.criteria import Simulation
@@ -34,6 +35,11 @@ _AS_GOOD = 1.05  # free-run error / one-step error up to which measured lags add
 _SMALL = 0.05  # of the residual's variance: what could be predicted below that is a small effect
 _SMALL_SIZE = 0.05  # of the output's deviation, beside it
 _SMALL_COLOUR = 0.2  # the same of what a free run's own past tells: more of it is hardly noise
+_HOLD = 0.5  # share of the squares
+_FEW, _LEAST = 0.005, 6  # share of the rows that they are at most, and the number that is always few
+_WILD = 20.0  # robust deviations; a normal residual reaches five
+_MAD = 1.4826
+_NAMED = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,3 +279,27 @@ def _noise_in_lags(problem: Problem, ratio: float | None, one_step: Response) ->
         lagged = lagged - rest @ np.linalg.lstsq(rest, lagged, rcond=None)[0]
     smallest = float(np.linalg.eigvalsh(lagged.T @ lagged / len(lagged)).min())
     return 1.0 / smallest if smallest > 1.0 else 1.0
+
+
+def wild_rows(response: Response, experiments: Sequence[Experiment]) -> tuple[Warning, ...]:
+    """A warning for each output whose error is mostly that of a few rows, far from all others."""
+    found = []
+    errors = errors_of(response)
+    starts = [t.start for t in response.trajectories]
+    rows = [(i, starts[i] + k) for i, error in enumerate(errors) for k in range(len(error))]
+    for j, output in enumerate(response.outputs):
+        error = np.concatenate(errors)[:, j]
+        size = np.abs(error - np.median(error))
+        wild = np.flatnonzero(size > _WILD * _MAD * np.median(size))
+        held = float(np.sum(size[wild] ** 2)) / max(float(np.sum(size**2)), 1e-300)
+        if not len(wild) or len(wild) > max(_LEAST, _FEW * len(error)) or held < _HOLD or not np.median(size):
+            continue
+        named = [experiments[rows[k][0]].where(rows[k][1]) for k in wild[:_NAMED]]
+        more = f" and {len(wild) - _NAMED} more" if len(wild) > _NAMED else ""
+        text = (
+            f"{percent(held, 3)} of the squares of the one-step residual of {output.name} stand in "
+            f"{counted(len(wild), 'row')} of {len(error)}: {'; '.join(named)}{more}. If samples are wrong there, so is "
+            'θ: mark them (step = "outliers" of data.prepare), or leave them out.'
+        )
+        found.append(Warning("wild_rows", text))
+    return tuple(found)

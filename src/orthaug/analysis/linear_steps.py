@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Vector
 from orthaug._base.jax import Array, jax, jnp
-from orthaug.analysis.local_dynamics import by_differences
+from orthaug.analysis.feedback import by_differences
 from orthaug.fitting.motion_course import LOOSE
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged

@@ -19,7 +19,7 @@ from orthaug._base.lines import percent
 from orthaug._base.warning import Warning
 from orthaug.analysis.absorbed import Smoother
 from orthaug.fitting.estimates import Estimate
-from orthaug.inference.intervals import newey_west
+from orthaug.inference.covariance import newey_west
 from orthaug.models.response import Response
 from orthaug.physics.output_weights import times
 from orthaug.physics.problem import Problem

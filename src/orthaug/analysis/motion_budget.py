@@ -7,18 +7,17 @@ residual tells: one Gauss-Newton step. Only terms that someone suspects are look
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from orthaug._base.warning import Warning
-from orthaug.analysis.budget import AS_MUCH, LEAST_SHARE, ParameterBias, told_bias, with_bias
+from orthaug.analysis.budget import AS_MUCH, LEAST_SHARE, ParameterBias, parameter_biases, told_biases, with_bias
 from orthaug.analysis.motion_bias import TermBias
 from orthaug.fitting.motion_estimates import MotionEstimate
 
 _SURE = 3.3  # standard errors of a coefficient that the residual tells: one in a thousand is so large by chance
 _ELSEWHERE = 0.5  # of a bias, from which that of a rival is another one
-_TOLD = 4  # parameters that a warning lists at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,17 +58,11 @@ def motion_budget(
     ends = with_bias(value, std, fit.freedom, bias, rest)
     parameters = fit.problem.motion.parameters
     ends = np.clip(ends, [[p.min] for p in parameters], [[p.max] for p in parameters])
-    rows = []
-    for i, name in enumerate(cause.names):
-        if np.isfinite(bias[i]):
-            errors = float(abs(bias[i]) / std[i]) if std[i] > 0 else None
-            limits = (float(ends[i, 0]), float(ends[i, 1])) if np.isfinite(ends[i]).all() else None
-            relative = float(bias[i] / value[i]) if value[i] else None
-            rows.append(ParameterBias(name, float(bias[i]), cause.suspect.name, share, relative, errors, limits))
-    found = MotionBudget(cause, coefficient, share, tuple(rows), ())
+    rows = parameter_biases(cause.names, value, std, bias, ends, cause.suspect.name, share)
+    found = MotionBudget(cause, coefficient, share, rows, ())
     far = [rival for rival, by in zip(rivals, apart, strict=True) if np.any(by > _ELSEWHERE * np.abs(bias))]
     warning = _warning(found, far, learns=learns)
-    return found if warning is None else MotionBudget(cause, coefficient, share, tuple(rows), (warning,))
+    return found if warning is None else replace(found, warnings=(warning,))
 
 
 def rivals_of(cause: TermBias, table: Sequence[TermBias]) -> list[TermBias]:
@@ -114,8 +107,6 @@ def _warning(budget: MotionBudget, rivals: Sequence[TermBias], *, learns: bool) 
     large = [entry for entry in budget.parameters if (entry.errors or 0.0) > 1]
     if not large:
         return None
-    shown = sorted(large, key=lambda entry: -(entry.errors or 0.0))[:_TOLD]
-    more = f" and {len(large) - len(shown)} more" if len(large) > len(shown) else ""
     what = "the learner" if learns else "the squares that the free run leaves"
     unit = f" {budget.cause.suspect.unit}".rstrip()
     named = ", ".join(rival.suspect.name for rival in sorted(rivals, key=lambda rival: -(rival.explained or 0.0))[:2])
@@ -124,6 +115,6 @@ def _warning(budget: MotionBudget, rivals: Sequence[TermBias], *, learns: bool) 
     return Warning(
         "biased",
         f"{budget.cause.suspect.name} of size {budget.coefficient:.3g}{unit} explains {100 * budget.share:.0f} % of "
-        f"{what} and moves {', '.join(told_bias(entry) for entry in shown)}{more}, which the standard errors do not "
+        f"{what} and moves {told_biases(large)}, which the standard errors do not "
         f"cover{other}: add it to the equation of {budget.cause.equation}, with its size as a parameter.",
     )

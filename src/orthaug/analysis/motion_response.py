@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import Array, jax, jnp
-from orthaug.analysis.waves import Waves
+from orthaug.analysis.absorbed import Waves
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.motion_course import MotionCourse
 from orthaug.fitting.segments import sensitivity

@@ -8,9 +8,8 @@ import numpy as np
 
 from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
-from orthaug.analysis.correlation import autocorrelation
 from orthaug.analysis.residuals import LAGS, PRACTICALLY_WHITE, ROUNDING, rms_errors
-from orthaug.analysis.whiteness import ROWS_PER_LAG, ljung_box
+from orthaug.analysis.whiteness import ROWS_PER_LAG, autocorrelation, ljung_box
 from orthaug.fitting.estimates import Estimate
 from orthaug.models.response import Response
 

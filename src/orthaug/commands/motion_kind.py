@@ -37,10 +37,10 @@ _NOT_RICH = Warning(
 
 def checked(job: MotionJob) -> CheckResult:
     """What the outputs tell apart, what the learner could imitate, substeps and holds."""
+    from orthaug.analysis.absorbed import Waves
     from orthaug.analysis.holds import try_holds
+    from orthaug.analysis.imitation import imitation_before
     from orthaug.analysis.motion_identifiability import identified
-    from orthaug.analysis.motion_imitation import imitation_before
-    from orthaug.analysis.waves import Waves
     from orthaug.fitting.motion_course import MotionCourse
     from orthaug.fitting.motion_estimation import without_learner
     from orthaug.models.moving import Moving
@@ -115,8 +115,8 @@ def content(
     warnings: list[Any],
 ) -> tuple[MotionEstimate, dict[str, Any]]:
     """The fit, and what results tell of it; warnings are added."""
+    from orthaug.analysis.imitation import MotionImitation
     from orthaug.analysis.motion_diagnosis import robust_motion
-    from orthaug.analysis.motion_imitation import MotionImitation
     from orthaug.physics.excitation import Excitation, of_gram
 
     motion, form = job.problem.motion, fit.model.form
@@ -159,9 +159,9 @@ def content(
 def _analysed(job: MotionJob, fit: MotionEstimate, free_run: Response, warnings: list[Any]) -> dict[str, Any]:
     """What is asked of a fit behind its training; None for an analysis that fails. Warnings are added."""
     from orthaug.analysis.learned_part import equation_parts
+    from orthaug.analysis.motion_bias import softened_bias, suspected_bias
     from orthaug.analysis.motion_budget import motion_budget
     from orthaug.analysis.motion_diagnosis import diagnose_motion
-    from orthaug.analysis.motion_ground import softened_bias, suspected_bias
     from orthaug.analysis.motion_modes import motion_stability
     from orthaug.analysis.motion_substeps import substep_bias
 
