@@ -1,6 +1,7 @@
 from . import signals as signals
 from .budget import bias_budget as bias_budget
 from .design import design_input as design_input
+from .diagnosis import diagnose as diagnose
 from .free_run_stability import stability as stability
 from .linear_view import Linearization as Linearization
 from .linear_view import LinearView as LinearView
@@ -12,4 +13,3 @@ from .motion_suspects import MotionSuspect as MotionSuspect
 from .observer import Observer as Observer
 from .suspects import Suspect as Suspect
 from .validation import verdict as verdict
-from .verdict_on_residuals import diagnose as diagnose

@@ -7,25 +7,28 @@ With many rows every test rejects; so effects are measured, as shares of varianc
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from orthaug._base.checks import check_type
+from orthaug._base.errors import InputError
 from orthaug._base.lines import counted, percent
 from orthaug._base.parallel import one_blas_thread
 from orthaug._base.warning import Warning
 from orthaug.analysis.changes import Change, fall_of, model_changes, own_share
-from orthaug.analysis.missing_terms import MissingTest
-from orthaug.analysis.predictability import Predictable, predictable
+from orthaug.analysis.motion_diagnosis import diagnose_motion
+from orthaug.analysis.predictability import predictable
 from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, errors_of, rms_errors
-from orthaug.analysis.verdict_text import SHARE, Finding, words
+from orthaug.analysis.verdict_text import SHARE, Diagnosis, Finding, words
 from orthaug.data.record import Experiment
 from orthaug.data.regressors import Lags
 from orthaug.data.survey import quantum_of
 from orthaug.fitting.criteria import Simulation
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import estimate
+from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.models.response import Response
 from orthaug.physics.problem import Problem
 
@@ -35,49 +38,50 @@ _AS_GOOD = 1.05  # free-run error / one-step error up to which measured lags add
 _SMALL = 0.05  # of the residual's variance: what could be predicted below that is a small effect
 _SMALL_SIZE = 0.05  # of the output's deviation, beside it
 _SMALL_COLOUR = 0.2  # the same of what a free run's own past tells: more of it is hardly noise
-_HOLD = 0.5  # share of the squares
-_FEW, _LEAST = 0.005, 6  # share of the rows that they are at most, and the number that is always few
+_HOLD = 0.5  # share of the squares that stands in wild rows
+_FEW, _LEAST = 0.005, 6  # share of the rows that these are at most, and the number that is always few
 _WILD = 20.0  # robust deviations; a normal residual reaches five
 _MAD = 1.4826
 _NAMED = 3
 
 
-@dataclass(frozen=True, eq=False)
-class Diagnosis:
-    """`verdict` is white, equation_noise, sensor_noise or unmodelled; `text` says why and what to do.
-
-    `one_step` and `free_run` are the tests of the two residuals per output. `ratio` is the free run's RMS error against
-    the one-step error, `noise_in_lags` the share of noise in the least excited direction of the lagged outputs.
-    `predictable` is what could be predicted of the error that was minimised, per output. `changes` are predicted to
-    lower it, the first of them by most; there is none where it is noise. `steps` are the steps of those outputs whose
-    one-step error is no larger, None where there are none. `missing` is the test of terms that the
-    equations of a motion could lack; None for other models.
-    """
-
-    verdict: str
-    text: str
-    one_step: tuple[ResidualTest, ...]
-    free_run: tuple[ResidualTest, ...] | None
-    ratio: float | None
-    noise_in_lags: float | None
-    warnings: tuple[Warning, ...]
-    predictable: tuple[Predictable, ...] = ()
-    changes: tuple[Change, ...] = ()
-    missing: MissingTest | None = None
-    steps: Mapping[str, float] | None = None
-
-    def __repr__(self) -> str:
-        return f"Diagnosis({self.verdict}: {self.text})"
-
-
-def diagnose(fit: Estimate, *, one_step: Response | None = None, free_run: Response | None = None) -> Diagnosis | None:
+def diagnose(
+    fit: Estimate | MotionEstimate, *, one_step: Response | None = None, free_run: Response | None = None
+) -> Diagnosis | None:
     """Analyse the residuals of a fit on its training data; None where they cannot be tested.
 
-    A one-step fit whose residual is coloured is set beside the free run of the physics alone, trained on it: that is
-    what sensor noise asks for, and it does not suffer from the bias of the fit in question.
+    Of lagged physics those one step ahead and of the free run; of a motion those of the free run, for its states are
+    not measured, with a test of the terms that its equations could lack (`missing`).
 
     Args:
         one_step: the prediction of the training data, if it is there already; likewise their `free_run`.
+
+    Raises:
+        InputError: an estimate that is not usable.
+
+    Examples:
+        >>> import numpy as np
+        >>> import orthaug as oa
+        >>> u = np.random.default_rng(0).uniform(-1, 1, 300)
+        >>> record = oa.Record.from_arrays(u, 2 * u + u**3 + 0.05 * np.random.default_rng(1).normal(size=300))
+        >>> gain = oa.Baseline.from_terms([oa.Term("gain", "u[k]")])
+        >>> diagnose(oa.estimate(record, gain, learner=None)).verdict
+        'unmodelled'
+    """
+    check_type(fit, Estimate | MotionEstimate, "fit", "an Estimate")
+    if isinstance(fit, Estimate):
+        return _of_lagged(fit, one_step, free_run)
+    if not fit.status.ok:
+        raise InputError(f"`fit` has no model: {fit.status.message}.")
+    own = fit.model.simulate(fit.problem.record) if free_run is None else free_run
+    return diagnose_motion(fit, own)
+
+
+def _of_lagged(fit: Estimate, one_step: Response | None, free_run: Response | None) -> Diagnosis | None:
+    """By its one-step residual and its free run.
+
+    A one-step fit whose residual is coloured is set beside the free run of the physics alone, trained on it: that is
+    what sensor noise asks for, and it does not suffer from the bias of the fit in question.
     """
     problem, model, simulated = fit.problem, fit.model, fit.criterion.flown is not None
     one_step = model.predict(problem.record) if one_step is None else one_step

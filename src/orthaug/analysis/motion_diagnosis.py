@@ -13,11 +13,11 @@ from orthaug._base.errors import InputError
 from orthaug._base.lines import percent
 from orthaug._base.parallel import one_blas_thread
 from orthaug._base.warning import Warning
-from orthaug.analysis.diagnosis import Diagnosis
 from orthaug.analysis.missing_terms import MissingTest, missing_terms
 from orthaug.analysis.predictability import Predictable, from_lags, from_own_past
 from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, errors_of, rms_errors
 from orthaug.analysis.robustness import block_of, rows_suffice
+from orthaug.analysis.verdict_text import Diagnosis
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.models.response import Response
 

@@ -15,7 +15,7 @@ import scipy.optimize
 
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError
-from orthaug.analysis.verdict_on_residuals import diagnose
+from orthaug.analysis.diagnosis import diagnose
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.motion_estimates import MotionEstimate
