@@ -29,6 +29,7 @@ from orthaug.fitting.criteria import Simulation
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.inference.covariance import by_experiment
 from orthaug.models.response import Response
 from orthaug.physics.problem import Problem
 
@@ -248,12 +249,11 @@ def _lags_of(fit: Estimate) -> Lags | None:
 def _tests(problem: Problem, response: Response, skip: int = 0) -> tuple[ResidualTest, ...]:
     """The tests of measured minus model on every usable row of the problem after the first `skip`."""
     record, start = problem.record, problem.rows.start
-    ends = np.cumsum([len(experiment) - start for experiment in record.experiments])
     residuals, inputs = [], []
     for experiment, trajectory in zip(record.experiments, response.trajectories, strict=True):
         residuals.append((experiment.outputs - trajectory.model)[start:][skip:])
         inputs.append(experiment.inputs[start:][skip:])
-    regressors = [x[skip:] for x in np.split(problem.rows.x, ends[:-1])]
+    regressors = [x[skip:] for x in by_experiment(problem, problem.rows.x)]
     names = ([c.name for c in record.outputs], [c.name for c in record.inputs], [str(lag) for lag in problem.layout])
     with one_blas_thread():
         return analyse(residuals, inputs, regressors, *names, lags=LAGS)

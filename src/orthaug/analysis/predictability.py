@@ -15,6 +15,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector
 from orthaug.analysis.residuals import errors_of
 from orthaug.analysis.whiteness import Pieces, pieces_of
+from orthaug.inference.covariance import by_experiment
 from orthaug.models.response import Response
 from orthaug.physics.problem import Problem
 
@@ -162,8 +163,7 @@ def predictable(problem: Problem, response: Response, skip: int = 0) -> tuple[Pr
     errors, functions, found = errors_of(response, skip), SimpleFunctions.of(problem), []
     starts = [run.start + skip for run in response.trajectories]
     inputs = [e.inputs[a:] for e, a in zip(problem.record.experiments, starts, strict=True)]
-    ends = np.cumsum([len(e) - problem.rows.start for e in problem.record.experiments])[:-1]
-    x = np.concatenate([piece[skip:] for piece in np.split(problem.rows.x, ends)])
+    x = np.concatenate([piece[skip:] for piece in by_experiment(problem, problem.rows.x)])
     every = slice(None, None, -(-len(x) // _ROWS))
     columns = np.column_stack([np.ones(len(x[every])), functions(x[every])])
     longest = max((lag.lag for lag in problem.layout), default=0) + _FURTHER

@@ -116,7 +116,7 @@ def content(
 ) -> tuple[MotionEstimate, dict[str, Any]]:
     """The fit, and what results tell of it; warnings are added."""
     from orthaug.analysis.imitation import MotionImitation
-    from orthaug.analysis.motion_diagnosis import robust_motion
+    from orthaug.analysis.robustness import robust_motion
     from orthaug.physics.excitation import Excitation, of_gram
 
     motion, form = job.problem.motion, fit.model.form

@@ -1,7 +1,9 @@
-"""Statistics of θ: noise covariance, standard errors and intervals under the training measure.
+"""Covariances and intervals: of θ, of θ and weights together, of predictions, robust to coloured or uneven noise.
 
-The calibrated form `(Σψᵀψ)⁻¹(ΣψᵀΣ_eψ)(Σψᵀψ)⁻¹` for the criterion `1/N Σ‖ε‖²` (Ljung 1999, ch. 9): the
-factor 2 of the paper's eq:cov_approx cancels against the second derivative of the criterion.
+The calibrated form `(Σψᵀψ)⁻¹(ΣψᵀΣ_eψ)(Σψᵀψ)⁻¹` for the criterion `1/N Σ‖ε‖²` (Ljung 1999, ch. 9): the factor 2 of the
+paper's eq:cov_approx cancels against the second derivative of the criterion; for plain least squares that form gives
+twice `σ²(ΦᵀΦ)⁻¹`. Learner weights are over-parametrised, so their block is singular. Only functions of the model have
+intervals.
 """
 
 from __future__ import annotations
@@ -229,7 +231,7 @@ def robust_covariance(problem: Problem, residual: Matrix, used: float, lags: int
     whitened = problem.weight.rows(residual)
     scores = np.einsum("kit,ki->kt", projection.q, whitened)
     factor = projection.covariance_factor()
-    return _correction(problem, residual, used) * factor @ newey_west(_by_experiment(problem, scores), lags) @ factor.T
+    return _correction(problem, residual, used) * factor @ newey_west(by_experiment(problem, scores), lags) @ factor.T
 
 
 def robust_split_covariance(
@@ -251,7 +253,7 @@ def robust_split_covariance(
     matrix = problem.weight.matrix
     weighed = residual @ (matrix.T @ matrix)
     scores = np.einsum("kro,ko->kr", changes.reshape(len(residual), nt, ny), weighed)
-    return _correction(problem, residual, used) * newey_west(_by_experiment(problem, scores), lags)
+    return _correction(problem, residual, used) * newey_west(by_experiment(problem, scores), lags)
 
 
 def _correction(problem: Problem, residual: Matrix, used: float) -> float:
@@ -261,6 +263,7 @@ def _correction(problem: Problem, residual: Matrix, used: float) -> float:
     return share * samples / max(samples - len(problem.baseline.names) - used, 1.0)
 
 
-def _by_experiment(problem: Problem, scores: Matrix) -> list[Matrix]:
+def by_experiment(problem: Problem, values: Matrix) -> list[Matrix]:
+    """What each usable row has, (N, m), in a piece per experiment."""
     ends = np.cumsum([len(experiment) - problem.rows.start for experiment in problem.record.experiments])
-    return np.split(scores, ends[:-1])
+    return np.split(values, ends[:-1])
