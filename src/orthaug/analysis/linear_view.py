@@ -12,7 +12,6 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import scipy.special
 from jaxtyping import Complex, Float
 
 from orthaug._base.checks import Matrix, Vector, check_choice
@@ -22,6 +21,7 @@ from orthaug.analysis.continuous_time import Continuous
 from orthaug.analysis.linear_system import System
 from orthaug.analysis.measured_response import MeasuredResponse
 from orthaug.analysis.operating_points import OperatingPoint
+from orthaug.inference.covariance import interval, reach
 
 if TYPE_CHECKING:
     import control
@@ -169,7 +169,7 @@ class LinearView:
     def matrix_ci95(self) -> Float[np.ndarray, "m k 2"] | None:
         """Intervals of [[A, B], [C, D]]; of entries that are no estimates both ends are the entry."""
         std = self.system.std
-        return None if std is None else around(self.system.matrix, std, self.freedom)
+        return None if std is None else interval(self.system.matrix, std, self.freedom)
 
     def to_control(self, time: str = "discrete") -> control.StateSpace:
         """The system for python-control, with the names of states, inputs and outputs.
@@ -202,16 +202,6 @@ class LinearView:
         return f"LinearView({self.point}: {n} states, {nu} inputs, {ny} outputs, {len(self.poles)} poles)"
 
 
-def reach(freedom: float) -> float:
-    """The 97.5 % quantile of Student's t."""
-    return float(scipy.special.stdtrit(max(freedom, 1.0), 0.975))
-
-
-def around(value: Any, std: Any, freedom: float) -> Any:
-    """Symmetric intervals, (…, 2)."""
-    return np.stack([value - reach(freedom) * std, value + reach(freedom) * std], axis=-1)
-
-
 def about(value: Any, relative: Any, freedom: float) -> Any:
     """Intervals of positive values whose logarithms are normal, (…, 2)."""
     with np.errstate(all="ignore"):
@@ -227,7 +217,7 @@ def bode_of(system: System, frequency: Vector, freedom: float) -> Bode:
     with np.errstate(all="ignore"):
         relative = found.moved / found.value[:, None]
     gain, turn = (np.sqrt(np.sum(part**2, axis=1)) for part in (relative.real, relative.imag))
-    phases = around(phase_of(found.value), np.degrees(turn), freedom)
+    phases = interval(phase_of(found.value), np.degrees(turn), freedom)
     return Bode(frequency, found.value, about(np.abs(found.value), gain, freedom), phases)
 
 
@@ -239,7 +229,7 @@ def gain_of(system: System, freedom: float) -> tuple[Matrix | None, Any]:
     value = found.value[0]
     if found.moved is None:
         return value, None
-    return value, around(value, np.sqrt(np.sum(found.moved[0] ** 2, axis=0)), freedom)
+    return value, interval(value, np.sqrt(np.sum(found.moved[0] ** 2, axis=0)), freedom)
 
 
 def poles_of(system: System, own: System | None, freedom: float) -> tuple[Pole, ...]:
@@ -285,7 +275,7 @@ def _pole(z: complex, relative: Any, s: complex, moved: Any, exact: bool, freedo
     if moved is not None:
         change = moved / s
         sine = abs(s.imag) / abs(s)
-        turn = None if real else _pair(np.clip(around(damping, sine * size(change.imag), freedom), -1.0, 1.0))
+        turn = None if real else _pair(np.clip(interval(damping, sine * size(change.imag), freedom), -1.0, 1.0))
         spans = (_pair(about(frequency, size(change.real), freedom)), turn)
     return Pole(complex(z), complex(s), magnitude, radius, float(frequency), spans[0], float(damping), spans[1])
 

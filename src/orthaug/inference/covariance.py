@@ -98,10 +98,15 @@ def theta_block(information: Matrix, ridge: float, nt: int, fixed: Collection[in
     return covariance
 
 
-def interval(value: Vector, std: Vector, freedom: float, level: float = 0.95) -> Float[np.ndarray, "n 2"]:
-    """Student-t interval of each entry, (n, 2)."""
-    reach = scipy.special.stdtrit(max(freedom, 1.0), 0.5 + level / 2) * std
-    return np.stack([value - reach, value + reach], axis=-1)
+def reach(freedom: float, level: float = 0.95) -> float:
+    """Half the length of a Student-t interval, in standard errors."""
+    return float(scipy.special.stdtrit(max(freedom, 1.0), 0.5 + level / 2))
+
+
+def interval(value: Any, std: Any, freedom: float, level: float = 0.95) -> Float[np.ndarray, "*n 2"]:
+    """Student-t interval of each entry, (…, 2)."""
+    half = reach(freedom, level) * std
+    return np.stack([value - half, value + half], axis=-1)
 
 
 def joint_covariance(problem: Problem, model: Model, convention: str = "calibrated") -> Matrix:
@@ -212,11 +217,11 @@ def newey_west(scores: Sequence[Float[np.ndarray, "N nt"]], lags: int | None = N
     if lags is not None:
         check_count(lags, "lags", least=0)
     rows = sum(len(s) for s in scores)
-    reach = int(4 * (rows / 100) ** (2 / 9)) if lags is None else lags
+    lags = int(4 * (rows / 100) ** (2 / 9)) if lags is None else lags
     total = sum(s.T @ s for s in scores)
-    for lag in range(1, reach + 1):
+    for lag in range(1, lags + 1):
         share = sum(s[lag:].T @ s[:-lag] for s in scores if len(s) > lag)
-        total = total + (1 - lag / (reach + 1)) * (share + np.transpose(share))
+        total = total + (1 - lag / (lags + 1)) * (share + np.transpose(share))
     return np.asarray(total)
 
 
