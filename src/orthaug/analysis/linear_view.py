@@ -17,8 +17,7 @@ from jaxtyping import Complex, Float
 from orthaug._base.checks import Matrix, Vector, check_choice
 from orthaug._base.errors import InputError
 from orthaug._base.warning import Warning
-from orthaug.analysis.continuous_time import Continuous
-from orthaug.analysis.linear_system import System
+from orthaug.analysis.linear_system import Continuous, System
 from orthaug.analysis.measured_response import MeasuredResponse
 from orthaug.analysis.operating_points import OperatingPoint
 from orthaug.inference.covariance import interval, reach

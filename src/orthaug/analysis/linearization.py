@@ -12,7 +12,6 @@ from orthaug._base.checks import Vector, check_choice, check_type
 from orthaug._base.errors import InputError
 from orthaug._base.lines import percent
 from orthaug._base.warning import Warning
-from orthaug.analysis.continuous_time import METHODS, Continuous, converted
 from orthaug.analysis.linear_steps import (
     MotionStep,
     difference_widths,
@@ -23,7 +22,7 @@ from orthaug.analysis.linear_steps import (
     step_of,
     unrest_along,
 )
-from orthaug.analysis.linear_system import System
+from orthaug.analysis.linear_system import METHODS, Continuous, System, converted
 from orthaug.analysis.linear_view import Linearization, LinearView, bode_of, gain_of, poles_of
 from orthaug.analysis.measured_response import measured_response
 from orthaug.analysis.operating_points import OperatingPoint, Search, operating_points, parse_point

@@ -16,8 +16,8 @@ from orthaug.commands.motion_suspects import bias_before
 from orthaug.reports.result import CheckResult, FitResult, ParameterResult, parameter_rows
 
 if TYPE_CHECKING:
+    from orthaug.analysis.budget import MotionBudget
     from orthaug.analysis.holds import Trial
-    from orthaug.analysis.motion_budget import MotionBudget
     from orthaug.fitting.motion_estimates import MotionEstimate
     from orthaug.models.response import Response
     from orthaug.reports.drawing import Figure
@@ -158,12 +158,12 @@ def content(
 
 def _analysed(job: MotionJob, fit: MotionEstimate, free_run: Response, warnings: list[Any]) -> dict[str, Any]:
     """What is asked of a fit behind its training; None for an analysis that fails. Warnings are added."""
+    from orthaug.analysis.budget import motion_budget
     from orthaug.analysis.learned_part import equation_parts
     from orthaug.analysis.motion_bias import softened_bias, suspected_bias
-    from orthaug.analysis.motion_budget import motion_budget
     from orthaug.analysis.motion_diagnosis import diagnose_motion
     from orthaug.analysis.motion_modes import motion_stability
-    from orthaug.analysis.motion_substeps import substep_bias
+    from orthaug.analysis.motion_response import substep_bias
 
     def residuals() -> Any:
         diagnosis = diagnose_motion(fit, free_run)
