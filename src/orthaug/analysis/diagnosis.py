@@ -93,7 +93,7 @@ def _of_lagged(fit: Estimate, one_step: Response | None, free_run: Response | No
     seen = Finding(fit, simulated, one_step, tests, white=white, free_white=True, ratio=None, noise=None)
     seen = replace(seen, steps={} if white else _steps(problem, tests))
     if not model.form.states:
-        return _concluded(replace(seen, **_effects(fit, one_step, one_step, False)), None)
+        return _concluded(replace(seen, **_effects(fit, one_step, one_step, False)))
     free_run = model.simulate(problem.record) if free_run is None else free_run
     skip = fit.criterion.washout
     flown = [(free_run, skip)] if not any(t.diverged for t in free_run.trajectories) else []
@@ -118,20 +118,18 @@ def _of_lagged(fit: Estimate, one_step: Response | None, free_run: Response | No
     )
     if not simulated and not white:
         seen = replace(seen, changes=_with_criterion(seen, free_run if flown else None, trained))
-    return _concluded(seen, free_tests)
+    return _concluded(seen)
 
 
-def _concluded(seen: Finding, free_tests: tuple[ResidualTest, ...] | None) -> Diagnosis:
+def _concluded(seen: Finding) -> Diagnosis:
     """The verdict and its words."""
     misfit = any(t.follows() or t.curved_over(SHARE) for t in seen.tests) or seen.lacks
     complete = seen.white and not misfit and not seen.follows(_SMALL)
-    noise = "white" if seen.free_white and seen.white else "equation_noise"
-    if not seen.fit.model.form.states:
-        noise = "white"
+    white = (seen.free_white and seen.white) or not seen.fit.model.form.states
     if seen.sensor:
         verdict = "sensor_noise"
     elif complete or _is_small(seen):
-        verdict = noise
+        verdict = "white" if white else "equation_noise"
     else:
         verdict = "unmodelled"
     seen = replace(seen, complete=complete)
@@ -139,18 +137,8 @@ def _concluded(seen: Finding, free_tests: tuple[ResidualTest, ...] | None) -> Di
         seen = replace(seen, changes=_toward_prediction(seen))
     text, warnings = words(verdict, seen)
     warnings = (*wild_rows(seen.one_step, seen.fit.problem.record.experiments), *warnings)
-    return Diagnosis(
-        verdict,
-        text,
-        seen.tests,
-        free_tests,
-        seen.ratio,
-        seen.noise,
-        warnings,
-        seen.predictable,
-        seen.changes,
-        steps=seen.steps or None,
-    )
+    tested = seen.tests, seen.free_tests, seen.ratio, seen.noise
+    return Diagnosis(verdict, text, *tested, warnings, seen.predictable, seen.changes, steps=seen.steps or None)
 
 
 def _steps(problem: Problem, tests: tuple[ResidualTest, ...]) -> dict[str, float]:

@@ -235,12 +235,11 @@ def poles_of(system: System, own: System | None, freedom: float) -> tuple[Pole, 
     """Poles of a sampled system; `own` are a motion's equations, whose poles are matched to these."""
     modes, step = system.modes, system.step
     assert step is not None
+    with np.errstate(all="ignore"):
+        found = [(z, None if d is None else d / z) for z, d in zip(modes.values, modes.moved, strict=True)]
     if own is None:
-        with np.errstate(all="ignore"):
-            found = [(z, None if d is None else d / z) for z, d in zip(modes.values, modes.moved, strict=True)]
         logs = [(np.log(z) / step, None if r is None else r / step) for z, r in found]
     else:
-        found = [(z, None if d is None else d / z) for z, d in zip(modes.values, modes.moved, strict=True)]
         logs = _matched(modes.values, own, step)
     return tuple(_pole(z, r, s, d, own is not None, freedom) for (z, r), (s, d) in zip(found, logs, strict=True))
 

@@ -20,13 +20,13 @@ from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug.analysis.absorbed import completing
 from orthaug.analysis.bias import IN_SPAN, Certificate, SuspectedBias, find_certificate
 from orthaug.analysis.motion_response import Place, TermsResponse, respond_to
-from orthaug.analysis.motion_suspects import MotionSuspect, check_motion_suspects, softened
+from orthaug.analysis.motion_suspects import MotionSuspect, check_motion_suspects, equations_of, softened
 from orthaug.analysis.robustness import block_of
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_measures import field_under
 from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.structures import Structure
-from orthaug.inference.motion_split import Field, MotionSplit, shared_of_motion, slopes_at
+from orthaug.inference.motion_split import Field, MotionSplit, learned_places, shared_of_motion, slopes_at
 from orthaug.models.motion_parts import parts_at
 from orthaug.physics.motion import Motion
 from orthaug.physics.projection import Projection
@@ -135,7 +135,7 @@ class MotionGround:
     def phi(self) -> Projection:
         """∂f/∂q of the learned equations over the points, rows times the root of their weights over their sizes."""
         slopes = np.asarray(slopes_at(self.place.course.dynamics.alone, self.q, self.field.x, self.field.u))
-        slopes = slopes[:, self._learned]
+        slopes = slopes[:, learned_places(self.motion)]
         return Projection.factor(self._weighed(np.moveaxis(slopes, 2, 0)).transpose(1, 2, 0))
 
     def _weighed(self, rows: np.ndarray) -> np.ndarray:
@@ -189,17 +189,17 @@ class MotionGround:
         expected = None
         if suspect.coefficient is not None:
             expected = suspect.coefficient * per_unit
-        known = (*motion.names_of_states, *(output.name for output in motion.outputs))
-        own = (suspect, known[place], names, moved, per_unit, value, expected)
+        own = (suspect, equations_of(motion)[place], names, moved, per_unit, value, expected)
         told = (response.cosine(k), response.size(k), seen, explained, found, certificate)
         return TermBias(*own, *told, None if seen else residual)
 
     def _rows(self, suspect: MotionSuspect, place: int) -> Matrix:
         """The term (M, nl) in the learned equations, 0 where it acts elsewhere."""
-        rows = np.zeros((len(self.field.x), len(self._learned)))
-        if place in self._learned:
+        learned = learned_places(self.motion)
+        rows = np.zeros((len(self.field.x), len(learned)))
+        if place in learned:
             p = self.motion.coordinates.physical(self.q)
-            rows[:, self._learned.index(place)] = suspect.values(self.motion, p, self.field.x, self.field.u)
+            rows[:, learned.index(place)] = suspect.values(self.motion, p, self.field.x, self.field.u)
         return np.where(np.isfinite(rows), rows, 0.0)
 
     def _explained(self, held: Matrix) -> tuple[float | None, float | None]:
@@ -218,15 +218,9 @@ class MotionGround:
         product = float(np.vdot(rest, tilde)) / norm
         return float(min((product / np.linalg.norm(tilde)) ** 2, 1.0)), float(product / norm)
 
-    @property
-    def _learned(self) -> list[int]:
-        """The numbers of the learned equations, outputs after states."""
-        states, outputs = self.motion.learned
-        return [*states, *(len(self.motion.states) + i for i in outputs)]
-
     def _seen(self, suspect: MotionSuspect) -> bool:
         """Whether the learner is added where the term acts, and the term is a function of what the learner sees."""
-        if suspect.place(self.motion) not in self._learned:
+        if suspect.place(self.motion) not in learned_places(self.motion):
             return False
         start, end = self._moves
         p, nx = self.motion.coordinates.physical(self.q), len(self.motion.states)

@@ -95,7 +95,7 @@ class MotionSuspect:
         Raises:
             InputError: an unknown equation, or none where there are several.
         """
-        known = (*motion.names_of_states, *(output.name for output in motion.outputs))
+        known = equations_of(motion)
         if self.equation is not None:
             if self.equation not in known:
                 hint = nearest(self.equation, known) or f"; known are {', '.join(known)}"
@@ -115,6 +115,11 @@ class MotionSuspect:
         with np.errstate(all="ignore"):
             found = self.parsed(motion).value(motion.values(x.T, u.T, p, np), np)
         return np.broadcast_to(np.asarray(found, dtype=float), (len(x),))
+
+
+def equations_of(motion: Motion) -> tuple[str, ...]:
+    """Whose equations there are, outputs after states."""
+    return (*motion.names_of_states, *(output.name for output in motion.outputs))
 
 
 def usual_places(motion: Motion) -> tuple[int, ...]:
