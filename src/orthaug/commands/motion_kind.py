@@ -17,7 +17,7 @@ from orthaug.reports.result import CheckResult, FitResult, ParameterResult, para
 
 if TYPE_CHECKING:
     from orthaug.analysis.budget import MotionBudget
-    from orthaug.analysis.holds import Trial
+    from orthaug.analysis.motion_check import Trial
     from orthaug.fitting.motion_estimates import MotionEstimate
     from orthaug.models.response import Response
     from orthaug.reports.drawing import Figure
@@ -38,9 +38,8 @@ _NOT_RICH = Warning(
 def checked(job: MotionJob) -> CheckResult:
     """What the outputs tell apart, what the learner could imitate, substeps and holds."""
     from orthaug.analysis.absorbed import Waves
-    from orthaug.analysis.holds import try_holds
     from orthaug.analysis.imitation import imitation_before
-    from orthaug.analysis.motion_identifiability import identified
+    from orthaug.analysis.motion_check import identified, try_holds
     from orthaug.fitting.motion_course import MotionCourse
     from orthaug.fitting.motion_estimation import without_learner
     from orthaug.models.moving import Moving

@@ -1,21 +1,31 @@
-"""Which parameters of a motion can the outputs tell apart: on a record's inputs, and on inputs that excite everything?
+"""What a record tells of a motion before training: which parameters its outputs tell apart, and which hold fits best.
 
-The rank of the free run's sensitivities to the parameters' coordinates, the starts of all segments eliminated, at the
-initial parameters and some near them. A direction that only rounding or one particular value hides has full rank there.
+Parameters are told apart on the record's inputs, or on inputs that excite everything, by the rank of the free run's
+sensitivities to the parameters' coordinates, the starts of all segments eliminated, at the initial parameters and some
+near them. A direction that only rounding or one particular value hides has full rank there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.errors import InputError
 from orthaug.data.record import Record
+from orthaug.fitting.course import Flight
+from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.initial_states import Start
 from orthaug.fitting.motion_course import MotionCourse
+from orthaug.fitting.motion_task import MotionTask
+from orthaug.fitting.structures import Structure
+from orthaug.models.learners import Learner
 from orthaug.physics.excitation import Excitation, of_gram
+from orthaug.physics.motion import HOLDS
+from orthaug.physics.motion_problem import MotionProblem
 
 _DRAWS = 3  # parameters near the initial ones
 _NEAR = 0.1  # of a logarithm, or of the value
@@ -24,6 +34,9 @@ _LOOSER = 1e3  # times as free as in training: a start that costs something tell
 _WIDTHS = (2.0, 1.0, 0.5)  # times the range of the data, until a run is finite
 _LONGEST_LEVEL = 60  # steps for which a random input stays
 _SEED = 20_250_117
+ROWS = 4000  # at most, of which every hold is tried
+_CLEARLY = 0.02  # lower, of the residual
+_REFITTED = 30  # iterations from where the declared hold ended
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,3 +143,83 @@ def _levels(count: int, random: np.random.Generator) -> Vector:
     """Levels in [-1, 1] that stay for 1 to some steps, short ones as often as long ones."""
     lengths = np.exp(random.uniform(0, np.log(_LONGEST_LEVEL), count)).astype(int)
     return np.repeat(random.uniform(-1, 1, count), lengths)[:count]
+
+
+@dataclass(frozen=True)
+class Held:
+    """The residual of physics alone under a hold, RMS in deviations of the outputs; None where it has no run."""
+
+    hold: str
+    residual: float | None
+    declared: bool
+    parameters: dict[str, float] | None = None
+    """What physics alone is fitted with under it."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Physics alone on the first rows of the longest experiment: its substeps, and every hold's residual."""
+
+    rows: int
+    substeps: int | None
+    holds: tuple[Held, ...]
+    task: MotionTask = field(repr=False, compare=False)
+    """With physics alone trained."""
+
+    @property
+    def best(self) -> str | None:
+        """The hold that explains the data clearly better than the declared one."""
+        own = next((h.residual for h in self.holds if h.declared), None)
+        known = [h for h in self.holds if h.residual is not None]
+        if own is None or len(known) < 2:
+            return None
+        least = min(known, key=lambda h: h.residual or 0.0)
+        return least.hold if least.residual is not None and least.residual < (1 - _CLEARLY) * own else None
+
+
+def try_holds(
+    problem: MotionProblem, criterion: Criterion, solver: Any, structure: Structure, learner: Learner | None = None
+) -> Trial:
+    """Fit physics alone with the declared hold, and go on from there with every other.
+
+    One hold alone is tried where the motion is discrete or has no inputs.
+
+    Args:
+        learner: what the trial's task has beside the physics; it is not trained.
+    """
+    longest = max(problem.record.experiments, key=len)
+    record = replace(problem.record, experiments=(longest.rows(0, ROWS),))
+    task = MotionTask.of(problem.on(record), learner, criterion).prepared(solver, structure)
+    motion, flight = problem.motion, task.physics
+    found = [_held(task.plan, flight, declared=True)]
+    several = motion.integrator != "discrete" and bool(motion.inputs) and flight is not None
+    for hold in HOLDS if several else ():
+        if hold != motion.hold:
+            found.append(_refitted(task, record, hold, solver))
+    substeps = None if flight is None else task.plan.dynamics.substeps
+    return Trial(len(longest.rows(0, ROWS)), substeps, tuple(found), task)
+
+
+def _refitted(task: MotionTask, record: Record, hold: str, solver: Any) -> Held:
+    flight, plan = task.physics, task.plan
+    assert flight is not None
+    motion = replace(plan.problem.motion, hold=hold, substeps=plan.dynamics.substeps)
+    try:
+        course = MotionCourse.of(replace(plan.problem, motion=motion, record=record), None, plan.criterion)
+    except InputError:
+        return Held(hold, None, False)
+    course = course.from_states(flight.end.flown.states)
+    again = course.descend(course.objective(), flight.end.flown.theta, solver.at_most(_REFITTED))
+    return _held(course, again if again.ending.usable else None, declared=False)
+
+
+def _held(course: MotionCourse, flight: Flight | None, *, declared: bool) -> Held:
+    """The residual of a flight, RMS in deviations of the outputs, and its parameters."""
+    motion = course.problem.motion
+    if flight is None:
+        return Held(motion.hold, None, declared)
+    scaled = flight.end.flown.errors / course.deviation[:, None]
+    value = float(np.sqrt(np.sum(scaled**2) / course.residuals))
+    p = motion.coordinates.physical(flight.end.flown.theta)
+    named = dict(zip(motion.names, map(float, p), strict=True))
+    return Held(motion.hold, value, declared, named) if np.isfinite(value) else Held(motion.hold, None, declared)
