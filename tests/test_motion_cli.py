@@ -491,13 +491,13 @@ def test_parameters_of_equations_without_a_learner_are_not_moved_by_what_it_sees
 
 
 def test_an_analysis_that_fails_numerically_loses_no_training(motor, monkeypatch):
-    from orthaug.analysis import motion_ground, motion_modes
+    from orthaug.analysis import motion_bias, motion_modes
 
     def fails(*_, **__):
         raise np.linalg.LinAlgError("Singular matrix")
 
     monkeypatch.setattr(motion_modes, "motion_stability", fails)
-    monkeypatch.setattr(motion_ground, "suspected_bias", fails)
+    monkeypatch.setattr(motion_bias, "suspected_bias", fails)
     code, out, err = orthaug("fit", motor, "--out", motor.parent / "out")
     assert code == 0, err
     told = strict((motor.parent / "out" / "result.json").read_text())

@@ -298,7 +298,8 @@ def test_a_model_runs_on_other_records(fitted: oa.MotionEstimate) -> None:
 
 
 def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(fitted: oa.MotionEstimate) -> None:
-    from orthaug.analysis.motion_diagnosis import diagnose_motion, robust_motion
+    from orthaug.analysis.motion_diagnosis import diagnose_motion
+    from orthaug.analysis.robustness import robust_motion
 
     found = diagnose_motion(fitted, fitted.model.simulate(data()))
     assert found is not None and found.verdict == "white" and "noise on the outputs" in found.text

@@ -15,8 +15,7 @@ from orthaug.fitting.elsewhere import orthogonalize
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive, OrthogonalPenalty
-from orthaug.inference.covariance import interval
-from orthaug.inference.intervals import newey_west, prediction_std, robust_split_covariance
+from orthaug.inference.covariance import interval, newey_west, prediction_std, robust_split_covariance
 from orthaug.inference.measures import Samples, Training, Uniform
 from orthaug.models.learners import MLP, Function
 from orthaug.physics.baseline import Baseline, Term

@@ -9,17 +9,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from orthaug._base.errors import InputError
 from orthaug._base.lines import percent
 from orthaug._base.parallel import one_blas_thread
 from orthaug._base.warning import Warning
-from orthaug.analysis.dead_time import DeadTime, dead_times
-from orthaug.analysis.diagnosis import Diagnosis
-from orthaug.analysis.holds import on_longest
+from orthaug.analysis.input_timing import DeadTime, dead_times, on_longest
 from orthaug.analysis.missing_terms import MissingTest, missing_terms
 from orthaug.analysis.predictability import Predictable, from_lags, from_own_past
 from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, errors_of, rms_errors
-from orthaug.analysis.robustness import block_of, rows_suffice
+from orthaug.analysis.verdict_text import Diagnosis
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_estimation import without_learner
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
@@ -33,19 +30,6 @@ _LITTLE = 0.005  # of the error's variance: what its own past tells below that i
 _LAGS = 10  # of inputs that may tell the error
 _ROWS_PER_LAG = 20
 _MOST_ROWS = 20_000  # at which the error is set beside states
-
-
-def robust_motion(fit: MotionEstimate) -> MotionEstimate:
-    """The fit with robust standard errors where its free run leaves coloured errors and the rows suffice."""
-    if not fit.status.ok or fit.covariance is None:
-        return fit
-    steps = block_of(fit)
-    if steps is None or not rows_suffice(len(fit.problem.record), steps):
-        return fit
-    try:
-        return fit.robust(steps)
-    except InputError:
-        return fit
 
 
 def diagnose_motion(fit: MotionEstimate, free_run: Response) -> Diagnosis | None:

@@ -10,7 +10,7 @@ from orthaug.analysis.measure_bias import Ground, bias_under
 from orthaug.commands.lagged_job import LaggedJob, structure_of
 from orthaug.commands.suspects import declared
 from orthaug.fitting.elimination import directions
-from orthaug.inference.weighed import weigh_problem
+from orthaug.inference.measures import weigh_problem
 
 if TYPE_CHECKING:
     from orthaug.analysis.budget import Budget

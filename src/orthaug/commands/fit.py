@@ -238,7 +238,7 @@ def score_part(model: Any, part: Part, warnings: list[Any]) -> tuple[PartScores,
 
 def _scored_along(model: Any, part: Part, warnings: list[Any]) -> PartScores:
     """Scores of all rows of a part of which only a witness is in memory, and tests of the residual of all of them."""
-    from orthaug.analysis.running_residuals import RunningResidual
+    from orthaug.analysis.residuals import RunningResidual
     from orthaug.data.sources import rows_of
     from orthaug.models.long_runs import scores_along
 

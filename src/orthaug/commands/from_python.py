@@ -23,8 +23,7 @@ from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.kinds import STRUCTURES
 from orthaug.fitting.motion_estimates import MotionEstimate
-from orthaug.inference.measures import Training
-from orthaug.inference.weighed import weigh_problem
+from orthaug.inference.measures import Training, weigh_problem
 from orthaug.models.rows import InMemory
 
 NAME = "fit.report()"

@@ -28,8 +28,7 @@ from orthaug.fitting.kinds import STRUCTURES
 from orthaug.fitting.rules import check_scored
 from orthaug.fitting.structures import Structure
 from orthaug.inference.measure_files import MeasurePlace
-from orthaug.inference.measures import Measure
-from orthaug.inference.weighed import Weighed, weigh_problem
+from orthaug.inference.measures import Measure, Weighed, weigh_problem
 from orthaug.physics.parameters import PhysicsMap, with_initial
 from orthaug.physics.problem import Problem, check_defined, pose, regressor_of
 from orthaug.physics.streamed import pose_streamed

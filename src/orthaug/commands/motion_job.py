@@ -22,8 +22,7 @@ from orthaug.fitting.cost import check_cost
 from orthaug.fitting.rules import check_motion_choices, check_scored, check_solver, tried
 from orthaug.fitting.structures import Structure
 from orthaug.inference.measure_files import MeasurePlace
-from orthaug.inference.measures import Measure
-from orthaug.inference.motion_support import support_of
+from orthaug.inference.measures import Measure, Support
 from orthaug.physics.motion import Motion
 from orthaug.physics.motion_layout import layout_of
 from orthaug.physics.motion_problem import MotionProblem, pose_motion
@@ -163,5 +162,5 @@ def _measure_of(spec: Spec, problem: MotionProblem, folder: Path) -> Measure:
     measure = spec.declared_measure(MeasurePlace(folder, names, problem.record, problem.first_row))
     rows = len(problem.record)  # a measure may weigh each of them
     x, u = (np.resize(part.T, (rows, len(part))) for part in problem.looked_at)
-    measure.points(support_of(problem.motion, x, u))
+    measure.points(Support.of_motion(problem.motion, x, u))
     return measure

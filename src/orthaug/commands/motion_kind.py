@@ -16,8 +16,8 @@ from orthaug.commands.motion_suspects import bias_before
 from orthaug.reports.result import CheckResult, FitResult, ParameterResult, parameter_rows
 
 if TYPE_CHECKING:
-    from orthaug.analysis.holds import Trial
-    from orthaug.analysis.motion_budget import MotionBudget
+    from orthaug.analysis.budget import MotionBudget
+    from orthaug.analysis.input_timing import Trial
     from orthaug.fitting.motion_estimates import MotionEstimate
     from orthaug.models.response import Response
     from orthaug.reports.drawing import Figure
@@ -37,11 +37,10 @@ _NOT_RICH = Warning(
 
 def checked(job: MotionJob) -> CheckResult:
     """What the outputs tell apart, what the learner could imitate, substeps and holds."""
-    from orthaug.analysis.dead_time import dead_times
-    from orthaug.analysis.holds import try_holds
+    from orthaug.analysis.absorbed import Waves
+    from orthaug.analysis.imitation import imitation_before
+    from orthaug.analysis.input_timing import dead_times, try_holds
     from orthaug.analysis.motion_identifiability import identified
-    from orthaug.analysis.motion_imitation import imitation_before
-    from orthaug.analysis.waves import Waves
     from orthaug.fitting.motion_course import MotionCourse
     from orthaug.fitting.motion_estimation import without_learner
     from orthaug.models.moving import Moving
@@ -117,8 +116,8 @@ def content(
     warnings: list[Any],
 ) -> tuple[MotionEstimate, dict[str, Any]]:
     """The fit, and what results tell of it; warnings are added."""
-    from orthaug.analysis.motion_diagnosis import robust_motion
-    from orthaug.analysis.motion_imitation import MotionImitation
+    from orthaug.analysis.imitation import MotionImitation
+    from orthaug.analysis.robustness import robust_motion
     from orthaug.physics.excitation import Excitation, of_gram
 
     motion, form = job.problem.motion, fit.model.form
@@ -160,12 +159,12 @@ def content(
 
 def _analysed(job: MotionJob, fit: MotionEstimate, free_run: Response, warnings: list[Any]) -> dict[str, Any]:
     """What is asked of a fit behind its training; None for an analysis that fails. Warnings are added."""
+    from orthaug.analysis.budget import motion_budget
     from orthaug.analysis.learned_part import equation_parts
-    from orthaug.analysis.motion_budget import motion_budget
+    from orthaug.analysis.motion_bias import softened_bias, suspected_bias
     from orthaug.analysis.motion_diagnosis import diagnose_motion
-    from orthaug.analysis.motion_ground import softened_bias, suspected_bias
     from orthaug.analysis.motion_modes import motion_stability
-    from orthaug.analysis.motion_substeps import substep_bias
+    from orthaug.analysis.motion_response import substep_bias
 
     def residuals() -> Any:
         diagnosis = diagnose_motion(fit, free_run)

@@ -45,7 +45,7 @@ def bias_before(
 
     None where physics alone has no run.
     """
-    from orthaug.analysis.motion_ground import ground_before
+    from orthaug.analysis.motion_bias import ground_before
 
     ground = ground_before(task, structure)
     if ground is None:

@@ -21,8 +21,7 @@ from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.held_out import HeldOut
 from orthaug.fitting.parameter_table import parameter_frame, parameter_lines
 from orthaug.fitting.status import Status
-from orthaug.inference.covariance import interval
-from orthaug.inference.intervals import joint_covariance, robust_covariance, robust_split_covariance
+from orthaug.inference.covariance import interval, joint_covariance, robust_covariance, robust_split_covariance
 from orthaug.inference.learned_terms import equation, learned_terms, term_frame, term_lines
 from orthaug.inference.measures import Measure, Points, Support, Training
 from orthaug.inference.physical import PhysicalEstimate, profile, solve

@@ -8,9 +8,8 @@ import numpy as np
 
 from orthaug._base.errors import InputError
 from orthaug._base.warning import Warning
-from orthaug.inference.measures import Measure
+from orthaug.inference.measures import Measure, Support
 from orthaug.inference.motion_split import Field
-from orthaug.inference.motion_support import support_of
 from orthaug.inference.splitting import SUPPORTED
 from orthaug.models.dynamics import Numbers
 
@@ -32,7 +31,7 @@ def field_under(
     finite = np.isfinite(x).all(axis=1)
     x, u = x[finite], u[finite]
     nx = x.shape[1]
-    support = support_of(motion, x, u)
+    support = Support.of_motion(motion, x, u)
     points = measure.points(support)
     at, beside = points.x[:, :nx], points.x[:, nx:]
     size = sizes_learned(course, c, x, u)

@@ -18,8 +18,7 @@ from orthaug.fitting.recursion import Recursion, squares, started
 from orthaug.fitting.recursive_course import inflation_of
 from orthaug.fitting.recursive_rows import whitened_rows
 from orthaug.fitting.residual_band import Reference
-from orthaug.inference.covariance import whitening
-from orthaug.inference.intervals import newey_west
+from orthaug.inference.covariance import newey_west, whitening
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.lines import fold, table
-from orthaug.analysis.continuous_time import Continuous
+from orthaug.analysis.linear_system import Continuous
 from orthaug.analysis.linear_view import COHERENT, Linearization, LinearView, Pole
 from orthaug.reports.linear import gain_unit
 

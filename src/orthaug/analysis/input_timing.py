@@ -1,13 +1,15 @@
-"""Which hold explains the data best: physics alone fitted with each way in which inputs run between samples."""
+"""When the inputs of a motion act: physics alone, fitted under each hold between samples and with inputs delayed."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from orthaug._base.errors import InputError
+from orthaug._base.warning import Warning
 from orthaug.data.record import Record
 from orthaug.fitting.course import Flight
 from orthaug.fitting.criteria import Criterion
@@ -19,7 +21,9 @@ from orthaug.physics.motion import HOLDS, Motion
 from orthaug.physics.motion_problem import MotionProblem
 
 ROWS = 4000  # at most
-_CLEARLY = 0.02  # lower, of the residual
+_CLEARLY = 0.02  # lower, of the residual: another hold
+_LATE = 0.2  # lower: a delay; missing friction or a small lag gains less by one
+_LONGEST = 20  # rows of the record to one of delay
 _REFITTED = 30  # iterations from where the declared hold ended
 
 
@@ -124,3 +128,85 @@ def _held(course: MotionCourse, flight: Flight | None, *, declared: bool) -> Hel
         return Held(motion.hold, None, declared)
     p = motion.coordinates.physical(flight.end.flown.theta)
     return Held(motion.hold, value, declared, dict(zip(motion.names, map(float, p), strict=True)))
+
+
+@dataclass(frozen=True)
+class DeadTime:
+    """An input that acts `samples` later: what physics alone then leaves, and leaves without, in deviations."""
+
+    input: str
+    samples: int
+    residual: float
+    undelayed: float
+
+    @property
+    def gain(self) -> str:
+        """What a delay explains, in words."""
+        late = f"{self.samples} sample{'s' * (self.samples > 1)}"
+        return (
+            f"with a delay of {late} physics alone leaves {self.residual:.3g} deviations of the output instead of "
+            f"{self.undelayed:.3g}"
+        )
+
+    @property
+    def warning(self) -> Warning:
+        """With what to write into the spec."""
+        return Warning(
+            "dead_time",
+            f"{self.input} seems to act late: {self.gain}, and its parameters are others. If there is a dead time, "
+            f'delay the input by [[data.prepare]] with step = "shift", channel = "{self.input}", samples = '
+            f"{self.samples}; a lag of its drive belongs into the equations.",
+        )
+
+
+def dead_times(task: MotionTask, solver: Any) -> tuple[DeadTime, ...]:
+    """The inputs that act clearly later than they do in the equations, and by how many samples.
+
+    Each input is delayed in turn, by 1, 2, 4, … samples while that explains the data better, then by what lies
+    between; physics alone is refitted each time from where the last one ended.
+
+    Args:
+        task: with physics alone trained; what it leaves is set against.
+    """
+    motion, record = task.problem.motion, task.problem.record
+    first = task.physics
+    if first is None:
+        return ()
+    found = []
+    for number, name in enumerate(motion.inputs):
+        tried = {0: (residual_of(task.plan, first), first)}
+
+        def leaves(samples: int, number: int = number, tried: dict = tried) -> float:
+            if samples not in tried:
+                nearest = tried[min(tried, key=lambda known: (abs(known - samples), tried[known][0]))][1]
+                course, flight = refitted(task, nearest, motion, _delayed(record, number, samples), solver)
+                tried[samples] = (residual_of(course, flight), flight or first)
+            return tried[samples][0]
+
+        best = _least(leaves, len(record) // _LONGEST)
+        if leaves(best) < (1 - _LATE) * leaves(0):
+            found.append(DeadTime(name, best, leaves(best), leaves(0)))
+    return tuple(found)
+
+
+def _least(leaves: Callable[[int], float], most: int) -> int:
+    """Where a function of whole numbers from 0 on that falls and rises is least."""
+    best, step = 0, 1
+    while step <= most and leaves(step) < leaves(best):
+        best, step = step, 2 * step
+    step = best // 2
+    while step:
+        best = min((best - step, best, best + step), key=leaves)
+        step //= 2
+    return best
+
+
+def _delayed(record: Record, number: int, samples: int) -> Record:
+    """An input later by so many samples; what it was before the record is its first value."""
+
+    def moved(inputs: np.ndarray) -> np.ndarray:
+        column = inputs[:, number]
+        late = np.concatenate([np.full(min(samples, len(column)), column[0]), column])[: len(column)]
+        return np.where(np.arange(inputs.shape[1]) == number, late[:, None], inputs)
+
+    return replace(record, experiments=tuple(replace(e, inputs=moved(e.inputs)) for e in record.experiments))
