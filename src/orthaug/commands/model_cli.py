@@ -145,7 +145,7 @@ def explain(
     """
     from orthaug.commands.explain import explain_model
     from orthaug.commands.run import Reading, open_run, read_rows
-    from orthaug.reports.explanation_text import explain_text
+    from orthaug.reports.explanation import explain_text
 
     opened = open_run(model, data, reading=Reading(rows=read_rows(rows), prepare=True))
     prepare_jax()

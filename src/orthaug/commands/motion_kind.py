@@ -210,7 +210,7 @@ def figures(
     one_step, free = responses[part.name]
     learns = fit.model.form.bound is not None
     drawn = {
-        "simulation": motion_plots.run_figure(free, f"free run, {part.name}", learns=learns),
+        "simulation": plots.output_figure(free, f"free run, {part.name}", learns=learns),
         "residual": plots.residual_figure(free, f"free-run residual, {part.name}"),
         "states": motion_plots.states_figure(fit.model, part.record, f"states of the free run, {part.name}"),
     }

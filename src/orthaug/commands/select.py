@@ -105,7 +105,7 @@ def steps_at_most(terms: int | None) -> int:
 def write_selected(selected: Selected, folder: Path, *, force: bool = False) -> None:
     """result.json, spec.toml, table.csv and the figure, whole or not at all."""
     from orthaug.reports.drawing import save
-    from orthaug.reports.selection_plot import selection_figure
+    from orthaug.reports.plots import selection_figure
 
     with whole_folder(folder, not_a_result, force=force) as partial:
         (partial / "result.json").write_text(selected.result.to_json() + "\n", encoding="utf-8")

@@ -168,12 +168,11 @@ def _result(opened: Opened, online: Recursive) -> TrackResult:
 def write_tracked(tracked: Tracked, folder: Path, text: str, *, force: bool = False) -> None:
     """result.json, report.txt, table.csv, figures/ and the state, whole or not at all."""
     from orthaug.reports.drawing import save
-    from orthaug.reports.tracking_plot import THETA, labels, tracking_figure
+    from orthaug.reports.plots import tracking_figure
 
     online, result = tracked.online, tracked.result
     history = online.history
     physical = None if tracked.physics is None else online.physical_history(tracked.physics)
-    theta, others = labels(result.parameters), labels(result.physical_parameters or ())
     alarms = [alarm.time for alarm in online.alarms]
     with whole_folder(folder, not_a_result, force=force) as partial:
         (partial / "result.json").write_text(result.to_json() + "\n", encoding="utf-8")
@@ -182,6 +181,7 @@ def write_tracked(tracked: Tracked, folder: Path, text: str, *, force: bool = Fa
         if physical is not None:
             physical.to_csv(partial / "physical.csv")
         (partial / "figures").mkdir()
-        save(tracking_figure(history, theta, alarms, THETA, physical, others), partial / "figures" / "parameters.png")
+        figure = tracking_figure(history, result.parameters, alarms, None, physical, result.physical_parameters or ())
+        save(figure, partial / "figures" / "parameters.png")
         (partial / STATE).mkdir()
         online.fill(partial / STATE)

@@ -72,11 +72,8 @@ def _drawn(what: Any, kind: str, title: str | None) -> Figure:
             raise InputError("the model has no inputs, so that it has no frequency response to draw.")
         return linear_plots.bode_figure(what) if kind == "bode" else linear_plots.poles_figure(what)
     if isinstance(what, Recursive):
-        from orthaug.reports.tracking_plot import THETA, labels, tracking_figure
-
-        named = labels(what.fitted.form.baseline.parameters)
         alarms = [alarm.time for alarm in what.alarms]
-        return tracking_figure(what.history, named, alarms, THETA if title is None else title)
+        return plots.tracking_figure(what.history, what.fitted.form.baseline.parameters, alarms, title)
     if isinstance(what, CompareResult):
         return plots.comparison_figure(what.comparison)
     if not isinstance(what, Response):

@@ -1,4 +1,4 @@
-"""Figures of fitted motions: the free run with and without learner, states, what acts in it, and what was learned."""
+"""Figures of fitted motions: states, what acts in them, and what was learned."""
 
 from __future__ import annotations
 
@@ -8,55 +8,26 @@ import numpy as np
 
 from orthaug.data.record import Record
 from orthaug.models.motion_parts import parts_at
-from orthaug.models.response import Response
 from orthaug.reports.drawing import (
-    BLACK,
     BLUE,
     GREEN,
     GREY,
-    ORANGE,
     SIZE,
     TOP,
     Figure,
-    extent,
     grid,
     headline,
     label,
     legend,
-    panels,
     plain,
-    window,
 )
 from orthaug.reports.learned_part import LearnedPart, curve_limits, labels_with_units, trajectory_of
+from orthaug.reports.page_blocks import with_unit
 
 if TYPE_CHECKING:
     from orthaug.models.motion_model import MotionModel
 
 _COLUMNS = 3  # panels beside each other
-
-
-@plain
-def run_figure(response: Response, title: str, *, learns: bool) -> Figure:
-    """Measured output, model and, where something was learned, the model without its learner; below, differences."""
-    trajectory = response.trajectories[0]
-    time, rows = window(response)
-    figure, axes = panels(response, f"{title}: {extent(response, rows)}", heights=(2, 1))
-    drawn = [("model", trajectory.model, BLACK, "-")]
-    drawn = [("model without its learner", trajectory.baseline, ORANGE, "--"), *drawn] if learns else drawn
-    for i, channel in enumerate(response.outputs):
-        upper, lower = axes[2 * i], axes[2 * i + 1]
-        if trajectory.measured is not None:
-            upper.plot(time, trajectory.measured[rows, i], color=GREY, linewidth=2.6, label="measured")
-        for name, values, color, style in drawn:
-            upper.plot(time, values[rows, i], style, color=color, linewidth=0.9, label=name)
-            if trajectory.measured is not None:
-                error = trajectory.measured[rows, i] - values[rows, i]
-                lower.plot(time, error, style, color=BLUE if name == "model" else color, linewidth=0.9)
-        label(upper, y=channel.label)
-        label(lower, y="difference" + (f" [{channel.unit}]" if channel.unit else ""))
-        legend(upper)
-    label(axes[-1], x="time [s]")
-    return figure
 
 
 @plain
@@ -69,7 +40,7 @@ def states_figure(model: MotionModel, record: Record, title: str) -> Figure:
     figure, axes = _stacked(len(motion.states), f"{title}: samples 0 to {rows.stop - 1}")
     for axis, state, values in zip(axes, motion.states, states.T, strict=True):
         axis.plot(time, values[rows], color=BLUE, linewidth=1.1)
-        label(axis, y=_with_unit(state.name, state.unit))
+        label(axis, y=with_unit(state.name, state.unit))
     label(axes[-1], x="time [s]")
     return figure
 
@@ -122,16 +93,12 @@ def learner_figure(part: LearnedPart, title: str) -> Figure:
                 axis.axvspan(along[inside][0], along[inside][-1], color=GREY, alpha=0.15, linewidth=0, zorder=0)
                 axis.plot(along, learned, "--", color=GREEN, linewidth=1.0)
                 axis.plot(along[inside], learned[inside], color=GREEN, linewidth=1.2, label="learner")
-            label(axis, x=_with_unit(feature, part.units[j]), y=None if column else name)
+            label(axis, x=with_unit(feature, part.units[j]), y=None if column else name)
     for axis in axes.flat:
         axis.set_visible(bool(axis.lines))
     told = max(axes[0], key=lambda axis: len(axis.get_legend_handles_labels()[1]))
     legend(axes[0, -1] if axes[0, -1].lines else told, *told.get_legend_handles_labels())
     return figure
-
-
-def _with_unit(name: str, unit: str) -> str:
-    return f"{name} [{unit}]" if unit else name
 
 
 def _stacked(count: int, title: str) -> tuple[Figure, list]:
