@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -27,9 +27,6 @@ from orthaug.commands.program import (
     other_writes,
     prepare_jax,
 )
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["main"]
 _LARGE = 20e6  # bytes of a data file from which on `init` tells what it is at
@@ -59,20 +56,21 @@ def check(
     force: Force = False,
 ) -> None:
     """Report excitation and identifiability; trains nothing."""
-    from orthaug.commands.check import check_job, refusal, write_figure
-    from orthaug.commands.folder import check_figure
-    from orthaug.commands.opening import open_job
+    from orthaug.commands.folder import check_figure, save_figure
+    from orthaug.commands.kinds import kind_of, open_job
     from orthaug.reports.text import check_text
 
     job = open_job(spec, require_full_rank=False)
     check_figure(figure, *job.files, force=force)
     if job.spec.motion is not None:  # its runs are computed
         prepare_jax()
-    result = check_job(job)
+    result = kind_of(job).checked(job)
     streams.echo(result.to_json() if as_json else check_text(result))
     if figure is not None and result.bias:
-        write_figure(result.bias, figure, force=force)
-    refused = refusal(job, result)
+        from orthaug.reports.plots import bias_figure
+
+        save_figure(bias_figure(result.bias), figure, force=force)
+    refused = kind_of(job).refused(job, result)
     if refused is not None:
         raise type(refused)(f"{spec}: {refused}")
 
@@ -88,7 +86,7 @@ def fit(
     """Fit a spec, print a summary and write the result folder."""
     from orthaug.commands.fit import fit_job, keeping, write_result
     from orthaug.commands.folder import check_folder, check_inputs_kept
-    from orthaug.commands.opening import open_job
+    from orthaug.commands.kinds import open_job
     from orthaug.reports.text import fit_text
 
     folder = out or Path("orthaug-out") / spec.stem
@@ -125,7 +123,7 @@ def compare(
 ) -> None:
     """Physics alone and every structure, one table."""
     from orthaug.commands.folder import check_folder, check_inputs_kept
-    from orthaug.commands.opening import open_job
+    from orthaug.commands.kinds import open_job
     from orthaug.reports.text import compare_text
 
     folder = out or Path("orthaug-out") / spec.stem
@@ -159,7 +157,7 @@ def design(
     """
     from orthaug.commands import design as designing
     from orthaug.commands.folder import check_file
-    from orthaug.commands.opening import open_job
+    from orthaug.commands.kinds import open_job
     from orthaug.reports.result import DesignResult
     from orthaug.reports.text import design_text
 

@@ -90,8 +90,6 @@ def _verdicts(job: Job, fitted: dict[str, Fitted]) -> dict[str, Verdict]:
 
 def write(comparison: Comparison, folder: Path, *, force: bool = False) -> None:
     """result.json, models/, figures/ and report.html, whole or not at all."""
-    from orthaug.commands.reporting import compare_report
-
     with whole_folder(folder, not_a_result, force=force) as partial:
         (partial / "result.json").write_text(comparison.result.to_json() + "\n", encoding="utf-8")
         for kind, fitted in comparison.fitted.items():
@@ -103,6 +101,20 @@ def write(comparison: Comparison, folder: Path, *, force: bool = False) -> None:
         figure = plots.comparison_figure(comparison.result.comparison)
         plots.save(figure, partial / "figures" / "comparison.png")
         (partial / "report.html").write_text(compare_report(comparison), encoding="utf-8")
+
+
+def compare_report(comparison: Comparison) -> str:
+    """The page of a comparison."""
+    from orthaug.commands.reporting import origin_of
+    from orthaug.reports.page import compare_page
+    from orthaug.reports.page_compare import ComparePage
+
+    responses = {
+        name: {part: free for part, (_, free) in fitted.responses.items()}
+        for name, fitted in comparison.fitted.items()
+        if fitted.responses
+    }
+    return compare_page(ComparePage(origin_of(comparison.job, "compare"), comparison.result, responses))
 
 
 def _matching(path: Path, job: Job) -> Model | MotionModel:

@@ -149,7 +149,7 @@ def draft(found: Survey, roles: Roles, out: Path) -> Draft:
 
 def write_spec(found: Draft, out: Path, *, force: bool = False) -> None:
     """The spec, once it has been opened with its data as `orthaug fit` would."""
-    from orthaug.commands.opening import open_job
+    from orthaug.commands.kinds import open_job
 
     with whole_file(out, force=force) as partial:
         partial.write_text(found.spec, encoding="utf-8")

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from orthaug.inference.physical import PhysicalEstimate
     from orthaug.models.response import Response
     from orthaug.reports.drawing import Figure
-    from orthaug.reports.learned_part import LearnedPart
 
 _UNKNOWN = ("physical_parameters", "physical_consistency", "sensitivities", "bias")
 
@@ -126,18 +125,9 @@ def figures(
 def physics_alone(
     job: LaggedJob, fit: Estimate, responses: Mapping[str, tuple[Response, Response]]
 ) -> Mapping[str, Response]:
-    """The free run of every part by the physics without the learner; empty where nothing was learned."""
-    if fit.model.form.bound is None:
-        return {}
+    """The free run of every part by the physics without the learner."""
     alone = fit.model.alone
     return {part.name: alone.simulate(part.record) for part in job.parts}
-
-
-def learned(job: LaggedJob, fit: Estimate) -> LearnedPart | None:
-    """What was learned, as a function; None where nothing was."""
-    from orthaug.reports.learned_part import learned_of
-
-    return learned_of(fit, job.train.record)
 
 
 def _physical_content(job: LaggedJob, fit: Estimate, warnings: list[Any]) -> dict[str, Any]:

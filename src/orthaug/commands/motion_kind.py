@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from orthaug.fitting.motion_estimates import MotionEstimate
     from orthaug.models.response import Response
     from orthaug.reports.drawing import Figure
-    from orthaug.reports.learned_part import LearnedPart
 
 _UNKNOWN = ("physical_parameters", "physical_consistency", "sensitivities", "bias", "missing_lags")
 _STIFF = 20  # substeps from which a motion is told to be stiff for its sampling
@@ -205,6 +204,7 @@ def figures(
 ) -> dict[str, Figure]:
     """The figures of a result by their names."""
     from orthaug.reports import motion_plots, plots
+    from orthaug.reports.learned_part import learned_of
 
     part = job.parts[-1]
     one_step, free = responses[part.name]
@@ -219,7 +219,7 @@ def figures(
     drawn["prediction"] = plots.output_figure(one_step, f"one-step prediction, {part.name}")
     if learns:
         drawn["components"] = motion_plots.parts_figure(fit.model, part.record, f"physics and learner, {part.name}")
-        part = learned(job, fit)
+        part = learned_of(fit, job.train.record)
         assert part is not None
         title = f"learned beside the physics, by the {fit.model.measure} measure"
         drawn["learner"] = motion_plots.learner_figure(part, title)
@@ -229,17 +229,8 @@ def figures(
 def physics_alone(
     job: MotionJob, fit: MotionEstimate, responses: Mapping[str, tuple[Response, Response]]
 ) -> Mapping[str, Response]:
-    """The free run of every part by the physics without the learner; empty where nothing was learned."""
-    if fit.model.form.bound is None:
-        return {}
+    """The free run of every part by the physics without the learner."""
     return {part: free.physics_alone for part, (_, free) in responses.items()}
-
-
-def learned(job: MotionJob, fit: MotionEstimate) -> LearnedPart | None:
-    """What was learned, as a function; None where nothing was."""
-    from orthaug.reports.learned_part import learned_of
-
-    return learned_of(fit, job.train.record)
 
 
 def _parameters(fit: MotionEstimate, budget: MotionBudget | None) -> list[ParameterResult]:

@@ -1,4 +1,4 @@
-"""The page of a result: what it tells beside result.json, such as free runs, and where and how it was made."""
+"""Where and how a result was made, for its page."""
 
 from __future__ import annotations
 
@@ -6,66 +6,16 @@ import importlib.metadata
 import os
 import platform
 import shlex
-from collections.abc import Mapping
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any
 
 from orthaug import __version__
 from orthaug._base.errors import InputError
 from orthaug.commands.job import Job
-from orthaug.commands.kinds import kind_of
 from orthaug.commands.spec import load_spec
-from orthaug.reports.page import compare_page, fit_page
-from orthaug.reports.page_compare import ComparePage
-from orthaug.reports.page_fit import FitPage, Origin
-
-if TYPE_CHECKING:
-    from orthaug.models.response import Response
-    from orthaug.reports.result import CompareResult, FitResult
+from orthaug.reports.page_fit import Origin
 
 _TOLD = ("jax", "numpy", "scipy")  # packages whose versions move numbers
-
-
-class HasFit(Protocol):
-    """What a page is made of: `Fitted`."""
-
-    @property
-    def job(self) -> Job: ...
-    @property
-    def fit(self) -> Any: ...
-    @property
-    def result(self) -> FitResult: ...
-    @property
-    def responses(self) -> Mapping[str, tuple[Response, Response]]: ...
-
-
-class HasFits(Protocol):
-    """What a page of several is made of: `Comparison`."""
-
-    @property
-    def job(self) -> Job: ...
-    @property
-    def fitted(self) -> Mapping[str, HasFit]: ...
-    @property
-    def result(self) -> CompareResult: ...
-
-
-def fit_report(fitted: HasFit, origin: Origin | None = None) -> str:
-    """The page of a fit that has a model; `origin` is where it comes from, None for its spec."""
-    job, fit, kind = fitted.job, fitted.fit, kind_of(fitted.job)
-    alone = kind.physics_alone(job, fit, fitted.responses)
-    page = FitPage(origin or origin_of(job, "fit"), fitted.result, fitted.responses, alone, kind.learned(job, fit))
-    return fit_page(page)
-
-
-def compare_report(comparison: HasFits) -> str:
-    """The page of a comparison."""
-    responses: dict[str, Mapping[str, Response]] = {
-        name: {part: free for part, (_, free) in fitted.responses.items()}
-        for name, fitted in comparison.fitted.items()
-        if fitted.responses
-    }
-    return compare_page(ComparePage(origin_of(comparison.job, "compare"), comparison.result, responses))
 
 
 def origin_of(job: Job, command: str) -> Origin:

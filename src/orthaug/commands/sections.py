@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import types
 import typing
 from collections.abc import Mapping, Sequence
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from orthaug._base.registry import InSpec, Key, OneOf, Option, Registry
+from orthaug.physics.parameters import PhysicalParameter
 
 Count = Annotated[int, Field(ge=0, strict=True)]
 Positive = Annotated[int, Field(ge=1, strict=True)]
@@ -21,6 +23,20 @@ class Section(BaseModel):
     """A table of the spec; unknown keys are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class PhysicalSection(Section):
+    """A physical parameter."""
+
+    initial: Finite
+    unit: str = ""
+    min: Finite | None = None
+    max: Finite | None = None
+
+    def declared(self, name: str) -> PhysicalParameter:
+        """The parameter of this name."""
+        low, high = -math.inf if self.min is None else self.min, math.inf if self.max is None else self.max
+        return PhysicalParameter(name, self.initial, self.unit, low, high)
 
 
 class KindSection(Section):

@@ -20,8 +20,7 @@ from orthaug._base.registry import resolve
 from orthaug.commands.data_sections import Data
 from orthaug.commands.engine_section import EngineSection
 from orthaug.commands.motion_spec import MotionSection
-from orthaug.commands.physical_section import PhysicalSection
-from orthaug.commands.sections import Count, Finite, KindSection, Positive, Section, with_kinds
+from orthaug.commands.sections import Count, Finite, KindSection, PhysicalSection, Positive, Section, with_kinds
 from orthaug.commands.spec_errors import first_message
 from orthaug.data.expressions import SAMPLING_TIME
 from orthaug.data.record import Channel
