@@ -31,7 +31,7 @@ def _report(fit: Any, path: Any, tests: Any) -> Any:
 
 
 def _progress() -> Any:
-    from orthaug.commands.shown_progress import shown_progress
+    from orthaug.commands.bars import shown_progress
 
     return shown_progress()
 

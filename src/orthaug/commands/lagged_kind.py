@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -11,15 +11,20 @@ import numpy as np
 from orthaug._base.errors import InputError
 from orthaug._base.warning import Warning
 from orthaug.analysis.closed_loop import closed_loop
+from orthaug.analysis.imitation import Imitation, imitation
+from orthaug.analysis.measure_bias import Ground, bias_under
 from orthaug.commands.attempt import attempt
-from orthaug.commands.bias import bias_of, budget_of, with_biases
 from orthaug.commands.lagged_job import LaggedJob
-from orthaug.commands.shared import shared_of
+from orthaug.commands.suspects import declared
+from orthaug.fitting.elimination import directions
+from orthaug.inference.weighed import weigh_problem
 from orthaug.physics.derived_units import derived_units
 from orthaug.physics.excitation import identifiability, require_rank
+from orthaug.physics.problem import Problem
 from orthaug.reports.result import CheckResult, FitResult, ParameterResult, parameter_rows, physical_rows
 
 if TYPE_CHECKING:
+    from orthaug.analysis.budget import Budget
     from orthaug.fitting.estimates import Estimate
     from orthaug.inference.physical import PhysicalEstimate
     from orthaug.models.response import Response
@@ -39,8 +44,8 @@ def checked(job: LaggedJob) -> CheckResult:
             "rows": problem.count,
             "excitation": problem.excitation,
             "identifiability": identifiability(problem.baseline, problem.layout, problem.outputs, problem.rows.x),
-            "shared": shared_of(job),
-            "bias": bias_of(job) if problem.excitation.full_rank else None,
+            "shared": _shared_of(job),
+            "bias": _bias_of(job) if problem.excitation.full_rank else None,
             "warnings": [*job.warnings, *closed_loop(job.train.record)],
         }
     )
@@ -67,9 +72,9 @@ def content(
         plain = fit
         fit = attempt("the robust covariance", lambda: robust_where_coloured(plain, one_step), warnings, plain)
         told |= _physical_content(job, fit, warnings)
-        told["bias"] = attempt("the bias by suspects", partial(bias_of, job, fit), warnings, None)
+        told["bias"] = attempt("the bias by suspects", partial(_bias_of, job, fit), warnings, None)
         told |= _analysed(fit, one_step, free_run, warnings)
-    shared = shared_of(job, fit.problem, others=False)
+    shared = _shared_of(job, fit.problem, others=False)
     rows = parameter_rows(
         fit.problem.baseline.parameters,
         fit.theta if fit.status.ok else np.full(len(fit.theta), np.nan),
@@ -90,8 +95,8 @@ def content(
     }
     budget = None
     if fit.status.ok:
-        budget = attempt("the bias that the learner implies", partial(budget_of, job, fit), warnings, None)
-    found, biased = with_biases(fit, shared, told, budget)
+        budget = attempt("the bias that the learner implies", partial(_budget_of, job, fit), warnings, None)
+    found, biased = _with_biases(fit, shared, told, budget)
     warnings += biased
     return fit, told | found
 
@@ -194,3 +199,79 @@ def _analysed(fit: Estimate, one_step: Response, free_run: Response, warnings: l
         "residuals": attempt("the analysis of the residual", residuals, warnings, None),
         "missing_lags": attempt("the search for missing lags", hidden, warnings, None),
     }
+
+
+def _bias_of(job: LaggedJob, fit: Estimate | None = None) -> list[dict[str, Any]]:
+    """The table of suspects under the spec's measure; after a fit with its θ and what its learner explains.
+
+    Whether a measure can remove a bias is asked before a fit: then it is answered for the usual suspects, too.
+    """
+    if not job.problem.baseline.names:
+        return []
+    ground = _ground(job, fit)
+    return bias_under(ground, declared(job.spec.suspects, ground.problem), certify_usual=fit is None)
+
+
+def _budget_of(job: LaggedJob, fit: Estimate) -> Budget | None:
+    """The bias that what the learner found implies, under the spec's measure."""
+    from orthaug.analysis.budget import budget_on
+
+    if fit.model.structure != "orthogonal" or fit.model.form.bound is None:
+        return None
+    ground = _ground(job, fit)
+    return budget_on(ground, fit, declared(job.spec.suspects, ground.problem))
+
+
+def _with_biases(
+    fit: Estimate, shared: Imitation | None, content: Mapping[str, Any], budget: Budget | None
+) -> tuple[dict[str, list[ParameterResult] | None], tuple[Warning, ...]]:
+    """The rows of `parameters` and `physical_parameters` with what the learner shares and what biases them."""
+    physical = content["physical_parameters"]
+    if fit.model.structure != "orthogonal" or fit.model.form.bound is None:  # a variant of what the spec declares
+        shared = None
+
+    def told(rows: list[ParameterResult] | None, determined: Sequence[str] | None) -> list[ParameterResult] | None:
+        if rows is None:
+            return None
+        return [
+            row.told(
+                None if determined is None else row.name not in determined, budget.of(row.name) if budget else None
+            )
+            for row in rows
+        ]
+
+    rows = {
+        "parameters": told(content["parameters"], shared.determined if shared else None),
+        "physical_parameters": told(physical, shared.physical if shared else None),
+    }
+    return rows, budget.warnings if budget else ()
+
+
+def _ground(job: LaggedJob, fit: Estimate | None) -> Ground:
+    problem, weighed, structure = job.problem, job.weighed, job.spec.declared_structure()
+    if fit is None:
+        along = directions(structure, problem) if job.spec.declared_learner() is not None else None
+        return Ground(weighed, problem, problem.least_squares, job.physics, None, along)
+    if fit.problem.weight.kind != problem.weight.kind:  # weighed by the errors that the fit left
+        problem = fit.problem
+        weighed = weigh_problem(job.measure, problem)
+    learned = None
+    if fit.model.form.bound is not None:
+        learned = fit.model.learner_at(weighed.points.x)
+    return Ground(weighed, problem, fit.theta, job.physics, learned, fit.model.shared)
+
+
+def _shared_of(job: LaggedJob, problem: Problem | None = None, *, others: bool = True) -> Imitation | None:
+    """Before training already; None without a learner, or where the structure splits nothing along chosen directions.
+
+    Args:
+        problem: the job's, as it was fitted; None for as it was posed.
+        others: tell what other learner inputs would make of it.
+    """
+    structure = job.spec.declared_structure()
+    if job.spec.declared_learner() is None or not structure.projects or structure.shared == "all":
+        return None
+    problem = job.problem if problem is None else problem
+    return (
+        imitation(problem, job.physics, others=others) if problem.baseline.names and problem.features.entries else None
+    )

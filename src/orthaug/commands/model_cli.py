@@ -87,7 +87,10 @@ def predict(
     opened = run.open_ahead(model, data, reading, horizon, initial, observer=observer)
     check_file(out, model, data, Path(initial or data), force=force)
     prepare_jax()
-    response, told = run.observed(opened, horizon) if observer else (run.predicted(opened, horizon), [])
+    if observer:
+        response, told = run.observed(opened, horizon)
+    else:
+        response, told = opened.model.predict(opened.record, horizon=horizon), []
     _write_response(response, opened, out, force, [*opened.notes, *told])
 
 
@@ -113,13 +116,12 @@ def split(
     Without training again.
     """
     from orthaug.commands import split as splitting
-    from orthaug.commands.measure_options import read_measure, split_place
     from orthaug.commands.run import prepared_notes, read_rows
     from orthaug.reports.text import split_text
 
     opened = splitting.open_training(model, data, read_rows(rows))
     given = {"box": box or [], "samples": [samples] if samples else [], "weights": [weights] if weights else []}
-    chosen = read_measure(measure, given, split_place(opened.model, opened.record))
+    chosen = splitting.read_measure(measure, given, opened)
     prepare_jax()
     for line in prepared_notes(opened.model, opened.record):
         streams.say(line)
@@ -143,8 +145,7 @@ def explain(
 
     And what to write into the physics.
     """
-    from orthaug.commands.explain import explain_model
-    from orthaug.commands.run import Reading, open_run, read_rows
+    from orthaug.commands.run import Reading, explain_model, open_run, read_rows
     from orthaug.reports.explanation import explain_text
 
     opened = open_run(model, data, reading=Reading(rows=read_rows(rows), prepare=True))

@@ -10,10 +10,10 @@ import numpy as np
 from orthaug._base.errors import InputError, RankError
 from orthaug._base.warning import Warning
 from orthaug.analysis.closed_loop import closed_loop
+from orthaug.analysis.motion_suspects import usual_motion_suspects
 from orthaug.commands.attempt import attempt
 from orthaug.commands.motion_job import MotionJob
-from orthaug.commands.motion_suspects import bias_before
-from orthaug.reports.result import CheckResult, FitResult, ParameterResult, parameter_rows
+from orthaug.reports.result import CheckResult, FitResult, MeasureResult, ParameterResult, parameter_rows
 
 if TYPE_CHECKING:
     from orthaug.analysis.holds import Trial
@@ -85,7 +85,17 @@ def checked(job: MotionJob) -> CheckResult:
 
 
 def _biases(job: MotionJob, trial: Trial) -> list[dict[str, Any]] | None:
-    return bias_before(job.suspects, job.problem, job.structure, trial.task)
+    """What every suspect would do, about physics alone; of the usual ones those that do anything, where none is named.
+
+    None where physics alone has no run.
+    """
+    from orthaug.analysis.motion_ground import ground_before
+
+    ground = ground_before(trial.task, job.structure)
+    if ground is None:
+        return None
+    table = ground.table(job.suspects or usual_motion_suspects(job.problem))
+    return [entry.as_dict() for entry in table if job.suspects or entry.size]
 
 
 def refused(job: MotionJob, result: CheckResult) -> InputError | None:
@@ -130,15 +140,8 @@ def content(
         told |= {name: found[name] for name in ("residuals", "stability", "bias")}
     budget, coarse, parts = found["budget"], found["coarse"], found["parts"] or ()
     if fit.status.ok and form.bound is not None:
-        split = fit.split_by
         told["shared"] = MotionImitation.of([str(entry) for entry in form.features], fit.shared)
-        told["measure_detail"] = {
-            "name": split.name,
-            "points": len(split.field.x),
-            "support": split.support,
-            "condition": None,
-            "price": None,
-        }
+        told["measure_detail"] = MeasureResult.of_motion(fit.split_by)
     return fit, told | {
         "parameters": _parameters(fit, budget),
         "standard_errors": None if fit.std is None else "plain" if fit.plain_covariance is None else "robust",

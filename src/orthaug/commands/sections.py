@@ -26,7 +26,7 @@ class Section(BaseModel):
 
 
 class PhysicalSection(Section):
-    """A physical parameter."""
+    """One physical parameter."""
 
     initial: Finite
     unit: str = ""
