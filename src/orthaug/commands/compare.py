@@ -138,41 +138,24 @@ def _matching(path: Path, job: Job) -> Model | MotionModel:
 
 
 def _row(kind: str, fitted: Fitted, verdict: Verdict | None) -> RowResult:
-    result, bound = fitted.result, fitted.fit.model.form.bound
-    return RowResult.model_validate(
-        {
-            "name": kind,
-            "status": result.status.code,
-            "seconds": result.status.seconds,
-            "weights": bound.size if bound else 0,
-            "parameters": result.parameters,
-            "orthogonality_defect": result.orthogonality_defect,
-            "scores": result.scores,
-            "residuals": result.residuals,
-            "warnings": result.warnings,
-            "learner_to_physics": dominance(fitted.fit) if fitted.fit.status.ok else None,
-            "validation": verdict,
-        }
-    )
+    result, fit = fitted.result, fitted.fit
+    own = {key: getattr(result, key) for key in ("parameters", "orthogonality_defect", "residuals")}
+    own |= {"status": result.status.code, "seconds": result.status.seconds, "validation": verdict}
+    share = dominance(fit) if fit.status.ok else None
+    return _row_of(kind, fit.model, result.scores, result.warnings, **own, learner_to_physics=share)
 
 
 def _saved_row(name: str, model: Model | MotionModel, job: Job) -> RowResult:
     warnings: list[Any] = []
     scores = {part.name: score_part(model, part, warnings)[0] for part in job.parts}
+    return _row_of(name, model, scores, warnings, status="saved", parameters=parameter_rows(*model.estimated))
+
+
+def _row_of(name: str, model: Model | MotionModel, scores: Any, warnings: Sequence[Any], **told: Any) -> RowResult:
+    """A row; null for what is not `told`."""
+    own = {"name": name, "weights": model.form.bound.size if model.form.bound else 0}
     return RowResult.model_validate(
-        {
-            "name": name,
-            "status": "saved",
-            "seconds": None,
-            "weights": model.form.bound.size if model.form.bound else 0,
-            "parameters": parameter_rows(*model.estimated),
-            "orthogonality_defect": None,
-            "scores": scores,
-            "residuals": None,
-            "warnings": warnings,
-            "learner_to_physics": None,
-            "validation": None,
-        }
+        dict.fromkeys(RowResult.model_fields) | own | {"scores": scores, "warnings": warnings} | told
     )
 
 

@@ -36,12 +36,8 @@ class ChannelSection(Section):
 class PrepareSection(KindSection):
     """A step that every part of the data goes through."""
 
+    registries = {"step": STEPS}
     step: str
-
-    @model_validator(mode="after")
-    def _check(self) -> PrepareSection:
-        self.declared(STEPS, self.step)
-        return self
 
 
 class Data(Section):
@@ -57,7 +53,7 @@ class Data(Section):
     validation: PartSection | None = None
     tests: dict[str, PartSection] = {}
     channels: dict[str, ChannelSection] = {}
-    prepare: list[with_kinds(PrepareSection, step=STEPS)] = []  # type: ignore[valid-type]
+    prepare: list[with_kinds(PrepareSection)] = []  # type: ignore[valid-type]
 
     @property
     def steps(self) -> tuple[Any, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -83,3 +84,11 @@ def save_figure(figure: Figure, out: Path, *, force: bool = False) -> None:
 
     with whole_file(out, force=force) as partial:
         save(figure, partial, out.suffix[1:].lower())
+
+
+def relative(file: Path, folder: Path) -> str:
+    """A file as a spec in the folder names it."""
+    try:
+        return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
+    except ValueError:  # on another drive
+        return file.resolve().as_posix()

@@ -161,10 +161,6 @@ def write_spec(found: Draft, out: Path, *, force: bool = False) -> None:
                 raise InputError(f"{out}: a spec for these columns would be refused: {told}") from None
 
 
-def _names(text: str) -> list[str]:
-    return [name.strip() for name in text.split(",") if name.strip()]
-
-
 def _extent(roles: Roles) -> tuple[int, int]:
     """Rows up to the last value of any channel, and how many of them lack one."""
     columns = [*roles.inputs, *roles.outputs]

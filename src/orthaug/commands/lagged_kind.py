@@ -13,7 +13,7 @@ from orthaug._base.warning import Warning
 from orthaug.analysis.closed_loop import closed_loop
 from orthaug.analysis.imitation import Imitation, imitation
 from orthaug.analysis.measure_bias import Ground, bias_under
-from orthaug.commands.attempt import attempt
+from orthaug.commands.attempt import attempt, attempt_warned
 from orthaug.commands.lagged_job import LaggedJob
 from orthaug.commands.suspects import declared
 from orthaug.fitting.elimination import directions
@@ -26,10 +26,13 @@ from orthaug.reports.result import CheckResult, FitResult, ParameterResult, para
 if TYPE_CHECKING:
     from orthaug.analysis.budget import Budget
     from orthaug.fitting.estimates import Estimate
-    from orthaug.inference.physical import PhysicalEstimate
     from orthaug.models.response import Response
     from orthaug.reports.drawing import Figure
 
+_NOT_ANALYSED = Warning(
+    "residual_not_analysed",
+    "the residual is not analysed: there are too few rows for that, or it is rounding only.",
+)
 _UNKNOWN = ("physical_parameters", "physical_consistency", "sensitivities", "bias")
 
 
@@ -84,10 +87,8 @@ def content(
         None if fit.plain_covariance is None else np.sqrt(np.diag(fit.plain_covariance)),
     )
     units = derived_units(fit.problem.baseline, fit.problem.record.outputs, fit.problem.record.inputs)
+    rows = [row if row.unit else row.model_copy(update={"derived_unit": units.get(row.name)}) for row in rows]
     told |= {
-        "parameters": [
-            row if row.unit else row.model_copy(update={"derived_unit": units.get(row.name)}) for row in rows
-        ],
         "standard_errors": None if fit.std is None else "plain" if fit.plain_covariance is None else "robust",
         "measure_detail": fit.measure,
         "excitation": fit.excitation,
@@ -96,9 +97,14 @@ def content(
     budget = None
     if fit.status.ok:
         budget = attempt("the bias that the learner implies", partial(_budget_of, job, fit), warnings, None)
-    found, biased = _with_biases(fit, shared, told, budget)
-    warnings += biased
-    return fit, told | found
+    warnings += budget.warnings if budget else ()
+    if fit.model.structure != "orthogonal" or fit.model.form.bound is None:  # a variant of what the spec declares
+        shared = None
+    told["parameters"] = _with_biases(rows, shared.determined if shared else None, budget)
+    if told["physical_parameters"] is not None:
+        physical = shared.physical if shared else None
+        told["physical_parameters"] = _with_biases(told["physical_parameters"], physical, budget)
+    return fit, told
 
 
 def figures(
@@ -139,30 +145,19 @@ def _physical_content(job: LaggedJob, fit: Estimate, warnings: list[Any]) -> dic
     """The physical parameters of θ̂ and what belongs to them, where the spec has a map; warnings are added."""
     if job.physics is None:
         return {}
-    physical = fit.physical(job.physics)
+    physical, profiles, slopes = fit.physical(job.physics), None, None
     warnings += physical.warnings
+    if job.spec.physics is not None and job.spec.physics.profile and physical.covariance is not None:
+        profiles = {name: fit.physical_profile(job.physics, name) for name in physical.names}
+    if physical.sensitivities is not None:  # ∂ln p / ∂ln θ by name
+        slopes = {
+            name: dict(zip(job.physics.theta_names, row, strict=True))
+            for name, row in zip(physical.names, physical.sensitivities, strict=True)
+        }
     return {
-        "physical_parameters": _physical_rows(job, physical, fit),
+        "physical_parameters": physical_rows(physical, profiles),
         "physical_consistency": physical.consistency,
-        "sensitivities": _sensitivities(job, physical),
-    }
-
-
-def _physical_rows(job: LaggedJob, physical: PhysicalEstimate, fit: Estimate) -> list[ParameterResult]:
-    """The physical parameters, with profile intervals where the spec asks for them."""
-    assert job.physics is not None and job.spec.physics is not None
-    if not job.spec.physics.profile or physical.covariance is None:
-        return physical_rows(physical)
-    return physical_rows(physical, {name: fit.physical_profile(job.physics, name) for name in physical.names})
-
-
-def _sensitivities(job: LaggedJob, physical: PhysicalEstimate) -> dict[str, dict[str, float]] | None:
-    """∂ln p / ∂ln θ by name."""
-    if job.physics is None or physical.sensitivities is None:
-        return None
-    return {
-        name: dict(zip(job.physics.theta_names, row, strict=True))
-        for name, row in zip(physical.names, physical.sensitivities, strict=True)
+        "sensitivities": slopes,
     }
 
 
@@ -173,31 +168,20 @@ def _analysed(fit: Estimate, one_step: Response, free_run: Response, warnings: l
     from orthaug.analysis.missing_lags import missing_lags
 
     problem = fit.problem
-
-    def residuals() -> Any:
-        diagnosis = diagnose(fit, one_step=one_step, free_run=free_run)
-        if diagnosis is None:
-            told = "the residual is not analysed: there are too few rows for that, or it is rounding only."
-            warnings.append(Warning("residual_not_analysed", told))
-        else:
-            warnings.extend(diagnosis.warnings)
-        return diagnosis
-
-    def steady() -> Any:
-        found = stability(fit.model, problem.record, response=free_run, x=problem.rows.x)
-        warnings.extend(found.warnings)
-        return found
-
-    def hidden() -> Any:
-        found = missing_lags(fit, one_step)
-        warnings.extend(found.warnings if found else ())
-        return found
-
     warnings += closed_loop(problem.record)
     return {
-        "stability": attempt("the analysis of the free run's sensitivity", steady, warnings, None),
-        "residuals": attempt("the analysis of the residual", residuals, warnings, None),
-        "missing_lags": attempt("the search for missing lags", hidden, warnings, None),
+        "stability": attempt_warned(
+            "the analysis of the free run's sensitivity",
+            lambda: stability(fit.model, problem.record, response=free_run, x=problem.rows.x),
+            warnings,
+        ),
+        "residuals": attempt_warned(
+            "the analysis of the residual",
+            lambda: diagnose(fit, one_step=one_step, free_run=free_run),
+            warnings,
+            _NOT_ANALYSED,
+        ),
+        "missing_lags": attempt_warned("the search for missing lags", lambda: missing_lags(fit, one_step), warnings),
     }
 
 
@@ -223,28 +207,12 @@ def _budget_of(job: LaggedJob, fit: Estimate) -> Budget | None:
 
 
 def _with_biases(
-    fit: Estimate, shared: Imitation | None, content: Mapping[str, Any], budget: Budget | None
-) -> tuple[dict[str, list[ParameterResult] | None], tuple[Warning, ...]]:
-    """The rows of `parameters` and `physical_parameters` with what the learner shares and what biases them."""
-    physical = content["physical_parameters"]
-    if fit.model.structure != "orthogonal" or fit.model.form.bound is None:  # a variant of what the spec declares
-        shared = None
-
-    def told(rows: list[ParameterResult] | None, determined: Sequence[str] | None) -> list[ParameterResult] | None:
-        if rows is None:
-            return None
-        return [
-            row.told(
-                None if determined is None else row.name not in determined, budget.of(row.name) if budget else None
-            )
-            for row in rows
-        ]
-
-    rows = {
-        "parameters": told(content["parameters"], shared.determined if shared else None),
-        "physical_parameters": told(physical, shared.physical if shared else None),
-    }
-    return rows, budget.warnings if budget else ()
+    rows: Sequence[ParameterResult], determined: Sequence[str] | None, budget: Budget | None
+) -> list[ParameterResult]:
+    """Parameters with whether the learner could imitate them, and what biases them."""
+    shared = [None if determined is None else row.name not in determined for row in rows]
+    biases = [budget.of(row.name) if budget else None for row in rows]
+    return [row.told(imitated, bias) for row, imitated, bias in zip(rows, shared, biases, strict=True)]
 
 
 def _ground(job: LaggedJob, fit: Estimate | None) -> Ground:
@@ -255,9 +223,7 @@ def _ground(job: LaggedJob, fit: Estimate | None) -> Ground:
     if fit.problem.weight.kind != problem.weight.kind:  # weighed by the errors that the fit left
         problem = fit.problem
         weighed = weigh_problem(job.measure, problem)
-    learned = None
-    if fit.model.form.bound is not None:
-        learned = fit.model.learner_at(weighed.points.x)
+    learned = None if fit.model.form.bound is None else fit.model.learner_at(weighed.points.x)
     return Ground(weighed, problem, fit.theta, job.physics, learned, fit.model.shared)
 
 
@@ -271,7 +237,7 @@ def _shared_of(job: LaggedJob, problem: Problem | None = None, *, others: bool =
     structure = job.spec.declared_structure()
     if job.spec.declared_learner() is None or not structure.projects or structure.shared == "all":
         return None
-    problem = job.problem if problem is None else problem
-    return (
-        imitation(problem, job.physics, others=others) if problem.baseline.names and problem.features.entries else None
-    )
+    problem = problem or job.problem
+    if not problem.baseline.names or not problem.features.entries:
+        return None
+    return imitation(problem, job.physics, others=others)

@@ -11,7 +11,7 @@ from orthaug._base.errors import InputError, RankError
 from orthaug._base.warning import Warning
 from orthaug.analysis.closed_loop import closed_loop
 from orthaug.analysis.motion_suspects import usual_motion_suspects
-from orthaug.commands.attempt import attempt
+from orthaug.commands.attempt import attempt, attempt_warned
 from orthaug.commands.motion_job import MotionJob
 from orthaug.reports.result import CheckResult, FitResult, MeasureResult, ParameterResult, parameter_rows
 
@@ -167,21 +167,6 @@ def _analysed(job: MotionJob, fit: MotionEstimate, free_run: Response, warnings:
     from orthaug.analysis.motion_modes import motion_stability
     from orthaug.analysis.motion_substeps import substep_bias
 
-    def residuals() -> Any:
-        diagnosis = diagnose_motion(fit, free_run)
-        warnings.extend([_NOT_ANALYSED] if diagnosis is None else diagnosis.warnings)
-        return diagnosis
-
-    def stability() -> Any:
-        stable = motion_stability(fit.model, x, u, record=job.train.record)
-        warnings.extend(stable.warnings)
-        return stable
-
-    def coarse() -> Any:
-        found = substep_bias(fit)
-        warnings.extend(found.warnings if found else ())
-        return found
-
     def biases() -> Any:
         table = suspected_bias(fit, job.suspects) if job.suspects else []
         budget = motion_budget(fit, table, softened_bias(fit, job.suspects))
@@ -191,13 +176,17 @@ def _analysed(job: MotionJob, fit: MotionEstimate, free_run: Response, warnings:
     points = job.reach(fit.model, job.train.record)[0]
     x, u = np.split(points, [fit.model.form.states], axis=1)
     found = {
-        "residuals": attempt("the analysis of the residual", residuals, warnings, None),
-        "stability": attempt("the analysis of the modes", stability, warnings, None),
+        "residuals": attempt_warned(
+            "the analysis of the residual", lambda: diagnose_motion(fit, free_run), warnings, _NOT_ANALYSED
+        ),
+        "stability": attempt_warned(
+            "the analysis of the modes", lambda: motion_stability(fit.model, x, u, record=job.train.record), warnings
+        ),
         "parts": None,
     }
     if fit.model.form.bound is not None:
         found["parts"] = attempt("the size of the learned part", lambda: equation_parts(fit, x, u), warnings, None)
-    found["coarse"] = attempt("the analysis of the substeps", coarse, warnings, None)
+    found["coarse"] = attempt_warned("the analysis of the substeps", lambda: substep_bias(fit), warnings)
     table, budget = attempt("the bias by suspects", biases, warnings, (None, None))
     return found | {"bias": table, "budget": budget}
 

@@ -128,40 +128,29 @@ class DesignSection(Section):
 class LearnerSection(KindSection):
     """The learned correction."""
 
+    registries = {"kind": LEARNERS}
     kind: str = "mlp"
-
-    @model_validator(mode="after")
-    def _check(self) -> LearnerSection:
-        self.declared(LEARNERS, self.kind)
-        return self
 
 
 class MeasureSection(KindSection):
     """The set of regressor points on which physics and learner are made orthogonal."""
 
+    registries = {"kind": MEASURES}
     kind: str = "training"
-
-    @model_validator(mode="after")
-    def _check(self) -> MeasureSection:
-        self.declared(MEASURES, self.kind)
-        return self
 
 
 class StructureSection(KindSection):
     """How physics and learner share the fitted function."""
 
+    registries = {"kind": STRUCTURES}
     kind: str = "orthogonal"
     measure: MeasureSection = MeasureSection()
-
-    @model_validator(mode="after")
-    def _check(self) -> StructureSection:
-        self.declared(STRUCTURES, self.kind)
-        return self
 
 
 class TrainingSection(KindSection):
     """Solver, criterion and regularisation."""
 
+    registries = {"solver": SOLVERS, "focus": CRITERIA}
     solver: str = "levenberg-marquardt"
     focus: str = "prediction"
     restarts: Positive = 1
@@ -357,11 +346,9 @@ def spec_model() -> type[Spec]:
 
 @lru_cache(maxsize=8)
 def _spec_model(registered: object) -> type[Spec]:
-    learner = with_kinds(LearnerSection, kind=LEARNERS)
-    measure = with_kinds(MeasureSection, kind=MEASURES)
-    structure = with_kinds(StructureSection, {"measure": (measure, measure())}, kind=STRUCTURES)
-    training = with_kinds(TrainingSection, solver=SOLVERS, focus=CRITERIA)
-    sections = {"learner": learner, "structure": structure, "training": training}
+    measure = with_kinds(MeasureSection)
+    structure = with_kinds(StructureSection, measure=(measure, measure()))
+    sections = {"learner": with_kinds(LearnerSection), "structure": structure, "training": with_kinds(TrainingSection)}
     return create_model("Spec", __base__=Spec, **{name: (section, section()) for name, section in sections.items()})  # type: ignore[call-overload]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections.abc import Sequence
@@ -14,6 +13,7 @@ from pydantic import ValidationError
 
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
+from orthaug._base.manifest import file_digest
 from orthaug._base.warning import Warning
 from orthaug.commands.folder import not_a_result
 from orthaug.commands.run import Reading, record_for
@@ -79,8 +79,7 @@ def open_track(
     records, files = [], []
     for path in data:
         records.append(record_for(loaded, path, loaded.outputs, Reading("skip", prepare=True)))
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()
-        files.append(FileResult(file=str(path), sha256=digest, rows=len(records[-1])))
+        files.append(FileResult(file=str(path), sha256=file_digest(path), rows=len(records[-1])))
     given = open_training(model, training, rows).record if training else None
     return Opened(loaded, Record.join(records), given, tuple(files), _physics_of(model, loaded.sampling_time))
 
