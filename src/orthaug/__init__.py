@@ -19,7 +19,7 @@ def _html(shown: Any) -> str:
 
 
 def _plot(fit: Any) -> Any:
-    from orthaug.reports.fit_plots import FitPlots
+    from orthaug.reports.figures import FitPlots
 
     return FitPlots(fit)
 

@@ -13,7 +13,7 @@ import numpy as np
 from orthaug._base.errors import InputError, KeyedError
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.warning import Warning
-from orthaug.commands.engine_section import engine_of
+from orthaug.commands.data_sections import engine_of
 from orthaug.commands.job import ALONE, AS_DECLARED, Job, Variant
 from orthaug.commands.parts import load_parts
 from orthaug.commands.spec import Spec

@@ -195,7 +195,7 @@ def figures(
     job: MotionJob, fit: MotionEstimate, result: FitResult, responses: Mapping[str, tuple[Response, Response]]
 ) -> dict[str, Figure]:
     """The figures of a result by their names."""
-    from orthaug.reports import motion_plots, plots
+    from orthaug.reports import plots
     from orthaug.reports.learned_part import learned_of
 
     part = job.parts[-1]
@@ -204,17 +204,17 @@ def figures(
     drawn = {
         "simulation": plots.output_figure(free, f"free run, {part.name}", learns=learns),
         "residual": plots.residual_figure(free, f"free-run residual, {part.name}"),
-        "states": motion_plots.states_figure(fit.model, part.record, f"states of the free run, {part.name}"),
+        "states": plots.states_figure(fit.model, part.record, f"states of the free run, {part.name}"),
     }
     if result.bias:
         drawn["bias"] = plots.bias_figure(result.bias)
     drawn["prediction"] = plots.output_figure(one_step, f"one-step prediction, {part.name}")
     if learns:
-        drawn["components"] = motion_plots.parts_figure(fit.model, part.record, f"physics and learner, {part.name}")
+        drawn["components"] = plots.parts_figure(fit.model, part.record, f"physics and learner, {part.name}")
         part = learned_of(fit, job.train.record)
         assert part is not None
         title = f"learned beside the physics, by the {fit.model.measure} measure"
-        drawn["learner"] = motion_plots.learner_figure(part, title)
+        drawn["learner"] = plots.learner_figure(part, title)
     return drawn
 
 

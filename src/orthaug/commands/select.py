@@ -12,7 +12,7 @@ import tomlkit
 
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
-from orthaug.commands.engine_section import EngineSection, engine_of
+from orthaug.commands.data_sections import EngineSection, engine_of
 from orthaug.commands.folder import not_a_result, relative
 from orthaug.commands.lagged_job import LaggedJob, open_lagged
 from orthaug.commands.spec import LearnerSection, Spec, load_spec

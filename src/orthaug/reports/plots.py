@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from orthaug._base.lines import percent
+from orthaug.data.record import Record
+from orthaug.models.motion_parts import parts_at
 from orthaug.models.response import Response
 from orthaug.reports.drawing import (
     BLACK,
@@ -34,6 +36,7 @@ from orthaug.reports.drawing import (
     window,
 )
 from orthaug.reports.findings import SuspectResult
+from orthaug.reports.learned_part import LearnedPart, curve_limits, labels_with_units, trajectory_of
 from orthaug.reports.page_blocks import with_unit
 from orthaug.reports.residual_tests import ResidualTestResult
 from orthaug.reports.result import RowResult
@@ -42,10 +45,13 @@ from orthaug.reports.selection import SelectResult
 if TYPE_CHECKING:
     import pandas as pd
 
+    from orthaug.models.motion_model import MotionModel
+
 __all__ = ["save"]
 
 _CYCLE = (BLUE, ORANGE, GREEN, BLACK)
 _KINDS = ("prediction", "simulation")
+_BESIDE = 3  # panels beside each other
 _MOST_NUMBERS = 200  # in a heat map: of more the colours alone are shown
 _SIZES = {"orders": "linear lags", "terms": "terms beside the physics", "learner": "weights of the network"}
 _WIDE = 5.0  # ratio of scores from which their axis is logarithmic
@@ -113,6 +119,77 @@ def components_figure(response: Response, title: str) -> Figure:
             label(axis, y=with_unit(part, channel.unit))
             legend(axis)
     label(axes[-1], x="time [s]")
+    return figure
+
+
+@plain
+def states_figure(model: MotionModel, record: Record, title: str) -> Figure:
+    """Every state along the free run of the first experiment."""
+    states, _ = trajectory_of(model, record)
+    motion = model.form.motion
+    rows = slice(0, min(len(states), 250))
+    time = np.arange(rows.stop) * model.sampling_time
+    figure, axes = _stacked(len(motion.states), f"{title}: samples 0 to {rows.stop - 1}")
+    for axis, state, values in zip(axes, motion.states, states.T, strict=True):
+        axis.plot(time, values[rows], color=BLUE, linewidth=1.1)
+        label(axis, y=with_unit(state.name, state.unit))
+    label(axes[-1], x="time [s]")
+    return figure
+
+
+@plain
+def parts_figure(model: MotionModel, record: Record, title: str) -> Figure:
+    """Of each learned equation and output what the physics gives, and what is learned beside it, along the free run."""
+    states, inputs = trajectory_of(model, record)
+    rows = slice(0, min(len(states), 250))
+    physics, learner = parts_at(model.form, model.numbers, states[rows], inputs[rows])
+    names = labels_with_units(model)
+    time = np.arange(rows.stop) * model.sampling_time
+    figure, axes = _stacked(2 * len(names), f"{title}: samples 0 to {rows.stop - 1}")
+    for i, name in enumerate(names):
+        axes[2 * i].plot(time, physics[:, i], color=BLUE, linewidth=1.1, label="physics")
+        axes[2 * i + 1].plot(time, learner[:, i], color=GREEN, linewidth=1.1, label="learner")
+        for axis in axes[2 * i : 2 * i + 2]:
+            label(axis, y=name)
+            legend(axis)
+    label(axes[-1], x="time [s]")
+    return figure
+
+
+@plain
+def learner_figure(part: LearnedPart, title: str) -> Figure:
+    """What was learned over each input of the learner: along the training run, and as a curve where that is one.
+
+    The curve of a state or input is drawn with all others at their medians, dashed beyond the reach of the data.
+    """
+    values, names, seen = part.values, part.names, part.features
+    columns = min(len(seen), _BESIDE)
+    rows = len(names) * -(-len(seen) // columns)
+    figure = Figure(figsize=(SIZE[0] * (1 if columns == 1 else 1.3), TOP + 2.4 * rows))
+    axes = grid(figure, rows, columns, gap=(0.75, 0.85))
+    headline(figure, title)
+    curves = [part.curve(feature) for feature in seen]
+    for k, name in enumerate(names):
+        for j, feature in enumerate(seen):
+            row, column = divmod(j, columns)
+            axis = axes[k * (rows // len(names)) + row, column]
+            axis.plot(part.seen[:, j], values[:, k], ".", color=GREY, markersize=6, label="training run")
+            curve = curves[j]
+            if curve is not None:
+                along, inside, learned = curve.along, curve.inside, curve.learned[:, k]
+                if curve.half is not None:
+                    half = curve.half[:, k]
+                    band = learned - half, learned + half
+                    axis.fill_between(along, *band, color=GREEN, alpha=0.2, linewidth=0, label="95 % interval")
+                axis.set_ylim(*curve_limits(curve, k, values[:, k]))
+                axis.axvspan(along[inside][0], along[inside][-1], color=GREY, alpha=0.15, linewidth=0, zorder=0)
+                axis.plot(along, learned, "--", color=GREEN, linewidth=1.0)
+                axis.plot(along[inside], learned[inside], color=GREEN, linewidth=1.2, label="learner")
+            label(axis, x=with_unit(feature, part.units[j]), y=None if column else name)
+    for axis in axes.flat:
+        axis.set_visible(bool(axis.lines))
+    told = max(axes[0], key=lambda axis: len(axis.get_legend_handles_labels()[1]))
+    legend(axes[0, -1] if axes[0, -1].lines else told, *told.get_legend_handles_labels())
     return figure
 
 
@@ -292,3 +369,11 @@ def _mean_nrmse(row: RowResult, kind: str) -> float:
 def _floats(values: Sequence[float | None]) -> np.ndarray:
     """The numbers of a result, NaN for None."""
     return np.array(values, dtype=float)
+
+
+def _stacked(count: int, title: str) -> tuple[Figure, list]:
+    """Panels below each other."""
+    figure = Figure(figsize=(SIZE[0], TOP + 1.6 * count))
+    axes = grid(figure, count, 1, sharex=True)[:, 0]
+    headline(figure, title)
+    return figure, list(axes)
