@@ -26,6 +26,7 @@ from orthaug.commands.program import (
     main,
     other_writes,
     prepare_jax,
+    tell,
 )
 
 __all__ = ["main"]
@@ -65,7 +66,7 @@ def check(
     if job.spec.motion is not None:  # its runs are computed
         prepare_jax()
     result = kind_of(job).checked(job)
-    streams.echo(result.to_json() if as_json else check_text(result))
+    tell(result, check_text(result), as_json)
     if figure is not None and result.bias:
         from orthaug.reports.plots import bias_figure
 
@@ -102,11 +103,7 @@ def fit(
     if other_writes():
         return
     write_result(fitted, folder, force=force)
-    if as_json:
-        streams.echo(fitted.result.to_json())
-    else:
-        streams.echo(fit_text(fitted.fit, fitted.result))
-        streams.echo(f"\nwritten to {folder}")
+    tell(fitted.result, fit_text(fitted.fit, fitted.result), as_json, folder)
     if not fitted.fit.status.ok:
         raise TrainingError(f"{fitted.fit.status.message}. The account is in {folder / 'result.json'}.")
 
@@ -140,8 +137,7 @@ def compare(
     if other_writes():
         return
     comparing.write(comparison, folder, force=force)
-    text = compare_text(comparison.result, comparison.verdicts)
-    streams.echo(comparison.result.to_json() if as_json else f"{text}\n\nwritten to {folder}")
+    tell(comparison.result, compare_text(comparison.result, comparison.verdicts), as_json, folder)
 
 
 @app.command()
@@ -166,7 +162,7 @@ def design(
     designed = designing.design_for(job)
     designing.write(job, designed, out, force=force)
     result = DesignResult.of(designed)
-    streams.echo(result.to_json() if as_json else f"{design_text(result)}\n\nwritten to {out}")
+    tell(result, design_text(result), as_json, out)
 
 
 @app.command()
@@ -188,11 +184,8 @@ def select(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force
     with selection_bar(steps_at_most(given.selection.terms)) as told:
         selected = select_for(job, given, folder, told)
     write_selected(selected, folder, force=force)
-    if as_json:
-        streams.echo(selected.result.to_json())
-    else:
-        streams.echo(selection_text(selected.result))
-        streams.echo(f"\nwritten to {folder}; next: orthaug fit {folder / 'spec.toml'}")
+    place = f"{folder}; next: orthaug fit {folder / 'spec.toml'}"
+    tell(selected.result, selection_text(selected.result), as_json, place)
 
 
 @app.command()
@@ -294,7 +287,8 @@ def schema(
     if check_choice(command, (*RESULTS, "spec", "keys"), "WHAT") == "keys":
         streams.echo(keys_of_a_spec())
     else:
-        streams.echo(_json(schema_of_a_spec() if command == "spec" else schema_of(command)))
+        content = schema_of_a_spec() if command == "spec" else schema_of(command)
+        streams.echo(json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False))
 
 
 @app.command()
@@ -330,10 +324,6 @@ def reproduce(
         reproduced = reproduction.reproduce(entries, pipeline=pipeline, small=small, progress=progress, client=client)
     reproduction.write(reproduced, folder, pipeline, force=force)
     streams.echo(f"{reproduction.text(reproduced)}\n\nwritten to {folder}/index.html")
-
-
-def _json(content: Any) -> str:
-    return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
 
 
 from orthaug.commands import model_cli  # noqa: E402, F401  (its commands stand behind these)

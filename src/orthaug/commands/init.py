@@ -85,8 +85,7 @@ def question(found: Survey, inputs: str | None = None, outputs: str | None = Non
     free = [c.header for c in found.signals if id(c) not in given]
     if not found.signals or (outputs is None and not free):
         raise InputError(f"{found.path}: {_nothing_left(found, inputs)}")
-    listed = [c.header for c in found.signals]
-    some = ", ".join(listed[:_LISTED]) + (f" and {len(listed) - _LISTED} more" if len(listed) > _LISTED else "")
+    some = _listed([c.header for c in found.signals])
     output = free.pop() if outputs is None else outputs
     named = ",".join(free[:_LISTED]) if outputs is not None else free[0] if free else ""
     proposed = f'--inputs "{named if inputs is None else inputs}" --outputs "{output}"'
@@ -117,8 +116,12 @@ def _nothing_left(found: Survey, inputs: str | None) -> str:
 def left_out(found: Survey, used: Sequence[Column]) -> str:
     """The columns that are not used, and why, in a list; the time is none of them."""
     apart = {id(c) for c in (*used, found.clock.column)}
-    rest = [f"{c.header} ({why_not(c)})" for c in found.columns if id(c) not in apart]
-    return ", ".join(rest[:_LISTED]) + (f" and {len(rest) - _LISTED} more" if len(rest) > _LISTED else "")
+    return _listed([f"{c.header} ({why_not(c)})" for c in found.columns if id(c) not in apart])
+
+
+def _listed(columns: Sequence[str]) -> str:
+    more = f" and {len(columns) - _LISTED} more" if len(columns) > _LISTED else ""
+    return ", ".join(columns[:_LISTED]) + more
 
 
 def why_not(column: Column) -> str:

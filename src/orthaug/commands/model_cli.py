@@ -24,6 +24,7 @@ from orthaug.commands.program import (
     Rows,
     app,
     prepare_jax,
+    tell,
 )
 
 if TYPE_CHECKING:
@@ -126,7 +127,7 @@ def split(
     for line in prepared_notes(opened.model, opened.record):
         streams.say(line)
     result = splitting.split_model(opened, chosen)
-    streams.echo(result.to_json() if as_json else split_text(result))
+    tell(result, split_text(result), as_json)
 
 
 @app.command()
@@ -153,7 +154,7 @@ def explain(
     for line in opened.notes:
         streams.say(line)
     result = explain_model(opened, degree=degree, functions=functions or (), most=most)
-    streams.echo(result.to_json() if as_json else explain_text(result))
+    tell(result, explain_text(result), as_json)
 
 
 @app.command()
@@ -257,7 +258,7 @@ def track(
     tracked = tracking.track(opened, forgetting=forgetting, memory=memory, state=state, follows=follows)
     text = track_text(tracked.result)
     tracking.write_tracked(tracked, folder, text, force=force)
-    streams.echo(tracked.result.to_json() if as_json else f"{text}\n\nwritten to {folder}")
+    tell(tracked.result, text, as_json, folder)
 
 
 def _written_long(model: Path, data: Path, reading: Reading, out: Path | None, force: bool, *, free: bool) -> bool:

@@ -253,7 +253,7 @@ class FitPlots:
         axis.set_xscale("log")
         if not phase:
             axis.set_yscale("log")
-        unit = gain_unit(view, view.outputs[i], view.inputs[j])
+        unit = gain_unit(view, i, j)
         what = "phase [°]" if phase else f"gain [{unit}]" if unit else "gain"
         axis.set(xlabel="frequency [Hz]", ylabel=what, title=f"from {view.inputs[j]} to {view.outputs[i]}")
         return axis

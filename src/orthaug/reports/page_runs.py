@@ -15,7 +15,7 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug.data.record import Channel
 from orthaug.models.response import Response
-from orthaug.reports.page_blocks import Plot, number, percent, with_unit
+from orthaug.reports.page_blocks import Plot, area, number, percent, with_unit
 
 MOST_POINTS = 100_000  # of a curve
 _BUDGET = 560_000  # points of a page: three million letters
@@ -261,7 +261,9 @@ def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
             told = {"name": "measured − model", "line": {"color": "@residual", "width": 1}}
             panels.add_residual("model", i, model, told)
             if limits is not None:
-                panels.layout["shapes"].append(_stripe(limits, 2 * i + 2))
+                low, high = limits
+                place = {"xref": "paper", "x0": 0, "x1": 1, "yref": f"y{2 * i + 2}"}
+                panels.layout["shapes"].append(area("@band", **place, y0=low, y1=high))
         panels.finish(i, drawn)
     _mark(panels.layout, run, panels.start, panels.step)
     time = "time [s]" if len(response.trajectories) == 1 else "time, experiments one after another [s]"
@@ -300,21 +302,6 @@ def _axes(i: int, panels: int, channel: Channel, limits: list[float] | None) -> 
         "domain": [max(bottom, 0), middle - _GAP / 2],
     }
     return {f"yaxis{2 * i + 1}" if i else "yaxis": upper, f"yaxis{2 * i + 2}": lower}
-
-
-def _stripe(limits: tuple[float, float], axis: int) -> dict[str, Any]:
-    return {
-        "type": "rect",
-        "xref": "paper",
-        "x0": 0,
-        "x1": 1,
-        "yref": f"y{axis}",
-        "y0": limits[0],
-        "y1": limits[1],
-        "fillcolor": "@band",
-        "line": {"width": 0},
-        "layer": "below",
-    }
 
 
 def _mark(layout: dict[str, Any], run: Run, start: float, step: float) -> None:
