@@ -15,7 +15,7 @@ from orthaug._base.progress import SILENT, Progress
 from orthaug.analysis.validation import Verdict, dominance
 from orthaug.commands.fit import Fitted, cross_validated, fit_variant, judge_fit, score_part, wanted_blocks
 from orthaug.commands.folder import not_a_result
-from orthaug.commands.job import ALONE, Job, Variant
+from orthaug.commands.job import ALONE, Job, Variant, origin_of
 from orthaug.data.record import same_step
 from orthaug.models import storage
 from orthaug.models.model import Model
@@ -105,7 +105,6 @@ def write(comparison: Comparison, folder: Path, *, force: bool = False) -> None:
 
 def compare_report(comparison: Comparison) -> str:
     """The page of a comparison."""
-    from orthaug.commands.reporting import origin_of
     from orthaug.reports.page import compare_page
     from orthaug.reports.page_compare import ComparePage
 

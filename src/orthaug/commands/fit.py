@@ -17,7 +17,7 @@ from orthaug._base.views import MAKERS
 from orthaug._base.warning import Warning
 from orthaug.commands.attempt import attempt
 from orthaug.commands.folder import not_a_result
-from orthaug.commands.job import ALONE, AS_DECLARED, DEFAULT_BLOCKS, Job, Variant
+from orthaug.commands.job import ALONE, AS_DECLARED, DEFAULT_BLOCKS, Job, Variant, origin_of
 from orthaug.commands.kinds import kind_of
 from orthaug.commands.parts import Part
 from orthaug.inference.learned_terms import equation, learned_terms
@@ -288,7 +288,6 @@ def _draw(fitted: Fitted, folder: Path) -> None:
 
 def fit_report(fitted: Fitted, origin: Origin | None = None) -> str:
     """The page of a fit that has a model; `origin` is where it comes from, None for its spec."""
-    from orthaug.commands.reporting import origin_of
     from orthaug.reports.learned_part import learned_of
     from orthaug.reports.page import fit_page
     from orthaug.reports.page_fit import FitPage
