@@ -291,7 +291,7 @@ def test_what_a_fit_seldom_needs_is_not_loaded_for_it(tmp_path: Path) -> None:
 
 
 def test_reading_a_spec_and_its_data_does_not_load_jax() -> None:
-    names = [n for n in FILES if room_of(n) in ("data", "physics")] + ["commands.opening", "commands.run"]
+    names = [n for n in FILES if room_of(n) in ("data", "physics")] + ["commands.kinds", "commands.run"]
     report = loaded_by(
         "import importlib\n"
         f"for name in {names!r}:\n"

@@ -17,7 +17,7 @@ import pytest
 
 import orthaug as oa
 from orthaug.commands.fit import fit_job
-from orthaug.commands.opening import open_job
+from orthaug.commands.kinds import open_job
 from orthaug.commands.select import open_select, select_for
 from orthaug.commands.spec import load_spec
 from orthaug.data.sources import witness

@@ -22,7 +22,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import jnp
 from orthaug.analysis.motion_modes import motion_stability
 from orthaug.commands import cli
-from orthaug.commands.opening import open_job
+from orthaug.commands.kinds import open_job
 from orthaug.data.readers import read_record
 from orthaug.models.motion_parts import parts_at
 
@@ -606,7 +606,7 @@ def test_rows_of_a_motion_are_all_usable(folder):
 
 def test_opening_a_motion_loads_no_jax(folder):
     program = (
-        "import sys\nfrom pathlib import Path\nfrom orthaug.commands.opening import open_job\n"
+        "import sys\nfrom pathlib import Path\nfrom orthaug.commands.kinds import open_job\n"
         f"open_job(Path({str(put(folder))!r}))\nassert 'jax' not in sys.modules\n"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)

@@ -11,11 +11,11 @@ import numpy as np
 from orthaug._base.errors import InputError, KeyedError
 from orthaug._base.progress import SILENT, Progress
 from orthaug.analysis.motion_suspects import MotionSuspect
-from orthaug.commands.engine_section import engine_of
+from orthaug.commands.data_sections import engine_of
 from orthaug.commands.job import ALONE, AS_DECLARED, Job, Variant
-from orthaug.commands.motion_suspects import declared_terms
 from orthaug.commands.parts import Part, load_parts
 from orthaug.commands.spec import Spec
+from orthaug.commands.suspects import declared_terms
 from orthaug.data.record import Record, check_channels
 from orthaug.data.regressors import Layout
 from orthaug.fitting.cost import check_cost
