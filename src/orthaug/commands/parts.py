@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from orthaug._base.errors import InputError
-from orthaug._base.manifest import file_digest
+from orthaug._base.folders import file_digest
 from orthaug._base.memory import few_arenas
 from orthaug._base.warning import Warning
 from orthaug.commands.data_sections import PartSection
