@@ -12,10 +12,9 @@ from orthaug import __version__
 from orthaug._base.checks import check_type, nearest
 from orthaug._base.errors import InputError, shown
 from orthaug._base.folders import check_replaceable, whole_folder
-from orthaug.export.kinds import TARGETS
+from orthaug.export.kinds import TARGETS, VECTORS, Target
 from orthaug.export.lowering import program_of
 from orthaug.export.program import Program, Signal
-from orthaug.export.target import VECTORS, Target
 from orthaug.export.vectors import Vectors
 from orthaug.models import storage
 from orthaug.models.model import Model

@@ -1,4 +1,4 @@
-"""Scalar expressions in the intermediate form: numbers, names, entries of vectors, and functions of them.
+"""Scalar expressions in the intermediate form: numbers, names, entries of vectors, functions of them, and activations.
 
 Targets write them; nothing of Python's syntax tree, of NumPy or of JAX is left in them.
 """
@@ -6,6 +6,7 @@ Targets write them; nothing of Python's syntax tree, of NumPy or of JAX is left 
 from __future__ import annotations
 
 import ast
+import math
 import unicodedata
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -158,3 +159,30 @@ def identifier(name: str) -> str:
     """A name in ASCII: other letters by their code point, as `u03b8` for θ."""
     plain = unicodedata.normalize("NFKC", name)
     return "".join(c if c.isascii() and (c.isalnum() or c == "_") else f"u{ord(c):04x}" for c in plain)
+
+
+def _of(function: str, *arguments: Node) -> Node:
+    return Apply(function, arguments)
+
+
+_A, _ONE, _NULL = Name("a"), Number(1.0), Number(0.0)
+
+
+_SIGMOID = _of("div", _ONE, _of("add", _ONE, _of("exp", _of("neg", _A))))
+_CUBIC = _of("add", _A, _of("mul", Number(0.044715), _of("whole_power", _A, Number(3.0))))
+ACTIVATIONS: dict[str, Node] = {
+    "tanh": _of("tanh", _A),
+    "relu": _of("max", _A, _NULL),
+    "gelu": _of(
+        "mul",
+        _of("mul", Number(0.5), _A),
+        _of("add", _ONE, _of("tanh", _of("mul", Number(math.sqrt(2 / math.pi)), _CUBIC))),
+    ),
+    "sigmoid": _SIGMOID,
+    "silu": _of("mul", _A, _SIGMOID),
+    "elu": _of("add", _of("max", _A, _NULL), _of("expm1", _of("min", _A, _NULL))),
+    "softplus": _of("add", _of("max", _A, _NULL), _of("log1p", _of("exp", _of("neg", _of("abs", _A))))),
+    "identity": _A,
+}
+"""The activations of networks as nodes of `a`, so that no target needs a table of them; the names are those of
+`models.learners`."""

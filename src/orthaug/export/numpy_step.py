@@ -9,9 +9,8 @@ import numpy as np
 
 from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
-from orthaug.export.activations import ACTIVATIONS
 from orthaug.export.lowering import program_of
-from orthaug.export.nodes import Apply, Entry, Name, Node, Number
+from orthaug.export.nodes import ACTIVATIONS, Apply, Entry, Name, Node, Number
 from orthaug.export.program import Block, Program, Scheme
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
@@ -71,10 +70,9 @@ class NumpyStep:
 
     def _block(self, block: Block) -> Callable[[Vector, Vector], Vector]:
         intermediate = [(name, self._evaluation(node)) for name, node in block.locals]
-        network = block.network
-        features = [self._evaluation(node) for node in network.features] if network is not None else []
+        features = [] if block.network is None else list(map(self._evaluation, block.network.features))
         layers = []
-        for layer in network.layers if network is not None else ():
+        for layer in block.layers:
             bias = np.zeros(len(layer.weight)) if layer.bias is None else layer.bias
             act = None if layer.activation == "identity" else self._evaluation(ACTIVATIONS[layer.activation])
             layers.append((layer.weight, bias, act))

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.errors import InputError
-from orthaug.export.activations import ACTIVATIONS
-from orthaug.export.nodes import Apply, Entry, Name, Node, Number
+from orthaug.export.nodes import ACTIVATIONS, Apply, Entry, Name, Node, Number
 from orthaug.export.program import Block, Program
 from orthaug.export.vectors import Vectors
 

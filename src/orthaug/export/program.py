@@ -63,16 +63,15 @@ class Block:
     results: tuple[Node, ...]
 
     @property
-    def functions(self) -> set[str]:
-        """The functions of all its expressions."""
+    def nodes(self) -> tuple[Node, ...]:
+        """All its expressions."""
         features = self.network.features if self.network is not None else ()
-        nodes = (*(node for _, node in self.locals), *features, *self.results)
-        return set[str]().union(*map(functions_in, nodes))
+        return (*(node for _, node in self.locals), *features, *self.results)
 
     @property
-    def activations(self) -> set[str]:
+    def layers(self) -> tuple[Layer, ...]:
         """Those of its network."""
-        return {layer.activation for layer in self.network.layers} if self.network is not None else set()
+        return self.network.layers if self.network is not None else ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,12 +126,12 @@ class Program:
     @property
     def functions(self) -> set[str]:
         """The functions of all expressions."""
-        return set[str]().union(*(block.functions for block in self.blocks))
+        return set[str]().union(*(functions_in(node) for block in self.blocks for node in block.nodes))
 
     @property
     def activations(self) -> set[str]:
         """Those of all networks."""
-        return set[str]().union(*(block.activations for block in self.blocks))
+        return {layer.activation for block in self.blocks for layer in block.layers}
 
     @property
     def held(self) -> int:

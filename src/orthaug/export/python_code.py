@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthaug.export.activations import ACTIVATIONS
+from orthaug.export.nodes import ACTIVATIONS
 from orthaug.export.program import Block, Program
 from orthaug.export.text import Language, decimal, wrapped
 
@@ -62,7 +62,7 @@ def arithmetic(program: Program, dialect: Dialect) -> str:
 
 def _arrays(block: Block, dialect: Dialect) -> list[str]:
     found = []
-    for i, layer in enumerate(block.network.layers if block.network is not None else (), start=1):
+    for i, layer in enumerate(block.layers, start=1):
         found.append(_array(f"{block.name}_w{i}", layer.weight, dialect))
         if layer.bias is not None:
             found.append(_array(f"{block.name}_b{i}", layer.bias, dialect))
@@ -83,8 +83,8 @@ def _block(block: Block, dialect: Dialect) -> str:
     lines = [f"{name} = {write(node)}" for name, node in block.locals]
     if block.network is not None:
         lines.append(f"z = {_vector([write(node) for node in block.network.features], dialect)}")
-        last = len(block.network.layers)
-        for i, layer in enumerate(block.network.layers, start=1):
+        last = len(block.layers)
+        for i, layer in enumerate(block.layers, start=1):
             target, source = "g" if i == last else f"h{i}", "z" if i == 1 else f"h{i - 1}"
             value = f"{block.name}_w{i} @ {source}" + (f" + {block.name}_b{i}" if layer.bias is not None else "")
             lines.append(f"{target} = {value if layer.activation == 'identity' else f'_{layer.activation}({value})'}")
