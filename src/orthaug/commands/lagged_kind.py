@@ -15,7 +15,7 @@ from orthaug.commands.attempt import attempt
 from orthaug.commands.bias import bias_of, budget_of, with_biases
 from orthaug.commands.lagged_job import LaggedJob
 from orthaug.commands.shared import shared_of
-from orthaug.physics.derived_units import derived_units
+from orthaug.physics.baseline import derived_units
 from orthaug.physics.excitation import identifiability, require_rank
 from orthaug.reports.result import CheckResult, FitResult, ParameterResult, parameter_rows, physical_rows
 

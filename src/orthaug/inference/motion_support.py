@@ -8,7 +8,7 @@ from orthaug._base.checks import Matrix
 from orthaug.data.record import Channel, Experiment, Record
 from orthaug.inference.measures import Support
 from orthaug.physics.motion import Motion
-from orthaug.physics.motion_layout import layout_of
+from orthaug.physics.motion_problem import layout_of
 
 
 def support_of(motion: Motion, x: Matrix, u: Matrix) -> Support:

@@ -217,9 +217,8 @@ def _posed(
     rows = stack_rows(record, layout)
     signals = [np.concatenate([e.outputs, e.inputs], axis=1) for e in record.experiments]
     check_moving(Extent.of(np.concatenate(signals)), record, layout)
+    phi, known = baseline.on(rows.x, layout, outputs)
     with np.errstate(all="ignore"):
-        phi = np.asarray(baseline.phi(rows.x, layout, outputs, np))
-        known = np.asarray(baseline.known(rows.x, layout, outputs, np))
         target = rows.y - known
         deviation = rows.y.std(axis=0)
     check_physics(phi, known, baseline, rows, record)
@@ -239,9 +238,7 @@ def check_defined(problem: Problem, record: Record) -> None:
     for experiment in record.experiments:
         alone = replace(record, experiments=(experiment,))
         rows = UsableRows(lag_matrix(experiment, layout, record, start), experiment.outputs[start:], layout, start)
-        with np.errstate(all="ignore"):
-            phi = np.asarray(problem.baseline.phi(rows.x, layout, outputs, np))
-            known = np.asarray(problem.baseline.known(rows.x, layout, outputs, np))
+        phi, known = problem.baseline.on(rows.x, layout, outputs)
         check_physics(phi, known, problem.baseline, rows, alone)
         feature_rows(problem.features, rows, layout, alone)
 
