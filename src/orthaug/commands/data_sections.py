@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from orthaug._base.checks import check_label
 from orthaug.commands.sections import Count, Finite, KindSection, Positive, Section, with_kinds
-from orthaug.data.steps import STEPS
+from orthaug.data.preparation import STEPS
 
 Range = Annotated[list[Count], Field(min_length=2, max_length=2)]
 

@@ -16,8 +16,7 @@ import numpy as np
 from orthaug._base.checks import Vector, nearest
 from orthaug._base.errors import LONGEST, InputError, shown
 from orthaug.data.expressions import SAMPLING_TIME, is_name
-from orthaug.data.headers import is_time, last_part, split_header, step_of
-from orthaug.data.instants import in_seconds
+from orthaug.data.headers import in_seconds, is_time, last_part, split_header, step_of
 from orthaug.data.readers import JITTER
 from orthaug.data.record import same_step
 from orthaug.data.steps import Outliers
