@@ -23,9 +23,17 @@ from orthaug.data.regressors import Features, Layout, UsableRows, lag_matrix, la
 from orthaug.data.sources import Partition, Source
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.excitation import excitation, require_rank
-from orthaug.physics.moments import Extent, Moments
 from orthaug.physics.output_weights import OutputWeights, weigh_outputs
-from orthaug.physics.problem import Problem, check_moving, check_physics, check_sizes, feature_rows, pose
+from orthaug.physics.problem import (
+    Extent,
+    Moments,
+    Problem,
+    check_moving,
+    check_physics,
+    check_sizes,
+    feature_rows,
+    pose,
+)
 from orthaug.physics.projection import Projection, powers_of_two
 
 Passes = Callable[[Callable[[Partition], Any], Sequence[Partition]], list[Any]]
