@@ -211,7 +211,6 @@ def _path(path: Any) -> Path:
 
 
 def _columns(channels: Sequence[Sequence[Channel]], columns: Any) -> dict[str, str]:
-    """The file's column for each channel."""
     check_type(columns, Mapping | None, "columns", "this file's column by channel, such as {'y': 'yVal'}")
     given = dict(columns or {})
     for name, column in given.items():

@@ -330,7 +330,6 @@ def _by_single_number(path: Path) -> Clock:
 
 
 def _ticking(column: Column, seconds: Vector) -> Clock:
-    """The clock of a column of rising instants."""
     steps = np.diff(seconds[np.isfinite(seconds)])
     usual = float(np.median(steps))
     even = column.missing > 0 or bool((np.abs(steps - usual) <= JITTER * usual).all())

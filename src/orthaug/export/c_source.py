@@ -62,6 +62,11 @@ def fields_of(program: Program) -> list[tuple[str, Signal, int]]:
     return fields
 
 
+def places_of(fields: list[tuple[str, Signal, int]]) -> list[str]:
+    """Every entry of the state as a member of its struct."""
+    return [f"{name}[{i}]" if depth else name for name, _, depth in fields for i in range(max(depth, 1))]
+
+
 def _header(program: Program, fields: list[tuple[str, Signal, int]]) -> str:
     name, upper = program.name, program.name.upper()
     members = []
@@ -181,7 +186,7 @@ def _checks(program: Program, following: bool) -> list[str]:
 
 def _lagged_step(program: Program, fields: list[tuple[str, Signal, int]]) -> str:
     """The block in place on the state's fields, then every line moved on by one sample."""
-    place = [f"state->{identifier}[{i}]" for identifier, _, depth in fields for i in range(depth)]
+    place = [f"state->{place}" for place in places_of(fields)]
     lines = [*_step_head(program), "    int i, ok = 1;"]
     lines += c_arithmetic.body(program.output, "y", lambda vector, i: place[i] if vector == "x" else f"{vector}[{i}]")
     lines += _checks(program, following=False)
@@ -215,9 +220,7 @@ def _check(program: Program, fields: list[tuple[str, Signal, int]], vectors: Vec
         )
 
     inputs = vectors.inputs.tolist() if program.inputs else [[0.0]] * rows
-    places = [f"{identifier}[{i}]" for identifier, _, depth in fields for i in range(depth)]
-    places = places or [identifier for identifier, *_ in fields]
-    setting = "\n".join(f"        state.{place} = (real)states[k][{i}];" for i, place in enumerate(places))
+    setting = "\n".join(f"        state.{place} = (real)states[k][{i}];" for i, place in enumerate(places_of(fields)))
     states = vectors.states.tolist() if program.states else [[0.0]] * rows
     return f"""/* Runs the test vectors: `cc -std=c99 -O2 {name}.c check.c -lm -o check && ./check`. */
 #include "{name}.h"

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from typing import Protocol, runtime_checkable
 
 from orthaug.export.c_source import CSource
-from orthaug.export.casadi_module import CasadiModule
 from orthaug.export.fmu import Fmu
 from orthaug.export.latex_text import LatexText
 from orthaug.export.numpy_module import ControlModule, NumpyModule
 from orthaug.export.onnx_graph import OnnxGraph
 from orthaug.export.program import Program
+from orthaug.export.python_code import CasadiModule
 from orthaug.export.vectors import Vectors
 
 VECTORS = "vectors.csv"

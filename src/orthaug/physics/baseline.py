@@ -314,7 +314,6 @@ def _agreed(terms: Sequence[Term]) -> list[Term]:
 
 
 def _parameter(term: Term) -> Parameter:
-    """The parameter of a term from `_agreed`."""
     low = -math.inf if term.min is None else float(term.min)
     high = math.inf if term.max is None else float(term.max)
     return Parameter(term.parameter, float(term.initial or 0.0), term.unit or "", low, high)

@@ -128,7 +128,6 @@ def pose_motion(
 
 
 def _features(motion: Motion, texts: Sequence[str] | None) -> tuple[Expression, ...]:
-    """What the learner sees, as expressions."""
     known = {name: value for name, value in motion.known.items() if name not in motion.names}
     reach = {name for name, expression in motion.definitions if set(expression.names) & set(motion.names)}
     texts = (*motion.names_of_states, *motion.inputs) if texts is None else tuple(texts)

@@ -263,7 +263,6 @@ def check_parameters(
 
 
 def _parsed(name: str, text: str, known: Mapping[str, float], parameters: Sequence[str]) -> Expression:
-    """The expression of one θ."""
     where = f"physics.theta '{name}'"
     declare = {SAMPLING_TIME: "; give it in `constants`, {'Ts': record.sampling_time}"}
     expression = parse_named(text, known, where, declare)

@@ -100,7 +100,6 @@ class _Known:
 
 
 def _chunks(runs: TermRuns, chosen: Sequence[int] | np.ndarray) -> Iterator[tuple[slice, Float[np.ndarray, "K m"]]]:
-    """Some terms over all rows, a chunk at a time."""
     numbers, begin = runs.library.numbers[np.asarray(chosen, dtype=int)], 0
     for experiment in runs.problem.record.experiments:
         factors = runs.factors(experiment)

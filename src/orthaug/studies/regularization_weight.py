@@ -232,7 +232,6 @@ def _mean(structure: str, weight: float) -> float:
 
 
 def _weights(table: pd.DataFrame) -> list[Finding]:
-    """Each weight that the scripts ran too."""
     compared = []
     for structure, limit in zip(PENALTIES, _limits(), strict=True):
         for weight in sorted(table.weight[table.structure == structure].unique()):

@@ -208,7 +208,6 @@ def _marked(reference: str, met: bool | None) -> str:
 
 
 def _page(reproduced: Sequence[Reproduced], pipeline: str) -> str:
-    """One HTML file with its figures inside."""
     source = files("orthaug.studies").joinpath("templates/reproduction.html").read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     environment.filters["whole"] = lambda words: words.replace("e-", f"e{HYPHEN}")
