@@ -6,9 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from orthaug.export.nodes import ACTIVATIONS, functions_in, names_in
+from orthaug.export.nodes import ACTIVATIONS, Language, decimal, functions_in, names_in, wrapped
 from orthaug.export.program import Block, Constant, Layer, Program
-from orthaug.export.text import Language, decimal, wrapped
 
 _MATH = {"sin", "cos", "tan", "atan", "atan2", "exp", "log", "sqrt", "floor", "tanh", "expm1", "log1p"}
 _OWN = {

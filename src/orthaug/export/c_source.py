@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from orthaug.export import c_arithmetic
 from orthaug.export.c_arithmetic import FIELD_WORDS
-from orthaug.export.program import Program, Signal
-from orthaug.export.vectors import Vectors
+from orthaug.export.program import Program, Signal, Vectors
 
 
 @dataclass(frozen=True)

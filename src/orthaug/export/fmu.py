@@ -18,8 +18,7 @@ from xml.sax.saxutils import quoteattr
 from orthaug import __version__
 from orthaug._base.errors import InputError
 from orthaug.export.c_source import CSource, fields_of, places_of
-from orthaug.export.program import Program
-from orthaug.export.vectors import Vectors
+from orthaug.export.program import Program, Vectors
 
 _WRAPPER = Path(__file__).parent / "templates" / "fmi2.c"
 _SOURCES = ("model.c", "fmi2.c")

@@ -10,9 +10,8 @@ from orthaug.export.fmu import Fmu
 from orthaug.export.latex_text import LatexText
 from orthaug.export.numpy_module import ControlModule, NumpyModule
 from orthaug.export.onnx_graph import OnnxGraph
-from orthaug.export.program import Program
+from orthaug.export.program import Program, Vectors
 from orthaug.export.python_code import CasadiModule
-from orthaug.export.vectors import Vectors
 
 VECTORS = "vectors.csv"
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from orthaug.export.program import Program
+from orthaug.export.program import Program, Vectors
 from orthaug.export.python_code import Dialect, arithmetic, declarations, python_language
-from orthaug.export.vectors import Vectors
 
 _SAME = ("sin", "cos", "tan", "exp", "log", "sqrt", "abs", "sign", "floor", "tanh", "expm1", "log1p", "power")
 _OTHER = {"atan": "np.arctan", "atan2": "np.arctan2", "min": "np.minimum", "max": "np.maximum"}

@@ -5,6 +5,8 @@ A target writes a `Program`, and knows nothing of models.
 
 from __future__ import annotations
 
+import csv
+import io
 from dataclasses import dataclass
 
 import numpy as np
@@ -137,3 +139,22 @@ class Program:
     def held(self) -> int:
         """Inputs at an instant, of which a step takes `ends`."""
         return len(self.inputs) // self.ends
+
+
+@dataclass(frozen=True, eq=False)
+class Vectors:
+    """Steps by which an export is checked where it runs: inputs, the state before and the outputs, all finite."""
+
+    inputs: Float[np.ndarray, "r nu"]
+    states: Float[np.ndarray, "r n"]
+    outputs: Float[np.ndarray, "r ny"]
+
+    def csv(self, program: Program) -> str:
+        """A column for each input, state and output, with `state:` or `output:` before names that stand twice."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        kinds = {"input": program.inputs, "state": program.states, "output": program.outputs}
+        writer.writerow([f"{kind}:{signal.name}" for kind, signals in kinds.items() for signal in signals])
+        for row in np.concatenate([self.inputs, self.states, self.outputs], axis=1):
+            writer.writerow([repr(float(value)) for value in row])
+        return text.getvalue()

@@ -7,10 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthaug.export.nodes import ACTIVATIONS
-from orthaug.export.program import Block, Program
-from orthaug.export.text import Language, decimal, wrapped
-from orthaug.export.vectors import Vectors
+from orthaug.export.nodes import ACTIVATIONS, Language, decimal, wrapped
+from orthaug.export.program import Block, Program, Vectors
 
 
 @dataclass(frozen=True)
