@@ -49,7 +49,7 @@ def prepare(record: Record, *steps: Any) -> Record:
     Examples:
         >>> import numpy as np
         >>> record = Record.from_arrays(u=np.ones(40), y=np.arange(40.0), sampling_time=0.1)
-        >>> from orthaug.data.steps import Decimate, Detrend
+        >>> from orthaug.data.steps import Detrend
         >>> prepare(record, Detrend(degree=1)).prepared[0].text
         'detrend (degree 1)'
     """
