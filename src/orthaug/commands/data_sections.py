@@ -13,7 +13,7 @@ from orthaug._base.checks import check_label
 from orthaug._base.errors import InputError
 from orthaug._base.memory import available
 from orthaug.commands.sections import Count, Finite, KindSection, Positive, Section, with_kinds
-from orthaug.data.steps import STEPS
+from orthaug.data.preparation import STEPS
 
 if TYPE_CHECKING:
     from orthaug.models.rows import Engine

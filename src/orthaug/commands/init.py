@@ -13,9 +13,9 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_file
 from orthaug._base.lines import counted, percent
 from orthaug.commands.first_spec import FILLED, Roles, channel_names, lacking, spec_text, steps_of, time_of
+from orthaug.data.preparation import STEPS
 from orthaug.data.readers import read_record
 from orthaug.data.record import Channel, Record
-from orthaug.data.steps import STEPS
 from orthaug.data.survey import Column, Survey, survey
 from orthaug.selection.first_orders import LOOKED_AT, FirstModel, first_model
 

@@ -18,7 +18,7 @@ from orthaug.commands.lagged_job import LaggedJob
 from orthaug.commands.suspects import declared
 from orthaug.fitting.elimination import directions
 from orthaug.inference.measures import weigh_problem
-from orthaug.physics.derived_units import derived_units
+from orthaug.physics.baseline import derived_units
 from orthaug.physics.excitation import identifiability, require_rank
 from orthaug.physics.problem import Problem
 from orthaug.reports.result import CheckResult, FitResult, ParameterResult, parameter_rows, physical_rows

@@ -24,8 +24,7 @@ from orthaug.fitting.structures import Structure
 from orthaug.inference.measure_files import MeasurePlace
 from orthaug.inference.measures import Measure, Support
 from orthaug.physics.motion import Motion
-from orthaug.physics.motion_layout import layout_of
-from orthaug.physics.motion_problem import MotionProblem, pose_motion
+from orthaug.physics.motion_problem import MotionProblem, layout_of, pose_motion
 
 if TYPE_CHECKING:
     from orthaug.fitting.motion_estimates import MotionEstimate

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from orthaug._base.errors import InputError
+from orthaug._base.folders import file_digest
 from orthaug._base.lines import counted
-from orthaug._base.manifest import file_digest
 from orthaug._base.memory import few_arenas
 from orthaug._base.warning import Warning
 from orthaug.commands.data_sections import PartSection

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ValidationError
 
 from orthaug._base.errors import InputError
-from orthaug._base.folders import whole_folder
-from orthaug._base.manifest import file_digest
+from orthaug._base.folders import file_digest, whole_folder
 from orthaug._base.warning import Warning
 from orthaug.commands.folder import not_a_result
 from orthaug.commands.run import Reading, record_for

@@ -31,8 +31,7 @@ from orthaug.inference.motion_split import MotionSplit, split_motion
 from orthaug.models.dynamics import Numbers
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.statistics import JointCovariance, column_units
-from orthaug.physics.motion_layout import layout_of
-from orthaug.physics.motion_problem import MotionProblem
+from orthaug.physics.motion_problem import MotionProblem, layout_of
 from orthaug.physics.shared import Shared
 
 if TYPE_CHECKING:

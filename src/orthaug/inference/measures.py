@@ -26,7 +26,7 @@ from orthaug.data.regressors import Layout, lag_matrix, largest_lag, stack_rows
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.excitation import Excitation, excitation
 from orthaug.physics.motion import Motion
-from orthaug.physics.motion_layout import layout_of
+from orthaug.physics.motion_problem import layout_of
 from orthaug.physics.output_weights import times
 from orthaug.physics.problem import Problem
 from orthaug.physics.projection import Projection

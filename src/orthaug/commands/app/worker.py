@@ -24,7 +24,7 @@ from orthaug.commands.job import Job
 from orthaug.commands.kinds import kind_of, open_job
 from orthaug.data.record import Channel, check_step
 from orthaug.data.survey import Column, Survey
-from orthaug.physics.derived_units import derived_units
+from orthaug.physics.baseline import derived_units
 from orthaug.reports.text import check_text
 
 MOST = 3000
