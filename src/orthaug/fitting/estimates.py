@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -19,7 +19,6 @@ from orthaug.data.regressors import Layout, lag_rows
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.held_out import HeldOut
-from orthaug.fitting.parameter_table import parameter_frame, parameter_lines
 from orthaug.fitting.status import Status
 from orthaug.inference.covariance import interval
 from orthaug.inference.intervals import joint_covariance, robust_covariance, robust_split_covariance
@@ -37,7 +36,6 @@ from orthaug.physics.streamed import StreamedProblem
 
 if TYPE_CHECKING:
     import pandas as pd
-
 
 NOT_UNIQUE = "theta_not_unique"
 """The code of the warning that a split under a measure makes untrue."""
@@ -336,3 +334,37 @@ def summary_lines(fit: Estimate) -> Sequence[str]:
         lines.append(f"std         {ROBUST if fit.criterion.flown is None else ROBUST_FLOWN}")
     lines += ["", *parameter_lines(baseline.parameters, fit.theta, fit.std, fit.interval)]
     return [*lines, *term_lines(learned_terms(fit.model))]
+
+
+def parameter_frame(parameters: Sequence[Any], values: Vector, std: Vector | None, ci: Matrix | None) -> pd.DataFrame:
+    """A row per parameter: unit, initial, value, std, and the 95 % interval; NaN where there is none."""
+    import pandas as pd
+
+    nothing = np.full(len(parameters), np.nan)
+    ci = np.stack([nothing, nothing], axis=-1) if ci is None else ci
+    return pd.DataFrame(
+        {
+            "unit": [p.unit for p in parameters],
+            "initial": [p.initial for p in parameters],
+            "value": values,
+            "std": nothing if std is None else std,
+            "ci95_low": ci[:, 0],
+            "ci95_high": ci[:, 1],
+        },
+        index=pd.Index([p.name for p in parameters], name="parameter"),
+    )
+
+
+def parameter_lines(parameters: Sequence[Any], values: Vector, std: Vector | None, ci: Matrix | None) -> list[str]:
+    """The same as lines of text, a heading first; a dash where there is no interval."""
+    width = max([9, *(len(p.name) for p in parameters)])
+    lines = [f"{'parameter':<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  {'initial':>11}  unit"]
+    for i, parameter in enumerate(parameters):
+        spread, reach = f"{'–':>11}", f"{'–':^29}"
+        if std is not None and ci is not None and np.isfinite(std[i]):
+            spread, reach = f"{std[i]:11.4g}", f"[{ci[i, 0]:13.7g}, {ci[i, 1]:13.7g}]"
+        lines.append(
+            f"{parameter.name:<{width}}  {values[i]:14.8g}  {spread}  {reach}  "
+            f"{parameter.initial:11.5g}  {parameter.unit}".rstrip()
+        )
+    return lines

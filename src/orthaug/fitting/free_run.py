@@ -16,7 +16,7 @@ from orthaug._base.progress import RunTell, quiet
 from orthaug.data.record import Record
 from orthaug.fitting.course import Flight
 from orthaug.fitting.criteria import Criterion
-from orthaug.fitting.flight_plan import FlightPlan
+from orthaug.fitting.flight_plan import FlightPlan, StructuredObjective
 from orthaug.fitting.flights import FlightTask, Place
 from orthaug.fitting.initial_states import Start
 from orthaug.fitting.learned import Learned
@@ -24,7 +24,6 @@ from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.physics_alone import fly_alone
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.source_plan import SourcePlan
-from orthaug.fitting.structured_objective import StructuredObjective
 from orthaug.fitting.structures import Structure
 from orthaug.models.learners import Bound
 from orthaug.physics.streamed import StreamedProblem

@@ -1,4 +1,4 @@
-"""From a trained motion to an estimate: the model, the window it predicts from, p̂ under a measure."""
+"""From a motion to an estimate, after training and of a saved one: the model, its window, p̂ under a measure."""
 
 from __future__ import annotations
 
@@ -9,15 +9,18 @@ import numpy as np
 from orthaug._base.errors import InputError
 from orthaug.data.record import Record
 from orthaug.fitting.conclusion import without_loss
+from orthaug.fitting.criteria import Simulation
 from orthaug.fitting.learned import Learned
 from orthaug.fitting.motion_course import MotionCourse
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_task import MotionTask
-from orthaug.fitting.status import Status
+from orthaug.fitting.status import Ending, Status
 from orthaug.fitting.structures import Structure
 from orthaug.inference.motion_split import MotionSplit
+from orthaug.models.learners import Scaling
 from orthaug.models.motion_model import MotionModel, Trained
 from orthaug.models.statistics import Statistics
+from orthaug.physics.motion_problem import pose_motion
 
 _WINDOWS = (4, 16)  # times (states + 1): rows of a window to predict from
 _TRIED_ROWS = 1000  # on which windows are compared
@@ -101,3 +104,43 @@ def _best_window(model: MotionModel, record: Record) -> int:
         if square < 0.98 * least:  # a longer one only where it is clearly better
             best, least = window, square
     return best
+
+
+def reopened(model: MotionModel, record: Record) -> MotionEstimate:
+    """The estimate of a saved model with its training data, to split again, less what was told of its training.
+
+    Raises:
+        InputError: other data than the model was trained on.
+    """
+    kept, form, numbers = model.trained, model.form, model.numbers
+    if kept is None:
+        raise InputError("the model was saved without what a split needs; fit it again.")
+    record = model.fitting(record, need_outputs=True)
+    problem = pose_motion(record, form.motion, [entry.text for entry in form.features] or None)
+    problem = replace(problem, weight=replace(problem.weight, matrix=model.weight))
+    criterion = Simulation(kept.segment, kept.washout)
+    course = MotionCourse.of(problem, form.bound, criterion).refined(form.substeps)
+    centre, half = (numbers.centre, numbers.halfwidth) if form.bound is not None else (np.zeros(0), np.ones(0))
+    course = replace(course, scaling=Scaling(np.asarray(centre), np.asarray(half)), unit=np.asarray(numbers.gain))
+    if np.asarray(course.segments.start).shape != np.shape(kept.states):
+        raise InputError(
+            f"the model was trained on other rows: these {len(record)} give other segments than those it keeps the "
+            "starts of. Give the files, and --rows, that it was trained on."
+        )
+    c = np.asarray(numbers.theta - numbers.theta_aux)
+    return MotionEstimate(
+        model=model,
+        status=Status(Ending.EXACT, 0, 0.0, np.nan),
+        restarts=(),
+        covariance=None,
+        freedom=model.statistics.freedom,
+        effective_weights=np.nan,
+        defect=None,
+        problem=problem,
+        criterion=criterion,
+        split_by=MotionSplit.none(model.measure, form, c),
+        course=course,
+        states=kept.states,
+        slope=kept.slope,
+        alone=np.asarray(kept.alone),
+    )

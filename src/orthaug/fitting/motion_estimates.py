@@ -18,12 +18,10 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import Layout
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion
-from orthaug.fitting.estimates import Restart
+from orthaug.fitting.estimates import Restart, parameter_frame, parameter_lines
 from orthaug.fitting.held_out import HeldOut
-from orthaug.fitting.motion_measures import field_under
-from orthaug.fitting.parameter_table import parameter_frame, parameter_lines
+from orthaug.fitting.motion_measures import field_under, wobble
 from orthaug.fitting.status import Status
-from orthaug.fitting.wobble import wobble
 from orthaug.inference.covariance import interval
 from orthaug.inference.learned_terms import equation, learned_terms, term_frame, term_lines
 from orthaug.inference.measures import Measure, Training

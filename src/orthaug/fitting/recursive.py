@@ -21,9 +21,8 @@ from orthaug._base.jax import jax
 from orthaug._base.lines import percent
 from orthaug.data.record import Record
 from orthaug.fitting import recursive_start, recursive_storage
-from orthaug.fitting.estimates import Estimate, order_of
-from orthaug.fitting.parameter_table import parameter_frame, parameter_lines
-from orthaug.fitting.recursive_course import Course, covariances
+from orthaug.fitting.estimates import Estimate, order_of, parameter_frame, parameter_lines
+from orthaug.fitting.recursion import Course, covariances
 from orthaug.fitting.recursive_rows import Lagging, Whitened, joined_rows, whitened_rows
 from orthaug.fitting.residual_band import Watch
 from orthaug.inference.covariance import interval

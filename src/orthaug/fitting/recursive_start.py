@@ -14,8 +14,7 @@ from orthaug.data.regressors import stack_rows
 from orthaug.fitting.colour import correlation_length
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.motion_estimates import MotionEstimate
-from orthaug.fitting.recursion import Recursion, squares, started
-from orthaug.fitting.recursive_course import inflation_of
+from orthaug.fitting.recursion import Recursion, inflation_of, squares, started
 from orthaug.fitting.recursive_rows import whitened_rows
 from orthaug.fitting.residual_band import Reference
 from orthaug.inference.covariance import whitening
