@@ -16,7 +16,7 @@ from orthaug.fitting.motion_measures import field_under
 from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.structures import Structure
 from orthaug.inference.motion_split import MotionSplit, shared_of_motion
-from orthaug.models.motion_parts import parts_at
+from orthaug.models.motion_field import parts_at
 from orthaug.physics.shared import Shared
 
 

@@ -145,9 +145,7 @@ class InMemory(Here):
     resident: bool = True
 
     def lay(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Chunk:
-        shape = chunk_shape(len(z), self.limit)
-        padded = in_chunks(z, shape, repeat=True)  # zeros may be where the learner has no value
-        return Chunk(*map(jax.device_put, (padded, *(in_chunks(piece, shape) for piece in (q, e, gain)))))
+        return self.place(laid_out(z, q, e, gain, chunk_shape(len(z), self.limit)))
 
     def draw(self, source: Any, laying: Callable[[Any], Any]) -> Chunk:
         return self.lay(*brought(source, laying))
@@ -184,7 +182,11 @@ def _compiled_sum(function: Callable[..., Any], rows: Chunk, arguments: tuple[An
 
 def all_chunks(function: Callable[[Any], Any], partitions: Sequence[Any]) -> Any:
     """The chunks that a function gives of every partition, (k, …) each."""
-    chunks = [chunk for partition in partitions for chunk in function(partition)]
+    return together([chunk for partition in partitions for chunk in function(partition)])
+
+
+def together(chunks: Sequence[Any]) -> Any:
+    """Chunks of any pytree as one, (k, …) each."""
     return jax.tree.map(lambda *parts: np.stack(parts), *chunks)
 
 
@@ -232,6 +234,13 @@ def in_chunks(
         if repeat and len(piece) < size:
             padded[i, ..., len(piece) :] = values[-1][..., None]
     return padded
+
+
+def laid_out(z: Matrix, q: Any, e: Matrix, gain: Any, shape: tuple[int, int]) -> Chunk:
+    """Rows (N, …) as a chunk (k, …, m) of NumPy arrays."""
+    padded = in_chunks(z, shape, repeat=True)  # zeros may be where the learner has no value
+    pieces: Any = (padded, *(in_chunks(piece, shape) for piece in (q, e, gain)))
+    return Chunk(*pieces)
 
 
 def from_chunks(chunks: Float[np.ndarray, "k ... m"], rows: int) -> Float[np.ndarray, "N ..."]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from orthaug.data.record import Record
-from orthaug.models.motion_parts import parts_at
+from orthaug.models.motion_field import parts_at
 from orthaug.models.response import Response
 from orthaug.reports.drawing import (
     BLACK,
