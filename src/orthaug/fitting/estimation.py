@@ -10,7 +10,6 @@ import numpy as np
 
 from orthaug._base.checks import Vector, check_choice, check_count, check_type, is_number
 from orthaug._base.errors import InputError, shown
-from orthaug._base.jax import jax
 from orthaug._base.progress import SILENT, Tell
 from orthaug._base.views import with_progress
 from orthaug.data.record import Record
@@ -32,9 +31,9 @@ from orthaug.fitting.rules import check_solver, checked_starts, tried
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Orthogonal, Structure
-from orthaug.fitting.training import Choice, PlannedRun, train
+from orthaug.fitting.training import Choice, PlannedRun, planned, train
 from orthaug.inference.measures import Training
-from orthaug.models.learners import MLP, Bound, Learner, Scaling
+from orthaug.models.learners import MLP, Learner, Scaling
 from orthaug.models.model import Model
 from orthaug.models.rows import Engine, InMemory
 from orthaug.models.tasks import Tasks, runs_on
@@ -155,7 +154,9 @@ def estimate(
         options |= {"regularization": regularization, "restarts": restarts, "seed": seed, "validation": validation}
         options |= {"blocks": _check_blocks(blocks), "progress": progress, "engine": engine or InMemory()}
         return fit_motion(problem, learner=learner, **options)
-    _check_record(record, baseline, lags, learner, initial)
+    check_record(record)
+    _check_types(baseline=baseline, lags=lags, learner=learner)
+    check_type(initial, Estimate | Model | None, "initial", "an Estimate, a Model or None")
     criterion = Prediction() if criterion is None else criterion
     model = initial.model if isinstance(initial, Estimate) else initial
     channels = (tuple(channel.name for channel in group) for group in (record.outputs, record.inputs))
@@ -163,7 +164,7 @@ def estimate(
     inputs = None if learner is None else learner.inputs
     if model is not None:
         inputs = tuple(str(entry) for entry in model.form.features.entries)
-    check_type(criterion, Criterion, "criterion", "Prediction(…) or Simulation(…)")
+    _check_types(criterion=criterion)
     problem, engine = posed_on(record, engine, baseline, lags, inputs, output_weights=output_weights)
     return fit(
         problem,
@@ -215,7 +216,8 @@ def fit(
     Raises:
         InputError: as `estimate`.
     """
-    _check_choices(learner, structure, criterion, solver, initial, validation)
+    _check_types(learner=learner, structure=structure, criterion=criterion, solver=solver)
+    _check_types(initial=initial, validation=validation)
     _check_splittable(structure, problem.baseline, learner)
     blocks = _check_blocks(blocks)
     conditions = {"linear": problem.baseline.linear, "validated": validation is not None}
@@ -223,7 +225,8 @@ def fit(
     auto = _check_regularizations(regularization, choices, validation is not None or blocks > 0)
     restarts, seed = checked_starts(restarts, seed, warm=initial is not None, ensemble=ensemble)
     check_solver(solver, criterion, () if learner is None else choices)
-    engine = _engine_of(engine, problem, len(choices) * (restarts if initial is None else 1))
+    if len(choices) * (restarts if initial is None else 1) > 1 and not isinstance(problem, StreamedProblem):
+        engine = runs_on(engine)  # with a cluster several runs over rows in memory are its tasks
     warm, told = None, ()
     if initial is not None:
         task, weights, warm = _warm_start(problem, initial, engine)
@@ -232,14 +235,15 @@ def fit(
         _check_cost(problem, learner, solver, restarts * len(choices), engine)
         problem, learner, told = independent_terms(problem, learner)
         task = OneStepTask.of(problem, learner, engine=engine)
-        starts = _starts(task.bound, range(seed, seed + restarts), choices)
+        starts = planned(task.bound, range(seed, seed + restarts), choices)
     solved = criterion.one_step and problem.baseline.linear
     ensemble = _check_ensemble(ensemble and task.bound is not None, problem)
     if task.bound is None and solved:
         estimate = conclude(task, structure, task.physics_learned())
         estimate = replace(estimate, status=replace(estimate.status, start_loss=estimate.status.loss))
     else:
-        task = _keeping(task, checkpoints)
+        kept = None if isinstance(task.engine, Tasks) else checkpoints  # a worker may have another disk
+        task = replace(task, checkpoints=kept)
         trained = task if solved else FreeRunTask.of(task, criterion, warm)
         chosen = Choice(validation, blocks if initial is None else 0, fallback, ensemble, scored=auto and solved)
         estimate = train(trained, starts, structure, solver, chosen, progress, runner=engine)
@@ -258,28 +262,10 @@ def fit(
     return reweighted(estimate, again)
 
 
-def _engine_of(engine: Engine, problem: Problem, runs: int) -> Engine:
-    """With a cluster several runs over rows in memory are its tasks."""
-    return runs_on(engine) if runs > 1 and not isinstance(problem, StreamedProblem) else engine
-
-
-def _keeping(task: OneStepTask, checkpoints: Checkpoints | None) -> OneStepTask:
-    """With the states of its runs kept, unless they are a cluster's tasks: a worker may have another disk."""
-    return replace(task, checkpoints=None if isinstance(task.engine, Tasks) else checkpoints)
-
-
 def _check_cost(problem: Problem, learner: Learner | None, solver: Solver, runs: int, engine: Engine) -> None:
     """Raise InputError for what would take more memory or time than there is."""
     sizes = {"rows": problem.count, "features": len(problem.features.entries), "outputs": len(problem.outputs)}
     check_cost(learner, **sizes, held=len(problem.rows), iterations=solver.iterations, runs=runs, room=engine.room())
-
-
-def _starts(bound: Bound | None, seeds: range, choices: Sequence[Regularization]) -> list[PlannedRun]:
-    """A run from every seed with every regularization; one without a learner."""
-    if bound is None:
-        return [PlannedRun(seeds.start, np.zeros(0), "none")]
-    keyed = {seed: bound.init(jax.random.key(seed)) for seed in seeds}
-    return [PlannedRun(seed, w, choice) for choice in choices for seed, w in keyed.items()]
 
 
 def _check_blocks(blocks: int) -> int:
@@ -333,21 +319,23 @@ def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStep
     return task, np.asarray(numbers.weights), model.theta - model.theta_aux
 
 
-def _check_record(record: Any, baseline: Any, lags: Any, learner: Any, initial: Any) -> None:
-    check_record(record)
-    check_type(baseline, Baseline, "baseline", "a Baseline or a Motion")
-    check_type(lags, Lags | None, "lags", "Lags(…) or None")
-    check_type(learner, Learner | None, "learner", "a learner such as MLP(), or None")
-    check_type(initial, Estimate | Model | None, "initial", "an Estimate, a Model or None")
+_TYPES: dict[str, tuple[Any, str]] = {
+    "baseline": (Baseline, "a Baseline or a Motion"),
+    "lags": (Lags | None, "Lags(…) or None"),
+    "learner": (Learner | None, "a learner such as MLP(), or None"),
+    "structure": (Structure, "a structure such as Orthogonal()"),
+    "criterion": (Criterion, "Prediction(…) or Simulation(…)"),
+    "solver": (Solver, "a solver such as LevenbergMarquardt()"),
+    "initial": (Model | None, "a Model or None"),
+    "validation": (Record | None, "a Record or None"),
+}
 
 
-def _check_choices(learner: Any, structure: Any, criterion: Any, solver: Any, initial: Any, validation: Any) -> None:
-    check_type(learner, Learner | None, "learner", "a learner such as MLP(), or None")
-    check_type(structure, Structure, "structure", "a structure such as Orthogonal()")
-    check_type(criterion, Criterion, "criterion", "Prediction(…) or Simulation(…)")
-    check_type(solver, Solver, "solver", "a solver such as LevenbergMarquardt()")
-    check_type(initial, Model | None, "initial", "a Model or None")
-    check_type(validation, Record | None, "validation", "a Record or None")
+def _check_types(**given: Any) -> None:
+    """Raise InputError for an argument of another type."""
+    for name, value in given.items():
+        kind, words = _TYPES[name]
+        check_type(value, kind, name, words)
 
 
 def _check_regularizations(given: Any, choices: Sequence[Any], chosen: bool) -> bool:

@@ -87,8 +87,10 @@ class FlightPlan(Course):
         """The same over segments of another length; 0 for whole experiments."""
         washout = min(self.flown.washout, segment // 2) if segment else self.flown.washout
         flown = replace(self.flown, segment=segment, washout=washout)
-        segments = lay_segments(self.record, self.dynamics, segment, washout, shares=self.shares)
-        return replace(self, segments=segments, flown=flown)
+        return replace(self, segments=self._laid(segment, washout), flown=flown)
+
+    def _laid(self, segment: int, washout: int) -> Any:
+        return lay_segments(self.record, self.dynamics, segment, washout, shares=self.shares)
 
     def objective(self, structure: Structure) -> StructuredObjective:
         """The criterion as a function of θ and the weights."""

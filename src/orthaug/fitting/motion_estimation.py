@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from orthaug._base.checks import check_type
-from orthaug._base.jax import jax
 from orthaug._base.progress import SILENT, Tell
 from orthaug.data.record import Record
 from orthaug.fitting.checkpoints import Checkpoints
@@ -18,7 +17,7 @@ from orthaug.fitting.rules import check_motion_choices, check_solver, checked_st
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Orthogonal, Structure
-from orthaug.fitting.training import Choice, PlannedRun, train
+from orthaug.fitting.training import Choice, planned, train
 from orthaug.models.learners import Learner
 from orthaug.models.rows import Engine, InMemory
 from orthaug.models.tasks import Tasks, runs_on
@@ -73,10 +72,7 @@ def fit_motion(
     engine = runs_on(engine) if restarts * len(choices) > 1 else engine
     kept = None if isinstance(engine, Tasks) else checkpoints
     task = MotionTask.of(problem, learner, criterion, engine).keeping(kept)
-    starts = [PlannedRun(seed, (), "none")]
-    if task.bound is not None:
-        keyed = {s: task.bound.init(jax.random.key(s)) for s in range(seed, seed + restarts)}
-        starts = [PlannedRun(s, w, choice) for choice in choices for s, w in keyed.items()]
+    starts = planned(task.bound, range(seed, seed + restarts), choices)
     chosen = Choice(validation, blocks, fallback)
     return train(task, starts, structure, solver, chosen, progress, conclude_motion, runner=engine)
 

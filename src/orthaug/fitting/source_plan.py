@@ -75,13 +75,9 @@ class SourcePlan(FlightPlan):
     def lengthens(self) -> bool:
         return False
 
-    def over(self, segment: int) -> SourcePlan:
-        """The same over segments of another length."""
-        washout = min(self.flown.washout, segment // 2)
-        flown = replace(self.flown, segment=segment, washout=washout)
+    def _laid(self, segment: int, washout: int) -> Any:
         made = (self.task.engine, self.source, self.found, self.dynamics, self.empty)
-        segments: Any = SourceSegments.cut(*made, segment, washout)
-        return replace(self, segments=segments, flown=flown)
+        return SourceSegments.cut(*made, segment, washout)
 
     def mean_square(self, c: Vector, w: Any, tilt: Any = None) -> float:
         if not isinstance(self.whole, WholeRuns):
