@@ -14,7 +14,7 @@ from orthaug._base.progress import SILENT, Tell
 from orthaug._base.views import with_progress
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
-from orthaug.data.sources import Source
+from orthaug.data.sources import Source, witness
 from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.conclusion import conclude
 from orthaug.fitting.cost import check_cost
@@ -25,7 +25,6 @@ from orthaug.fitting.independent_terms import independent_terms
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_estimation import DEFAULT, fit_motion, pose_for
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.posing import check_record, posed_on
 from orthaug.fitting.reweighting import reweighted
 from orthaug.fitting.rules import check_solver, checked_starts, tried
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
@@ -40,8 +39,8 @@ from orthaug.models.tasks import Tasks, runs_on
 from orthaug.models.terms import over_lags, over_states
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.motion import Motion
-from orthaug.physics.problem import Problem
-from orthaug.physics.streamed import StreamedProblem
+from orthaug.physics.problem import Problem, pose
+from orthaug.physics.streamed import StreamedProblem, pose_streamed
 
 Regularization = str | float
 
@@ -143,6 +142,8 @@ def estimate(
         >>> f"{fit.theta[0]:.3f}"
         '2.000'
     """
+    options: dict[str, Any] = {"structure": structure, "solver": solver, "regularization": regularization, "seed": seed}
+    options |= {"restarts": restarts, "fallback": fallback, "validation": validation, "progress": progress}
     if isinstance(baseline, Motion):
         if lags is not None or initial is not None or ensemble:
             raise InputError("a motion has no `lags`, no `initial` and no `ensemble`; leave them out.")
@@ -150,9 +151,7 @@ def estimate(
         assert isinstance(record, Record)
         learner = over_states(learner, baseline)
         problem = pose_for(record, baseline, learner, output_weights)
-        options = {"structure": structure, "criterion": criterion or DEFAULT, "solver": solver, "fallback": fallback}
-        options |= {"regularization": regularization, "restarts": restarts, "seed": seed, "validation": validation}
-        options |= {"blocks": _check_blocks(blocks), "progress": progress, "engine": engine or InMemory()}
+        options |= {"criterion": criterion or DEFAULT, "blocks": _check_blocks(blocks), "engine": engine or InMemory()}
         return fit_motion(problem, learner=learner, **options)
     check_record(record)
     _check_types(baseline=baseline, lags=lags, learner=learner)
@@ -166,23 +165,8 @@ def estimate(
         inputs = tuple(str(entry) for entry in model.form.features.entries)
     _check_types(criterion=criterion)
     problem, engine = posed_on(record, engine, baseline, lags, inputs, output_weights=output_weights)
-    return fit(
-        problem,
-        learner=learner,
-        structure=structure,
-        criterion=criterion,
-        solver=solver,
-        regularization=regularization,
-        restarts=restarts,
-        seed=seed,
-        ensemble=ensemble,
-        blocks=blocks,
-        fallback=fallback,
-        initial=model,
-        validation=validation,
-        progress=progress,
-        engine=engine,
-    )
+    options |= {"criterion": criterion, "ensemble": ensemble, "blocks": blocks, "initial": model, "engine": engine}
+    return fit(problem, learner=learner, **options)
 
 
 def fit(
@@ -225,8 +209,7 @@ def fit(
     auto = _check_regularizations(regularization, choices, validation is not None or blocks > 0)
     restarts, seed = checked_starts(restarts, seed, warm=initial is not None, ensemble=ensemble)
     check_solver(solver, criterion, () if learner is None else choices)
-    if len(choices) * (restarts if initial is None else 1) > 1 and not isinstance(problem, StreamedProblem):
-        engine = runs_on(engine)  # with a cluster several runs over rows in memory are its tasks
+    engine = _for_runs(engine, problem, len(choices) * (restarts if initial is None else 1))
     warm, told = None, ()
     if initial is not None:
         task, weights, warm = _warm_start(problem, initial, engine)
@@ -239,11 +222,9 @@ def fit(
     solved = criterion.one_step and problem.baseline.linear
     ensemble = _check_ensemble(ensemble and task.bound is not None, problem)
     if task.bound is None and solved:
-        estimate = conclude(task, structure, task.physics_learned())
-        estimate = replace(estimate, status=replace(estimate.status, start_loss=estimate.status.loss))
+        estimate = _physics_alone(task, structure)
     else:
-        kept = None if isinstance(task.engine, Tasks) else checkpoints  # a worker may have another disk
-        task = replace(task, checkpoints=kept)
+        task = replace(task, checkpoints=None if isinstance(task.engine, Tasks) else checkpoints)  # not a worker's disk
         trained = task if solved else FreeRunTask.of(task, criterion, warm)
         chosen = Choice(validation, blocks if initial is None else 0, fallback, ensemble, scored=auto and solved)
         estimate = train(trained, starts, structure, solver, chosen, progress, runner=engine)
@@ -260,6 +241,17 @@ def fit(
         return fit(problem, structure=structure, criterion=criterion, solver=solver, progress=progress, **more)
 
     return reweighted(estimate, again)
+
+
+def _for_runs(engine: Engine, problem: Problem, runs: int) -> Engine:
+    """With a cluster several runs over rows in memory are its tasks."""
+    return runs_on(engine) if runs > 1 and not isinstance(problem, StreamedProblem) else engine
+
+
+def _physics_alone(task: OneStepTask, structure: Structure) -> Estimate:
+    """Physics alone, which is solved: it ends at the loss where it starts."""
+    estimate = conclude(task, structure, task.physics_learned())
+    return replace(estimate, status=replace(estimate.status, start_loss=estimate.status.loss))
 
 
 def _check_cost(problem: Problem, learner: Learner | None, solver: Solver, runs: int, engine: Engine) -> None:
@@ -353,3 +345,42 @@ def _check_regularizations(given: Any, choices: Sequence[Any], chosen: bool) -> 
     if not choices:
         raise InputError("`regularization` is empty; give auto, none, evidence, ard or a number.")
     return auto
+
+
+def posed_on(
+    record: Record | Source, engine: Engine | None, baseline: Baseline, *args: Any, **options: Any
+) -> tuple[Problem, Engine]:
+    """The problem with the engine that sums over its rows; further arguments as of `pose`.
+
+    Args:
+        engine: None for what suits the record: memory, a stream of its files, the cluster that holds it.
+
+    Raises:
+        InputError: as `pose`.
+    """
+    if isinstance(record, Record):
+        return pose(record, baseline, *args, **options), InMemory() if engine is None else engine
+    engine = _engine_of(record) if engine is None else engine
+    return pose_streamed(record, witness(record), engine.passes, baseline, *args, **options), engine
+
+
+def _engine_of(source: Source) -> Engine:
+    client = getattr(source, "client", None)
+    if client is not None:
+        from orthaug.models.cluster import Dask
+
+        return Dask(client)
+    from orthaug.models.streaming import Stream
+
+    return Stream()
+
+
+def check_record(record: Any, *, moves: bool = False) -> None:
+    """Raise InputError for what holds no rows, or none in memory where a motion needs them."""
+    if not isinstance(record, Source):
+        check_type(record, Record, "record", "a Record")
+    elif moves and not isinstance(record, Record):
+        raise InputError(
+            "a motion takes a Record, whose segments an engine may share out; read these rows into memory "
+            "(read_record, Record.join), or fit the physics in its lagged form."
+        )

@@ -17,7 +17,7 @@ from orthaug.fitting.residual_band import Reference, Watch
 from orthaug.models import storage
 from orthaug.models.learners import Learner
 from orthaug.models.model import Model
-from orthaug.models.packing import pack, read_packed, write_packed
+from orthaug.models.storage import pack, read_packed, write_packed
 from orthaug.physics.baseline import Baseline
 
 FORMAT = 1
