@@ -24,7 +24,7 @@ from orthaug.analysis.motion_modes import motion_stability
 from orthaug.commands import cli
 from orthaug.commands.kinds import open_job
 from orthaug.data.readers import read_record
-from orthaug.models.motion_parts import parts_at
+from orthaug.models.motion_field import parts_at
 
 SPEC = """
 [data]

@@ -247,7 +247,7 @@ def test_what_the_prior_of_the_weights_holds_has_no_interval() -> None:
 def test_the_band_of_what_is_learned_follows_all_that_was_estimated(fitted: oa.MotionEstimate) -> None:
     """Its variance is that of the learner's part when (c, w), and p̂ with them, move by columns of a root of Cov."""
     from orthaug.analysis.learned_part import learned_reach
-    from orthaug.models.motion_parts import parts_at
+    from orthaug.models.motion_field import parts_at
 
     x, u = np.stack([np.zeros(5), np.linspace(-1, 1, 5)], axis=1), np.zeros((5, 1))
     numbers, slope, tiny = fitted.model.numbers, fitted.split_by.slope, 1e-4

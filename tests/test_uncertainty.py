@@ -10,8 +10,8 @@ import pytest
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Record
+from orthaug.fitting.conclusion import orthogonalize
 from orthaug.fitting.criteria import Simulation
-from orthaug.fitting.elsewhere import orthogonalize
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive, OrthogonalPenalty

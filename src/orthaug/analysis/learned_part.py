@@ -19,7 +19,7 @@ from orthaug.fitting.motion_estimates import MotionEstimate, free_covariance
 from orthaug.inference.covariance import reach
 from orthaug.inference.motion_split import rest_of
 from orthaug.models.dynamics import Numbers
-from orthaug.models.motion_parts import labels_of, parts_at
+from orthaug.models.motion_field import labels_of, parts_at
 from orthaug.models.moving import Moving
 
 

@@ -27,7 +27,7 @@ from orthaug.fitting.motion_measures import field_under
 from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.structures import Structure
 from orthaug.inference.motion_split import Field, MotionSplit, learned_places, shared_of_motion, slopes_at
-from orthaug.models.motion_parts import parts_at
+from orthaug.models.motion_field import parts_at
 from orthaug.physics.motion import Motion
 from orthaug.physics.projection import Projection
 from orthaug.physics.shared import Shared, moves

@@ -115,7 +115,7 @@ def _split_lagged(model: Model, record: Record, measure: Measure) -> SplitResult
 
 
 def _split_motion(model: MotionModel, record: Record, measure: Measure) -> SplitResult:
-    from orthaug.fitting.motion_reopening import reopened
+    from orthaug.fitting.motion_estimation import reopened
 
     fit = reopened(model, record).split(measure)
     split, (parameters, values) = fit.split_by, fit.model.estimated

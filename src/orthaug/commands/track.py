@@ -72,7 +72,7 @@ def open_track(
         check_readable(path)
     loaded = load(model)
     if not isinstance(loaded, Model):
-        from orthaug.fitting.recursive_start import MOTION
+        from orthaug.fitting.recursive_rows import MOTION
 
         raise InputError(f"{model}: {MOTION}")
     records, files = [], []

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from orthaug._base.checks import Matrix, Vector
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
-from orthaug.models.motion_parts import labels_of, parts_at
+from orthaug.models.motion_field import labels_of, parts_at
 from orthaug.reports.page_blocks import with_unit
 
 if TYPE_CHECKING:

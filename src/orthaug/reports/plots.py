@@ -10,7 +10,7 @@ import numpy as np
 
 from orthaug._base.lines import percent
 from orthaug.data.record import Record
-from orthaug.models.motion_parts import parts_at
+from orthaug.models.motion_field import parts_at
 from orthaug.models.response import Response
 from orthaug.reports.drawing import (
     BLACK,

@@ -23,8 +23,8 @@ from orthaug.data.regressors import lag_matrix, stack_rows
 from orthaug.inference.motion_split import slopes_at
 from orthaug.models.dynamics import Numbers
 from orthaug.models.model import Model
+from orthaug.models.motion_field import labels_of, parts_at
 from orthaug.models.motion_model import MotionModel
-from orthaug.models.motion_parts import labels_of, parts_at
 from orthaug.models.moving import Moving
 from orthaug.models.statistics import JointCovariance
 from orthaug.physics.baseline import Baseline, Parameter
