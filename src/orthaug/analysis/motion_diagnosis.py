@@ -67,7 +67,7 @@ def diagnose_motion(fit: MotionEstimate, free_run: Response) -> Diagnosis | None
     verdict = "unmodelled" if told or late else "white" if white else "equation_noise"
     text = _words(verdict, fit, tests, shares, followed, curved, lacks, late)
     warnings = [one.warning for one in late]
-    warnings += [] if white else [Warning("coloured_residual", _COLOURED)]
+    warnings += [] if white else [Warning("coloured_residual", _COLOURED + (_UNCOUNTED if told else ""))]
     return Diagnosis(verdict, text, (), tests, None, None, tuple(warnings), shares, (), missing)
 
 
@@ -81,6 +81,7 @@ _COLOURED = (
     "the errors of the free run are coloured: held-out errors say how good the model is, and standard errors are "
     "robust only where there are rows enough."
 )
+_UNCOUNTED = " Intervals count noise alone: what is missing may have moved the parameters by more than that."
 
 
 def _predictable(i: int, test: ResidualTest, errors: list, inputs: list, every: int) -> Predictable:
