@@ -17,7 +17,7 @@ from machine import describe
 
 import orthaug as oa
 from orthaug.analysis.learned_part import learned_reach
-from orthaug.models.motion_parts import parts_at
+from orthaug.models.motion_field import parts_at
 
 M, C, K, COULOMB = 1.0, 2.0, 100.0, 1.5
 TS, ROWS, HELD, FINE = 0.01, 1000, 25, 10

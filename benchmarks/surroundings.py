@@ -237,7 +237,7 @@ def make_project(folder: Path) -> None:
 
 
 def settings(base: Path) -> dict[str, str]:
-    from orthaug._base.partials import _HOST
+    from orthaug._base.folders import _HOST
 
     kept = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}
     mine = {"PYTHON": sys.executable, "MAIN": MAIN, "HOST": _HOST, "JAX_COMPILATION_CACHE_DIR": str(base / "cache")}

@@ -31,7 +31,7 @@ import given
 import tomlkit
 from test_cli import run
 
-from orthaug.commands.opening import open_job
+from orthaug.commands.kinds import open_job
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMENT = re.compile(r"<!-- (given|not run): (.+?) -->|<!-- exit (\d+) -->")

@@ -291,7 +291,7 @@ def test_what_a_fit_seldom_needs_is_not_loaded_for_it(tmp_path: Path) -> None:
 
 
 def test_reading_a_spec_and_its_data_does_not_load_jax() -> None:
-    names = [n for n in FILES if room_of(n) in ("data", "physics")] + ["commands.opening", "commands.run"]
+    names = [n for n in FILES if room_of(n) in ("data", "physics")] + ["commands.kinds", "commands.run"]
     report = loaded_by(
         "import importlib\n"
         f"for name in {names!r}:\n"
@@ -310,3 +310,19 @@ def test_every_name_of_a_face_is_there(room: str) -> None:
         assert getattr(face, name) is not None
     if not room:
         assert set(orthaug.__all__) >= {"estimate", "Record", "Baseline", "load", "synthetic"}
+
+
+def _imported(path: Path) -> Iterator[tuple[str, str]]:
+    """Modules and names of orthaug that a program imports."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "orthaug":
+            yield from ((node.module or "", alias.name) for alias in node.names)
+
+
+@pytest.mark.parametrize("folder", ["benchmarks", "examples"])
+def test_programs_beside_the_package_import_what_is_there(folder: str) -> None:
+    """Most of them run by command only."""
+    for path in sorted((SOURCE.parents[1] / folder).glob("*.py")):
+        for module, name in _imported(path):
+            found = importlib.import_module(module)
+            assert hasattr(found, name) or importlib.import_module(f"{module}.{name}"), (path.name, module, name)

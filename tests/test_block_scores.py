@@ -17,7 +17,7 @@ from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.colour import correlation_length
 from orthaug.fitting.criteria import Simulation
 from orthaug.fitting.estimation import estimate
-from orthaug.inference.intervals import prediction_std
+from orthaug.inference.covariance import prediction_std
 from orthaug.inference.measures import Symmetrized, Training
 from orthaug.physics.baseline import Baseline, Term
 

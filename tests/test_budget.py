@@ -16,8 +16,7 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.inference.measures import Training, Uniform
-from orthaug.inference.weighed import weigh_problem
+from orthaug.inference.measures import Training, Uniform, weigh_problem
 from orthaug.models.learners import MLP
 from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.parameters import PhysicalParameter, PhysicsMap

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 import orthaug as oa
 from orthaug.commands.cli import app
 from orthaug.commands.fit import fit_job, keeping, write_result
-from orthaug.commands.opening import open_job
+from orthaug.commands.kinds import open_job
 from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.estimation import fit
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
-from orthaug.fitting.elsewhere import orthogonalize
+from orthaug.fitting.conclusion import orthogonalize
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import Ending

@@ -17,7 +17,7 @@ import pytest
 
 import orthaug as oa
 from orthaug.commands.fit import fit_job
-from orthaug.commands.opening import open_job
+from orthaug.commands.kinds import open_job
 from orthaug.commands.select import open_select, select_for
 from orthaug.commands.spec import load_spec
 from orthaug.data.sources import witness
@@ -247,7 +247,7 @@ def test_segments_of_files_give_the_free_run_of_rows_in_memory(folder, in_memory
 def test_errors_of_a_streamed_free_run_are_those_of_all_rows(folder, monkeypatch):
     """Also where a witness stands for them: what the learner takes from θ is known from all, its scores are scaled."""
     whole = flown_lagged(from_files(folder))
-    monkeypatch.setattr("orthaug.fitting.posing.witness", lambda source: witness(source, 500))
+    monkeypatch.setattr("orthaug.fitting.estimation.witness", lambda source: witness(source, 500))
     found = flown_lagged(opened(folder))
     assert len(found.problem.record) == 500 and found.problem.count == whole.problem.count
     np.testing.assert_allclose(found._slope(), whole._slope(), rtol=1e-6, atol=1e-9)

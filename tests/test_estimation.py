@@ -14,7 +14,7 @@ from orthaug._base.jax import jax, jnp
 from orthaug._base.progress import Enough
 from orthaug.data.record import Channel, Record
 from orthaug.data.regressors import Lags
-from orthaug.fitting.elsewhere import orthogonalize
+from orthaug.fitting.conclusion import orthogonalize
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt

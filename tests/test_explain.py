@@ -14,8 +14,8 @@ from orthaug.commands.spec import load_spec
 from orthaug.data.expressions import parse_named
 from orthaug.physics.motion import Output, State
 from orthaug.selection.added_physics import Added, added_to_motion
+from orthaug.selection.explained_ground import MotionResponse
 from orthaug.selection.explaining import _written
-from orthaug.selection.tangent_run import MotionResponse
 
 ROWS = 600
 SPEC = """

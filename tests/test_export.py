@@ -22,7 +22,7 @@ from orthaug._base.jax import jax, jnp
 from orthaug.commands.cli import main
 from orthaug.data.expressions import FUNCTIONS, parse, parse_named
 from orthaug.data.regressors import Features
-from orthaug.export import activations, fmu
+from orthaug.export import fmu, nodes
 from orthaug.export.kinds import TARGETS
 from orthaug.export.lowering import program_of
 from orthaug.export.nodes import Number, apply
@@ -428,7 +428,7 @@ def test_starts_that_are_refused_in_words():
 def test_activations_are_those_of_the_learners(name):
     a = np.array([-800.0, -30.0, -2.5, -1e-9, 0.0, 1e-9, 0.7, 3.0, 40.0, 800.0])
     with np.errstate(all="ignore"):
-        found = NumpyStep(program_of(case("terms").model))._evaluation(activations.ACTIVATIONS[name])({"a": a})
+        found = NumpyStep(program_of(case("terms").model))._evaluation(nodes.ACTIVATIONS[name])({"a": a})
     np.testing.assert_allclose(found, ACTIVATIONS[name](jnp.asarray(a)), rtol=1e-14, atol=1e-15)
 
 

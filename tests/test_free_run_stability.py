@@ -21,7 +21,7 @@ from orthaug.analysis.free_run_stability import stability
 from orthaug.analysis.lipschitz import lipschitz
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags, stack_rows
-from orthaug.fitting.elsewhere import orthogonalize
+from orthaug.fitting.conclusion import orthogonalize
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.models.dynamics import Differentiated, Dynamics, Parts

@@ -13,7 +13,7 @@ import scipy.io
 import scipy.signal
 from test_cli import run
 
-from orthaug.commands import cli, opening
+from orthaug.commands import cli, kinds
 from orthaug.commands import init as commands_init
 from orthaug.commands.init import as_seen
 from orthaug.data.survey import channel_name, split_header, survey
@@ -156,7 +156,7 @@ def test_one_wrong_sample_of_a_signal_that_moves_fast_is_seen_and_replaced(tmp_p
     pd.DataFrame({"u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
     done = run("init", tmp_path / "a.csv", "--sampling-time", "0.1", "--out", tmp_path / "spec.toml")
     assert done.code == 0 and "; 1 sample far from all neighbours, which the spec replaces" in done.out
-    job = opening.open_job(tmp_path / "spec.toml")
+    job = kinds.open_job(tmp_path / "spec.toml")
     assert job.train.record.prepared[0].samples == 1
 
 
@@ -276,7 +276,7 @@ def test_dates_are_the_clock(tmp_path):
         done = run("init", tmp_path / f"a.{ending}", "--out", tmp_path / "spec.toml", "--force")
         assert "sampling time: 0.02 s, from column 'logged'" in done.out, done.err
         assert "left out" not in done.out
-        assert opening.open_job(tmp_path / "spec.toml").train.record.sampling_time == pytest.approx(0.02)
+        assert kinds.open_job(tmp_path / "spec.toml").train.record.sampling_time == pytest.approx(0.02)
 
 
 def test_uneven_milliseconds_are_resampled_and_their_steps_told(tmp_path):
@@ -289,12 +289,12 @@ def test_uneven_milliseconds_are_resampled_and_their_steps_told(tmp_path):
     pd.DataFrame({"t [ms]": t, "u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
     assert run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml").code == 0
     assert "sampling_time" in tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
-    assert not [w for w in opening.open_job(tmp_path / "spec.toml").warnings if w.code == "other_sampling_time"]
+    assert not [w for w in kinds.open_job(tmp_path / "spec.toml").warnings if w.code == "other_sampling_time"]
     t[200:] += 20.0
     pd.DataFrame({"t [ms]": t, "u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
     done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml", "--force")
     assert "but the steps are uneven; single steps are 0.017 to 0.045 s" in done.out, done.err
-    job = opening.open_job(tmp_path / "spec.toml")
+    job = kinds.open_job(tmp_path / "spec.toml")
     assert job.train.record.prepared[0].step == "resample"
     assert job.train.record.sampling_time == pytest.approx(0.02, rel=0.3)
 
@@ -314,7 +314,7 @@ def test_a_column_that_tells_another_step_is_a_warning(tmp_path, header, every, 
     spec = f'[data]\n{given}\ninputs = ["u"]\noutputs = ["y"]\ntrain = {{files = ["a.csv"]}}\n'
     spec += '[[baseline.terms]]\nparameter = "a"\nregressor = "y[k-1]"\n'
     (tmp_path / "spec.toml").write_text(spec)
-    warnings = [w for w in opening.open_job(tmp_path / "spec.toml").warnings if w.code == "other_sampling_time"]
+    warnings = [w for w in kinds.open_job(tmp_path / "spec.toml").warnings if w.code == "other_sampling_time"]
     assert len(warnings) == bool(told) and all(told in w.text for w in warnings)
 
 

@@ -16,8 +16,7 @@ from test_surface import WRONG, tried
 
 import orthaug as oa
 from orthaug._base.errors import InputError
-from orthaug.analysis.continuous_time import converted, observer_form
-from orthaug.analysis.linear_system import System, modes_of
+from orthaug.analysis.linear_system import System, converted, modes_of, observer_form
 from orthaug.analysis.measured_response import measured_response
 from orthaug.data.expressions import Lag
 from orthaug.models.stepping import Memory

@@ -22,9 +22,9 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import jnp
 from orthaug.analysis.motion_modes import motion_stability
 from orthaug.commands import cli
-from orthaug.commands.opening import open_job
+from orthaug.commands.kinds import open_job
 from orthaug.data.readers import read_record
-from orthaug.models.motion_parts import parts_at
+from orthaug.models.motion_field import parts_at
 
 SPEC = """
 [data]
@@ -491,13 +491,13 @@ def test_parameters_of_equations_without_a_learner_are_not_moved_by_what_it_sees
 
 
 def test_an_analysis_that_fails_numerically_loses_no_training(motor, monkeypatch):
-    from orthaug.analysis import motion_ground, motion_modes
+    from orthaug.analysis import motion_bias, motion_modes
 
     def fails(*_, **__):
         raise np.linalg.LinAlgError("Singular matrix")
 
     monkeypatch.setattr(motion_modes, "motion_stability", fails)
-    monkeypatch.setattr(motion_ground, "suspected_bias", fails)
+    monkeypatch.setattr(motion_bias, "suspected_bias", fails)
     code, out, err = orthaug("fit", motor, "--out", motor.parent / "out")
     assert code == 0, err
     told = strict((motor.parent / "out" / "result.json").read_text())
@@ -606,7 +606,7 @@ def test_rows_of_a_motion_are_all_usable(folder):
 
 def test_opening_a_motion_loads_no_jax(folder):
     program = (
-        "import sys\nfrom pathlib import Path\nfrom orthaug.commands.opening import open_job\n"
+        "import sys\nfrom pathlib import Path\nfrom orthaug.commands.kinds import open_job\n"
         f"open_job(Path({str(put(folder))!r}))\nassert 'jax' not in sys.modules\n"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)

@@ -19,7 +19,7 @@ from orthaug.models.integrators import held
 from orthaug.models.learners import Bound
 from orthaug.models.moving import Moving
 from orthaug.models.settling import Windows, settle
-from orthaug.physics.starts import guess
+from orthaug.physics.motion_problem import guess
 
 TS = 0.05
 PARAMETERS = [oa.PhysicalParameter(n, v, min=0) for n, v in (("m", 1.3), ("c", 0.7), ("k", 9.0))]

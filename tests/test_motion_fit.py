@@ -247,7 +247,7 @@ def test_what_the_prior_of_the_weights_holds_has_no_interval() -> None:
 def test_the_band_of_what_is_learned_follows_all_that_was_estimated(fitted: oa.MotionEstimate) -> None:
     """Its variance is that of the learner's part when (c, w), and p̂ with them, move by columns of a root of Cov."""
     from orthaug.analysis.learned_part import learned_reach
-    from orthaug.models.motion_parts import parts_at
+    from orthaug.models.motion_field import parts_at
 
     x, u = np.stack([np.zeros(5), np.linspace(-1, 1, 5)], axis=1), np.zeros((5, 1))
     numbers, slope, tiny = fitted.model.numbers, fitted.split_by.slope, 1e-4
@@ -298,7 +298,8 @@ def test_a_model_runs_on_other_records(fitted: oa.MotionEstimate) -> None:
 
 
 def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(fitted: oa.MotionEstimate) -> None:
-    from orthaug.analysis.motion_diagnosis import diagnose_motion, robust_motion
+    from orthaug.analysis.motion_diagnosis import diagnose_motion
+    from orthaug.analysis.robustness import robust_motion
 
     found = diagnose_motion(fitted, fitted.model.simulate(data()))
     assert found is not None and found.verdict == "white" and "noise on the outputs" in found.text
@@ -309,6 +310,7 @@ def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(fitted:
     alone = oa.estimate(data(), spring(), learner=None, criterion=WHOLE)
     found = diagnose_motion(alone, alone.model.simulate(data()))
     assert found is not None and found.verdict == "unmodelled" and found.predictable[0].own_past > 0.5
+    assert "Intervals count noise alone" in dict(found.warnings)["coloured_residual"]
     assert found.missing is not None and found.missing.p < 1e-4
     term = found.missing.terms[0]
     assert (term.equation, term.variable, term.shape) == ("v", "v", "jump") and term.share > 0.5
@@ -322,6 +324,20 @@ def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(fitted:
     np.testing.assert_array_equal(robust.values, alone.values)
     np.testing.assert_array_equal(robust.plain_std, alone.std)
     assert (robust.std > 1.2 * alone.std).all() and robust.freedom < 31
+
+
+@pytest.mark.parametrize("samples", [0, 5])
+def test_an_input_that_acts_late_is_named_with_its_delay(samples: int) -> None:
+    """Friction is missing in both; it is not taken for a dead time."""
+    record = data()
+    (e,) = record.experiments
+    early = np.concatenate([e.inputs[samples:, 0], np.zeros(samples)])
+    record = oa.Record.from_arrays(u=early, y=e.outputs[:, 0], sampling_time=TS)
+    found = oa.diagnose(oa.estimate(record, spring(), learner=None, criterion=WHOLE))
+    assert found is not None and found.verdict == "unmodelled"
+    texts = [warning.text for warning in found.warnings if warning.code == "dead_time"]
+    assert len(texts) == (samples > 0) and ("Most likely u acts later" in found.text) == bool(samples)
+    assert all('channel = "u", samples = 5;' in text for text in texts)
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,8 @@ from test_motion_fit import WHOLE, data, positive, spring
 import orthaug as oa
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jnp
-from orthaug.analysis.budget import AS_MUCH
-from orthaug.analysis.motion_budget import motion_budget, rivals_of
-from orthaug.analysis.motion_ground import softened_bias
+from orthaug.analysis.budget import AS_MUCH, motion_budget, rivals_of
+from orthaug.analysis.motion_bias import softened_bias
 from orthaug.analysis.motion_suspects import check_motion_suspects, usual_motion_suspects
 from orthaug.physics.motion_problem import pose_motion
 

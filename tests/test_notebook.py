@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 import orthaug as oa
 from orthaug._base.views import MAKERS
-from orthaug.commands import shown_progress
+from orthaug.commands import bars
 from orthaug.models.learners import MLP
 
 VOID = {"br", "meta", "hr", "link", "img", "input"}
@@ -215,7 +215,7 @@ class _Notebook:
 
 def test_progress_in_a_notebook(monkeypatch):
     notebook = _Notebook()
-    monkeypatch.setattr(shown_progress, "_display", lambda: notebook.display)
+    monkeypatch.setattr(bars, "_display", lambda: notebook.display)
     with MAKERS["progress"]() as tell:
         tell(0, 20, 0.5)
         tell(1, 30, 0.25)
@@ -235,7 +235,7 @@ def test_progress_is_shown_to_people_only(monkeypatch, capsys):
     assert capsys.readouterr() == ("", "")
     ipython.get_ipython = lambda: type("ZMQInteractiveShell", (), {})()
     display.display = _Notebook().display
-    assert shown_progress._display() == display.display
+    assert bars._display() == display.display
 
 
 def test_the_page_of_the_documents(tmp_path, monkeypatch):

@@ -11,12 +11,11 @@ import pytest
 from orthaug._base.jax import jax
 from orthaug.data.record import Record
 from orthaug.fitting.criteria import Simulation
-from orthaug.fitting.flight_plan import FlightPlan
+from orthaug.fitting.flight_plan import FlightPlan, StructuredObjective
 from orthaug.fitting.initial_states import Start
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.solvers.descent import MARQUARDT, SquaredResiduals, descend
 from orthaug.fitting.status import Ending
-from orthaug.fitting.structured_objective import StructuredObjective
 from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
 from orthaug.models.learners import MLP
 from orthaug.physics.baseline import Baseline, Term

@@ -15,7 +15,7 @@ from orthaug.fitting.estimation import estimate
 from orthaug.fitting.reweighting import reweighted
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive, OrthogonalPenalty
-from orthaug.inference.intervals import joint_covariance
+from orthaug.inference.covariance import joint_covariance
 from orthaug.inference.measures import Uniform
 from orthaug.models.learners import MLP
 from orthaug.models.storage import load, save

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from orthaug.data.record import Record
-from orthaug.fitting.elsewhere import orthogonalize
+from orthaug.fitting.conclusion import orthogonalize
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive

@@ -18,7 +18,9 @@ from test_motion_cli import SPEC as MOTION
 from test_motion_cli import put
 
 import orthaug as oa
-from orthaug.commands.reporting import compare_report, fit_report, origin_of
+from orthaug.commands.compare import compare_report
+from orthaug.commands.fit import fit_report
+from orthaug.commands.job import origin_of
 from orthaug.data.record import Channel
 from orthaug.models.response import Response, Trajectory
 from orthaug.reports.learned_part import Curve, curve_limits

@@ -12,7 +12,9 @@ import pytest
 from test_cli import MLP, SPEC, make_project
 
 import orthaug as oa
-from orthaug.commands.reporting import compare_report, fit_report, origin_of
+from orthaug.commands.compare import compare_report
+from orthaug.commands.fit import fit_report
+from orthaug.commands.job import origin_of
 from orthaug.data.record import Channel
 from orthaug.models.response import Response, Trajectory
 from orthaug.reports.page import fit_page

@@ -25,15 +25,14 @@ import pytest
 from test_cli import run as run_command
 
 from orthaug._base.errors import InputError
-from orthaug.studies.catalogue import catalogue
-from orthaug.studies.common import extremes, panels, scripts_bars, whiskers
-from orthaug.studies.entry import Counts, Finding
+from orthaug.studies.common import Counts, Finding, extremes, panels, scripts_bars, whiskers
 from orthaug.studies.references import Spread
 from orthaug.studies.reproduction import (
     HYPHEN,
     WIDTH,
     Reproduced,
     as_rows,
+    catalogue,
     chosen,
     not_a_reproduction,
     reproduce,

@@ -11,10 +11,9 @@ from scipy.signal import lfilter
 
 from orthaug._base.errors import InputError
 from orthaug._base.parallel import one_blas_thread
-from orthaug.analysis.correlation import autocorrelation, cross_correlation
 from orthaug.analysis.independence import against_input, against_regressor
 from orthaug.analysis.residuals import analyse
-from orthaug.analysis.whiteness import ljung_box, normality, whitening
+from orthaug.analysis.whiteness import autocorrelation, cross_correlation, ljung_box, normality, whitening
 from orthaug.reports.residual_tests import ResidualTestResult
 
 RECORDS, ROWS, WARM_UP = 2000, 1000, 300

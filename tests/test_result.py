@@ -18,13 +18,13 @@ from orthaug.reports.fields import Content, Flag, Number, Numbers, WarningResult
 from orthaug.reports.result import DataResult, FitResult, ParameterResult, ScoreResult
 from orthaug.reports.schemas import RESULTS, schema_of
 
-DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "spec.md"
+DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "result.md"
 
 
 def documented() -> dict[str, set[str]]:
-    """The keys of each place in the tables of docs/spec.md."""
+    """The keys of each place in the tables of docs/result.md."""
     places: dict[str, set[str]] = {}
-    for line in DOCUMENT.read_text(encoding="utf-8").split("## Result folder")[1].splitlines():
+    for line in DOCUMENT.read_text(encoding="utf-8").splitlines():
         if not line.startswith("| ") or line.startswith("| where"):
             continue
         where, keys = line.strip("| ").split(" | ", maxsplit=1)
@@ -64,7 +64,7 @@ def test_every_key_is_documented(command, place, model):
     keys = {key_of(model, name) for name in model.model_fields}
     known = documented()
     told = known.get(f"{command}: {place}", known.get(f"fit: {place}", set()))
-    assert keys <= told, f"docs/spec.md does not tell of {', '.join(sorted(keys - told))} at {place}"
+    assert keys <= told, f"docs/result.md does not tell of {', '.join(sorted(keys - told))} at {place}"
 
 
 def test_no_key_is_documented_that_is_not_there():

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthaug.analysis.residuals import analyse
-from orthaug.analysis.running_residuals import RunningResidual
+from orthaug.analysis.residuals import RunningResidual, analyse
 
 
 def signals(rows, seed):

@@ -11,8 +11,8 @@ from test_cli import run
 from orthaug._base.errors import InputError, RankError
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
+from orthaug.fitting.conclusion import orthogonalize
 from orthaug.fitting.criteria import Simulation
-from orthaug.fitting.elsewhere import orthogonalize
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive, Orthogonal

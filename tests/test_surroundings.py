@@ -15,7 +15,7 @@ import pytest
 from test_cli import SPEC, make_project, one_line, run
 
 from orthaug._base.errors import InputError
-from orthaug._base.programs import Checked
+from orthaug._base.jax import Checked
 from orthaug.commands import streams
 from orthaug.commands.folder import check_figure, check_folder
 

@@ -12,8 +12,8 @@ import pytest
 
 from orthaug._base.errors import InputError
 from orthaug.data import tables
+from orthaug.data.layouts import layout
 from orthaug.data.tables import check_readable, column_names, has_column, read_table
-from orthaug.data.text_files import layout
 
 
 def put(folder: Path, name: str, content: str | bytes) -> Path:

@@ -13,7 +13,7 @@ import pytest
 from test_architecture import ROOMS
 
 from orthaug.commands.cli import app
-from orthaug.studies.catalogue import catalogue
+from orthaug.studies.reproduction import catalogue
 from orthaug.studies.theory import THEORY, Statement
 
 TESTS = Path(__file__).parent

@@ -10,13 +10,12 @@ import pytest
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Record
+from orthaug.fitting.conclusion import orthogonalize
 from orthaug.fitting.criteria import Simulation
-from orthaug.fitting.elsewhere import orthogonalize
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive, OrthogonalPenalty
-from orthaug.inference.covariance import interval
-from orthaug.inference.intervals import newey_west, prediction_std, robust_split_covariance
+from orthaug.inference.covariance import interval, newey_west, prediction_std, robust_split_covariance
 from orthaug.inference.measures import Samples, Training, Uniform
 from orthaug.models.learners import MLP, Function
 from orthaug.physics.baseline import Baseline, Term

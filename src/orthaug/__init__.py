@@ -19,7 +19,7 @@ def _html(shown: Any) -> str:
 
 
 def _plot(fit: Any) -> Any:
-    from orthaug.reports.fit_plots import FitPlots
+    from orthaug.reports.figures import FitPlots
 
     return FitPlots(fit)
 
@@ -31,7 +31,7 @@ def _report(fit: Any, path: Any, tests: Any) -> Any:
 
 
 def _progress() -> Any:
-    from orthaug.commands.shown_progress import shown_progress
+    from orthaug.commands.bars import shown_progress
 
     return shown_progress()
 

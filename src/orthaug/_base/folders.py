@@ -1,19 +1,143 @@
 """Folders and files that appear whole or not at all: written beside their place, then renamed.
 
-What stands in the place is replaced only where orthaug wrote it and nobody changed it, or by force.
+What stands in the place is replaced only where orthaug wrote it and nobody changed it, or by force. The manifest of a
+folder tells: every file that orthaug wrote into it, with its checksum. What is not in its place yet is named after the
+process, and removed when that ends early.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
+import platform
+import secrets
+import shutil
 import tempfile
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from orthaug import __version__
 from orthaug._base.errors import InputError
-from orthaug._base.manifest import Foreign, not_ours, write_manifest
-from orthaug._base.partials import PARTIALS
+
+MANIFEST = "manifest.json"
+Foreign = Callable[[Path, Sequence[str]], str | None]
+"""Of a folder without manifest, as older versions wrote them, and the names of all files in it: one that is not theirs,
+None where all are."""
+
+_PARTIAL, _OLD = ".orthaug-partial-", ".orthaug-old-"
+_HOST = hashlib.sha256(platform.node().encode()).hexdigest()[:8]  # of a folder that several machines share
+_OF_THE_SYSTEM = {".DS_Store", "Thumbs.db", "desktop.ini"}  # file managers write these into every folder
+
+
+class Partials:
+    """The partial folders and files of this process. `lock` is held while one is put in its place."""
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self.placed: list[Path] = []
+        self._open: dict[Path, Sequence[Path]] = {}
+        self._swept: set[Path] = set()
+
+    def folder(self, parent: Path, made: Sequence[Path] = ()) -> Path:
+        """A new folder in `parent`; `made` are the parents that vanish with it."""
+        with self.lock:
+            partial = self._named(parent, made)
+            partial.mkdir()
+            return partial
+
+    def file(self, parent: Path) -> Path:
+        """A new empty file in `parent`."""
+        with self.lock:
+            partial = self._named(parent, ())
+            partial.touch(exist_ok=False)
+            return partial
+
+    def shelter(self, parent: Path) -> Path:
+        """A new folder for what stood there before, until the new one stands."""
+        shelter = parent / _name(_OLD)
+        shelter.mkdir()
+        return shelter
+
+    def stands(self, partial: Path, place: Path) -> None:
+        """Note that a partial one is in its place."""
+        self._open.pop(partial, None)
+        self.placed.append(place)
+
+    def discard(self, partial: Path) -> None:
+        """Remove a partial one, and the parents that were made for it."""
+        made = self._open.pop(partial, ())
+        for _ in range(20):  # whoever writes into it may not have stopped yet
+            if partial.is_dir():
+                shutil.rmtree(partial, ignore_errors=True)
+            else:
+                with suppress(OSError):
+                    partial.unlink(missing_ok=True)
+            if not os.path.lexists(partial):
+                break
+            time.sleep(0.01)
+        for parent in made:
+            with suppress(OSError):  # somebody else's files are in it by now
+                parent.rmdir()
+
+    def discard_all(self) -> None:
+        """Remove all of them, and let no other be made or put in its place: the process ends."""
+        self.lock.acquire()
+        for partial in list(self._open):
+            self.discard(partial)
+
+    def _named(self, parent: Path, made: Sequence[Path]) -> Path:
+        if parent not in self._swept:
+            remove_stale(parent, self._open)
+            self._swept.add(parent)
+        partial = parent / _name(_PARTIAL)
+        self._open[partial] = made
+        return partial
+
+
+PARTIALS = Partials()  # of the process, as its signals are
+
+
+def remove_stale(parent: Path, alive: Sequence[Path] | dict[Path, Sequence[Path]] = ()) -> None:
+    """Remove what processes of this machine left in `parent` when they were killed; what stood there comes back."""
+    if os.name != "posix":  # elsewhere asking for a process may end it
+        return
+    with suppress(OSError):
+        for path in parent.iterdir():
+            if path in alive or not path.name.startswith((_PARTIAL, _OLD)) or _lives(path.name):
+                continue
+            if path.name.startswith(_OLD):
+                for old in path.iterdir():
+                    if not os.path.lexists(parent / old.name):
+                        old.rename(parent / old.name)
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
+
+
+def _name(kind: str) -> str:
+    return f"{kind}{_HOST}-{os.getpid()}-{secrets.token_hex(4)}"
+
+
+def _lives(name: str) -> bool:
+    """Whether the process in a name may be alive; one of another machine may be."""
+    parts = name.split("-")
+    if len(parts) != 5 or parts[2] != _HOST or not parts[3].isdecimal():
+        return True
+    process = int(parts[3])
+    if process == os.getpid():  # an earlier process had the same number
+        return name.startswith(_OLD)
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:
+        return True
+    return True
 
 
 def check_replaceable(folder: Path, foreign: Foreign, *, force: bool = False) -> None:
@@ -184,3 +308,56 @@ def _place_file(partial: Path, target: Path, force: bool) -> None:
     with suppress(FileNotFoundError):
         partial.chmod(target.stat().st_mode & 0o777)
     partial.replace(target)
+
+
+def write_manifest(folder: Path) -> None:
+    """Write `manifest.json` about all files of a folder."""
+    files = {name: file_digest(folder / name) for name in sorted(_names(folder))}
+    content = {"orthaug": __version__, "files": files}
+    (folder / MANIFEST).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def not_ours(folder: Path, foreign: Foreign) -> str | None:
+    """A file of a folder that orthaug did not write or that was changed, in words; None where all may be replaced."""
+    listed = _listed(folder / MANIFEST)
+    if listed is None:
+        names = list(_names(folder))
+        name = foreign(folder, names) if names else None
+        return None if name is None else f"{name} and is not an orthaug result"
+    names = [name for name in _names(folder) if name != MANIFEST]
+    for name in names:
+        if name not in listed:
+            return f"{name}, which orthaug did not write"
+    for name in names:
+        if (folder / name).is_symlink() or file_digest(folder / name) != listed[name]:
+            return f"{name}, which was changed since orthaug wrote it"
+    return None
+
+
+def _names(folder: Path) -> Iterator[str]:
+    """Relative names of all files below a folder, of links to folders too."""
+    for place, folders, files in os.walk(folder):
+        folders.sort()
+        links = [name for name in folders if os.path.islink(os.path.join(place, name))]
+        for name in sorted(files + links):
+            if name not in _OF_THE_SYSTEM:
+                yield Path(place, name).relative_to(folder).as_posix()
+
+
+def file_digest(path: Path) -> str:
+    """The sha256 of a file; empty where there is none."""
+    if not path.is_file():
+        return ""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _listed(path: Path) -> dict[str, str] | None:
+    """The checksums of a manifest; None where there is none of orthaug's."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
+    if not isinstance(content, dict) or "orthaug" not in content or not isinstance(content.get("files"), dict):
+        return None
+    return content["files"]

@@ -2,16 +2,22 @@
 
 `jax` and `jnp` stand for the modules. `jax.jit` compiles at the first call, so that a module with compiled functions
 can be imported without JAX.
+
+Programs that it keeps on disk end with a checksum, and one that was cut, altered or exchanged is compiled again: JAX
+runs whatever it finds under a program's name, and two that are exchanged give an error, or other numbers.
 """
 
 from __future__ import annotations
 
 import functools
+import hashlib
 import os
 import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthaug._base.errors import PrecisionError
@@ -23,6 +29,7 @@ if TYPE_CHECKING:
 else:
     Array = Any  # in annotations; at run time jaxtyping checks shape and type of whatever is an array
 
+_LENGTH = hashlib.sha256().digest_size
 __all__ = ["Array", "is_traced", "jax", "jnp", "padded_length", "starts", "use_compilation_cache"]
 
 
@@ -137,10 +144,60 @@ def use_compilation_cache() -> None:
     """Keep compiled programs between processes (the command line does; the library never on its own)."""
     import platformdirs
 
-    from orthaug._base.programs import check_cached_programs
-
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or platformdirs.user_cache_dir("orthaug")
     jax.config.update("jax_compilation_cache_dir", folder)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    check_cached_programs()
+    _check_cached_programs()
+
+
+class Checked:
+    """A cache of JAX whose entries end with a checksum of their key and content; a cache without writing is silent."""
+
+    def __init__(self, cache: Any, folder: str) -> None:
+        self._cache, self._folder = cache, Path(folder)
+        self._path = getattr(cache, "_path", folder)
+
+    def get(self, key: str) -> bytes | None:
+        """The content of an entry; None where there is none, or not that one."""
+        try:
+            entry = self._cache.get(key)
+        except Exception:  # JAX words each failure in a warning of many lines
+            return None
+        if entry is None or entry[-_LENGTH:] == _digest(key, entry[:-_LENGTH]):
+            return entry and entry[:-_LENGTH]
+        with suppress(OSError):  # or what is compiled now would not be kept
+            (self._folder / f"{key}-cache").unlink(missing_ok=True)
+        return None
+
+    def put(self, key: str, value: bytes) -> None:
+        """Keep an entry, if it can be written."""
+        with suppress(Exception):
+            self._cache.put(key, value + _digest(key, value))
+
+
+def _digest(key: str, content: bytes) -> bytes:
+    return hashlib.sha256(key.encode() + b"\0" + content).digest()
+
+
+def _check_cached_programs() -> None:
+    """From now on JAX's cache is a checked one. Where JAX is built otherwise than known, nothing is kept."""
+    try:
+        from jax._src import compilation_cache
+
+        make = compilation_cache.get_file_cache
+    except (ImportError, AttributeError):
+        jax.config.update("jax_enable_compilation_cache", False)
+        return
+    if hasattr(make, "__wrapped__"):
+        return
+
+    @functools.wraps(make)
+    def checked(path: str) -> Any:
+        try:
+            made = make(path)
+        except Exception:  # a place that cannot be written
+            return None
+        return made and (Checked(made[0], path), made[1])
+
+    compilation_cache.get_file_cache = checked

@@ -61,7 +61,6 @@ def in_words(size: float) -> str:
 
 
 def _unused() -> float:
-    """Memory that no process uses."""
     try:
         with open("/proc/meminfo", encoding="ascii") as file:
             lines = dict(line.split(":", 1) for line in file)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -18,12 +18,14 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.jax import jnp
 from orthaug._base.parallel import one_blas_thread
 from orthaug.physics.output_weights import times
 from orthaug.physics.problem import Problem
 
-_WAVES = 100  # tanh functions of z that stand for any function of it
+_MOST_WAVES = 100  # tanh functions of z that stand for any function of it
 _ROWS_PER_WAVE = 20
+WAVES = 24  # the same, before there is a fit
 _STEEPEST = 30.0  # of their slopes, in units of 1 / range of z
 _ROWS = 20_000
 _ROUNDING = 1e-10
@@ -95,10 +97,8 @@ class Smoother:
         z = self._z(x)
         functions = z
         if not problem.features.linear:
-            count = min(_WAVES, len(z) // _ROWS_PER_WAVE)
-            slopes = rng.normal(size=(count, z.shape[1]))
-            steep = np.exp(rng.uniform(0.0, np.log(_STEEPEST), size=(count, 1)))
-            slopes *= steep / np.linalg.norm(slopes, axis=1)[:, None]
+            count = min(_MOST_WAVES, len(z) // _ROWS_PER_WAVE)
+            slopes = _slopes(rng, count, z.shape[1])
             centres = z[rng.integers(len(z), size=count)]
             waves = np.tanh(z @ slopes.T - np.sum(slopes * centres, axis=1))
             phi = np.asarray(problem.baseline.phi(x, problem.layout, problem.outputs, np))
@@ -179,3 +179,33 @@ def completing(basis: Matrix) -> list[int]:
         return list(range(len(basis)))
     order = scipy.linalg.qr(basis.T, mode="r", pivoting=True)[-1]
     return sorted(int(i) for i in order[basis.shape[1] :])
+
+
+@dataclass(frozen=True)
+class Waves:
+    """A constant, the features z in [-1, 1] and tanh waves of them, each with a weight."""
+
+    inputs: tuple[str, ...] | None = None
+
+    def init(self, key: Any, nz: int, ny: int) -> Any:
+        return jnp.zeros((ny, 1 + nz + WAVES))
+
+    def apply(self, tree: Any, z: Any) -> Any:
+        slopes, offsets = _drawn(len(z))
+        waves = jnp.tanh(jnp.tensordot(slopes, z, 1) - offsets.reshape(-1, *(1,) * (z.ndim - 1)))
+        return tree @ jnp.concatenate([jnp.ones((1, *z.shape[1:])), z, waves])
+
+
+@lru_cache(maxsize=16)
+def _drawn(nz: int) -> tuple[Matrix, Vector]:
+    """Slopes (WAVES, nz) and offsets: every wave has its centre among the features."""
+    rng = np.random.default_rng(_SEED)
+    slopes, centres = _slopes(rng, WAVES, nz), rng.uniform(-1, 1, size=(WAVES, nz))
+    return slopes, np.sum(slopes * centres, axis=1)
+
+
+def _slopes(rng: np.random.Generator, count: int, nz: int) -> Matrix:
+    """Of waves in random directions, gentle ones as often as steep ones (count, nz)."""
+    slopes = rng.normal(size=(count, nz))
+    steep = np.exp(rng.uniform(0.0, np.log(_STEEPEST), size=(count, 1)))
+    return slopes * (steep / np.linalg.norm(slopes, axis=1)[:, None])

@@ -22,6 +22,7 @@ from orthaug.models.on_records import RUNAWAY
 
 _LARGEST_FACTOR = 1e4  # outputs of a stable linear model grow with its inputs, and 10⁶ times the largest is "diverged"
 _SIDE_BY_SIDE = 16  # runs of one compiled call
+_MARGIN = 1.5  # a factor below is told as a warning
 _CLOSE = 1.05  # ratio of two factors at which the bisection ends
 
 Diverging = Callable[[list[float]], np.ndarray]
@@ -51,6 +52,13 @@ def divergence_scaling(model: Model | MotionModel, record: Record, largest: floa
         return None
     high = int(np.argmax(wild))
     return _bisected(growing[high - 1], growing[high], diverges) if high else _below_one(diverges)
+
+
+def margin(factor: float | None, searched: float) -> tuple[str, str]:
+    """Such a factor, or that there is none up to `searched`, in a sentence; with the code of a warning, or nothing."""
+    stays, times = ("stays within", searched) if factor is None else ("leaves", factor)
+    told = f"The free run {stays} all bounds with the inputs' deviations from their means {times:.4g} times as large."
+    return told, "small_margin" if factor is not None and factor < _MARGIN else ""
 
 
 def _doubled(largest: float) -> list[float]:

@@ -3,30 +3,32 @@
 With F the learner's values under the measure and Δ a cause's, the coefficient is that of P⊥F on P⊥Δ and the bias,
 estimate less truth, `Φ_μ⁺Δ` times it. Only one cause is named: the declared suspect that explains most of ‖P⊥F‖² if
 that is enough, else the usual suspect or product of lags that does.
+
+Of a motion only terms that someone suspects are looked at. Without a learner their size is what the free run's residual
+tells: one Gauss-Newton step.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
-import scipy.special
 from jaxtyping import Float
 
-from orthaug._base.checks import Vector
+from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug._base.lines import percent, plain_number
 from orthaug._base.warning import Warning
 from orthaug.analysis.bias import SuspectedBias
-from orthaug.analysis.measure_bias import Ground
+from orthaug.analysis.measure_bias import Ground, physical_of
+from orthaug.analysis.motion_bias import TermBias
 from orthaug.analysis.remedies import remedies
 from orthaug.analysis.suspects import Suspect, usual_suspects, usual_terms
 from orthaug.fitting.estimates import Estimate
-from orthaug.inference.measures import Measure, Training
-from orthaug.inference.physical import solve
-from orthaug.inference.weighed import weigh_problem
+from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.inference.covariance import interval
+from orthaug.inference.measures import Measure, Training, weigh_problem
 from orthaug.physics.parameters import PhysicsMap
 
 LEAST_SHARE = 0.5  # of the learner's energy that a cause must explain to be named
@@ -37,6 +39,8 @@ _NEAR = 0.5  # of what the cause explains: a rival that is named beside it
 _MOST_RIVALS = 3
 _ROUNDING = 1e-9  # of a parameter: a bias that no one can speak of
 _TOLD = 4  # parameters that a warning lists at most
+_SURE = 3.3  # standard errors of a coefficient that the residual tells: one in a thousand is so large by chance
+_ELSEWHERE = 0.5  # of a bias, from which that of a rival is another one
 
 
 @dataclass(frozen=True)
@@ -128,10 +132,14 @@ def budget_on(ground: Ground, fit: Estimate, suspects: Sequence[Suspect]) -> Bud
     if cause is None or cause.explained is None or cause.coefficient_found is None:
         return None
     share, coefficient = cause.explained, cause.coefficient_found
-    told = partial(_rows, freedom=fit.freedom, cause=cause.suspect.name, share=share)
     rest, bias = left_over(ground, cause, suspects), coefficient * np.array(cause.bias)
     std = np.full(len(bias), np.nan) if fit.std is None else fit.std
     names, rows = ground.problem.baseline.names, ()
+
+    def told(names: Sequence[str], value: Vector, std: Vector, bias: Vector, rest: Vector) -> tuple[ParameterBias, ...]:
+        ends = with_bias(value, std, fit.freedom, bias, rest)
+        return parameter_biases(names, value, std, bias, ends, cause.suspect.name, share)
+
     parameters = told(names, fit.theta, std, bias, rest[: len(names)])
     if ground.physics is not None:
         physical = fit.physical(ground.physics)
@@ -149,10 +157,15 @@ def named_cause(ground: Ground, suspects: Sequence[Suspect], least: float = LEAS
     Of what no one declared only what the learner sees counts: the rest is no likely cause of what it found.
     """
     for table in (_declared(ground, suspects), _usual(ground)):
-        best = max(table, key=lambda entry: entry.explained or 0.0, default=None)
-        if best is not None and (best.explained or 0.0) >= least:
+        best = max(table, key=_explains, default=None)
+        if best is not None and _explains(best) >= least:
             return best
     return None
+
+
+def _explains(entry: SuspectedBias | TermBias) -> float:
+    """Its share of the learner."""
+    return entry.explained or 0.0
 
 
 def _declared(ground: Ground, suspects: Sequence[Suspect]) -> tuple[SuspectedBias, ...]:
@@ -172,7 +185,7 @@ def rival_of(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) 
     assert cause.explained
     if cause.suspect in suspects:
         return None
-    equal = [entry for entry in _usual(ground) if (entry.explained or 0.0) >= AS_MUCH * cause.explained]
+    equal = [entry for entry in _usual(ground) if _explains(entry) >= AS_MUCH * cause.explained]
     to_coordinates, own = ground.weighed.projection.to_coordinates, _moved(cause)
     nt = len(cause.names)
 
@@ -189,9 +202,9 @@ def near_causes(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect
     if cause.suspect in suspects or cause.explained >= SURE_SHARE:
         return []
     others = [entry for entry in _usual(ground) if entry.suspect != cause.suspect and entry.explained]
-    near = [entry for entry in others if (entry.explained or 0.0) >= _NEAR * cause.explained]
+    near = [entry for entry in others if _explains(entry) >= _NEAR * cause.explained]
     best: dict[str, SuspectedBias] = {}
-    for entry in sorted(near, key=lambda entry: -(entry.explained or 0.0)):
+    for entry in sorted(near, key=_explains, reverse=True):
         best.setdefault(entry.suspect.on or entry.suspect.expression, entry)
     return list(best.values())[:_MOST_RIVALS]
 
@@ -206,7 +219,7 @@ def left_over(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect])
     rest, others = ground.without(cause), tuple(suspect for suspect in suspects if suspect != cause.suspect)
     found = [best for group in {others, ()} if (best := named_cause(rest, group, 0.0)) is not None]
     own = _moved(cause) * np.sqrt((1 - cause.explained) / cause.explained)
-    next_best = _moved(max(found, key=lambda entry: entry.explained or 0.0)) if found else 0.0
+    next_best = _moved(max(found, key=_explains)) if found else 0.0
     rival = rival_of(ground, cause, suspects)
     return np.sqrt(own**2 + next_best**2 + (0.0 if rival is None else _moved(rival) - _moved(cause)) ** 2)
 
@@ -222,23 +235,15 @@ def with_bias(value: Vector, std: Vector, freedom: float, bias: Vector, rest: Ve
     Args:
         rest: standard deviation of the bias that its cause does not tell, as `left_over` gives it.
     """
-    reach = scipy.special.stdtrit(max(freedom, 1.0), 0.975) * np.sqrt(std**2 + rest**2)
-    return np.stack([value - bias - reach, value - bias + reach], axis=-1)
+    return interval(value - bias, np.sqrt(std**2 + rest**2), freedom)
 
 
-def _rows(
-    names: Sequence[str],
-    value: Vector,
-    std: Vector,
-    bias: Vector,
-    rest: Vector,
-    *,
-    freedom: float,
-    cause: str,
-    share: float,
+def parameter_biases(
+    names: Sequence[str], value: Vector, std: Vector, bias: Vector, ends: Matrix, cause: str, share: float
 ) -> tuple[ParameterBias, ...]:
+    """A row for each parameter whose bias is known; `ends` are those of its interval."""
     found = []
-    for name, v, s, b, ci in zip(names, value, std, bias, with_bias(value, std, freedom, bias, rest), strict=True):
+    for name, v, s, b, ci in zip(names, value, std, bias, ends, strict=True):
         if np.isfinite(b):
             errors, relative = float(abs(b) / s) if s > 0 else None, float(b / v) if v else None
             limits = (float(ci[0]), float(ci[1])) if np.isfinite(ci).all() else None
@@ -248,16 +253,11 @@ def _rows(
 
 def _physical(physics: PhysicsMap, fit: Estimate, bias: Vector) -> Vector:
     """p of θ̂ less p of θ̂ without the bias; NaN where that has no p."""
-    names = fit.problem.baseline.names
-    order = [names.index(name) for name in physics.theta_names]
-    covariance = None if fit.covariance is None else fit.covariance[np.ix_(order, order)]
     try:
-        biased, free = (
-            solve(physics, theta[order], covariance, freedom=np.inf).value for theta in (fit.theta, fit.theta - bias)
-        )
+        biased, free = (physical_of(physics, fit.problem, t, fit.covariance) for t in (fit.theta, fit.theta - bias))
     except InputError:
         return np.full(len(physics.names), np.nan)
-    return np.asarray(biased) - np.asarray(free)
+    return biased - free
 
 
 def _warning(
@@ -268,28 +268,128 @@ def _warning(
     large = [entry for entry in every if (entry.errors or 0.0) > 1 and abs(entry.relative or 1.0) > _ROUNDING]
     if not large:
         return None
-    shown = sorted(large, key=lambda entry: -(entry.errors or 0.0))[:_TOLD]
-    listed = ", ".join(told_bias(entry) for entry in shown)
-    more = f" and {len(large) - len(shown)} more" if len(large) > len(shown) else ""
+    listed = told_biases(large)
     cures = remedies(ground, budget.cause, [entry.name for entry in large])
     other = "" if rival is None else f" ({rival.suspect.name} explains as much and would move them elsewhere)"
     if budget.share < SURE_SHARE:
-        close = ", ".join(f"{entry.suspect.name} {percent(entry.explained or 0.0)}" for entry in near)
+        close = ", ".join(f"{entry.suspect.name} {percent(_explains(entry))}" for entry in near)
         beside = f"; next: {close}" if near else ""
         return Warning(
             "biased",
             f"what the learner found looks most like {budget.cause.suspect.name} ({percent(budget.share)} of it"
-            f"{beside}), which would move {listed}{more}, and the standard errors do not cover that{other}: if it is "
+            f"{beside}), which would move {listed}, and the standard errors do not cover that{other}: if it is "
             f"that term, {' or '.join(cures)}.",
         )
     return Warning(
         "biased",
-        f"{budget.cause.suspect.name} explains {100 * budget.share:.0f} % of the learner and moves {listed}{more}, "
+        f"{budget.cause.suspect.name} explains {100 * budget.share:.0f} % of the learner and moves {listed}, "
         f"which the standard errors do not cover{other}: {' or '.join(cures)}.",
     )
 
 
-def told_bias(entry: ParameterBias) -> str:
-    """A bias in words."""
+def told_biases(large: Sequence[ParameterBias]) -> str:
+    """The largest biases in words."""
+    shown = sorted(large, key=lambda entry: -(entry.errors or 0.0))[:_TOLD]
+    more = f" and {len(large) - len(shown)} more" if len(large) > len(shown) else ""
+    return f"{', '.join(map(_told_bias, shown))}{more}"
+
+
+def _told_bias(entry: ParameterBias) -> str:
     share = "" if entry.relative is None else f", {percent(entry.relative, sign='+')}"
     return f"{entry.name} by {entry.value:+.2g} ({plain_number(entry.errors or 0.0)} standard errors{share})"
+
+
+@dataclass(frozen=True, eq=False)
+class MotionBudget:
+    """The bias of every parameter by the term that explains `share` of the learner, or of what the free run leaves."""
+
+    cause: TermBias
+    coefficient: float
+    share: float
+    parameters: tuple[ParameterBias, ...]
+    warnings: tuple[Warning, ...]
+
+    def of(self, name: str) -> ParameterBias | None:
+        """The bias of a parameter."""
+        return next((entry for entry in self.parameters if entry.name == name), None)
+
+
+def motion_budget(
+    fit: MotionEstimate, table: Sequence[TermBias], smooth: Sequence[TermBias] = ()
+) -> MotionBudget | None:
+    """By the suspect that explains most; None where none explains enough.
+
+    Args:
+        table: what every suspect does to the fit.
+        smooth: the same of terms that stand beside those of the table (`softened_bias`), named where they explain
+            clearly more of a learner.
+    """
+    learns = fit.model.form.bound is not None
+    named = _of_learner(table, smooth) if learns else _of_residual(table)
+    if named is None:
+        return None
+    cause, coefficient, share, spread = named
+    rivals = rivals_of(cause, (*table, *smooth)) if learns else []
+    bias, value = coefficient * cause.per_unit, fit.values
+    std = np.full(len(value), np.nan) if fit.std is None else fit.std
+    apart = [np.abs((rival.coefficient_found or 0.0) * rival.per_unit - bias) for rival in rivals]
+    rest = np.hypot(spread * cause.per_unit, np.max([np.zeros(len(value)), *apart], axis=0))
+    ends = with_bias(value, std, fit.freedom, bias, rest)
+    parameters = fit.problem.motion.parameters
+    ends = np.clip(ends, [[p.min] for p in parameters], [[p.max] for p in parameters])
+    rows = parameter_biases(cause.names, value, std, bias, ends, cause.suspect.name, share)
+    found = MotionBudget(cause, coefficient, share, rows, ())
+    far = [rival for rival, by in zip(rivals, apart, strict=True) if np.any(by > _ELSEWHERE * np.abs(bias))]
+    warning = _motion_warning(found, far, learns=learns)
+    return found if warning is None else replace(found, warnings=(warning,))
+
+
+def rivals_of(cause: TermBias, table: Sequence[TermBias]) -> list[TermBias]:
+    """Terms that explain as much of the learner as a cause, which cannot be told from it."""
+    least = AS_MUCH * _explains(cause)
+    return [entry for entry in table if entry is not cause and _explains(entry) >= max(least, LEAST_SHARE)]
+
+
+def _of_learner(table: Sequence[TermBias], smooth: Sequence[TermBias]) -> tuple[TermBias, float, float, float] | None:
+    """The term that explains most of the learner: its coefficient, share, and how unsure the coefficient is."""
+    best, other = max(table, key=_explains, default=None), max(smooth, key=_explains, default=None)
+    if best is not None and other is not None and _explains(best) < AS_MUCH * _explains(other):
+        best = other
+    if best is None or best.explained is None or best.explained < LEAST_SHARE or best.coefficient_found is None:
+        return None
+    unsure = abs(best.coefficient_found) * np.sqrt((1 - best.explained) / best.explained)
+    return best, best.coefficient_found, best.explained, float(unsure)
+
+
+def _of_residual(table: Sequence[TermBias]) -> tuple[TermBias, float, float, float] | None:
+    """The term that lowers the residual most, where that is no chance and most of what is no white noise.
+
+    What stays beyond white noise counts as biased by as much for its size, of unknown sign.
+    """
+    sure = [entry for entry in table if entry.residual is not None and abs(entry.residual.t or 0.0) >= _SURE]
+    best = max(sure, key=lambda entry: entry.residual.share if entry.residual else 0.0, default=None)
+    if best is None or best.residual is None or best.residual.std is None:
+        return None
+    told, std = best.residual, best.residual.std
+    if told.share < LEAST_SHARE * (told.share + told.left):
+        return None
+    unsure = np.hypot(std, told.coefficient * np.sqrt(told.left / told.share))
+    return best, told.coefficient, told.share, float(unsure)
+
+
+def _motion_warning(budget: MotionBudget, rivals: Sequence[TermBias], *, learns: bool) -> Warning | None:
+    """One sentence on what is biased by more than its standard error: cause, size, remedy."""
+    large = [entry for entry in budget.parameters if (entry.errors or 0.0) > 1]
+    if not large:
+        return None
+    what = "the learner" if learns else "the squares that the free run leaves"
+    unit = f" {budget.cause.suspect.unit}".rstrip()
+    named = ", ".join(rival.suspect.name for rival in sorted(rivals, key=_explains, reverse=True)[:2])
+    explain = "explain" if len(rivals) > 1 else "explains"
+    other = f" ({named} {explain} as much and would move them elsewhere)" if rivals else ""
+    return Warning(
+        "biased",
+        f"{budget.cause.suspect.name} of size {budget.coefficient:.3g}{unit} explains {100 * budget.share:.0f} % of "
+        f"{what} and moves {told_biases(large)}, which the standard errors do not "
+        f"cover{other}: add it to the equation of {budget.cause.equation}, with its size as a parameter.",
+    )

@@ -16,10 +16,9 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.lines import percent
 from orthaug._base.parallel import one_blas_thread
-from orthaug.analysis.local_dynamics import transitions
-from orthaug.analysis.predictability import BlockSums, Share
+from orthaug.analysis.feedback import transitions
+from orthaug.analysis.predictability import BlockSums, Share, SimpleFunctions
 from orthaug.analysis.residuals import rms_errors
-from orthaug.analysis.simple_functions import SimpleFunctions
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Experiment, Record
 from orthaug.data.regressors import lag_matrix
@@ -186,7 +185,8 @@ class Candidates:
         there = slice(begin, begin + len(piece) - first)
         error = (piece.outputs[first:] - run.model[there])[:, :, None]
         if self.flown and not self.measured:
-            ran = np.where(np.isfinite(run.model), run.model, outputs_before(run))[begin - first : there.stop]
+            assert run.measured is not None
+            ran = np.where(np.isfinite(run.model), run.model, run.measured)[begin - first : there.stop]
             piece = Experiment(piece.inputs, ran)
         columns = self._columns(piece, record)
         if self.measured:
@@ -269,9 +269,3 @@ class Candidates:
         visible = seen(problem.features, problem.layout, problem.rows.x, lambda rows: rows)
         hidden = [str(lag) for lag, one in zip(problem.layout, visible, strict=True) if not one]
         return f"a learner that also sees {', '.join(hidden)}" if hidden else "a learner of more neurons"
-
-
-def outputs_before(run: Trajectory) -> Matrix:
-    """What was measured, for the rows before a run begins."""
-    assert run.measured is not None
-    return run.measured

@@ -138,8 +138,7 @@ def _rows(u: Vector, beside: Matrix, y: Matrix) -> tuple[Matrix, Matrix, Vector]
         levels = np.concatenate([u[:1], u[changes]])
         period = _period(levels, _LEVELS)
         past = _LEVELS if period is None else max(period + 1, _LEVELS)
-        rows, own = changes[past - 1 :], _lagged(levels, range(1, _LEVELS + 1), past)
-        own = own if period is None else np.column_stack([own, _lagged(levels, range(period - 1, period + 2), past)])
+        rows, own = changes[past - 1 :], _own_past(levels, _LEVELS, period, past)
         own = np.column_stack([own, levels[past - 1 : -1] ** 2, levels[past - 1 : -1] ** 3]) if len(own) else own
         enough = rows >= _BESIDE
         own = np.column_stack([own[enough], _past(beside, rows[enough], _BESIDE)])
@@ -149,13 +148,14 @@ def _rows(u: Vector, beside: Matrix, y: Matrix) -> tuple[Matrix, Matrix, Vector]
     past = max(lags, _BESIDE) if period is None else max(period + 1, _BESIDE)
     if len(u) <= past:
         return None
-    own = _lagged(u, range(1, lags + 1), past)
-    own = own if period is None else np.column_stack([own, _lagged(u, range(period - 1, period + 2), past)])
+    own = _own_past(u, lags, period, past)
     rows = np.arange(past, len(u))
     return np.column_stack([own, _past(beside, rows, _BESIDE)]), _past(y, rows, _OUTPUT_LAGS), u[past:]
 
 
-def _lagged(x: Vector, lags: range, first: int) -> Matrix:
+def _own_past(x: Vector, count: int, period: int | None, first: int) -> Matrix:
+    """So many lags, and those about a period."""
+    lags = [*range(1, count + 1), *(() if period is None else range(period - 1, period + 2))]
     rows = np.arange(first, len(x))
     return np.column_stack([x[rows - lag] for lag in lags]) if len(rows) else np.zeros((0, len(lags)))
 

@@ -11,8 +11,7 @@ from scipy import linalg
 
 from orthaug._base.checks import Matrix, Vector, check_count
 from orthaug._base.parallel import one_blas_thread
-from orthaug.analysis.feedback import MOST_WORK, Feedback, feedback
-from orthaug.analysis.local_dynamics import linearised
+from orthaug.analysis.feedback import MOST_WORK, Feedback, feedback, linearised
 from orthaug.analysis.visited import Place, evenly
 from orthaug.data.record import Record
 from orthaug.models.model import Model

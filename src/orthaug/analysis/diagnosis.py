@@ -7,24 +7,29 @@ With many rows every test rejects; so effects are measured, as shares of varianc
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from orthaug._base.checks import check_type
+from orthaug._base.errors import InputError
+from orthaug._base.lines import counted, percent
 from orthaug._base.parallel import one_blas_thread
 from orthaug._base.warning import Warning
 from orthaug.analysis.changes import Change, fall_of, model_changes, own_share
-from orthaug.analysis.missing_terms import MissingTest
-from orthaug.analysis.predictability import Predictable, predictable
-from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, rms_errors
-from orthaug.analysis.verdict_text import SHARE, Finding, words
-from orthaug.analysis.wild_rows import wild_rows
+from orthaug.analysis.motion_diagnosis import diagnose_motion
+from orthaug.analysis.predictability import predictable
+from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, errors_of, rms_errors
+from orthaug.analysis.verdict_text import SHARE, Diagnosis, Finding, words
+from orthaug.data.record import Experiment
 from orthaug.data.regressors import Lags
 from orthaug.data.survey import quantum_of
 from orthaug.fitting.criteria import Simulation
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import estimate
+from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.inference.covariance import by_experiment
 from orthaug.models.response import Response
 from orthaug.physics.problem import Problem
 
@@ -34,44 +39,50 @@ _AS_GOOD = 1.05  # free-run error / one-step error up to which measured lags add
 _SMALL = 0.05  # of the residual's variance: what could be predicted below that is a small effect
 _SMALL_SIZE = 0.05  # of the output's deviation, beside it
 _SMALL_COLOUR = 0.2  # the same of what a free run's own past tells: more of it is hardly noise
+_HOLD = 0.5  # share of the squares that stands in wild rows
+_FEW, _LEAST = 0.005, 6  # share of the rows that these are at most, and the number that is always few
+_WILD = 20.0  # robust deviations; a normal residual reaches five
+_MAD = 1.4826
+_NAMED = 3
 
 
-@dataclass(frozen=True, eq=False)
-class Diagnosis:
-    """`verdict` is white, equation_noise, sensor_noise or unmodelled; `text` says why and what to do.
-
-    `one_step` and `free_run` are the tests of the two residuals per output. `ratio` is the free run's RMS error against
-    the one-step error, `noise_in_lags` the share of noise in the least excited direction of the lagged outputs.
-    `predictable` is what could be predicted of the error that was minimised, per output. `changes` are predicted to
-    lower it, the first of them by most; there is none where it is noise. `steps` are the steps of those outputs whose
-    one-step error is no larger, None where there are none. `missing` is the test of terms that the
-    equations of a motion could lack; None for other models.
-    """
-
-    verdict: str
-    text: str
-    one_step: tuple[ResidualTest, ...]
-    free_run: tuple[ResidualTest, ...] | None
-    ratio: float | None
-    noise_in_lags: float | None
-    warnings: tuple[Warning, ...]
-    predictable: tuple[Predictable, ...] = ()
-    changes: tuple[Change, ...] = ()
-    missing: MissingTest | None = None
-    steps: Mapping[str, float] | None = None
-
-    def __repr__(self) -> str:
-        return f"Diagnosis({self.verdict}: {self.text})"
-
-
-def diagnose(fit: Estimate, *, one_step: Response | None = None, free_run: Response | None = None) -> Diagnosis | None:
+def diagnose(
+    fit: Estimate | MotionEstimate, *, one_step: Response | None = None, free_run: Response | None = None
+) -> Diagnosis | None:
     """Analyse the residuals of a fit on its training data; None where they cannot be tested.
 
-    A one-step fit whose residual is coloured is set beside the free run of the physics alone, trained on it: that is
-    what sensor noise asks for, and it does not suffer from the bias of the fit in question.
+    Of lagged physics those one step ahead and of the free run; of a motion those of the free run, for its states are
+    not measured, with a test of the terms that its equations could lack (`missing`).
 
     Args:
         one_step: the prediction of the training data, if it is there already; likewise their `free_run`.
+
+    Raises:
+        InputError: an estimate that is not usable.
+
+    Examples:
+        >>> import numpy as np
+        >>> import orthaug as oa
+        >>> u = np.random.default_rng(0).uniform(-1, 1, 300)
+        >>> record = oa.Record.from_arrays(u, 2 * u + u**3 + 0.05 * np.random.default_rng(1).normal(size=300))
+        >>> gain = oa.Baseline.from_terms([oa.Term("gain", "u[k]")])
+        >>> diagnose(oa.estimate(record, gain, learner=None)).verdict
+        'unmodelled'
+    """
+    check_type(fit, Estimate | MotionEstimate, "fit", "an Estimate")
+    if isinstance(fit, Estimate):
+        return _of_lagged(fit, one_step, free_run)
+    if not fit.status.ok:
+        raise InputError(f"`fit` has no model: {fit.status.message}.")
+    own = fit.model.simulate(fit.problem.record) if free_run is None else free_run
+    return diagnose_motion(fit, own)
+
+
+def _of_lagged(fit: Estimate, one_step: Response | None, free_run: Response | None) -> Diagnosis | None:
+    """By its one-step residual and its free run.
+
+    A one-step fit whose residual is coloured is set beside the free run of the physics alone, trained on it: that is
+    what sensor noise asks for, and it does not suffer from the bias of the fit in question.
     """
     problem, model, simulated = fit.problem, fit.model, fit.criterion.flown is not None
     one_step = model.predict(problem.record) if one_step is None else one_step
@@ -82,7 +93,7 @@ def diagnose(fit: Estimate, *, one_step: Response | None = None, free_run: Respo
     seen = Finding(fit, simulated, one_step, tests, white=white, free_white=True, ratio=None, noise=None)
     seen = replace(seen, steps={} if white else _steps(problem, tests))
     if not model.form.states:
-        return _concluded(replace(seen, **_effects(fit, one_step, one_step, False)), None)
+        return _concluded(replace(seen, **_effects(fit, one_step, one_step, False)))
     free_run = model.simulate(problem.record) if free_run is None else free_run
     skip = fit.criterion.washout
     flown = [(free_run, skip)] if not any(t.diverged for t in free_run.trajectories) else []
@@ -107,20 +118,18 @@ def diagnose(fit: Estimate, *, one_step: Response | None = None, free_run: Respo
     )
     if not simulated and not white:
         seen = replace(seen, changes=_with_criterion(seen, free_run if flown else None, trained))
-    return _concluded(seen, free_tests)
+    return _concluded(seen)
 
 
-def _concluded(seen: Finding, free_tests: tuple[ResidualTest, ...] | None) -> Diagnosis:
+def _concluded(seen: Finding) -> Diagnosis:
     """The verdict and its words."""
     misfit = any(t.follows() or t.curved_over(SHARE) for t in seen.tests) or seen.lacks
     complete = seen.white and not misfit and not seen.follows(_SMALL)
-    noise = "white" if seen.free_white and seen.white else "equation_noise"
-    if not seen.fit.model.form.states:
-        noise = "white"
+    white = (seen.free_white and seen.white) or not seen.fit.model.form.states
     if seen.sensor:
         verdict = "sensor_noise"
     elif complete or _is_small(seen):
-        verdict = noise
+        verdict = "white" if white else "equation_noise"
     else:
         verdict = "unmodelled"
     seen = replace(seen, complete=complete)
@@ -128,18 +137,8 @@ def _concluded(seen: Finding, free_tests: tuple[ResidualTest, ...] | None) -> Di
         seen = replace(seen, changes=_toward_prediction(seen))
     text, warnings = words(verdict, seen)
     warnings = (*wild_rows(seen.one_step, seen.fit.problem.record.experiments), *warnings)
-    return Diagnosis(
-        verdict,
-        text,
-        seen.tests,
-        free_tests,
-        seen.ratio,
-        seen.noise,
-        warnings,
-        seen.predictable,
-        seen.changes,
-        steps=seen.steps or None,
-    )
+    tested = seen.tests, seen.free_tests, seen.ratio, seen.noise
+    return Diagnosis(verdict, text, *tested, warnings, seen.predictable, seen.changes, steps=seen.steps or None)
 
 
 def _steps(problem: Problem, tests: tuple[ResidualTest, ...]) -> dict[str, float]:
@@ -238,12 +237,11 @@ def _lags_of(fit: Estimate) -> Lags | None:
 def _tests(problem: Problem, response: Response, skip: int = 0) -> tuple[ResidualTest, ...]:
     """The tests of measured minus model on every usable row of the problem after the first `skip`."""
     record, start = problem.record, problem.rows.start
-    ends = np.cumsum([len(experiment) - start for experiment in record.experiments])
     residuals, inputs = [], []
     for experiment, trajectory in zip(record.experiments, response.trajectories, strict=True):
         residuals.append((experiment.outputs - trajectory.model)[start:][skip:])
         inputs.append(experiment.inputs[start:][skip:])
-    regressors = [x[skip:] for x in np.split(problem.rows.x, ends[:-1])]
+    regressors = [x[skip:] for x in by_experiment(problem, problem.rows.x)]
     names = ([c.name for c in record.outputs], [c.name for c in record.inputs], [str(lag) for lag in problem.layout])
     with one_blas_thread():
         return analyse(residuals, inputs, regressors, *names, lags=LAGS)
@@ -273,3 +271,27 @@ def _noise_in_lags(problem: Problem, ratio: float | None, one_step: Response) ->
         lagged = lagged - rest @ np.linalg.lstsq(rest, lagged, rcond=None)[0]
     smallest = float(np.linalg.eigvalsh(lagged.T @ lagged / len(lagged)).min())
     return 1.0 / smallest if smallest > 1.0 else 1.0
+
+
+def wild_rows(response: Response, experiments: Sequence[Experiment]) -> tuple[Warning, ...]:
+    """A warning for each output whose error is mostly that of a few rows, far from all others."""
+    found = []
+    errors = errors_of(response)
+    starts = [t.start for t in response.trajectories]
+    rows = [(i, starts[i] + k) for i, error in enumerate(errors) for k in range(len(error))]
+    for j, output in enumerate(response.outputs):
+        error = np.concatenate(errors)[:, j]
+        size = np.abs(error - np.median(error))
+        wild = np.flatnonzero(size > _WILD * _MAD * np.median(size))
+        held = float(np.sum(size[wild] ** 2)) / max(float(np.sum(size**2)), 1e-300)
+        if not len(wild) or len(wild) > max(_LEAST, _FEW * len(error)) or held < _HOLD or not np.median(size):
+            continue
+        named = [experiments[rows[k][0]].where(rows[k][1]) for k in wild[:_NAMED]]
+        more = f" and {len(wild) - _NAMED} more" if len(wild) > _NAMED else ""
+        text = (
+            f"{percent(held, 3)} of the squares of the one-step residual of {output.name} stand in "
+            f"{counted(len(wild), 'row')} of {len(error)}: {'; '.join(named)}{more}. If samples are wrong there, so is "
+            'θ: mark them (step = "outliers" of data.prepare), or leave them out.'
+        )
+        found.append(Warning("wild_rows", text))
+    return tuple(found)

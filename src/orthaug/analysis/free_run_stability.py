@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from orthaug._base.checks import Matrix
 from orthaug._base.lines import percent
 from orthaug._base.warning import Warning
-from orthaug.analysis.boundedness import divergence_scaling
+from orthaug.analysis.boundedness import divergence_scaling, margin
 from orthaug.analysis.contraction import Contraction, contraction
 from orthaug.analysis.feedback import Feedback, feedback
 from orthaug.analysis.lipschitz import Lipschitz, lipschitz
@@ -78,7 +78,7 @@ def stability(
 
 def _sentences(checks: Stability) -> Iterator[tuple[str, str]]:
     """What the checks say, sentence by sentence; with the code of a warning, or nothing."""
-    run, contracts, factor = checks.feedback, checks.contraction, checks.diverges_at
+    run, contracts = checks.feedback, checks.contraction
     if checks.lipschitz:
         steepest = checks.lipschitz.gradient
         gradient = "no finite gradient" if steepest is None else f"a gradient of at most {steepest:.4g}"
@@ -106,6 +106,4 @@ def _sentences(checks: Stability) -> Iterator[tuple[str, str]]:
         share = f"{percent(1 - contracts.share, 3)} of the {contracts.samples} sampled points"
         worst = f"worst at {contracts.worst}, rate {contracts.rate:.4g}"
         yield f"At {share} the free run does not contract in the best metric that was found, {worst}.", ""
-    stays, times = ("stays within", checks.searched) if factor is None else ("leaves", factor)
-    bounds = f"{stays} all bounds with the inputs' deviations from their means {times:.4g} times as large"
-    yield f"The free run {bounds}.", "small_margin" if factor is not None and factor < 1.5 else ""
+    yield margin(checks.diverges_at, checks.searched)

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 
+from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug.analysis.measure_bias import physical_slopes
-from orthaug.data.expressions import parse
+from orthaug.data.expressions import parse, parse_named
 from orthaug.data.regressors import Features
+from orthaug.inference.motion_split import shared_of_motion
+from orthaug.models.moving import Moving
+from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import Problem
 from orthaug.physics.shared import Shared, shared_directions
@@ -28,6 +33,10 @@ class Alternative:
     determined: tuple[str, ...]
     physical: tuple[str, ...] | None
 
+    @classmethod
+    def of(cls, inputs: tuple[str, ...], shared: Shared, physical: tuple[str, ...] | None = None) -> Alternative:
+        return cls(inputs, shared.basis.shape[1], shared.untouched, physical)
+
 
 @dataclass(frozen=True)
 class Imitation:
@@ -41,10 +50,15 @@ class Imitation:
     everything: bool
     directions: tuple[dict[str, float], ...]
     determined: tuple[str, ...]
-    physical: tuple[str, ...] | None
-    alternatives: tuple[Alternative, ...]
+    physical: tuple[str, ...] | None = None
+    alternatives: tuple[Alternative, ...] = ()
     terms: bool = False
     """Whether the learner can be linear combinations of its inputs only."""
+
+    @classmethod
+    def of(cls, inputs: Sequence[str], shared: Shared, *others: Any) -> Self:
+        """Of the directions that a learner on these inputs shares; `others` are the last fields."""
+        return cls(tuple(inputs), shared.all, shared.directions, shared.untouched, *others)
 
     @property
     def text(self) -> str:
@@ -65,6 +79,24 @@ class Imitation:
         return " ".join(told)
 
 
+class MotionImitation(Imitation):
+    """The same of a motion; directions are those of the parameters' coordinates, logarithms of positive ones."""
+
+    @property
+    def text(self) -> str:
+        """In sentences."""
+        sees = f"The learner sees {', '.join(self.inputs)}"
+        if self.everything:
+            return f"{sees} and could imitate a change of every parameter: they are those of the nearest physics."
+        if not self.directions:
+            return f"{sees} and could imitate no change of a parameter: the fit determines all of them beside it."
+        moved = "; ".join(" with ".join(direction) for direction in self.directions)
+        told = f"{sees} and could imitate a change of {moved}: there, and only there, the nearest physics decides."
+        if self.determined:
+            told += f" The fit determines {', '.join(self.determined)} beside any learner of these inputs."
+        return told
+
+
 def imitation(problem: Problem, physics: PhysicsMap | None = None, *, others: bool = True) -> Imitation:
     """What the problem's learner could imitate, and what `others`, other inputs, would make of it."""
     slopes = _slopes(problem, physics)
@@ -75,10 +107,9 @@ def imitation(problem: Problem, physics: PhysicsMap | None = None, *, others: bo
         features = Features(tuple(parse(text, {}) for text in other))
         shared = shared_directions(problem.baseline, features, problem.layout, problem.outputs, problem.rows.x)
         if not shared.all and set(other) != set(inputs):
-            determined = Alternative(other, shared.basis.shape[1], shared.untouched, _untouched(shared, slopes))
-            alternatives.append(determined)
+            alternatives.append(Alternative.of(other, shared, _untouched(shared, slopes)))
     shown, terms = tuple(alternatives[:_ALTERNATIVES]), problem.features.linear
-    return Imitation(inputs, own.all, own.directions, own.untouched, _untouched(own, slopes), shown, terms)
+    return Imitation.of(inputs, own, _untouched(own, slopes), shown, terms)
 
 
 def _slopes(problem: Problem, physics: PhysicsMap | None) -> dict[str, np.ndarray] | None:
@@ -127,3 +158,25 @@ def _combination(direction: dict[str, float]) -> str:
 
 def _listed(words: tuple[str, ...] | list[str]) -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}" if words else "nothing"
+
+
+def imitation_before(form: Moving, q: Vector, x: Matrix, u: Matrix) -> MotionImitation:
+    """What a learner on the form's features would share with the physics, and what others would.
+
+    Args:
+        x: states (M, nx) of a run at the coordinates q; `u` its inputs (M, nu).
+    """
+    own = tuple(str(entry) for entry in form.features)
+    others = []
+    for texts in dict.fromkeys(_choices(form.motion)):
+        if set(texts) != set(own):
+            features = tuple(parse_named(text, form.motion.known, "learner input") for text in texts)
+            others.append(Alternative.of(texts, shared_of_motion(replace(form, features=features), q, x, u)))
+    return MotionImitation.of(own, shared_of_motion(form, q, x, u), None, tuple(others))
+
+
+def _choices(motion: Motion) -> Iterator[tuple[str, ...]]:
+    """Each state alone, all states, all states and inputs."""
+    states = motion.names_of_states
+    yield from ((name,) for name in states)
+    yield from (several for several in (states, (*states, *motion.inputs)) if len(several) > 1)

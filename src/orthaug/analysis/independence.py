@@ -16,8 +16,7 @@ import scipy.special
 from jaxtyping import Int
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.analysis.correlation import LARGEST, Pieces, cross_correlation, cut, pieces_of, standardised
-from orthaug.analysis.whiteness import whitening
+from orthaug.analysis.whiteness import LARGEST, Pieces, cross_correlation, cut, pieces_of, standardised, whitening
 
 _ROWS = 4096  # rows of a regressor matrix that exist at a time: 26 columns of them stay in the cache
 _ROWS_PER_BIN = 5  # fewer would make bins of chance

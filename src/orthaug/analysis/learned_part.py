@@ -11,15 +11,15 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import scipy.special
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.fitting.motion_estimates import MotionEstimate, free_covariance
+from orthaug.inference.covariance import reach
 from orthaug.inference.motion_split import rest_of
 from orthaug.models.dynamics import Numbers
-from orthaug.models.motion_parts import labels_of, parts_at
+from orthaug.models.motion_field import labels_of, parts_at
 from orthaug.models.moving import Moving
 
 
@@ -61,7 +61,7 @@ def learned_reach(fit: MotionEstimate, x: Matrix, u: Matrix) -> Matrix | None:
     joint, moves = made
     by_q, beside = (np.asarray(part) for part in _slopes(fit.model.form, fit.model.numbers, x, u))
     follows = (beside + by_q @ slope)[..., moves] @ joint.root()
-    return scipy.special.stdtrit(max(fit.freedom, 1.0), 0.975) * np.linalg.norm(follows, axis=-1)
+    return reach(fit.freedom) * np.linalg.norm(follows, axis=-1)
 
 
 @partial(jax.jit, static_argnames="form")

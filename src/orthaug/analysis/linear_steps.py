@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Vector
 from orthaug._base.jax import Array, jax, jnp
-from orthaug.analysis.local_dynamics import by_differences
+from orthaug.analysis.feedback import by_differences
 from orthaug.fitting.motion_course import LOOSE
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
@@ -35,8 +35,8 @@ class LaggedStep:
     form: Lagged
     memory: Memory
 
-    ends = 1
-    continuous = False
+    ends = 1  # how many instants' inputs a step reads
+    continuous = False  # whether there are derivatives in time
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -79,33 +79,28 @@ class LaggedStep:
 
 @dataclass(frozen=True)
 class MotionStep:
-    """A sample of a motion; it rests where no state changes."""
+    """As `LaggedStep`, of a motion; it rests where no state changes."""
 
     form: Moving
 
     @property
     def continuous(self) -> bool:
-        """Whether its equations are derivatives in time."""
         return self.form.motion.integrator != "discrete"
 
     @property
     def ends(self) -> int:
-        """At how many instants a step reads the inputs."""
         return 2 if self.form.motion.hold == "first-order" and self.inputs else 1
 
     @property
     def states(self) -> tuple[str, ...]:
-        """Names of the state's entries."""
         return self.form.motion.names_of_states
 
     @property
     def rest(self) -> tuple[str, ...]:
-        """Names of what is looked for at rest."""
         return self.states
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs."""
         return self.form.motion.inputs
 
     def state_at(self, rest: Any, inputs: Any) -> Any:
@@ -113,7 +108,6 @@ class MotionStep:
         return jnp.asarray(rest)
 
     def advance(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any]:
-        """The next state and the outputs."""
         following, parts = self.form.step(numbers, state, inputs)
         return following, parts.total
 
@@ -122,12 +116,10 @@ class MotionStep:
         return sum(self.form.rates(numbers, state, inputs)), self.form.observed(numbers, state, inputs)
 
     def unrest(self, numbers: Numbers, rest: Any, inputs: Any) -> tuple[Any, Any]:
-        """What is zero at rest, and the outputs."""
         rates, y = self.field(numbers, rest, inputs)
         return (rates if self.continuous else rates - rest), y
 
     def seen(self, numbers: Numbers, rest: Vector, inputs: Vector) -> Vector | None:
-        """The learner's features at rest, in [-1, 1] over the training data; None where that is not known."""
         if self.form.bound is None or not self.form.differentiable:
             return None
         z = np.asarray(self.form.seen(rest[:, None], inputs[:, None], np))[:, 0]

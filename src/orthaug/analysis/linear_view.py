@@ -12,16 +12,15 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import scipy.special
 from jaxtyping import Complex, Float
 
 from orthaug._base.checks import Matrix, Vector, check_choice
 from orthaug._base.errors import InputError
 from orthaug._base.warning import Warning
-from orthaug.analysis.continuous_time import Continuous
-from orthaug.analysis.linear_system import System
+from orthaug.analysis.linear_system import Continuous, System
 from orthaug.analysis.measured_response import MeasuredResponse
 from orthaug.analysis.operating_points import OperatingPoint
+from orthaug.inference.covariance import interval, reach
 
 if TYPE_CHECKING:
     import control
@@ -169,7 +168,7 @@ class LinearView:
     def matrix_ci95(self) -> Float[np.ndarray, "m k 2"] | None:
         """Intervals of [[A, B], [C, D]]; of entries that are no estimates both ends are the entry."""
         std = self.system.std
-        return None if std is None else around(self.system.matrix, std, self.freedom)
+        return None if std is None else interval(self.system.matrix, std, self.freedom)
 
     def to_control(self, time: str = "discrete") -> control.StateSpace:
         """The system for python-control, with the names of states, inputs and outputs.
@@ -202,16 +201,6 @@ class LinearView:
         return f"LinearView({self.point}: {n} states, {nu} inputs, {ny} outputs, {len(self.poles)} poles)"
 
 
-def reach(freedom: float) -> float:
-    """The 97.5 % quantile of Student's t."""
-    return float(scipy.special.stdtrit(max(freedom, 1.0), 0.975))
-
-
-def around(value: Any, std: Any, freedom: float) -> Any:
-    """Symmetric intervals, (…, 2)."""
-    return np.stack([value - reach(freedom) * std, value + reach(freedom) * std], axis=-1)
-
-
 def about(value: Any, relative: Any, freedom: float) -> Any:
     """Intervals of positive values whose logarithms are normal, (…, 2)."""
     with np.errstate(all="ignore"):
@@ -227,7 +216,7 @@ def bode_of(system: System, frequency: Vector, freedom: float) -> Bode:
     with np.errstate(all="ignore"):
         relative = found.moved / found.value[:, None]
     gain, turn = (np.sqrt(np.sum(part**2, axis=1)) for part in (relative.real, relative.imag))
-    phases = around(phase_of(found.value), np.degrees(turn), freedom)
+    phases = interval(phase_of(found.value), np.degrees(turn), freedom)
     return Bode(frequency, found.value, about(np.abs(found.value), gain, freedom), phases)
 
 
@@ -239,19 +228,18 @@ def gain_of(system: System, freedom: float) -> tuple[Matrix | None, Any]:
     value = found.value[0]
     if found.moved is None:
         return value, None
-    return value, around(value, np.sqrt(np.sum(found.moved[0] ** 2, axis=0)), freedom)
+    return value, interval(value, np.sqrt(np.sum(found.moved[0] ** 2, axis=0)), freedom)
 
 
 def poles_of(system: System, own: System | None, freedom: float) -> tuple[Pole, ...]:
     """Poles of a sampled system; `own` are a motion's equations, whose poles are matched to these."""
     modes, step = system.modes, system.step
     assert step is not None
+    with np.errstate(all="ignore"):
+        found = [(z, None if d is None else d / z) for z, d in zip(modes.values, modes.moved, strict=True)]
     if own is None:
-        with np.errstate(all="ignore"):
-            found = [(z, None if d is None else d / z) for z, d in zip(modes.values, modes.moved, strict=True)]
         logs = [(np.log(z) / step, None if r is None else r / step) for z, r in found]
     else:
-        found = [(z, None if d is None else d / z) for z, d in zip(modes.values, modes.moved, strict=True)]
         logs = _matched(modes.values, own, step)
     return tuple(_pole(z, r, s, d, own is not None, freedom) for (z, r), (s, d) in zip(found, logs, strict=True))
 
@@ -285,7 +273,7 @@ def _pole(z: complex, relative: Any, s: complex, moved: Any, exact: bool, freedo
     if moved is not None:
         change = moved / s
         sine = abs(s.imag) / abs(s)
-        turn = None if real else _pair(np.clip(around(damping, sine * size(change.imag), freedom), -1.0, 1.0))
+        turn = None if real else _pair(np.clip(interval(damping, sine * size(change.imag), freedom), -1.0, 1.0))
         spans = (_pair(about(frequency, size(change.real), freedom)), turn)
     return Pole(complex(z), complex(s), magnitude, radius, float(frequency), spans[0], float(damping), spans[1])
 

@@ -12,10 +12,8 @@ from orthaug._base.checks import Vector, check_choice, check_type
 from orthaug._base.errors import InputError
 from orthaug._base.lines import percent
 from orthaug._base.warning import Warning
-from orthaug.analysis.continuous_time import METHODS, Continuous, converted
 from orthaug.analysis.linear_steps import (
     MotionStep,
-    Step,
     difference_widths,
     one_sided,
     sizes_of,
@@ -24,7 +22,7 @@ from orthaug.analysis.linear_steps import (
     step_of,
     unrest_along,
 )
-from orthaug.analysis.linear_system import System
+from orthaug.analysis.linear_system import METHODS, Continuous, System, converted
 from orthaug.analysis.linear_view import Linearization, LinearView, bode_of, gain_of, poles_of
 from orthaug.analysis.measured_response import measured_response
 from orthaug.analysis.operating_points import OperatingPoint, Search, operating_points, parse_point
@@ -96,8 +94,7 @@ def linearize(
     if record is not None and record.inputs:
         held = np.concatenate([experiment.inputs for experiment in record.experiments]).mean(axis=0)
     outputs = [channel.name for channel in model.outputs]
-    size = sizes_of(model)
-    search = Search.of(step, model.numbers, size, outputs, given, held)
+    search = Search.of(step, model.numbers, sizes_of(model), outputs, given, held)
     points, warnings = operating_points(search)
     spread, told = _spread(model, fit)
     warnings += told
@@ -107,7 +104,7 @@ def linearize(
             "the frequency response that of the equations."
         )
         warnings.append(Warning("hold_replaced", text))
-    views = tuple(_view(model, step, point, size, spread, frequency, continuous) for point in points)
+    views = tuple(_view(model, search, point, spread, frequency, continuous) for point in points)
     measured = None if record is None else measured_response(record)
     return Linearization(views, measured, _held(search, given, record), tuple(warnings))
 
@@ -156,28 +153,26 @@ def _spread(model: Model | MotionModel, fit: Any) -> tuple[_Spread | None, list[
 
 def _view(
     model: Model | MotionModel,
-    step: Step,
+    search: Search,
     point: OperatingPoint,
-    size: Vector,
     spread: _Spread | None,
     frequency: Vector | None,
     method: str,
 ) -> LinearView:
-    sampled = _system(model, step, point, size, spread, field=False)
-    warnings = _kinks(model, step, point, size, sampled)
+    sampled = _system(search, point, spread, model.sampling_time)
+    warnings, step = _kinks(search, point, sampled), search.step
     freedom = np.inf if spread is None else spread.freedom
     names = step.states
-    if isinstance(step, MotionStep) and step.ends == 2:
+    if step.ends == 2:
         sampled = _without_next(sampled)
         text = (
             "inputs run straight between samples: the sampled states are those of the motion less B₁ times the input."
         )
         warnings.append(Warning("shifted_states", text))
     own: System | None = None
-    if isinstance(step, MotionStep) and step.continuous:
-        own = _system(model, step, point, size, spread, field=True)
-        dead = np.zeros(len(step.inputs))
-        found: Continuous | str = Continuous(own, dead, "equations", names)
+    if step.continuous:
+        own = _system(search, point, spread, None)
+        found: Continuous | str = Continuous(own, np.zeros(len(step.inputs)), "equations", names)
     else:
         found = converted(sampled, method, None if isinstance(step, MotionStep) else step.memory, names)
     poles = poles_of(sampled, own, freedom)
@@ -190,8 +185,7 @@ def _view(
         grid = _grid(poles, model.sampling_time) if frequency is None else frequency
         bode = bode_of(own if smooth and own is not None else sampled, grid, freedom)
         warnings += _rough(bode)
-    channels = (*model.outputs, *model.inputs)
-    units = {channel.name: channel.unit for channel in channels}
+    units = {channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
     if isinstance(model, MotionModel):
         units |= {state.name: state.unit for state in model.form.motion.states}
     return LinearView(
@@ -200,11 +194,10 @@ def _view(
     )  # fmt: skip
 
 
-def _system(
-    model: Model | MotionModel, step: Step, point: OperatingPoint, size: Vector, spread: _Spread | None, *, field: bool
-) -> System:
-    """The matrices of a step, or of the equations, and how they move along the covariance."""
-    numbers, width = model.numbers, difference_widths(size, point.inputs)
+def _system(search: Search, point: OperatingPoint, spread: _Spread | None, time: float | None) -> System:
+    """The matrices of a step of `time`, or of the equations, and how they move along the covariance."""
+    step, numbers, field = search.step, search.numbers, time is None
+    width = difference_widths(search.size, point.inputs)
     matrix = np.asarray(slope_at(step, field, numbers, point.rest, point.inputs, width))
     if not np.isfinite(matrix).all():
         raise InputError(f"the model has no finite derivative at {point}; give another operating point.")
@@ -220,7 +213,7 @@ def _system(
             slope_along(step, field, numbers, point.rest, point.inputs, unknowns, (along[:ne], along[ne:], root))
         )
         moved = np.where(np.isfinite(moved), moved, 0.0)
-    return System(matrix, len(step.states), None if field and _in_time(step) else model.sampling_time, moved)
+    return System(matrix, len(step.states), time, moved)
 
 
 def _smooth(model: Model | MotionModel) -> bool:
@@ -228,10 +221,6 @@ def _smooth(model: Model | MotionModel) -> bool:
     if not isinstance(model, MotionModel) or not model.inputs:
         return False
     return model.form.motion.hold == "spline" and model.form.motion.integrator != "discrete"
-
-
-def _in_time(step: Step) -> bool:
-    return isinstance(step, MotionStep) and step.continuous
 
 
 def _without_next(system: System) -> System:
@@ -263,14 +252,12 @@ def _shape(system: System) -> tuple[int, int]:
     return len(system.matrix), n + (system.matrix.shape[1] - n) // 2
 
 
-def _kinks(
-    model: Model | MotionModel, step: Step, point: OperatingPoint, size: Vector, system: System
-) -> list[Warning]:
+def _kinks(search: Search, point: OperatingPoint, system: System) -> list[Warning]:
     """Whether differences tell of another slope than the derivative: then the view holds in no neighbourhood."""
-    if not model.form.differentiable:
+    if not search.step.form.differentiable:
         return []
-    width, n = difference_widths(size, point.inputs), system.states
-    sides, full = map(np.asarray, one_sided(step, model.numbers, point.rest, point.inputs, width))
+    width, n = difference_widths(search.size, point.inputs), system.states
+    sides, full = map(np.asarray, one_sided(search.step, search.numbers, point.rest, point.inputs, width))
     unit = full[:n] / full[:n, None]  # entries in sizes of the states
     apart = np.abs(sides[:, :, :n] - system.a) * unit
     if np.all(apart <= _STEEP * np.abs(system.a * unit).max(initial=1e-300)):

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, jnp, padded_length
-from orthaug.analysis.local_dynamics import by_differences, difference_width
+from orthaug.analysis.feedback import by_differences, difference_width
 from orthaug.analysis.visited import MOST_STEPS, Place, Where, evenly, positive, usable
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Numbers

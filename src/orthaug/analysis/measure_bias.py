@@ -13,7 +13,8 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug.analysis.absorbed import Absorbed, absorbed
 from orthaug.analysis.bias import SuspectedBias, bias_table
 from orthaug.analysis.suspects import Suspect, suspect_columns, usual_suspects
-from orthaug.inference.weighed import Weighed
+from orthaug.inference.measures import Weighed
+from orthaug.inference.physical import solve
 from orthaug.physics.output_weights import times
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import Problem
@@ -126,11 +127,7 @@ def _expected(
     """What the guessed coefficient does to each physical parameter: p of θ̂ less p without the bias."""
     if physics is None or entry.expected is None:
         return None
-    from orthaug.inference.physical import solve
-
-    order = [problem.baseline.names.index(name) for name in physics.theta_names]
-    without = theta - np.array(entry.expected)
-    biased, true = (solve(physics, t[order], None, freedom=np.inf).value for t in (theta, without))
+    biased, true = (physical_of(physics, problem, t) for t in (theta, theta - np.array(entry.expected)))
     return {
         name: {"bias": float(b - t), "relative": float((b - t) / t) if t else None}
         for name, b, t in zip(physics.names, biased, true, strict=True)
@@ -150,18 +147,21 @@ def physical_slopes(
     """dp/dθ, in the order of the baseline's θ, at the p that θ gives; and that p."""
     if physics is None:
         return None
-    from orthaug.inference.physical import solve
-
-    order = [problem.baseline.names.index(name) for name in physics.theta_names]
-    p = solve(physics, theta[order], None, freedom=np.inf).value
-    inverse = np.linalg.pinv(physics.jacobian(p) / _size(physics, p)[0][:, None] * _size(physics, p)[1])
-    inverse = inverse * _size(physics, p)[1][:, None] / _size(physics, p)[0]
+    p = physical_of(physics, problem, theta)
+    of_theta = np.abs(physics.theta(p))  # scales of θ and p, so that the pseudo-inverse sees numbers of one size
+    of_theta, of_p = np.where(of_theta > 0, of_theta, 1.0), np.where(p != 0, np.abs(p), 1.0)
+    inverse = np.linalg.pinv(physics.jacobian(p) / of_theta[:, None] * of_p)
     rows = np.zeros((len(p), len(problem.baseline.names)))
-    rows[:, order] = inverse
+    rows[:, _order(physics, problem)] = inverse * of_p[:, None] / of_theta
     return dict(zip(physics.names, rows, strict=True)), p
 
 
-def _size(physics: PhysicsMap, p: Vector) -> tuple[Vector, Vector]:
-    """Scales of θ and p, so that the pseudo-inverse sees numbers of one size."""
-    theta = np.abs(physics.theta(p))
-    return np.where(theta > 0, theta, 1.0), np.where(p != 0, np.abs(p), 1.0)
+def physical_of(physics: PhysicsMap, problem: Problem, theta: Vector, covariance: Matrix | None = None) -> Vector:
+    """p of θ, weighted by its covariance where that is given."""
+    order = _order(physics, problem)
+    covariance = None if covariance is None else covariance[np.ix_(order, order)]
+    return solve(physics, theta[order], covariance, freedom=np.inf).value
+
+
+def _order(physics: PhysicsMap, problem: Problem) -> list[int]:
+    return [problem.baseline.names.index(name) for name in physics.theta_names]

@@ -18,8 +18,9 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.lines import percent
 from orthaug._base.warning import Warning
 from orthaug.analysis.absorbed import Smoother
+from orthaug.analysis.residuals import errors_of
 from orthaug.fitting.estimates import Estimate
-from orthaug.inference.intervals import newey_west
+from orthaug.inference.covariance import newey_west
 from orthaug.models.response import Response
 from orthaug.physics.output_weights import times
 from orthaug.physics.problem import Problem
@@ -88,8 +89,7 @@ def missing_lags(fit: Estimate, one_step: Response | None = None) -> MissingLags
     if not hidden or len(problem.rows) < _FEWEST_ROWS:
         return None
     response = fit.model.predict(problem.record) if one_step is None else one_step
-    residual = np.concatenate([(t.measured - t.model)[t.start :] for t in response.trajectories])  # type: ignore[operator]
-    return MissingLags(lag_tests(problem, residual, hidden))
+    return MissingLags(lag_tests(problem, np.concatenate(errors_of(response)), hidden))
 
 
 def lag_tests(problem: Problem, residual: Matrix, hidden: Sequence[int]) -> tuple[LagTest, ...]:

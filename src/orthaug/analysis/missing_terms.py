@@ -190,7 +190,7 @@ def _tested(found: Sensitivities) -> tuple[float, tuple[int, int], float, Vector
     null = None if plain is None else _regression(found, _filters(found, plain.errors))
     if plain is None or null is None:
         return None
-    basis, _ = _basis(null)
+    basis = _range(null.terms, _RANK)
     rank, freedom = basis.shape[1], null.left - basis.shape[1]
     total = float(null.errors @ null.errors)
     if rank == 0 or freedom < _ROWS_PER_COLUMN * rank or not total > 0:
@@ -198,18 +198,17 @@ def _tested(found: Sensitivities) -> tuple[float, tuple[int, int], float, Vector
     explained = float(np.sum((basis.T @ null.errors) ** 2))
     rest = max(total - explained, np.finfo(float).eps * total)
     p = float(scipy.special.fdtrc(rank, freedom, explained / rank / (rest / freedom)))
-    basis, _ = _basis(plain)
+    basis = _range(plain.terms, _RANK)
     beside = _regression(found, _filters(found, plain.errors - basis @ (basis.T @ plain.errors)))
     rows = null if beside is None else beside
     size = np.einsum("rj,rj->j", rows.terms, rows.terms)
     size = np.where(size > 0, size, np.inf)
     along = rows.terms.T @ rows.errors
-    return p, (rank, freedom), _share(plain), along**2 / size, _shares(plain), along / size
+    return p, (rank, freedom), _share(plain, basis), along**2 / size, _shares(plain), along / size
 
 
-def _share(plain: _Regression) -> float:
+def _share(plain: _Regression, basis: Matrix) -> float:
     """Of the errors' variance that all terms explain, less what chance does."""
-    basis, _ = _basis(plain)
     total = float(plain.errors @ plain.errors)
     rest = total - float(np.sum((basis.T @ plain.errors) ** 2))
     return max(1 - rest / max(plain.left - basis.shape[1], 1) / (total / plain.left), 0.0)
@@ -220,16 +219,6 @@ def _shares(plain: _Regression) -> Vector:
     total, size = float(plain.errors @ plain.errors), np.einsum("rj,rj->j", plain.terms, plain.terms)
     explained = (plain.terms.T @ plain.errors) ** 2 / np.where(size > 0, size, np.inf) / total
     return np.maximum(1 - (1 - explained) * plain.left / max(plain.left - 1, 1), 0.0)
-
-
-def _basis(rows: _Regression) -> tuple[Matrix, Any]:
-    """An orthonormal basis of the terms, and which of them have something of their own."""
-    size = np.linalg.norm(rows.terms, axis=0)
-    kept = size > 0
-    if not kept.any():
-        return np.zeros((len(rows.terms), 0)), kept
-    u, s, _ = np.linalg.svd(rows.terms[:, kept] / size[kept], full_matrices=False)
-    return u[:, s > _RANK * s[0]], kept
 
 
 def _regression(found: Sensitivities, filters: tuple[list[Vector], Vector] | None) -> _Regression | None:
@@ -255,14 +244,14 @@ def _regression(found: Sensitivities, filters: tuple[list[Vector], Vector] | Non
     return _Regression(terms, errors, left)
 
 
-def _range(columns: Matrix) -> Matrix:
+def _range(columns: Matrix, rank: float = 1e-10) -> Matrix:
     """An orthonormal basis of what columns span, each taken as of size 1."""
     size = np.linalg.norm(columns, axis=0)
     columns = columns[:, size > 0] / size[size > 0]
     if not columns.size:
         return np.zeros((len(columns), 0))
     u, s, _ = np.linalg.svd(columns, full_matrices=False)
-    return u[:, s > 1e-10 * s[0]]
+    return u[:, s > rank * s[0]]
 
 
 def _filtered(found: Sensitivities, segment: int, filters: tuple[list[Vector], Vector] | None) -> Matrix:

@@ -16,12 +16,18 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.checks import Matrix, Vector
+from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug.analysis.absorbed import completing
 from orthaug.analysis.bias import IN_SPAN, Certificate, SuspectedBias, find_certificate
 from orthaug.analysis.motion_response import Place, TermsResponse, respond_to
-from orthaug.analysis.motion_suspects import MotionSuspect
-from orthaug.inference.motion_split import Field, slopes_at
+from orthaug.analysis.motion_suspects import MotionSuspect, check_motion_suspects, equations_of, softened
+from orthaug.analysis.robustness import block_of
+from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.fitting.motion_measures import field_under
+from orthaug.fitting.motion_task import MotionTask
+from orthaug.fitting.structures import Structure
+from orthaug.inference.motion_split import Field, MotionSplit, learned_places, shared_of_motion, slopes_at
+from orthaug.models.motion_field import parts_at
 from orthaug.physics.motion import Motion
 from orthaug.physics.projection import Projection
 from orthaug.physics.shared import Shared, moves
@@ -129,7 +135,7 @@ class MotionGround:
     def phi(self) -> Projection:
         """∂f/∂q of the learned equations over the points, rows times the root of their weights over their sizes."""
         slopes = np.asarray(slopes_at(self.place.course.dynamics.alone, self.q, self.field.x, self.field.u))
-        slopes = slopes[:, self._learned]
+        slopes = slopes[:, learned_places(self.motion)]
         return Projection.factor(self._weighed(np.moveaxis(slopes, 2, 0)).transpose(1, 2, 0))
 
     def _weighed(self, rows: np.ndarray) -> np.ndarray:
@@ -183,17 +189,17 @@ class MotionGround:
         expected = None
         if suspect.coefficient is not None:
             expected = suspect.coefficient * per_unit
-        known = (*motion.names_of_states, *(output.name for output in motion.outputs))
-        own = (suspect, known[place], names, moved, per_unit, value, expected)
+        own = (suspect, equations_of(motion)[place], names, moved, per_unit, value, expected)
         told = (response.cosine(k), response.size(k), seen, explained, found, certificate)
         return TermBias(*own, *told, None if seen else residual)
 
     def _rows(self, suspect: MotionSuspect, place: int) -> Matrix:
         """The term (M, nl) in the learned equations, 0 where it acts elsewhere."""
-        rows = np.zeros((len(self.field.x), len(self._learned)))
-        if place in self._learned:
+        learned = learned_places(self.motion)
+        rows = np.zeros((len(self.field.x), len(learned)))
+        if place in learned:
             p = self.motion.coordinates.physical(self.q)
-            rows[:, self._learned.index(place)] = suspect.values(self.motion, p, self.field.x, self.field.u)
+            rows[:, learned.index(place)] = suspect.values(self.motion, p, self.field.x, self.field.u)
         return np.where(np.isfinite(rows), rows, 0.0)
 
     def _explained(self, held: Matrix) -> tuple[float | None, float | None]:
@@ -212,15 +218,9 @@ class MotionGround:
         product = float(np.vdot(rest, tilde)) / norm
         return float(min((product / np.linalg.norm(tilde)) ** 2, 1.0)), float(product / norm)
 
-    @property
-    def _learned(self) -> list[int]:
-        """The numbers of the learned equations, outputs after states."""
-        states, outputs = self.motion.learned
-        return [*states, *(len(self.motion.states) + i for i in outputs)]
-
     def _seen(self, suspect: MotionSuspect) -> bool:
         """Whether the learner is added where the term acts, and the term is a function of what the learner sees."""
-        if suspect.place(self.motion) not in self._learned:
+        if suspect.place(self.motion) not in learned_places(self.motion):
             return False
         start, end = self._moves
         p, nx = self.motion.coordinates.physical(self.q), len(self.motion.states)
@@ -259,3 +259,64 @@ def told_by_residual(response: TermsResponse, used: float, steps: int | None) ->
         shares = min(fall / whole, 1.0), float(np.clip((whole - noise - fall) / whole, 0.0, 1.0))
         found.append(Told(coefficient, std, None if std is None else coefficient / std, *shares))
     return found
+
+
+def suspected_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> list[TermBias]:
+    """What terms that the equations of a fitted motion may lack do to its parameters, and what tells of them.
+
+    Raises:
+        InputError: suspects that the motion cannot have, or a fit of difference equations.
+    """
+    check_type(
+        fit, MotionEstimate, "fit", "a fit of equations of motion (of difference equations `bias_budget` tells it)"
+    )
+    check_motion_suspects(suspects, fit.problem)
+    ground = ground_after(fit)
+    if ground is None or not suspects:
+        return []
+    steps = block_of(fit) if fit.plain_covariance is not None else None
+    return ground.table(suspects, fit.effective_weights, steps)
+
+
+def softened_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> list[TermBias]:
+    """What friction among the suspects does that turns round smoothly, of widths by the size of what it acts on.
+
+    Nothing without a learner: it alone shows the shape of what is missing.
+    """
+    if fit.model.form.bound is None:
+        return []
+    field = fit.split_by.field
+    smooth = softened(suspects, fit.problem.motion, fit.values, field.x, field.u)
+    return suspected_bias(fit, smooth) if smooth else []
+
+
+def ground_after(fit: MotionEstimate) -> MotionGround | None:
+    """Of a fitted motion under the measure that it was split under; None where it has no normal equations."""
+    if not fit.status.ok or fit.scores is None:
+        return None
+    numbers, field, learned = fit.model.numbers, fit.split_by.field, None
+    ridge = fit.model.statistics.ridge / fit.scores.unit
+    c, w = np.asarray(numbers.theta - numbers.theta_aux), np.asarray(numbers.weights)
+    place = Place(fit.course, c, w, fit.states, fit.scores.weight, ridge)
+    if fit.model.form.bound is not None:
+        learned = parts_at(fit.model.form, fit.model.numbers, field.x, field.u)[1]
+        learned = np.where(np.isfinite(learned), learned, 0.0)
+    unknown = (*fit.unidentified, *fit.at_bound)
+    return MotionGround(place, fit.theta, fit.shared, field, learned, unknown, fit.split_by.slope)
+
+
+def ground_before(task: MotionTask, structure: Structure) -> MotionGround | None:
+    """Of physics alone, with what a learner of the task's features could hold; None where it has no run."""
+    if task.physics is None:
+        return None
+    course, flown = task.plan, task.physics.end.flown
+    form, names = course.dynamics, course.problem.motion.names
+    weights = np.zeros(0)
+    place = Place(course, flown.theta, weights, flown.states, task.physics.objective.weight)
+    none = MotionSplit.none("training", form, flown.theta)
+    if course.bound is None:
+        return MotionGround(place, flown.theta, none.shared, none.field)
+    field = field_under(structure.measure, course.alone, course.alone.numbers(flown.theta, weights), flown.states)[0]
+    if structure.shared == "all":
+        return MotionGround(place, flown.theta, Shared(names, np.eye(len(names))), field)
+    return MotionGround(place, flown.theta, shared_of_motion(form, flown.theta, field.x, field.u), field)

@@ -1,21 +1,126 @@
 """Experiment design for a motion: an input under which sensor noise and suspected terms disturb its parameters least.
 
 As `design_input`, with the sensitivities of the free run for Φ: `[∂y/∂p]` less what the unknown start could do, so that
-`Cov p̂ = σ²(ΦᵀΦ)⁻¹` for white noise σ on the outputs.
+`Cov p̂ = σ²(ΦᵀΦ)⁻¹` for white noise σ on the outputs. All inputs that are tried run side by side.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from orthaug._base.checks import Matrix, Vector, check_number
+from orthaug._base.checks import Matrix, Vector, check_choice, check_number
 from orthaug._base.errors import InputError
+from orthaug._base.jax import Array, jax
 from orthaug.analysis.design import Design, check_samples, input_limits, searched
-from orthaug.analysis.motion_plant import MotionPlant
 from orthaug.analysis.motion_suspects import MotionSuspect
+from orthaug.analysis.plant import RUNS_AWAY
+from orthaug.models.dynamics import Numbers
+from orthaug.models.integrators import held
+from orthaug.models.moving import Moving
 from orthaug.physics.motion import Motion
+from orthaug.physics.suspected_motion import SuspectedMotion
+
+_WIDTH = 64  # inputs that run side by side: every number of them by the same program
+
+
+class MotionPlant:
+    """What a design needs of a motion at p (np,): rows of sensitivities of its outputs, the start eliminated.
+
+    A run starts from the declared numbers, and from zero where none is declared.
+    """
+
+    start = 0
+
+    def __init__(
+        self,
+        motion: Motion,
+        suspects: Sequence[MotionSuspect],
+        p: Vector,
+        sampling_time: float,
+        substeps: int,
+        channel: str | None = None,
+    ) -> None:
+        if channel is None and len(motion.inputs) != 1:
+            names = ", ".join(motion.inputs) or "none"
+            raise InputError(f"`channel` is missing: the input to design, one of the inputs ({names}).")
+        self.channel = motion.inputs[0] if channel is None else check_choice(channel, motion.inputs, "`channel`")
+        for suspect in suspects:
+            if suspect.coefficient is None:
+                raise InputError(f"suspect '{suspect.name}' has no `coefficient`; a design needs a guess of its size.")
+        self.names, self.theta, self.motion = motion.names, np.asarray(p, dtype=float), motion
+        self.outputs: Sequence[str] = tuple(output.name for output in motion.outputs)
+        self.others = {name: np.zeros((1, 1)) for name in motion.inputs if name != self.channel}
+        starts = [state.start for state in motion.states]
+        self.before = np.array([start if isinstance(start, float | int) else 0.0 for start in starts], dtype=float)
+        suspected = SuspectedMotion.of(motion, [suspect.term(motion) for suspect in suspects])
+        self._form = Moving(suspected, (), None, sampling_time, substeps)
+        self._coefficients = np.array([suspect.coefficient for suspect in suspects], dtype=float)
+        coordinates = motion.coordinates
+        q = coordinates.of(self.theta)
+        self._slopes = coordinates.slopes(q)
+        c = np.concatenate([q, self._coefficients])
+        self._numbers = Numbers(c, np.zeros_like(c), np.zeros(0), np.zeros(0), np.ones(0), np.ones(0))
+
+    def rows(self, u: Float[np.ndarray, "N M"]) -> tuple[Float[np.ndarray, "M N ny np+1"], np.ndarray]:
+        """Rows `[∂y/∂p Δ]` without what the start could do, zero for an input under which the run runs away.
+
+        And the weights of the outputs (M, 1, ny, 1).
+        """
+        pieces = [self._piece(u[:, first : first + _WIDTH]) for first in range(0, u.shape[1], _WIDTH)]
+        rows, deviation = (np.concatenate(part) for part in zip(*pieces, strict=True))
+        ny = rows.shape[2]
+        return rows, 1 / np.where((deviation > 0) & (ny > 1), deviation, 1.0)[:, None, :, None]
+
+    def _piece(self, u: Float[np.ndarray, "N m"]) -> tuple[Float[np.ndarray, "m N ny np+1"], Float[np.ndarray, "m ny"]]:
+        (length, count), motion = u.shape, self.motion
+        padded = np.concatenate([u, np.repeat(u[:, -1:], _WIDTH - count, axis=1)], axis=1)
+        signals = {name: np.broadcast_to(np.resize(v, (length, 1)), padded.shape) for name, v in self.others.items()}
+        together = np.stack([{self.channel: padded, **signals}[name] for name in motion.inputs], axis=1)
+        read = np.stack([held(one, motion.hold, self._form.substeps) for one in np.moveaxis(together, -1, 0)], axis=-1)
+        start = np.repeat(self.before[:, None], _WIDTH, axis=1)
+        values, slopes = (np.asarray(part)[..., :count] for part in _run(self._form, self._numbers, start, read))
+        with np.errstate(all="ignore"):
+            size, half = np.abs(values), length // 2
+            early, late = size[:half].max(axis=0), size[half:].max(axis=0)
+            sound = (late <= RUNS_AWAY * np.where(early > 0, early, late)).all(axis=0)
+        sound &= np.isfinite(slopes).all(axis=(0, 1, 2)) & np.isfinite(values).all(axis=(0, 1))
+        slopes = np.moveaxis(np.where(sound, slopes, 0.0), -1, 0)  # (m, N, ny, nx + np + ns)
+        nx, nt = self._form.states, len(self.theta)
+        missing = slopes[..., nx + nt :] @ self._coefficients
+        rows = np.concatenate([slopes[..., nx : nx + nt] / self._slopes, missing[..., None]], axis=-1)
+        deviation = np.where(sound, np.where(sound, values, 0.0).std(axis=0), 1.0).T
+        return _without(slopes[..., :nx], rows), deviation
+
+
+def _without(start: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Rows (m, N, ny, k) less what unknown starts (m, N, ny, nx) could do."""
+    shape, flat = rows.shape, start.reshape(len(start), -1, start.shape[-1])
+    size = np.linalg.norm(flat, axis=1, keepdims=True)
+    basis = np.linalg.svd(flat / np.where(size > 0, size, 1.0), full_matrices=False)
+    kept = np.where(basis[1] > 1e-10, 1.0, 0.0)[:, None, :]
+    q = basis[0] * kept
+    own = rows.reshape(len(rows), -1, shape[-1])
+    return (own - q @ (np.swapaxes(q, 1, 2) @ own)).reshape(shape)
+
+
+@partial(jax.jit, static_argnames="form")
+def _run(
+    form: Moving, numbers: Numbers, start: Float[Array, "nx m"], inputs: Float[Array, "T nu m"]
+) -> tuple[Float[Array, "T ny m"], Float[Array, "T ny n m"]]:
+    """Outputs of every run, and their sensitivities to start and coordinates."""
+    numbers = form.prepared(numbers)
+
+    def step(carry: Any, row: Any) -> Any:
+        state, slopes = carry
+        state, slopes, value, slope = form.tangents(numbers, state, slopes, row)
+        return (state, slopes), (value, slope)
+
+    return jax.lax.scan(step, (start, form.first_slopes(start.shape[1])), inputs)[1]
 
 
 def design_motion_input(

@@ -9,37 +9,27 @@ from __future__ import annotations
 
 import numpy as np
 
-from orthaug._base.errors import InputError
 from orthaug._base.lines import percent
 from orthaug._base.parallel import one_blas_thread
 from orthaug._base.warning import Warning
-from orthaug.analysis.diagnosis import Diagnosis
+from orthaug.analysis.input_timing import DeadTime, dead_times, on_longest
 from orthaug.analysis.missing_terms import MissingTest, missing_terms
 from orthaug.analysis.predictability import Predictable, from_lags, from_own_past
 from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, errors_of, rms_errors
-from orthaug.analysis.robustness import block_of, rows_suffice
+from orthaug.analysis.verdict_text import Diagnosis
 from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.fitting.motion_estimation import without_learner
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.structures import Orthogonal
 from orthaug.models.response import Response
 
 _LEVEL = 0.01  # of the test of missing terms
 _SMALL = 0.05  # of the error's variance: what inputs and states tell below that is a small effect
+_SIZABLE = 0.02  # of the output's deviation: a free run that leaves less has no dead time to look for
 _LITTLE = 0.005  # of the error's variance: what its own past tells below that is none
 _LAGS = 10  # of inputs that may tell the error
 _ROWS_PER_LAG = 20
 _MOST_ROWS = 20_000  # at which the error is set beside states
-
-
-def robust_motion(fit: MotionEstimate) -> MotionEstimate:
-    """The fit with robust standard errors where its free run leaves coloured errors and the rows suffice."""
-    if not fit.status.ok or fit.covariance is None:
-        return fit
-    steps = block_of(fit)
-    if steps is None or not rows_suffice(len(fit.problem.record), steps):
-        return fit
-    try:
-        return fit.robust(steps)
-    except InputError:
-        return fit
 
 
 def diagnose_motion(fit: MotionEstimate, free_run: Response) -> Diagnosis | None:
@@ -72,16 +62,26 @@ def diagnose_motion(fit: MotionEstimate, free_run: Response) -> Diagnosis | None
     lacks = missing if missing is not None and missing.found(_LEVEL, _SMALL) else None
     told = any(share.inputs > _SMALL for share in shares) or bool(curved) or lacks is not None
     white = all(test.practically_white() for test in tests)
-    verdict = "unmodelled" if told else "white" if white else "equation_noise"
-    text = _words(verdict, fit, tests, shares, followed, curved, lacks)
-    colour = () if white else (Warning("coloured_residual", _COLOURED),)
-    return Diagnosis(verdict, text, (), tests, None, None, colour, shares, (), missing)
+    size = rms_errors(free_run) / fit.problem.deviation
+    late = _late(fit) if motion.inputs and (told or not white) and np.any(size > _SIZABLE) else ()
+    verdict = "unmodelled" if told or late else "white" if white else "equation_noise"
+    text = _words(verdict, fit, tests, shares, followed, curved, lacks, late)
+    warnings = [one.warning for one in late]
+    warnings += [] if white else [Warning("coloured_residual", _COLOURED + (_UNCOUNTED if told else ""))]
+    return Diagnosis(verdict, text, (), tests, None, None, tuple(warnings), shares, (), missing)
+
+
+def _late(fit: MotionEstimate) -> tuple[DeadTime, ...]:
+    """Inputs that act later, by physics alone."""
+    solver = LevenbergMarquardt()
+    return dead_times(on_longest(without_learner(fit.problem), fit.criterion, solver, Orthogonal()), solver)
 
 
 _COLOURED = (
     "the errors of the free run are coloured: held-out errors say how good the model is, and standard errors are "
     "robust only where there are rows enough."
 )
+_UNCOUNTED = " Intervals count noise alone: what is missing may have moved the parameters by more than that."
 
 
 def _predictable(i: int, test: ResidualTest, errors: list, inputs: list, every: int) -> Predictable:
@@ -102,6 +102,7 @@ def _words(
     followed: dict,
     curved: dict,
     lacks: MissingTest | None,
+    late: tuple[DeadTime, ...],
 ) -> str:
     units = {c.name: c.unit for c in fit.problem.record.outputs}
     sizes = ", ".join(f"{s.rms:.3g} {units[s.name]}".strip() + f" of {s.name}" for s in shares)
@@ -113,6 +114,11 @@ def _words(
             f"What the free run leaves ({sizes}) is coloured ({_colour(tests, shares)}), and follows no input, no "
             "state at the same instant, and no simple term that an equation could lack: disturbances, or physics "
             f"missing in an equation {learner}."
+        )
+    if late:
+        return (
+            f"What the free run leaves ({sizes}) holds more than noise. Most likely {late[0].input} acts later than "
+            f"the equations say: {late[0].gain}."
         )
     if lacks is not None:
         return f"What the free run leaves ({sizes}) holds more than noise. {_named(lacks, fit)}"

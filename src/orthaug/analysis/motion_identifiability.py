@@ -1,7 +1,8 @@
-"""Which parameters of a motion can the outputs tell apart: on a record's inputs, and on inputs that excite everything?
+"""Which parameters of a motion the outputs tell apart, before training.
 
-The rank of the free run's sensitivities to the parameters' coordinates, the starts of all segments eliminated, at the
-initial parameters and some near them. A direction that only rounding or one particular value hides has full rank there.
+They are told apart on the record's inputs, or on inputs that excite everything, by the rank of the free run's
+sensitivities to the parameters' coordinates, the starts of all segments eliminated, at the initial parameters and some
+near them. A direction that only rounding or one particular value hides has full rank there.
 """
 
 from __future__ import annotations

@@ -17,14 +17,13 @@ from orthaug._base.checks import Matrix
 from orthaug._base.jax import Array, jax
 from orthaug._base.lines import percent
 from orthaug._base.warning import Warning
-from orthaug.analysis.boundedness import divergence_scaling
+from orthaug.analysis.boundedness import divergence_scaling, margin
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Numbers
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.moving import Moving
 
 _LARGEST = 1024.0  # factor on the inputs that is tried
-_MARGIN = 1.5  # a factor below is told as a warning
 _POINTS = 2000  # at most
 _OFTEN = 0.01  # of the points: growing modes on more are told as a warning
 _STILL = 1e-9  # of the fastest mode: an integrator's eigenvalue is rounding of zero
@@ -72,10 +71,8 @@ def motion_stability(model: MotionModel, x: Matrix, u: Matrix, record: Record | 
     if record is None or not record.inputs:
         return checks
     factor = divergence_scaling(model, record, _LARGEST)
-    stays, times = ("stays within", _LARGEST) if factor is None else ("leaves", factor)
-    told = f"The free run {stays} all bounds with the inputs' deviations from their means {times:.4g} times as large."
-    small = (Warning("small_margin", told),) if factor is not None and factor < _MARGIN else ()
-    text, warnings = f"{checks.text}\n{told}", (*checks.warnings, *small)
+    told, code = margin(factor, _LARGEST)
+    text, warnings = f"{checks.text}\n{told}", (*checks.warnings, *((Warning(code, told),) if code else ()))
     return replace(checks, text=text, warnings=warnings, diverges_at=factor, searched=_LARGEST)
 
 

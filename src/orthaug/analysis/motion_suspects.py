@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from orthaug._base.checks import Matrix, Vector, check_label, check_unique, is_number, nearest
+from orthaug._base.checks import Matrix, Vector, check_label, check_unique, nearest
 from orthaug._base.errors import InputError
-from orthaug.analysis.suspects import ODD_JUMPS, WIDTHS, changes_sign, written
+from orthaug.analysis.suspects import ODD_JUMPS, WIDTHS, changes_sign, check_coefficient, check_name, written
 from orthaug.data.expressions import Expression, parse_named
 from orthaug.physics.motion import Motion
 from orthaug.physics.motion_problem import MotionProblem
@@ -47,10 +47,8 @@ class MotionSuspect:
     output = None  # in the words of lagged suspects
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not self.name.strip() or not self.name.isprintable():
-            raise InputError(f"{self.name!r} cannot name a suspect; use visible characters on one line.")
-        if self.coefficient is not None and not is_number(self.coefficient):
-            raise InputError(f"suspect '{self.name}': `coefficient` must be a finite number; got {self.coefficient!r}.")
+        check_name(self.name)
+        check_coefficient(self.name, self.coefficient)
         check_label(self.unit, f"the unit of suspect '{self.name}'")
 
     @classmethod
@@ -97,7 +95,7 @@ class MotionSuspect:
         Raises:
             InputError: an unknown equation, or none where there are several.
         """
-        known = (*motion.names_of_states, *(output.name for output in motion.outputs))
+        known = equations_of(motion)
         if self.equation is not None:
             if self.equation not in known:
                 hint = nearest(self.equation, known) or f"; known are {', '.join(known)}"
@@ -117,6 +115,11 @@ class MotionSuspect:
         with np.errstate(all="ignore"):
             found = self.parsed(motion).value(motion.values(x.T, u.T, p, np), np)
         return np.broadcast_to(np.asarray(found, dtype=float), (len(x),))
+
+
+def equations_of(motion: Motion) -> tuple[str, ...]:
+    """Whose equations there are, outputs after states."""
+    return (*motion.names_of_states, *(output.name for output in motion.outputs))
 
 
 def usual_places(motion: Motion) -> tuple[int, ...]:

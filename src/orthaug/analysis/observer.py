@@ -74,7 +74,7 @@ class Observer:
             InputError: other channels, several experiments, a row that is not there.
         """
         form, _, size = self.model.filtering
-        record = self.model.fitting(record, need_outputs=True, gaps=True)
+        record = self._record(record)
         experiment = one_experiment(record)
         last = len(experiment) - form.hidden
         row = checked_row(row, form.first_row, last)
@@ -276,11 +276,7 @@ def _observed(told: Told, experiment: Experiment, first: int) -> Observed:
 
 
 def _checked(noise: Any, disturbances: int, outputs: int) -> Noise:
-    """Two covariances.
-
-    Raises:
-        InputError: anything else.
-    """
+    """Two covariances; raises InputError for anything else."""
     sizes = {"state": disturbances, "output": outputs}
     if not isinstance(noise, Noise):
         raise InputError(f"`noise` must be an oa.Noise(state, output) of two covariances; got {shown(noise)}.")
@@ -297,6 +293,6 @@ def _checked(noise: Any, disturbances: int, outputs: int) -> Noise:
         if not sound or np.linalg.eigvalsh(matrix).min(initial=0.0) < -1e-9 * largest:
             raise InputError(f"`noise.{name}` is no covariance: it must be finite, symmetric, and not negative.")
         parts.append(matrix)
-    if not all(part.any() for part in parts[:1]) and not np.linalg.eigvalsh(parts[1]).min(initial=1.0) > 0:
+    if not parts[0].any() and not np.linalg.eigvalsh(parts[1]).min(initial=1.0) > 0:
         raise InputError("`noise`: with no disturbance the sensors' covariance must be positive definite.")
     return Noise(*parts)

@@ -8,14 +8,14 @@ Otherwise both are there.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 import scipy.optimize
 
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError
-from orthaug.analysis.verdict_on_residuals import diagnose
+from orthaug.analysis.diagnosis import diagnose
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.motion_estimates import MotionEstimate
@@ -44,7 +44,7 @@ def by_verdict(model: Model | MotionModel, verdict: str | None = None) -> Noise:
     kept = model.statistics
     if verdict is None and kept.disturbance is not None and kept.sensor is not None:
         return Noise(kept.disturbance, kept.sensor)
-    if kept.noise is None or not np.all(np.diag(kept.noise) > 0):
+    if not _known(kept.noise):
         raise InputError(
             "the model has no estimate of its noise (few rows, or trained elsewhere); give the observer `noise=`, "
             "such as oa.Noise(state, output) with two covariances."
@@ -53,6 +53,10 @@ def by_verdict(model: Model | MotionModel, verdict: str | None = None) -> Noise:
     if not kept.flown and verdict != "sensor_noise":
         return Noise(np.array(kept.noise), nothing)
     return with_share(model, kept.noise, _MOST if verdict in BOTH else _LITTLE)
+
+
+def _known(noise: Matrix | None) -> TypeGuard[Matrix]:
+    return noise is not None and bool(np.all(np.diag(noise) > 0))
 
 
 def with_share(model: Model | MotionModel, noise: Matrix, share: float) -> Noise:
@@ -93,8 +97,7 @@ def to_keep(fit: Estimate | MotionEstimate, verdict: str) -> Noise | None:
     None where the verdict's rule is as good, without an estimate of the noise, and where a filter takes long.
     """
     model, kept = fit.model, fit.model.statistics
-    unknown = kept.noise is None or not np.all(np.diag(kept.noise) > 0)
-    if unknown or not kept.flown or verdict not in BOTH or not model.form.differentiable:
+    if not _known(kept.noise) or not kept.flown or verdict not in BOTH or not model.form.differentiable:
         return None
     if len(model.filtering[0].names) > _KEPT_STATES:
         return None

@@ -13,17 +13,56 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.analysis.correlation import Pieces, pieces_of
 from orthaug.analysis.residuals import errors_of
-from orthaug.analysis.simple_functions import SimpleFunctions
+from orthaug.analysis.whiteness import Pieces, pieces_of
+from orthaug.inference.covariance import by_experiment
 from orthaug.models.response import Response
 from orthaug.physics.problem import Problem
 
+_VARIABLES = 6  # that functions are made of, at most
+_FARTHEST = 4.0  # deviations: farther values count as this far
 BLOCKS = 8
 _PAST = 5  # lags of an output's own error
 _FURTHER = 10  # lags of inputs beyond the largest of the regressor
 _ROWS = 20_000
 _RIDGE = 1e-6  # of a column's sum of squares, so that columns that repeat each other do no harm
+
+
+@dataclass(frozen=True, eq=False)
+class SimpleFunctions:
+    """Directions of the regressor, of each channel its first lag and differences of lags, with mean and deviation."""
+
+    variables: tuple[tuple[Vector, float, float], ...]
+
+    @classmethod
+    def of(cls, problem: Problem) -> SimpleFunctions:
+        """Of what the physics and the learner read, the first lags and differences of all channels in front."""
+        layout, x, each = problem.layout, problem.rows.x, np.eye(len(problem.layout))
+        places: dict[str, list[int]] = {}
+        for j, lag in enumerate(layout):
+            places.setdefault(lag.channel, []).append(j)
+        directions = []
+        for i in range(max(map(len, places.values()), default=0)):
+            for own in places.values():
+                if i < len(own):
+                    directions.append(each[own[i]] if i == 0 else each[own[i - 1]] - each[own[i]])
+        moved = [(d, float((x @ d).mean()), float((x @ d).std())) for d in directions[:_VARIABLES]]
+        return cls(tuple(entry for entry in moved if entry[2] > 0))
+
+    def __len__(self) -> int:
+        n = len(self.variables)
+        return 5 * n + 3 * n * (n - 1) // 2
+
+    def __call__(self, x: Matrix) -> Matrix:
+        """On rows of the regressor, (N, functions)."""
+        columns = []
+        scaled = [np.clip((x @ d - mean) / size, -_FARTHEST, _FARTHEST) for d, mean, size in self.variables]
+        for v in scaled:
+            columns += [v**2, v**3, np.abs(v), v * np.abs(v), np.tanh(3 * v)]
+        for i, v in enumerate(scaled):
+            for w in scaled[:i]:
+                columns += [v * w, v**2 * w, v * w**2]
+        return np.stack(columns, axis=-1) if columns else np.zeros((len(x), 0))
 
 
 @dataclass(frozen=True)
@@ -124,8 +163,7 @@ def predictable(problem: Problem, response: Response, skip: int = 0) -> tuple[Pr
     errors, functions, found = errors_of(response, skip), SimpleFunctions.of(problem), []
     starts = [run.start + skip for run in response.trajectories]
     inputs = [e.inputs[a:] for e, a in zip(problem.record.experiments, starts, strict=True)]
-    ends = np.cumsum([len(e) - problem.rows.start for e in problem.record.experiments])[:-1]
-    x = np.concatenate([piece[skip:] for piece in np.split(problem.rows.x, ends)])
+    x = np.concatenate([piece[skip:] for piece in by_experiment(problem, problem.rows.x)])
     every = slice(None, None, -(-len(x) // _ROWS))
     columns = np.column_stack([np.ones(len(x[every])), functions(x[every])])
     longest = max((lag.lag for lag in problem.layout), default=0) + _FURTHER

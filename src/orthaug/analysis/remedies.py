@@ -16,8 +16,7 @@ from orthaug.analysis.measure_bias import Ground
 from orthaug.analysis.suspects import Suspect
 from orthaug.data.expressions import parse
 from orthaug.data.regressors import Features
-from orthaug.inference.measures import Symmetrized, Uniform
-from orthaug.inference.weighed import weigh_problem
+from orthaug.inference.measures import Symmetrized, Uniform, weigh_problem
 from orthaug.physics.output_weights import times
 from orthaug.physics.shared import seen, shared_directions
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
-from orthaug.analysis.correlation import autocorrelation
-from orthaug.analysis.residuals import LAGS, PRACTICALLY_WHITE, ROUNDING, rms_errors
-from orthaug.analysis.whiteness import ROWS_PER_LAG, ljung_box
+from orthaug.analysis.residuals import LAGS, PRACTICALLY_WHITE, ROUNDING, errors_of, rms_errors
+from orthaug.analysis.whiteness import ROWS_PER_LAG, autocorrelation, ljung_box
 from orthaug.fitting.estimates import Estimate
+from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.models.response import Response
 
 _FEWEST_ROWS, _ROWS_PER_TERM = 100, 10  # rows that a sum of autocovariances needs, in all and for each of its lags
@@ -29,17 +29,24 @@ def robust_where_coloured(fit: Estimate, response: Response) -> Estimate:
     if not fit.status.ok or fit.covariance is None or fit.at_bound:
         return fit
     lags = _memory(fit, response) if fit.criterion.flown is None else block_of(fit)
-    if lags is None or not rows_suffice(len(fit.problem.rows), lags):
+    return _robust(fit, len(fit.problem.rows), lags)
+
+
+def robust_motion(fit: MotionEstimate) -> MotionEstimate:
+    """The fit with robust standard errors where its free run leaves coloured errors and the rows suffice."""
+    if not fit.status.ok or fit.covariance is None:
+        return fit
+    return _robust(fit, len(fit.problem.record), block_of(fit))
+
+
+def _robust(fit: Any, rows: int, lags: int | None) -> Any:
+    """Where so many rows tell a sum of so many autocovariances."""
+    if lags is None or rows < max(_FEWEST_ROWS, _ROWS_PER_TERM * lags):
         return fit
     try:
         return fit.robust(lags)
     except InputError:  # an ensemble, or a fit without statistics
         return fit
-
-
-def rows_suffice(rows: int, lags: int) -> bool:
-    """Whether so many rows tell a sum of so many autocovariances."""
-    return rows >= max(_FEWEST_ROWS, _ROWS_PER_TERM * lags)
 
 
 def _memory(fit: Estimate, response: Response) -> int | None:
@@ -48,7 +55,7 @@ def _memory(fit: Estimate, response: Response) -> int | None:
     if np.all(rms_errors(response) / fit.problem.deviation < ROUNDING):
         return None
     for i in range(len(fit.problem.outputs)):
-        pieces = [(t.measured - t.model)[t.start :, i] for t in response.trajectories]  # type: ignore[operator]
+        pieces = [errors[:, i] for errors in errors_of(response)]
         if _is_coloured(pieces):
             rows = sum(map(len, pieces))
             acf = np.asarray(autocorrelation(pieces, rows // ROWS_PER_LAG))

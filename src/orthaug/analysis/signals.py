@@ -112,7 +112,7 @@ def prbs(samples: int, *, amplitude: float, hold: int = 1, bits: int | None = No
     if bits > _MOST_BITS:
         raise InputError(f"a register of {bits} bits is too long; at most {_MOST_BITS}. Use fewer samples or a hold.")
     sequence = scipy.signal.max_len_seq(bits)[0]
-    return _held(2.0 * np.resize(sequence, length) - 1.0, hold, samples) * amplitude
+    return amplitude * _held(np.resize(sequence, length), hold, samples)
 
 
 def swept_sine(
@@ -179,7 +179,7 @@ def binary_pattern(samples: int, pattern: Sequence[int] | np.ndarray, *, amplitu
     levels = np.asarray(pattern)
     if levels.ndim != 1 or not levels.size or levels.dtype.kind not in "biuf" or not np.isin(levels, (0, 1)).all():
         raise InputError(f"`pattern` must be a sequence of 0 and 1; got {pattern!r}.")
-    return _held(2.0 * np.resize(levels, -(-samples // hold)) - 1.0, hold, samples) * amplitude
+    return amplitude * _held(np.resize(levels, -(-samples // hold)), hold, samples)
 
 
 def white_gaussian(samples: int, *, amplitude: float, seed: int, deviation: float | None = None) -> Vector:
@@ -209,7 +209,7 @@ def white_binary(samples: int, *, amplitude: float, seed: int, hold: int = 1) ->
         InputError: numbers out of range.
     """
     amplitude, samples, hold = _amplitude(amplitude), check_count(samples, "samples"), check_count(hold, "hold")
-    return _held(2.0 * _generator(seed).integers(0, 2, -(-samples // hold)) - 1.0, hold, samples) * amplitude
+    return amplitude * _held(_generator(seed).integers(0, 2, -(-samples // hold)), hold, samples)
 
 
 def sign_symmetric(u: Vector) -> Vector:
@@ -347,8 +347,9 @@ def _van_der_corput(count: int) -> Vector:
     return np.argsort(np.argsort(inverse)) / count
 
 
-def _held(levels: Vector, hold: int, samples: int) -> Vector:
-    return np.repeat(levels, hold)[:samples]
+def _held(bits: Any, hold: int, samples: int) -> Vector:
+    """0 as -1, 1 as 1."""
+    return np.repeat(2.0 * bits - 1.0, hold)[:samples]
 
 
 def _amplitude(amplitude: Any) -> float:

@@ -82,13 +82,11 @@ class Suspect:
     on: str | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not self.name.strip() or not self.name.isprintable():
-            raise InputError(f"{self.name!r} cannot name a suspect; use visible characters on one line.")
+        check_name(self.name)
         if self.output is not None and not isinstance(self.output, str):
             raise InputError(f"suspect '{self.name}': `output` must be the name of a channel; got {self.output!r}.")
         constants = _checked_constants(dict(self.constants), self.name)
-        if self.coefficient is not None and not is_number(self.coefficient):
-            raise InputError(f"suspect '{self.name}': `coefficient` must be a finite number; got {self.coefficient!r}.")
+        check_coefficient(self.name, self.coefficient)
         object.__setattr__(self, "constants", constants)
         _ = self.parsed
 
@@ -166,9 +164,7 @@ class Suspect:
         Raises:
             InputError: lags that the layout lacks, an output that is missing or unknown, a value that is not finite.
         """
-        values = np.zeros((len(x), len(outputs)))
-        with np.errstate(all="ignore"):
-            column = _evaluate(self.parsed, x, layout, f"suspect '{self.name}'")
+        values, column = np.zeros((len(x), len(outputs))), self.form(x, layout)
         bad = np.flatnonzero(~np.isfinite(column))
         if bad.size:
             raise InputError(
@@ -192,6 +188,18 @@ class Suspect:
             hint = nearest(self.output, outputs)
             raise InputError(f"suspect '{self.name}': unknown output '{self.output}'{hint}; known are {known}.")
         return list(outputs).index(self.output)
+
+
+def check_name(name: Any) -> None:
+    """Raise InputError for what cannot name a suspect."""
+    if not isinstance(name, str) or not name.strip() or not name.isprintable():
+        raise InputError(f"{name!r} cannot name a suspect; use visible characters on one line.")
+
+
+def check_coefficient(suspect: str, coefficient: Any) -> None:
+    """Raise InputError for a coefficient that is no number."""
+    if coefficient is not None and not is_number(coefficient):
+        raise InputError(f"suspect '{suspect}': `coefficient` must be a finite number; got {coefficient!r}.")
 
 
 def written(
@@ -261,15 +269,14 @@ def usual_suspects(problem: Problem) -> tuple[Suspect, ...]:
     layout, outputs = problem.layout, problem.outputs
     pairs: list[tuple[str, str]] = []
     for channel in dict.fromkeys(lag.channel for lag in layout):
-        lags = sorted(lag.lag for lag in layout if lag.channel == channel)
-        first = next(str(lag) for lag in layout if lag.channel == channel and lag.lag == lags[0])
+        lags = sorted(lag for lag in layout if lag.channel == channel)
+        first = str(lags[0])
         pairs += [(kind, first) for kind in (_POSITION if channel in outputs else _INPUT)]
-        values = problem.rows.x[:, [str(lag) for lag in layout].index(first)]
+        values = problem.rows.x[:, layout.index(lags[0])]
         if channel in outputs and values.min() >= -_BELOW * values.max():
             pairs.append(("square_root", first))
         if channel in outputs and len(lags) > 1:
-            second = next(str(lag) for lag in layout if lag.channel == channel and lag.lag == lags[1])
-            pairs += [(kind, f"{first} - {second}") for kind in _VELOCITY]
+            pairs += [(kind, f"{first} - {lags[1]}") for kind in _VELOCITY]
     suspects = []
     values = {on: _evaluate(parse(on), problem.rows.x, layout, f"'{on}'") for _, on in pairs}
     pairs = [(kind, on) for kind, on in pairs if kind not in ODD_JUMPS or changes_sign(values[on])]

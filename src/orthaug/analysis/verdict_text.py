@@ -1,4 +1,4 @@
-"""The verdict on a residual in words, and the warnings that intervals of θ must carry."""
+"""The verdict on a residual: what it holds, its words, and the warnings that intervals of θ must carry."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from orthaug._base.lines import percent
 from orthaug._base.warning import Warning
 from orthaug.analysis.changes import WORTH, Change, fall_of
+from orthaug.analysis.missing_terms import MissingTest
 from orthaug.analysis.predictability import Predictable
 from orthaug.analysis.residuals import ResidualTest
 from orthaug.fitting.estimates import Estimate
@@ -25,6 +26,34 @@ _BIASED = Warning(
     "noise on the measured output biases the one-step θ, and its intervals do not cover that bias: "
     'train with focus = "simulation".',
 )
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """`verdict` is white, equation_noise, sensor_noise or unmodelled; `text` says why and what to do.
+
+    `one_step` and `free_run` are the tests of the two residuals per output. `ratio` is the free run's RMS error against
+    the one-step error, `noise_in_lags` the share of noise in the least excited direction of the lagged outputs.
+    `predictable` is what could be predicted of the error that was minimised, per output. `changes` are predicted to
+    lower it, the first of them by most; there is none where it is noise. `steps` are the steps of those outputs whose
+    one-step error is no larger, None where there are none. `missing` is the test of terms that the
+    equations of a motion could lack; None for other models.
+    """
+
+    verdict: str
+    text: str
+    one_step: tuple[ResidualTest, ...]
+    free_run: tuple[ResidualTest, ...] | None
+    ratio: float | None
+    noise_in_lags: float | None
+    warnings: tuple[Warning, ...]
+    predictable: tuple[Predictable, ...] = ()
+    changes: tuple[Change, ...] = ()
+    missing: MissingTest | None = None
+    steps: Mapping[str, float] | None = None
+
+    def __repr__(self) -> str:
+        return f"Diagnosis({self.verdict}: {self.text})"
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,3 +26,19 @@ def attempt(what: str, analysis: Callable[[], T], warnings: list[Any], otherwise
         told = f"{what} failed numerically ({str(error).rstrip('.')}): the result stands without it."
         warnings.append(Warning("analysis_failed", told))
         return otherwise
+
+
+def attempt_warned(
+    what: str, analysis: Callable[[], T | None], warnings: list[Any], without: Warning | None = None
+) -> T | None:
+    """As `attempt`, with the warnings that the finding has, or `without` where there is none; None where it fails."""
+
+    def found() -> T | None:
+        finding: Any = analysis()
+        if finding is not None:
+            warnings.extend(finding.warnings)
+        elif without is not None:
+            warnings.append(without)
+        return finding
+
+    return attempt(what, found, warnings, None)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -26,10 +26,8 @@ from orthaug.commands.program import (
     main,
     other_writes,
     prepare_jax,
+    tell,
 )
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["main"]
 _LARGE = 20e6  # bytes of a data file from which on `init` tells what it is at
@@ -59,20 +57,21 @@ def check(
     force: Force = False,
 ) -> None:
     """Report excitation and identifiability; trains nothing."""
-    from orthaug.commands.check import check_job, refusal, write_figure
-    from orthaug.commands.folder import check_figure
-    from orthaug.commands.opening import open_job
+    from orthaug.commands.folder import check_figure, save_figure
+    from orthaug.commands.kinds import kind_of, open_job
     from orthaug.reports.text import check_text
 
     job = open_job(spec, require_full_rank=False)
     check_figure(figure, *job.files, force=force)
     if job.spec.motion is not None:  # its runs are computed
         prepare_jax()
-    result = check_job(job)
-    streams.echo(result.to_json() if as_json else check_text(result))
+    result = kind_of(job).checked(job)
+    tell(result, check_text(result), as_json)
     if figure is not None and result.bias:
-        write_figure(result.bias, figure, force=force)
-    refused = refusal(job, result)
+        from orthaug.reports.plots import bias_figure
+
+        save_figure(bias_figure(result.bias), figure, force=force)
+    refused = kind_of(job).refused(job, result)
     if refused is not None:
         raise type(refused)(f"{spec}: {refused}")
 
@@ -88,7 +87,7 @@ def fit(
     """Fit a spec, print a summary and write the result folder."""
     from orthaug.commands.fit import fit_job, keeping, write_result
     from orthaug.commands.folder import check_folder, check_inputs_kept
-    from orthaug.commands.opening import open_job
+    from orthaug.commands.kinds import open_job
     from orthaug.reports.text import fit_text
 
     folder = out or Path("orthaug-out") / spec.stem
@@ -104,11 +103,7 @@ def fit(
     if other_writes():
         return
     write_result(fitted, folder, force=force)
-    if as_json:
-        streams.echo(fitted.result.to_json())
-    else:
-        streams.echo(fit_text(fitted.fit, fitted.result))
-        streams.echo(f"\nwritten to {folder}")
+    tell(fitted.result, fit_text(fitted.fit, fitted.result), as_json, folder)
     if not fitted.fit.status.ok:
         raise TrainingError(f"{fitted.fit.status.message}. The account is in {folder / 'result.json'}.")
 
@@ -125,7 +120,7 @@ def compare(
 ) -> None:
     """Physics alone and every structure, one table."""
     from orthaug.commands.folder import check_folder, check_inputs_kept
-    from orthaug.commands.opening import open_job
+    from orthaug.commands.kinds import open_job
     from orthaug.reports.text import compare_text
 
     folder = out or Path("orthaug-out") / spec.stem
@@ -142,8 +137,7 @@ def compare(
     if other_writes():
         return
     comparing.write(comparison, folder, force=force)
-    text = compare_text(comparison.result, comparison.verdicts)
-    streams.echo(comparison.result.to_json() if as_json else f"{text}\n\nwritten to {folder}")
+    tell(comparison.result, compare_text(comparison.result, comparison.verdicts), as_json, folder)
 
 
 @app.command()
@@ -159,7 +153,7 @@ def design(
     """
     from orthaug.commands import design as designing
     from orthaug.commands.folder import check_file
-    from orthaug.commands.opening import open_job
+    from orthaug.commands.kinds import open_job
     from orthaug.reports.result import DesignResult
     from orthaug.reports.text import design_text
 
@@ -168,7 +162,7 @@ def design(
     designed = designing.design_for(job)
     designing.write(job, designed, out, force=force)
     result = DesignResult.of(designed)
-    streams.echo(result.to_json() if as_json else f"{design_text(result)}\n\nwritten to {out}")
+    tell(result, design_text(result), as_json, out)
 
 
 @app.command()
@@ -190,11 +184,8 @@ def select(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force
     with selection_bar(steps_at_most(given.selection.terms)) as told:
         selected = select_for(job, given, folder, told)
     write_selected(selected, folder, force=force)
-    if as_json:
-        streams.echo(selected.result.to_json())
-    else:
-        streams.echo(selection_text(selected.result))
-        streams.echo(f"\nwritten to {folder}; next: orthaug fit {folder / 'spec.toml'}")
+    place = f"{folder}; next: orthaug fit {folder / 'spec.toml'}"
+    tell(selected.result, selection_text(selected.result), as_json, place)
 
 
 @app.command()
@@ -296,7 +287,8 @@ def schema(
     if check_choice(command, (*RESULTS, "spec", "keys"), "WHAT") == "keys":
         streams.echo(keys_of_a_spec())
     else:
-        streams.echo(_json(schema_of_a_spec() if command == "spec" else schema_of(command)))
+        content = schema_of_a_spec() if command == "spec" else schema_of(command)
+        streams.echo(json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False))
 
 
 @app.command()
@@ -332,10 +324,6 @@ def reproduce(
         reproduced = reproduction.reproduce(entries, pipeline=pipeline, small=small, progress=progress, client=client)
     reproduction.write(reproduced, folder, pipeline, force=force)
     streams.echo(f"{reproduction.text(reproduced)}\n\nwritten to {folder}/index.html")
-
-
-def _json(content: Any) -> str:
-    return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
 
 
 from orthaug.commands import model_cli  # noqa: E402, F401  (its commands stand behind these)

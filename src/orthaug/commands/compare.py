@@ -15,7 +15,7 @@ from orthaug._base.progress import SILENT, Progress
 from orthaug.analysis.validation import Verdict, dominance
 from orthaug.commands.fit import Fitted, cross_validated, fit_variant, judge_fit, score_part, wanted_blocks
 from orthaug.commands.folder import not_a_result
-from orthaug.commands.job import ALONE, Job, Variant
+from orthaug.commands.job import ALONE, Job, Variant, origin_of
 from orthaug.data.record import same_step
 from orthaug.models import storage
 from orthaug.models.model import Model
@@ -90,8 +90,6 @@ def _verdicts(job: Job, fitted: dict[str, Fitted]) -> dict[str, Verdict]:
 
 def write(comparison: Comparison, folder: Path, *, force: bool = False) -> None:
     """result.json, models/, figures/ and report.html, whole or not at all."""
-    from orthaug.commands.reporting import compare_report
-
     with whole_folder(folder, not_a_result, force=force) as partial:
         (partial / "result.json").write_text(comparison.result.to_json() + "\n", encoding="utf-8")
         for kind, fitted in comparison.fitted.items():
@@ -103,6 +101,19 @@ def write(comparison: Comparison, folder: Path, *, force: bool = False) -> None:
         figure = plots.comparison_figure(comparison.result.comparison)
         plots.save(figure, partial / "figures" / "comparison.png")
         (partial / "report.html").write_text(compare_report(comparison), encoding="utf-8")
+
+
+def compare_report(comparison: Comparison) -> str:
+    """The page of a comparison."""
+    from orthaug.reports.page import compare_page
+    from orthaug.reports.page_compare import ComparePage
+
+    responses = {
+        name: {part: free for part, (_, free) in fitted.responses.items()}
+        for name, fitted in comparison.fitted.items()
+        if fitted.responses
+    }
+    return compare_page(ComparePage(origin_of(comparison.job, "compare"), comparison.result, responses))
 
 
 def _matching(path: Path, job: Job) -> Model | MotionModel:
@@ -126,41 +137,24 @@ def _matching(path: Path, job: Job) -> Model | MotionModel:
 
 
 def _row(kind: str, fitted: Fitted, verdict: Verdict | None) -> RowResult:
-    result, bound = fitted.result, fitted.fit.model.form.bound
-    return RowResult.model_validate(
-        {
-            "name": kind,
-            "status": result.status.code,
-            "seconds": result.status.seconds,
-            "weights": bound.size if bound else 0,
-            "parameters": result.parameters,
-            "orthogonality_defect": result.orthogonality_defect,
-            "scores": result.scores,
-            "residuals": result.residuals,
-            "warnings": result.warnings,
-            "learner_to_physics": dominance(fitted.fit) if fitted.fit.status.ok else None,
-            "validation": verdict,
-        }
-    )
+    result, fit = fitted.result, fitted.fit
+    own = {key: getattr(result, key) for key in ("parameters", "orthogonality_defect", "residuals")}
+    own |= {"status": result.status.code, "seconds": result.status.seconds, "validation": verdict}
+    share = dominance(fit) if fit.status.ok else None
+    return _row_of(kind, fit.model, result.scores, result.warnings, **own, learner_to_physics=share)
 
 
 def _saved_row(name: str, model: Model | MotionModel, job: Job) -> RowResult:
     warnings: list[Any] = []
     scores = {part.name: score_part(model, part, warnings)[0] for part in job.parts}
+    return _row_of(name, model, scores, warnings, status="saved", parameters=parameter_rows(*model.estimated))
+
+
+def _row_of(name: str, model: Model | MotionModel, scores: Any, warnings: Sequence[Any], **told: Any) -> RowResult:
+    """A row; null for what is not `told`."""
+    own = {"name": name, "weights": model.form.bound.size if model.form.bound else 0}
     return RowResult.model_validate(
-        {
-            "name": name,
-            "status": "saved",
-            "seconds": None,
-            "weights": model.form.bound.size if model.form.bound else 0,
-            "parameters": parameter_rows(*model.estimated),
-            "orthogonality_defect": None,
-            "scores": scores,
-            "residuals": None,
-            "warnings": warnings,
-            "learner_to_physics": None,
-            "validation": None,
-        }
+        dict.fromkeys(RowResult.model_fields) | own | {"scores": scores, "warnings": warnings} | told
     )
 
 

@@ -1,16 +1,26 @@
-"""The section [data] of a spec: channels, sampling time, and the files of every part."""
+"""The sections [data] and [engine] of a spec: channels, files, and who sums over the rows of training."""
 
 from __future__ import annotations
 
 import difflib
-from typing import Annotated, Any, Literal
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from orthaug._base.checks import check_label
+from orthaug._base.errors import InputError
+from orthaug._base.memory import available
 from orthaug.commands.sections import Count, Finite, KindSection, Positive, Section, with_kinds
-from orthaug.data.steps import STEPS
+from orthaug.data.preparation import STEPS
 
+if TYPE_CHECKING:
+    from orthaug.models.rows import Engine
+
+_PARQUET = ".parquet"
+_SHARE = 0.25  # of the memory that is free: what the files may take before they are streamed
+_COPIES = 4  # of a file's bytes, in a fit in memory at least
 Range = Annotated[list[Count], Field(min_length=2, max_length=2)]
 
 
@@ -36,12 +46,8 @@ class ChannelSection(Section):
 class PrepareSection(KindSection):
     """A step that every part of the data goes through."""
 
+    registries = {"step": STEPS}
     step: str
-
-    @model_validator(mode="after")
-    def _check(self) -> PrepareSection:
-        self.declared(STEPS, self.step)
-        return self
 
 
 class Data(Section):
@@ -57,7 +63,7 @@ class Data(Section):
     validation: PartSection | None = None
     tests: dict[str, PartSection] = {}
     channels: dict[str, ChannelSection] = {}
-    prepare: list[with_kinds(PrepareSection, step=STEPS)] = []  # type: ignore[valid-type]
+    prepare: list[with_kinds(PrepareSection)] = []  # type: ignore[valid-type]
 
     @property
     def steps(self) -> tuple[Any, ...]:
@@ -96,3 +102,49 @@ class Data(Section):
             f"`channels.{name}` is neither an input nor an output, and `{kind}` has '{close[0]}', of which `channels` "
             "knows nothing; expected the same name in both, so one of them is misspelt"
         )
+
+
+class EngineSection(Section):
+    """Who sums over the rows."""
+
+    kind: Literal["auto", "memory", "stream", "devices", "dask"] = "auto"
+    scheduler: str | None = None
+    workers: Positive | None = None
+    devices: Positive | None = None
+    partition_rows: Positive = 1_000_000
+    checkpoint: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 10.0
+
+    def chosen(self, files: Sequence[Path]) -> str:
+        """The kind; "auto" streams Parquet files that are too large for memory."""
+        if self.kind != "auto":
+            return self.kind
+        parquet = all(file.suffix.lower() == _PARQUET for file in files)
+        try:
+            size = sum(file.stat().st_size for file in files)
+        except OSError:  # reading them will tell
+            return "memory"
+        return "stream" if parquet and _COPIES * size > _SHARE * available() else "memory"
+
+
+def engine_of(section: EngineSection, kind: str) -> Engine:
+    """The engine of a kind.
+
+    Raises:
+        InputError: one that is not installed, or cannot be reached.
+    """
+    if kind == "dask":
+        from orthaug.models.cluster import Dask, connected
+
+        return Dask(connected(section.scheduler, section.workers))
+    if kind == "devices":
+        from orthaug.models import hosts
+        from orthaug.models.devices import Devices
+
+        hosts.join()
+        if hosts.several() and section.devices is not None:
+            raise InputError(f"`engine.devices`: found {section.devices}; over several hosts all devices are used.")
+        return Devices(section.devices)
+    from orthaug.models.rows import InMemory
+    from orthaug.models.streaming import Stream
+
+    return Stream() if kind == "stream" else InMemory()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import tomlkit
 
 from orthaug._base.lines import counted
+from orthaug.commands.folder import relative
 from orthaug.data.survey import Column, Survey
 from orthaug.selection.first_orders import FirstModel
 
@@ -103,7 +103,7 @@ def spec_text(
 def _data(
     found: Survey, roles: Roles, out: Path, rows: int, cut: int, missing: int, named: tuple[list[str], list[str]]
 ) -> Any:
-    file, clock = _relative(found.path, out), found.clock
+    file, clock = relative(found.path, out.resolve().parent), found.clock
     data = tomlkit.table()
     time = time_of(found, roles)
     if time is not None:
@@ -145,14 +145,6 @@ def _data(
     if len(steps):
         data.add("prepare", steps)
     return data
-
-
-def _relative(path: Path, out: Path) -> str:
-    """The data file as the spec at `out` names it."""
-    try:
-        return Path(os.path.relpath(path.resolve(), out.resolve().parent)).as_posix()
-    except ValueError:  # on another drive
-        return path.resolve().as_posix()
 
 
 def _baseline(named: tuple[list[str], list[str]], model: FirstModel) -> Any:

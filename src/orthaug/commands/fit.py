@@ -17,7 +17,7 @@ from orthaug._base.views import MAKERS
 from orthaug._base.warning import Warning
 from orthaug.commands.attempt import attempt
 from orthaug.commands.folder import not_a_result
-from orthaug.commands.job import ALONE, AS_DECLARED, DEFAULT_BLOCKS, Job, Variant
+from orthaug.commands.job import ALONE, AS_DECLARED, DEFAULT_BLOCKS, Job, Variant, origin_of
 from orthaug.commands.kinds import kind_of
 from orthaug.commands.parts import Part
 from orthaug.inference.learned_terms import equation, learned_terms
@@ -27,6 +27,7 @@ from orthaug.reports.result import FitResult, PartScores, ScoreResult
 if TYPE_CHECKING:
     from orthaug.analysis.validation import Trial, Verdict
     from orthaug.models.response import Response
+    from orthaug.reports.page_fit import Origin
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,7 +239,7 @@ def score_part(model: Any, part: Part, warnings: list[Any]) -> tuple[PartScores,
 
 def _scored_along(model: Any, part: Part, warnings: list[Any]) -> PartScores:
     """Scores of all rows of a part of which only a witness is in memory, and tests of the residual of all of them."""
-    from orthaug.analysis.running_residuals import RunningResidual
+    from orthaug.analysis.residuals import RunningResidual
     from orthaug.data.sources import rows_of
     from orthaug.models.long_runs import scores_along
 
@@ -265,7 +266,6 @@ def write_result(fitted: Fitted, folder: Path, *, force: bool = False) -> None:
 
 def fill_result(fitted: Fitted, folder: Path) -> None:
     """Write the files of a result into an existing folder."""
-    from orthaug.commands.reporting import fit_report
     from orthaug.models import storage
 
     (folder / "result.json").write_text(fitted.result.to_json() + "\n", encoding="utf-8")
@@ -284,3 +284,15 @@ def _draw(fitted: Fitted, folder: Path) -> None:
     drawn = kind_of(fitted.job).figures(fitted.job, fitted.fit, fitted.result, fitted.responses)
     for name, figure in drawn.items():
         plots.save(figure, folder / f"{name}.png")
+
+
+def fit_report(fitted: Fitted, origin: Origin | None = None) -> str:
+    """The page of a fit that has a model; `origin` is where it comes from, None for its spec."""
+    from orthaug.reports.learned_part import learned_of
+    from orthaug.reports.page import fit_page
+    from orthaug.reports.page_fit import FitPage
+
+    job, fit, responses = fitted.job, fitted.fit, fitted.responses
+    alone = {} if fit.model.form.bound is None else kind_of(job).physics_alone(job, fit, responses)
+    learned = learned_of(fit, job.train.record)
+    return fit_page(FitPage(origin or origin_of(job, "fit"), fitted.result, responses, alone, learned))

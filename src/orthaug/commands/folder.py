@@ -1,15 +1,20 @@
-"""Checks of the places where commands write, made before anything is computed."""
+"""The places where commands write: checked before anything is computed."""
 
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from orthaug._base.errors import InputError
-from orthaug._base.folders import check_new_file, check_replaceable
+from orthaug._base.folders import check_new_file, check_replaceable, whole_file
 from orthaug.commands.job import Job
+
+if TYPE_CHECKING:
+    from orthaug.reports.drawing import Figure
 
 _MODEL = r"(model\.json|arrays\.safetensors)"
 _KNOWN = re.compile(
@@ -71,3 +76,19 @@ def check_figure(out: Path | None, *read: Path, force: bool = False) -> None:
     if out is not None and out.suffix.lower() not in (".png", ".pdf", ".svg"):
         raise InputError(f"{out}: found the ending '{out.suffix}'; expected .png, .pdf or .svg.")
     check_file(out, *read, force=force)
+
+
+def save_figure(figure: Figure, out: Path, *, force: bool = False) -> None:
+    """The figure in the format of its ending, whole or not at all."""
+    from orthaug.reports.drawing import save
+
+    with whole_file(out, force=force) as partial:
+        save(figure, partial, out.suffix[1:].lower())
+
+
+def relative(file: Path, folder: Path) -> str:
+    """A file as a spec in the folder names it."""
+    try:
+        return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
+    except ValueError:  # on another drive
+        return file.resolve().as_posix()

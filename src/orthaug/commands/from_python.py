@@ -12,19 +12,17 @@ from typing import Any
 from orthaug._base.checks import check_type
 from orthaug._base.errors import InputError, TrainingError
 from orthaug._base.folders import check_new_file, whole_file
-from orthaug.commands.fit import Fitted, judged, told_of
-from orthaug.commands.job import Job
+from orthaug.commands.fit import Fitted, fit_report, judged, told_of
+from orthaug.commands.job import Job, origin_of
 from orthaug.commands.lagged_job import LaggedJob
 from orthaug.commands.motion_job import MotionJob
 from orthaug.commands.parts import Part
-from orthaug.commands.reporting import fit_report, origin_of
 from orthaug.commands.spec import TrainingSection, ValidationSection
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.kinds import STRUCTURES
 from orthaug.fitting.motion_estimates import MotionEstimate
-from orthaug.inference.measures import Training
-from orthaug.inference.weighed import weigh_problem
+from orthaug.inference.measures import Training, weigh_problem
 from orthaug.models.rows import InMemory
 
 NAME = "fit.report()"

@@ -13,9 +13,9 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_file
 from orthaug._base.lines import counted, percent
 from orthaug.commands.first_spec import FILLED, Roles, channel_names, lacking, spec_text, steps_of, time_of
+from orthaug.data.preparation import STEPS
 from orthaug.data.readers import read_record
 from orthaug.data.record import Channel, Record
-from orthaug.data.steps import STEPS
 from orthaug.data.survey import Column, Survey, survey
 from orthaug.selection.first_orders import LOOKED_AT, FirstModel, first_model
 
@@ -85,8 +85,7 @@ def question(found: Survey, inputs: str | None = None, outputs: str | None = Non
     free = [c.header for c in found.signals if id(c) not in given]
     if not found.signals or (outputs is None and not free):
         raise InputError(f"{found.path}: {_nothing_left(found, inputs)}")
-    listed = [c.header for c in found.signals]
-    some = ", ".join(listed[:_LISTED]) + (f" and {len(listed) - _LISTED} more" if len(listed) > _LISTED else "")
+    some = _listed([c.header for c in found.signals])
     output = free.pop() if outputs is None else outputs
     named = ",".join(free[:_LISTED]) if outputs is not None else free[0] if free else ""
     proposed = f'--inputs "{named if inputs is None else inputs}" --outputs "{output}"'
@@ -117,8 +116,12 @@ def _nothing_left(found: Survey, inputs: str | None) -> str:
 def left_out(found: Survey, used: Sequence[Column]) -> str:
     """The columns that are not used, and why, in a list; the time is none of them."""
     apart = {id(c) for c in (*used, found.clock.column)}
-    rest = [f"{c.header} ({why_not(c)})" for c in found.columns if id(c) not in apart]
-    return ", ".join(rest[:_LISTED]) + (f" and {len(rest) - _LISTED} more" if len(rest) > _LISTED else "")
+    return _listed([f"{c.header} ({why_not(c)})" for c in found.columns if id(c) not in apart])
+
+
+def _listed(columns: Sequence[str]) -> str:
+    more = f" and {len(columns) - _LISTED} more" if len(columns) > _LISTED else ""
+    return ", ".join(columns[:_LISTED]) + more
 
 
 def why_not(column: Column) -> str:
@@ -149,7 +152,7 @@ def draft(found: Survey, roles: Roles, out: Path) -> Draft:
 
 def write_spec(found: Draft, out: Path, *, force: bool = False) -> None:
     """The spec, once it has been opened with its data as `orthaug fit` would."""
-    from orthaug.commands.opening import open_job
+    from orthaug.commands.kinds import open_job
 
     with whole_file(out, force=force) as partial:
         partial.write_text(found.spec, encoding="utf-8")
@@ -159,10 +162,6 @@ def write_spec(found: Draft, out: Path, *, force: bool = False) -> None:
             except InputError as error:
                 told = str(error).removeprefix(f"{partial}: ")
                 raise InputError(f"{out}: a spec for these columns would be refused: {told}") from None
-
-
-def _names(text: str) -> list[str]:
-    return [name.strip() for name in text.split(",") if name.strip()]
 
 
 def _extent(roles: Roles) -> tuple[int, int]:

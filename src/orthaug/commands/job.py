@@ -4,29 +4,34 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from orthaug import __version__
+from orthaug._base.errors import InputError
 from orthaug._base.parallel import Threads
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.warning import Warning
 from orthaug.commands.parts import Part
-from orthaug.commands.spec import Spec
+from orthaug.commands.spec import Spec, load_spec
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout
 from orthaug.reports.result import DataResult, PreparedResult
 
 if TYPE_CHECKING:
     from orthaug.fitting.checkpoints import Checkpoints
+    from orthaug.reports.page_fit import Origin
 
 DEFAULT_BLOCKS = 4
 ALONE = "physics alone"
+_TOLD = ("jax", "numpy", "scipy")  # packages whose versions move numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,3 +183,46 @@ class Job(ABC):
             "fallback": training.fallback,
             "validation": self.validation.scored(self.first_row) if validated and self.validation else None,
         }
+
+
+def origin_of(job: Job, command: str) -> Origin:
+    """Where a result of a job comes from. SOURCE_DATE_EPOCH, where it is set, is the date."""
+    import importlib.metadata
+    import platform
+    import shlex
+
+    from orthaug.reports.page_fit import Origin
+
+    epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
+    now = datetime.fromtimestamp(int(epoch), UTC) if epoch.isdigit() else datetime.now(UTC)
+    versions = {"orthaug": __version__, "Python": platform.python_version()}
+    versions |= {name: importlib.metadata.version(name) for name in _TOLD}
+    return Origin(
+        name=job.path.stem,
+        toml=_toml(job),
+        command=shlex.join(("orthaug", *(job.arguments or (command, job.path.name)))),
+        date=now.strftime("%Y-%m-%d %H:%M UTC"),
+        machine=f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+        versions=versions,
+        seed=job.spec.training.seed,
+    )
+
+
+def _toml(job: Job) -> str:
+    """The spec as it was written; where its file is another one by now, what was read of it."""
+    import tomlkit
+
+    try:
+        text = job.path.read_text(encoding="utf-8-sig")
+        if load_spec(job.path).model_dump(mode="json", exclude_unset=True) == job.declaration:
+            return text
+    except (InputError, OSError, UnicodeDecodeError):
+        pass
+    return tomlkit.dumps(_without_none(job.declaration))
+
+
+def _without_none(content: Any) -> Any:
+    """TOML has no null."""
+    if isinstance(content, dict):
+        return {key: _without_none(value) for key, value in content.items() if value is not None}
+    return [_without_none(value) for value in content] if isinstance(content, list) else content

@@ -1,21 +1,22 @@
-"""The kinds of jobs, and what is told of each: one module for lagged physics, one for motions."""
+"""The kinds of jobs: which one a spec opens, and what tells of it, a module for lagged physics and one for motions."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from orthaug._base.errors import InputError
 from orthaug.commands import lagged_kind, motion_kind
 from orthaug.commands.job import Job
-from orthaug.commands.lagged_job import LaggedJob
-from orthaug.commands.motion_job import MotionJob
+from orthaug.commands.lagged_job import LaggedJob, open_lagged
+from orthaug.commands.motion_job import MotionJob, open_motion
+from orthaug.commands.spec import load_spec
 from orthaug.reports.result import CheckResult, FitResult
 
 if TYPE_CHECKING:
     from orthaug.models.response import Response
     from orthaug.reports.drawing import Figure
-    from orthaug.reports.learned_part import LearnedPart
 
 
 @runtime_checkable
@@ -23,7 +24,7 @@ class Kind(Protocol):
     """What a module of a kind has."""
 
     def checked(self, job: Any) -> CheckResult:
-        """What can be said before training."""
+        """What can be said before training: excitation, identifiability, what may bias; nothing is kept."""
         ...
 
     def refused(self, job: Any, result: CheckResult) -> InputError | None:
@@ -45,11 +46,7 @@ class Kind(Protocol):
     def physics_alone(
         self, job: Any, fit: Any, responses: Mapping[str, tuple[Response, Response]]
     ) -> Mapping[str, Response]:
-        """The free run of every part by the physics without the learner; empty where nothing was learned."""
-        ...
-
-    def learned(self, job: Any, fit: Any) -> LearnedPart | None:
-        """What was learned, as a function; None where nothing was."""
+        """The free run of every part by the physics without the learner that there is."""
         ...
 
 
@@ -59,3 +56,18 @@ _KINDS: dict[type[Job], Kind] = {LaggedJob: lagged_kind, MotionJob: motion_kind}
 def kind_of(job: Job) -> Kind:
     """What tells of a job."""
     return _KINDS[type(job)]
+
+
+def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
+    """Read the spec and all its data, and pose the problem.
+
+    Args:
+        require_full_rank: refuse physics that is linear in θ and rank-deficient on the data.
+
+    Raises:
+        InputError: anything wrong with spec, files or physics; one line that names it.
+    """
+    spec = load_spec(path)
+    if spec.motion is not None:
+        return open_motion(path, spec)
+    return open_lagged(path, spec, require_full_rank=require_full_rank)

@@ -13,7 +13,7 @@ import numpy as np
 from orthaug._base.errors import InputError, KeyedError
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.warning import Warning
-from orthaug.commands.engine_section import engine_of
+from orthaug.commands.data_sections import engine_of
 from orthaug.commands.job import ALONE, AS_DECLARED, Job, Variant
 from orthaug.commands.parts import load_parts
 from orthaug.commands.spec import Spec
@@ -26,10 +26,8 @@ from orthaug.fitting.cost import check_cost
 from orthaug.fitting.independent_terms import independent_terms
 from orthaug.fitting.kinds import STRUCTURES
 from orthaug.fitting.rules import check_scored
-from orthaug.fitting.structures import Structure
 from orthaug.inference.measure_files import MeasurePlace
-from orthaug.inference.measures import Measure
-from orthaug.inference.weighed import Weighed, weigh_problem
+from orthaug.inference.measures import Measure, Weighed, weigh_problem
 from orthaug.physics.parameters import PhysicsMap, with_initial
 from orthaug.physics.problem import Problem, check_defined, pose, regressor_of
 from orthaug.physics.streamed import pose_streamed
@@ -85,7 +83,7 @@ class LaggedJob(Job):
     def refusal(self, variant: Variant) -> str | None:
         baseline = self.problem.baseline
         try:
-            structure_of(self.spec, variant.structure_kind).penalty(baseline.names, baseline.initial, 1.0)
+            self.spec.declared_structure(variant.structure_kind).penalty(baseline.names, baseline.initial, 1.0)
         except InputError as error:
             return str(error)
         return None
@@ -103,7 +101,7 @@ class LaggedJob(Job):
     def fold_fit(self, variant: Variant) -> Callable[[Record], Estimate]:
         """As there; it can be sent to another process. A fold is small: its rows are in memory."""
         spec, options = self.spec, self.training_options(variant.on(self.train.record))
-        options["structure"] = structure_of(spec, variant.structure_kind)  # predictions score it: no measure tells
+        options["structure"] = spec.declared_structure(variant.structure_kind)  # predictions score it: no measure tells
         weights, lags, learner_inputs = spec.training.output_weights, None, None
         if not variant.alone and spec.declared_learner() is not None:
             lags, learner_inputs = spec.lag_orders(), spec.learner_inputs()
@@ -115,7 +113,7 @@ class LaggedJob(Job):
 
         if variant.fold is not None:
             return self.fold_fit(variant)(variant.fold)
-        structure = structure_of(self.spec, variant.structure_kind, None if variant.alone else self.measure)
+        structure = self.spec.declared_structure(variant.structure_kind, None if variant.alone else self.measure)
         options = self.training_options(variant) | {"engine": self.engine, "checkpoints": self.checkpoints}
         options["ensemble"] = self.spec.training.ensemble and options["learner"] is not None
         problem = self.problem.physics_alone() if variant.alone else self.problem
@@ -145,7 +143,7 @@ def open_lagged(path: Path, spec: Spec, *, require_full_rank: bool = True) -> La
             baseline = with_initial(physics, baseline)
         baseline.check_initial()
         check_channels(spec.channels(spec.data.inputs), spec.channels(spec.data.outputs))
-        structure_of(spec).penalty(baseline.names, baseline.initial, 1.0)
+        spec.declared_structure().penalty(baseline.names, baseline.initial, 1.0)
         baseline.check_channels(spec.data.outputs, spec.data.inputs)
     except InputError as error:
         raise type(error)(f"{path}: {error}") from None
@@ -201,11 +199,6 @@ def _check_cost(spec: Spec, problem: Problem, engine: Engine) -> None:
     runs = spec.runs(linear=problem.baseline.linear)
     options: dict[str, Any] = {"held": len(problem.rows), "iterations": spec.declared_solver().iterations, "runs": runs}
     check_cost(spec.declared_learner(), **sizes, **options, room=engine.room())
-
-
-def structure_of(spec: Spec, kind: str | None = None, measure: Measure | None = None) -> Structure:
-    """The structure that a spec declares, or another kind with its keys."""
-    return spec.declared_structure(kind, measure)
 
 
 def measure_of(spec: Spec, problem: Problem, folder: Path) -> Measure:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -11,21 +11,28 @@ import numpy as np
 from orthaug._base.errors import InputError
 from orthaug._base.warning import Warning
 from orthaug.analysis.closed_loop import closed_loop
-from orthaug.commands.attempt import attempt
-from orthaug.commands.bias import bias_of, budget_of, with_biases
+from orthaug.analysis.imitation import Imitation, imitation
+from orthaug.analysis.measure_bias import Ground, bias_under
+from orthaug.commands.attempt import attempt, attempt_warned
 from orthaug.commands.lagged_job import LaggedJob
-from orthaug.commands.shared import shared_of
-from orthaug.physics.derived_units import derived_units
+from orthaug.commands.suspects import declared
+from orthaug.fitting.elimination import directions
+from orthaug.inference.measures import weigh_problem
+from orthaug.physics.baseline import derived_units
 from orthaug.physics.excitation import identifiability, require_rank
+from orthaug.physics.problem import Problem
 from orthaug.reports.result import CheckResult, FitResult, ParameterResult, parameter_rows, physical_rows
 
 if TYPE_CHECKING:
+    from orthaug.analysis.budget import Budget
     from orthaug.fitting.estimates import Estimate
-    from orthaug.inference.physical import PhysicalEstimate
     from orthaug.models.response import Response
     from orthaug.reports.drawing import Figure
-    from orthaug.reports.learned_part import LearnedPart
 
+_NOT_ANALYSED = Warning(
+    "residual_not_analysed",
+    "the residual is not analysed: there are too few rows for that, or it is rounding only.",
+)
 _UNKNOWN = ("physical_parameters", "physical_consistency", "sensitivities", "bias")
 
 
@@ -40,8 +47,8 @@ def checked(job: LaggedJob) -> CheckResult:
             "rows": problem.count,
             "excitation": problem.excitation,
             "identifiability": identifiability(problem.baseline, problem.layout, problem.outputs, problem.rows.x),
-            "shared": shared_of(job),
-            "bias": bias_of(job) if problem.excitation.full_rank else None,
+            "shared": _shared_of(job),
+            "bias": _bias_of(job) if problem.excitation.full_rank else None,
             "warnings": [*job.warnings, *closed_loop(job.train.record)],
         }
     )
@@ -68,9 +75,9 @@ def content(
         plain = fit
         fit = attempt("the robust covariance", lambda: robust_where_coloured(plain, one_step), warnings, plain)
         told |= _physical_content(job, fit, warnings)
-        told["bias"] = attempt("the bias by suspects", partial(bias_of, job, fit), warnings, None)
+        told["bias"] = attempt("the bias by suspects", partial(_bias_of, job, fit), warnings, None)
         told |= _analysed(fit, one_step, free_run, warnings)
-    shared = shared_of(job, fit.problem, others=False)
+    shared = _shared_of(job, fit.problem, others=False)
     rows = parameter_rows(
         fit.problem.baseline.parameters,
         fit.theta if fit.status.ok else np.full(len(fit.theta), np.nan),
@@ -80,10 +87,8 @@ def content(
         None if fit.plain_covariance is None else np.sqrt(np.diag(fit.plain_covariance)),
     )
     units = derived_units(fit.problem.baseline, fit.problem.record.outputs, fit.problem.record.inputs)
+    rows = [row if row.unit else row.model_copy(update={"derived_unit": units.get(row.name)}) for row in rows]
     told |= {
-        "parameters": [
-            row if row.unit else row.model_copy(update={"derived_unit": units.get(row.name)}) for row in rows
-        ],
         "standard_errors": None if fit.std is None else "plain" if fit.plain_covariance is None else "robust",
         "measure_detail": fit.measure,
         "excitation": fit.excitation,
@@ -91,10 +96,15 @@ def content(
     }
     budget = None
     if fit.status.ok:
-        budget = attempt("the bias that the learner implies", partial(budget_of, job, fit), warnings, None)
-    found, biased = with_biases(fit, shared, told, budget)
-    warnings += biased
-    return fit, told | found
+        budget = attempt("the bias that the learner implies", partial(_budget_of, job, fit), warnings, None)
+    warnings += budget.warnings if budget else ()
+    if fit.model.structure != "orthogonal" or fit.model.form.bound is None:  # a variant of what the spec declares
+        shared = None
+    told["parameters"] = _with_biases(rows, shared.determined if shared else None, budget)
+    if told["physical_parameters"] is not None:
+        physical = shared.physical if shared else None
+        told["physical_parameters"] = _with_biases(told["physical_parameters"], physical, budget)
+    return fit, told
 
 
 def figures(
@@ -126,48 +136,28 @@ def figures(
 def physics_alone(
     job: LaggedJob, fit: Estimate, responses: Mapping[str, tuple[Response, Response]]
 ) -> Mapping[str, Response]:
-    """The free run of every part by the physics without the learner; empty where nothing was learned."""
-    if fit.model.form.bound is None:
-        return {}
+    """The free run of every part by the physics without the learner."""
     alone = fit.model.alone
     return {part.name: alone.simulate(part.record) for part in job.parts}
-
-
-def learned(job: LaggedJob, fit: Estimate) -> LearnedPart | None:
-    """What was learned, as a function; None where nothing was."""
-    from orthaug.reports.learned_part import learned_of
-
-    return learned_of(fit, job.train.record)
 
 
 def _physical_content(job: LaggedJob, fit: Estimate, warnings: list[Any]) -> dict[str, Any]:
     """The physical parameters of θ̂ and what belongs to them, where the spec has a map; warnings are added."""
     if job.physics is None:
         return {}
-    physical = fit.physical(job.physics)
+    physical, profiles, slopes = fit.physical(job.physics), None, None
     warnings += physical.warnings
+    if job.spec.physics is not None and job.spec.physics.profile and physical.covariance is not None:
+        profiles = {name: fit.physical_profile(job.physics, name) for name in physical.names}
+    if physical.sensitivities is not None:  # ∂ln p / ∂ln θ by name
+        slopes = {
+            name: dict(zip(job.physics.theta_names, row, strict=True))
+            for name, row in zip(physical.names, physical.sensitivities, strict=True)
+        }
     return {
-        "physical_parameters": _physical_rows(job, physical, fit),
+        "physical_parameters": physical_rows(physical, profiles),
         "physical_consistency": physical.consistency,
-        "sensitivities": _sensitivities(job, physical),
-    }
-
-
-def _physical_rows(job: LaggedJob, physical: PhysicalEstimate, fit: Estimate) -> list[ParameterResult]:
-    """The physical parameters, with profile intervals where the spec asks for them."""
-    assert job.physics is not None and job.spec.physics is not None
-    if not job.spec.physics.profile or physical.covariance is None:
-        return physical_rows(physical)
-    return physical_rows(physical, {name: fit.physical_profile(job.physics, name) for name in physical.names})
-
-
-def _sensitivities(job: LaggedJob, physical: PhysicalEstimate) -> dict[str, dict[str, float]] | None:
-    """∂ln p / ∂ln θ by name."""
-    if job.physics is None or physical.sensitivities is None:
-        return None
-    return {
-        name: dict(zip(job.physics.theta_names, row, strict=True))
-        for name, row in zip(physical.names, physical.sensitivities, strict=True)
+        "sensitivities": slopes,
     }
 
 
@@ -178,29 +168,76 @@ def _analysed(fit: Estimate, one_step: Response, free_run: Response, warnings: l
     from orthaug.analysis.missing_lags import missing_lags
 
     problem = fit.problem
-
-    def residuals() -> Any:
-        diagnosis = diagnose(fit, one_step=one_step, free_run=free_run)
-        if diagnosis is None:
-            told = "the residual is not analysed: there are too few rows for that, or it is rounding only."
-            warnings.append(Warning("residual_not_analysed", told))
-        else:
-            warnings.extend(diagnosis.warnings)
-        return diagnosis
-
-    def steady() -> Any:
-        found = stability(fit.model, problem.record, response=free_run, x=problem.rows.x)
-        warnings.extend(found.warnings)
-        return found
-
-    def hidden() -> Any:
-        found = missing_lags(fit, one_step)
-        warnings.extend(found.warnings if found else ())
-        return found
-
     warnings += closed_loop(problem.record)
     return {
-        "stability": attempt("the analysis of the free run's sensitivity", steady, warnings, None),
-        "residuals": attempt("the analysis of the residual", residuals, warnings, None),
-        "missing_lags": attempt("the search for missing lags", hidden, warnings, None),
+        "stability": attempt_warned(
+            "the analysis of the free run's sensitivity",
+            lambda: stability(fit.model, problem.record, response=free_run, x=problem.rows.x),
+            warnings,
+        ),
+        "residuals": attempt_warned(
+            "the analysis of the residual",
+            lambda: diagnose(fit, one_step=one_step, free_run=free_run),
+            warnings,
+            _NOT_ANALYSED,
+        ),
+        "missing_lags": attempt_warned("the search for missing lags", lambda: missing_lags(fit, one_step), warnings),
     }
+
+
+def _bias_of(job: LaggedJob, fit: Estimate | None = None) -> list[dict[str, Any]]:
+    """The table of suspects under the spec's measure; after a fit with its θ and what its learner explains.
+
+    Whether a measure can remove a bias is asked before a fit: then it is answered for the usual suspects, too.
+    """
+    if not job.problem.baseline.names:
+        return []
+    ground = _ground(job, fit)
+    return bias_under(ground, declared(job.spec.suspects, ground.problem), certify_usual=fit is None)
+
+
+def _budget_of(job: LaggedJob, fit: Estimate) -> Budget | None:
+    """The bias that what the learner found implies, under the spec's measure."""
+    from orthaug.analysis.budget import budget_on
+
+    if fit.model.structure != "orthogonal" or fit.model.form.bound is None:
+        return None
+    ground = _ground(job, fit)
+    return budget_on(ground, fit, declared(job.spec.suspects, ground.problem))
+
+
+def _with_biases(
+    rows: Sequence[ParameterResult], determined: Sequence[str] | None, budget: Budget | None
+) -> list[ParameterResult]:
+    """Parameters with whether the learner could imitate them, and what biases them."""
+    shared = [None if determined is None else row.name not in determined for row in rows]
+    biases = [budget.of(row.name) if budget else None for row in rows]
+    return [row.told(imitated, bias) for row, imitated, bias in zip(rows, shared, biases, strict=True)]
+
+
+def _ground(job: LaggedJob, fit: Estimate | None) -> Ground:
+    problem, weighed, structure = job.problem, job.weighed, job.spec.declared_structure()
+    if fit is None:
+        along = directions(structure, problem) if job.spec.declared_learner() is not None else None
+        return Ground(weighed, problem, problem.least_squares, job.physics, None, along)
+    if fit.problem.weight.kind != problem.weight.kind:  # weighed by the errors that the fit left
+        problem = fit.problem
+        weighed = weigh_problem(job.measure, problem)
+    learned = None if fit.model.form.bound is None else fit.model.learner_at(weighed.points.x)
+    return Ground(weighed, problem, fit.theta, job.physics, learned, fit.model.shared)
+
+
+def _shared_of(job: LaggedJob, problem: Problem | None = None, *, others: bool = True) -> Imitation | None:
+    """Before training already; None without a learner, or where the structure splits nothing along chosen directions.
+
+    Args:
+        problem: the job's, as it was fitted; None for as it was posed.
+        others: tell what other learner inputs would make of it.
+    """
+    structure = job.spec.declared_structure()
+    if job.spec.declared_learner() is None or not structure.projects or structure.shared == "all":
+        return None
+    problem = problem or job.problem
+    if not problem.baseline.names or not problem.features.entries:
+        return None
+    return imitation(problem, job.physics, others=others)

@@ -11,7 +11,7 @@ from orthaug._base.checks import check_type
 from orthaug._base.errors import InputError
 from orthaug.commands.folder import check_folder, check_inputs_kept
 from orthaug.commands.job import Job
-from orthaug.commands.opening import open_job
+from orthaug.commands.kinds import open_job
 
 if TYPE_CHECKING:
     from orthaug.commands.compare import Comparison

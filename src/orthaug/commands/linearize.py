@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from orthaug._base.errors import InputError
 from orthaug._base.folders import check_replaceable, whole_file, whole_folder
-from orthaug.commands.folder import check_figure, check_file
+from orthaug.commands.folder import check_figure, check_file, save_figure
 from orthaug.commands.parts import load_parts
 from orthaug.commands.run import Reading, open_run
 from orthaug.commands.spec import load_spec
@@ -77,23 +77,28 @@ def write(found: Linearization, out: Path, *, force: bool = False) -> None:
     Whole or not at all.
     """
     from orthaug.reports.linear import LinearizeResult
+
+    suffix, content = out.suffix.lower(), LinearizeResult.of(found).to_json() + "\n"
+    if suffix == ".json":
+        with whole_file(out, force=force) as partial:
+            partial.write_text(content, encoding="utf-8")
+        return
+    from orthaug.reports.drawing import save
+    from orthaug.reports.linear_plots import bode_figure, poles_figure
     from orthaug.reports.linear_text import linear_text
 
-    suffix = out.suffix.lower()
     if suffix in _FIGURES:
-        with whole_file(out, force=force) as partial:
-            _bode(found, partial, suffix[1:])
-    elif suffix == ".json":
-        with whole_file(out, force=force) as partial:
-            partial.write_text(LinearizeResult.of(found).to_json() + "\n", encoding="utf-8")
-    else:
-        with whole_folder(out, not_a_linearization, force=force) as partial:
-            (partial / "result.json").write_text(LinearizeResult.of(found).to_json() + "\n", encoding="utf-8")
-            (partial / "linear.txt").write_text(linear_text(found) + "\n", encoding="utf-8")
-            (partial / "figures").mkdir()
-            if found[0].inputs:
-                _bode(found, partial / "figures" / "bode.png", "png")
-            _poles(found, partial / "figures" / "poles.png")
+        if not found[0].inputs:
+            raise InputError("the model has no inputs, so that it has no frequency response to draw; give a folder.")
+        save_figure(bode_figure(found), out, force=force)
+        return
+    with whole_folder(out, not_a_linearization, force=force) as partial:
+        (partial / "result.json").write_text(content, encoding="utf-8")
+        (partial / "linear.txt").write_text(linear_text(found) + "\n", encoding="utf-8")
+        (partial / "figures").mkdir()
+        if found[0].inputs:
+            save(bode_figure(found), partial / "figures" / "bode.png")
+        save(poles_figure(found), partial / "figures" / "poles.png")
 
 
 def told(found: Linearization, *, as_json: bool) -> str:
@@ -102,17 +107,3 @@ def told(found: Linearization, *, as_json: bool) -> str:
     from orthaug.reports.linear_text import linear_text
 
     return LinearizeResult.of(found).to_json() if as_json else linear_text(found)
-
-
-def _bode(found: Linearization, path: Path, kind: str) -> None:
-    from orthaug.reports import drawing, linear_plots
-
-    if not found[0].inputs:
-        raise InputError("the model has no inputs, so that it has no frequency response to draw; give a folder.")
-    drawing.save(linear_plots.bode_figure(found), path, kind)
-
-
-def _poles(found: Linearization, path: Path) -> None:
-    from orthaug.reports import drawing, linear_plots
-
-    drawing.save(linear_plots.poles_figure(found), path, "png")

@@ -24,6 +24,7 @@ from orthaug.commands.program import (
     Rows,
     app,
     prepare_jax,
+    tell,
 )
 
 if TYPE_CHECKING:
@@ -87,7 +88,10 @@ def predict(
     opened = run.open_ahead(model, data, reading, horizon, initial, observer=observer)
     check_file(out, model, data, Path(initial or data), force=force)
     prepare_jax()
-    response, told = run.observed(opened, horizon) if observer else (run.predicted(opened, horizon), [])
+    if observer:
+        response, told = run.observed(opened, horizon)
+    else:
+        response, told = opened.model.predict(opened.record, horizon=horizon), []
     _write_response(response, opened, out, force, [*opened.notes, *told])
 
 
@@ -113,18 +117,17 @@ def split(
     Without training again.
     """
     from orthaug.commands import split as splitting
-    from orthaug.commands.measure_options import read_measure, split_place
     from orthaug.commands.run import prepared_notes, read_rows
     from orthaug.reports.text import split_text
 
     opened = splitting.open_training(model, data, read_rows(rows))
     given = {"box": box or [], "samples": [samples] if samples else [], "weights": [weights] if weights else []}
-    chosen = read_measure(measure, given, split_place(opened.model, opened.record))
+    chosen = splitting.read_measure(measure, given, opened)
     prepare_jax()
     for line in prepared_notes(opened.model, opened.record):
         streams.say(line)
     result = splitting.split_model(opened, chosen)
-    streams.echo(result.to_json() if as_json else split_text(result))
+    tell(result, split_text(result), as_json)
 
 
 @app.command()
@@ -143,16 +146,15 @@ def explain(
 
     And what to write into the physics.
     """
-    from orthaug.commands.explain import explain_model
-    from orthaug.commands.run import Reading, open_run, read_rows
-    from orthaug.reports.explanation_text import explain_text
+    from orthaug.commands.run import Reading, explain_model, open_run, read_rows
+    from orthaug.reports.explanation import explain_text
 
     opened = open_run(model, data, reading=Reading(rows=read_rows(rows), prepare=True))
     prepare_jax()
     for line in opened.notes:
         streams.say(line)
     result = explain_model(opened, degree=degree, functions=functions or (), most=most)
-    streams.echo(result.to_json() if as_json else explain_text(result))
+    tell(result, explain_text(result), as_json)
 
 
 @app.command()
@@ -256,7 +258,7 @@ def track(
     tracked = tracking.track(opened, forgetting=forgetting, memory=memory, state=state, follows=follows)
     text = track_text(tracked.result)
     tracking.write_tracked(tracked, folder, text, force=force)
-    streams.echo(tracked.result.to_json() if as_json else f"{text}\n\nwritten to {folder}")
+    tell(tracked.result, text, as_json, folder)
 
 
 def _written_long(model: Path, data: Path, reading: Reading, out: Path | None, force: bool, *, free: bool) -> bool:

@@ -11,22 +11,20 @@ import numpy as np
 from orthaug._base.errors import InputError, KeyedError
 from orthaug._base.progress import SILENT, Progress
 from orthaug.analysis.motion_suspects import MotionSuspect
-from orthaug.commands.engine_section import engine_of
+from orthaug.commands.data_sections import engine_of
 from orthaug.commands.job import ALONE, AS_DECLARED, Job, Variant
-from orthaug.commands.motion_suspects import declared_terms
 from orthaug.commands.parts import Part, load_parts
 from orthaug.commands.spec import Spec
+from orthaug.commands.suspects import declared_terms
 from orthaug.data.record import Record, check_channels
 from orthaug.data.regressors import Layout
 from orthaug.fitting.cost import check_cost
 from orthaug.fitting.rules import check_motion_choices, check_scored, check_solver, tried
 from orthaug.fitting.structures import Structure
 from orthaug.inference.measure_files import MeasurePlace
-from orthaug.inference.measures import Measure
-from orthaug.inference.motion_support import support_of
+from orthaug.inference.measures import Measure, Support
 from orthaug.physics.motion import Motion
-from orthaug.physics.motion_layout import layout_of
-from orthaug.physics.motion_problem import MotionProblem, pose_motion
+from orthaug.physics.motion_problem import MotionProblem, layout_of, pose_motion
 
 if TYPE_CHECKING:
     from orthaug.fitting.motion_estimates import MotionEstimate
@@ -163,5 +161,5 @@ def _measure_of(spec: Spec, problem: MotionProblem, folder: Path) -> Measure:
     measure = spec.declared_measure(MeasurePlace(folder, names, problem.record, problem.first_row))
     rows = len(problem.record)  # a measure may weigh each of them
     x, u = (np.resize(part.T, (rows, len(part))) for part in problem.looked_at)
-    measure.points(support_of(problem.motion, x, u))
+    measure.points(Support.of_motion(problem.motion, x, u))
     return measure

@@ -10,18 +10,17 @@ import numpy as np
 from orthaug._base.errors import InputError, RankError
 from orthaug._base.warning import Warning
 from orthaug.analysis.closed_loop import closed_loop
-from orthaug.commands.attempt import attempt
+from orthaug.analysis.motion_suspects import usual_motion_suspects
+from orthaug.commands.attempt import attempt, attempt_warned
 from orthaug.commands.motion_job import MotionJob
-from orthaug.commands.motion_suspects import bias_before
-from orthaug.reports.result import CheckResult, FitResult, ParameterResult, parameter_rows
+from orthaug.reports.result import CheckResult, FitResult, MeasureResult, ParameterResult, parameter_rows
 
 if TYPE_CHECKING:
-    from orthaug.analysis.holds import Trial
-    from orthaug.analysis.motion_budget import MotionBudget
+    from orthaug.analysis.budget import MotionBudget
+    from orthaug.analysis.input_timing import Trial
     from orthaug.fitting.motion_estimates import MotionEstimate
     from orthaug.models.response import Response
     from orthaug.reports.drawing import Figure
-    from orthaug.reports.learned_part import LearnedPart
 
 _UNKNOWN = ("physical_parameters", "physical_consistency", "sensitivities", "bias", "missing_lags")
 _STIFF = 20  # substeps from which a motion is told to be stiff for its sampling
@@ -37,10 +36,10 @@ _NOT_RICH = Warning(
 
 def checked(job: MotionJob) -> CheckResult:
     """What the outputs tell apart, what the learner could imitate, substeps and holds."""
-    from orthaug.analysis.holds import try_holds
+    from orthaug.analysis.absorbed import Waves
+    from orthaug.analysis.imitation import imitation_before
+    from orthaug.analysis.input_timing import dead_times, try_holds
     from orthaug.analysis.motion_identifiability import identified
-    from orthaug.analysis.motion_imitation import imitation_before
-    from orthaug.analysis.waves import Waves
     from orthaug.fitting.motion_course import MotionCourse
     from orthaug.fitting.motion_estimation import without_learner
     from orthaug.models.moving import Moving
@@ -58,6 +57,7 @@ def checked(job: MotionJob) -> CheckResult:
     posed, waves = (problem, Waves()) if spec.declared_learner() is not None else (without_learner(problem), None)
     trial = try_holds(posed, criterion, spec.declared_solver(), job.structure, waves)
     text, warnings = _about_steps(job, trial)
+    warnings += [late.warning for late in dead_times(trial.task, spec.declared_solver())]
     if told.by_any is None:
         warnings.append(_NOT_RICH)
     return CheckResult.model_validate(
@@ -86,7 +86,17 @@ def checked(job: MotionJob) -> CheckResult:
 
 
 def _biases(job: MotionJob, trial: Trial) -> list[dict[str, Any]] | None:
-    return bias_before(job.suspects, job.problem, job.structure, trial.task)
+    """What every suspect would do, about physics alone; of the usual ones those that do anything, where none is named.
+
+    None where physics alone has no run.
+    """
+    from orthaug.analysis.motion_bias import ground_before
+
+    ground = ground_before(trial.task, job.structure)
+    if ground is None:
+        return None
+    table = ground.table(job.suspects or usual_motion_suspects(job.problem))
+    return [entry.as_dict() for entry in table if job.suspects or entry.size]
 
 
 def refused(job: MotionJob, result: CheckResult) -> InputError | None:
@@ -115,8 +125,8 @@ def content(
     warnings: list[Any],
 ) -> tuple[MotionEstimate, dict[str, Any]]:
     """The fit, and what results tell of it; warnings are added."""
-    from orthaug.analysis.motion_diagnosis import robust_motion
-    from orthaug.analysis.motion_imitation import MotionImitation
+    from orthaug.analysis.imitation import MotionImitation
+    from orthaug.analysis.robustness import robust_motion
     from orthaug.physics.excitation import Excitation, of_gram
 
     motion, form = job.problem.motion, fit.model.form
@@ -131,15 +141,8 @@ def content(
         told |= {name: found[name] for name in ("residuals", "stability", "bias")}
     budget, coarse, parts = found["budget"], found["coarse"], found["parts"] or ()
     if fit.status.ok and form.bound is not None:
-        split = fit.split_by
         told["shared"] = MotionImitation.of([str(entry) for entry in form.features], fit.shared)
-        told["measure_detail"] = {
-            "name": split.name,
-            "points": len(split.field.x),
-            "support": split.support,
-            "condition": None,
-            "price": None,
-        }
+        told["measure_detail"] = MeasureResult.of_motion(fit.split_by)
     return fit, told | {
         "parameters": _parameters(fit, budget),
         "standard_errors": None if fit.std is None else "plain" if fit.plain_covariance is None else "robust",
@@ -158,27 +161,12 @@ def content(
 
 def _analysed(job: MotionJob, fit: MotionEstimate, free_run: Response, warnings: list[Any]) -> dict[str, Any]:
     """What is asked of a fit behind its training; None for an analysis that fails. Warnings are added."""
+    from orthaug.analysis.budget import motion_budget
     from orthaug.analysis.learned_part import equation_parts
-    from orthaug.analysis.motion_budget import motion_budget
+    from orthaug.analysis.motion_bias import softened_bias, suspected_bias
     from orthaug.analysis.motion_diagnosis import diagnose_motion
-    from orthaug.analysis.motion_ground import softened_bias, suspected_bias
     from orthaug.analysis.motion_modes import motion_stability
-    from orthaug.analysis.motion_substeps import substep_bias
-
-    def residuals() -> Any:
-        diagnosis = diagnose_motion(fit, free_run)
-        warnings.extend([_NOT_ANALYSED] if diagnosis is None else diagnosis.warnings)
-        return diagnosis
-
-    def stability() -> Any:
-        stable = motion_stability(fit.model, x, u, record=job.train.record)
-        warnings.extend(stable.warnings)
-        return stable
-
-    def coarse() -> Any:
-        found = substep_bias(fit)
-        warnings.extend(found.warnings if found else ())
-        return found
+    from orthaug.analysis.motion_response import substep_bias
 
     def biases() -> Any:
         table = suspected_bias(fit, job.suspects) if job.suspects else []
@@ -189,13 +177,17 @@ def _analysed(job: MotionJob, fit: MotionEstimate, free_run: Response, warnings:
     points = job.reach(fit.model, job.train.record)[0]
     x, u = np.split(points, [fit.model.form.states], axis=1)
     found = {
-        "residuals": attempt("the analysis of the residual", residuals, warnings, None),
-        "stability": attempt("the analysis of the modes", stability, warnings, None),
+        "residuals": attempt_warned(
+            "the analysis of the residual", lambda: diagnose_motion(fit, free_run), warnings, _NOT_ANALYSED
+        ),
+        "stability": attempt_warned(
+            "the analysis of the modes", lambda: motion_stability(fit.model, x, u, record=job.train.record), warnings
+        ),
         "parts": None,
     }
     if fit.model.form.bound is not None:
         found["parts"] = attempt("the size of the learned part", lambda: equation_parts(fit, x, u), warnings, None)
-    found["coarse"] = attempt("the analysis of the substeps", coarse, warnings, None)
+    found["coarse"] = attempt_warned("the analysis of the substeps", lambda: substep_bias(fit), warnings)
     table, budget = attempt("the bias by suspects", biases, warnings, (None, None))
     return found | {"bias": table, "budget": budget}
 
@@ -204,42 +196,34 @@ def figures(
     job: MotionJob, fit: MotionEstimate, result: FitResult, responses: Mapping[str, tuple[Response, Response]]
 ) -> dict[str, Figure]:
     """The figures of a result by their names."""
-    from orthaug.reports import motion_plots, plots
+    from orthaug.reports import plots
+    from orthaug.reports.learned_part import learned_of
 
     part = job.parts[-1]
     one_step, free = responses[part.name]
     learns = fit.model.form.bound is not None
     drawn = {
-        "simulation": motion_plots.run_figure(free, f"free run, {part.name}", learns=learns),
+        "simulation": plots.output_figure(free, f"free run, {part.name}", learns=learns),
         "residual": plots.residual_figure(free, f"free-run residual, {part.name}"),
-        "states": motion_plots.states_figure(fit.model, part.record, f"states of the free run, {part.name}"),
+        "states": plots.states_figure(fit.model, part.record, f"states of the free run, {part.name}"),
     }
     if result.bias:
         drawn["bias"] = plots.bias_figure(result.bias)
     drawn["prediction"] = plots.output_figure(one_step, f"one-step prediction, {part.name}")
     if learns:
-        drawn["components"] = motion_plots.parts_figure(fit.model, part.record, f"physics and learner, {part.name}")
-        part = learned(job, fit)
+        drawn["components"] = plots.parts_figure(fit.model, part.record, f"physics and learner, {part.name}")
+        part = learned_of(fit, job.train.record)
         assert part is not None
         title = f"learned beside the physics, by the {fit.model.measure} measure"
-        drawn["learner"] = motion_plots.learner_figure(part, title)
+        drawn["learner"] = plots.learner_figure(part, title)
     return drawn
 
 
 def physics_alone(
     job: MotionJob, fit: MotionEstimate, responses: Mapping[str, tuple[Response, Response]]
 ) -> Mapping[str, Response]:
-    """The free run of every part by the physics without the learner; empty where nothing was learned."""
-    if fit.model.form.bound is None:
-        return {}
+    """The free run of every part by the physics without the learner."""
     return {part: free.physics_alone for part, (_, free) in responses.items()}
-
-
-def learned(job: MotionJob, fit: MotionEstimate) -> LearnedPart | None:
-    """What was learned, as a function; None where nothing was."""
-    from orthaug.reports.learned_part import learned_of
-
-    return learned_of(fit, job.train.record)
 
 
 def _parameters(fit: MotionEstimate, budget: MotionBudget | None) -> list[ParameterResult]:

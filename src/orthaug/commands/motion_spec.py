@@ -7,8 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from orthaug.commands.physical_section import PhysicalSection
-from orthaug.commands.sections import Finite, Section
+from orthaug.commands.sections import Finite, PhysicalSection, Section
 from orthaug.physics.motion import HOLDS, INTEGRATORS, MOST_SUBSTEPS, Motion, Output, State
 
 Text = Annotated[str, Field(min_length=1)]

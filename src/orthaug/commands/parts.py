@@ -6,9 +6,11 @@ import glob
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from orthaug._base.errors import InputError
-from orthaug._base.manifest import file_digest
+from orthaug._base.folders import file_digest
+from orthaug._base.lines import counted
 from orthaug._base.memory import few_arenas
 from orthaug._base.warning import Warning
 from orthaug.commands.data_sections import PartSection
@@ -102,14 +104,14 @@ def long_stretches(
         needed = f"at least {least} are needed" if most < least else needed
         raise InputError(
             f"{record.experiments[0].source}: {what}the longest stretch between missing samples has "
-            f"{_count(most, 'row')}, too few: {needed}."
+            f"{counted(most, 'row')}, too few: {needed}."
         )
     kept = replace(record, experiments=long)
     usable = sum(len(experiment) - first for experiment in long)
     lost = "row has missing cells and is" if record.missing == 1 else "rows have missing cells and are"
     return kept, (
         f"{record.missing} {lost} left out with all windows that touch them; "
-        f"{_count(usable, 'usable row')} remain, in {_count(len(long), 'stretch', 'stretches')}."
+        f"{counted(usable, 'usable row')} remain, in {len(long)} stretch{'es' * (len(long) > 1)}."
     )
 
 
@@ -159,15 +161,9 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
     for file in files:
         record = read_record(
             path.parent / file,
-            inputs=spec.channels(spec.data.inputs),
-            outputs=spec.channels(spec.data.outputs),
-            sampling_time=spec.data.sampling_time,
-            time=spec.data.time,
-            experiment=spec.data.experiment,
+            **_options(spec, part),
             rows=part.rows,  # type: ignore[arg-type]  (lists of two, checked by the spec)
             every=part.every,
-            columns=part.columns,
-            missing=spec.data.missing,
             prepare=spec.data.steps,
         )
         results.append(FileResult(file=file, sha256=file_digest(path.parent / file), rows=len(record)))
@@ -176,7 +172,10 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
     sources = (file for read, file in zip(records, files, strict=True) for _ in read.experiments)
     told = tuple(replace(e, source=file) for e, file in zip(record.experiments, sources, strict=True))
     record = replace(record, experiments=told)
-    warnings = (_thinned(name, part.every),) if part.every > 1 else ()
+    warnings = ()
+    if part.every > 1:
+        kept = f"{name}: one row in {part.every} is kept without a filter"
+        warnings = (Warning("thinned", f"{kept}; content above the new Nyquist frequency folds back."),)
     if spec.data.time is None:
         warnings += _other_step(path, spec, files, name, part.columns)
     if name == "train":
@@ -197,17 +196,8 @@ def _left(path: Path, spec: Spec, part: PartSection, name: str, files: Sequence[
             'engine.kind = "memory".'
         )
     few_arenas()
-    source = open_parquet(
-        [path.parent / file for file in files],
-        inputs=spec.channels(spec.data.inputs),
-        outputs=spec.channels(spec.data.outputs),
-        sampling_time=spec.data.sampling_time,
-        time=spec.data.time,
-        experiment=spec.data.experiment,
-        columns=part.columns,
-        missing=spec.data.missing,
-        partition_rows=spec.engine.partition_rows,
-    )
+    places = [path.parent / file for file in files]
+    source = open_parquet(places, **_options(spec, part), partition_rows=spec.engine.partition_rows)
     rows: dict[str, int] = {}
     for partition in source.partitions:
         rows[partition.path] = rows.get(partition.path, 0) + partition.rows
@@ -227,6 +217,14 @@ def _left(path: Path, spec: Spec, part: PartSection, name: str, files: Sequence[
     return Part(name, record, part.skip, tuple(results), warnings, source)
 
 
+def _options(spec: Spec, part: PartSection) -> dict[str, Any]:
+    """How the files of a part are read, wherever their rows are."""
+    data = spec.data
+    named = {key: getattr(data, key) for key in ("sampling_time", "time", "experiment", "missing")}
+    channels = {"inputs": spec.channels(data.inputs), "outputs": spec.channels(data.outputs)}
+    return named | channels | {"columns": part.columns}
+
+
 def _other_step(
     path: Path, spec: Spec, files: Sequence[str], name: str, columns: Mapping[str, str]
 ) -> tuple[Warning, ...]:
@@ -244,12 +242,3 @@ def _other_step(
         text = f"{name}: {said}, but column '{header}' of {file} tells {clock.step:g} s; perhaps {remedy} is meant."
         return (Warning("other_sampling_time", text),)
     return ()
-
-
-def _thinned(name: str, every: int) -> Warning:
-    kept = f"one row in {every} is kept without a filter"
-    return Warning("thinned", f"{name}: {kept}; content above the new Nyquist frequency folds back.")
-
-
-def _count(number: int, thing: str, things: str = "") -> str:
-    return f"{number} {thing if number == 1 else things or thing + 's'}"

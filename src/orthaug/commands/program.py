@@ -6,7 +6,7 @@ import errno
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 import typer.core
@@ -16,6 +16,9 @@ from orthaug._base.checks import check_choice
 from orthaug._base.errors import InputError, TrainingError
 from orthaug.commands import streams
 from orthaug.commands.signals import WATCH
+
+if TYPE_CHECKING:
+    from orthaug.reports.fields import Content
 
 
 class Interrupted(Exception):
@@ -121,16 +124,6 @@ def _version(show: bool) -> None:
         raise typer.Exit
 
 
-def _verbose(count: int) -> None:
-    """What -v, -vv and ORTHAUG_LOG ask for."""
-    level = os.environ.get("ORTHAUG_LOG", "").lower()
-    if not count and not level:
-        return
-    from orthaug._base.log import show_log
-
-    show_log(("info", "debug")[min(count, 2) - 1] if count else check_choice(level, ("info", "debug"), "ORTHAUG_LOG"))
-
-
 @app.callback()
 def options(
     verbose: Annotated[
@@ -140,14 +133,24 @@ def options(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    """What stands before a command."""
-    _verbose(verbose)
+    """What stands before a command: -v, -vv or ORTHAUG_LOG ask for the log."""
+    level, levels = os.environ.get("ORTHAUG_LOG", "").lower(), ("info", "debug")
+    if verbose or level:
+        from orthaug._base.log import show_log
+
+        show_log(levels[min(verbose, 2) - 1] if verbose else check_choice(level, levels, "ORTHAUG_LOG"))
 
 
 def _fail(message: str, code: int) -> None:
     WATCH.hold()
     streams.say(message)
     sys.exit(code)
+
+
+def tell(result: Content, text: str, as_json: bool, place: object = None) -> None:
+    """A result on standard output, as JSON or in words; then what was written."""
+    written = f"\n\nwritten to {place}" if place is not None else ""
+    streams.echo(result.to_json() if as_json else f"{text}{written}")
 
 
 def other_writes() -> bool:

@@ -1,4 +1,4 @@
-"""Saved models on data files: what `orthaug simulate` and `orthaug predict` do."""
+"""Saved models on data files: what `orthaug simulate`, `orthaug predict` and `orthaug explain` do."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from orthaug.data.preparation import MENDING, SAMPLING, steps_again
 from orthaug.data.readers import read_record
 from orthaug.data.record import Channel, Record
 from orthaug.data.tables import check_readable, has_column
+from orthaug.reports.explanation import ExplainResult
 
 if TYPE_CHECKING:
     from orthaug.analysis.observed import Consistency
@@ -248,11 +249,6 @@ def open_ahead(
     return opened if observer else replace(opened, record=with_initial(opened, read_initial(initial, opened)))
 
 
-def predicted(opened: ModelOnData, horizon: int) -> Response:
-    """The prediction `horizon` steps ahead from measured outputs."""
-    return opened.model.predict(opened.record, horizon=horizon)
-
-
 def observed(opened: ModelOnData, horizon: int) -> tuple[Response, list[str]]:
     """The prediction `horizon` steps ahead from an observer's state, and whether its band is what it says."""
     from orthaug.analysis.observer import Observer
@@ -314,3 +310,18 @@ def _table(response: Response, opened: ModelOnData) -> Any:
     first = stretches[0]
     time = first.start_time + (np.arange(opened.rows) - first.offset) * response.sampling_time
     return whole.assign(time=whole["time"].fillna(pd.Series(time)))
+
+
+def explain_model(opened: ModelOnData, *, degree: int, functions: Sequence[str], most: int) -> ExplainResult:
+    """The content of the explanation of a model over its data.
+
+    Raises:
+        InputError: physics alone, data without what the learner is evaluated at, too many candidates.
+    """
+    from orthaug.selection.explanation import explain
+
+    try:
+        explained = explain(opened.model, opened.record, degree=degree, functions=functions, most=most)
+    except InputError as error:
+        raise type(error)(f"{opened.source}: {error}") from None
+    return ExplainResult.model_validate(explained)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import types
 import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeVar, Union
 
-from pydantic import BaseModel, ConfigDict, Field, create_model
+from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
 
 from orthaug._base.registry import InSpec, Key, OneOf, Option, Registry
+from orthaug.physics.parameters import PhysicalParameter
 
 Count = Annotated[int, Field(ge=0, strict=True)]
 Positive = Annotated[int, Field(ge=1, strict=True)]
@@ -23,8 +25,25 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
+class PhysicalSection(Section):
+    """One physical parameter."""
+
+    initial: Finite
+    unit: str = ""
+    min: Finite | None = None
+    max: Finite | None = None
+
+    def declared(self, name: str) -> PhysicalParameter:
+        """The parameter of this name."""
+        low, high = -math.inf if self.min is None else self.min, math.inf if self.max is None else self.max
+        return PhysicalParameter(name, self.initial, self.unit, low, high)
+
+
 class KindSection(Section):
     """A table whose keys are those of the kinds in a registry; keys of kinds that are not chosen have no effect."""
+
+    registries: ClassVar[Mapping[str, Registry]] = {}
+    """By the key that chooses a kind."""
 
     if TYPE_CHECKING:
 
@@ -34,23 +53,28 @@ class KindSection(Section):
         """The declaration of a kind with the keys that the file gives."""
         return registry.declare(kind, {name: getattr(self, name) for name in self.model_fields_set})
 
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for chooser, registry in self.registries.items():
+            self.declared(registry, getattr(self, chooser))
+        return self
+
 
 Kinds = TypeVar("Kinds", bound=KindSection)
 
 
-def with_kinds(section: type[Kinds], other: dict[str, Any] | None = None, **registries: Registry) -> type[Kinds]:
+def with_kinds(section: type[Kinds], **other: Any) -> type[Kinds]:
     """A section with the keys of all kinds of its registries.
 
     Args:
         section: has each key that chooses a kind, with the default kind.
         other: further fields to replace.
-        registries: by the key that chooses the kind.
     """
     fields: dict[str, Any] = {}
-    for chooser, registry in registries.items():
+    for chooser, registry in section.registries.items():
         fields[chooser] = (Literal[tuple(registry)], section.model_fields[chooser].default)
         fields |= {name: _field(key) for name, key in registry.section_keys().items()}
-    return create_model(section.__name__, __base__=section, **(fields | (other or {})))
+    return create_model(section.__name__, __base__=section, **(fields | other))
 
 
 def _field(key: Key) -> tuple[Any, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +12,8 @@ import tomlkit
 
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
-from orthaug.commands.engine_section import EngineSection, engine_of
-from orthaug.commands.folder import not_a_result
+from orthaug.commands.data_sections import EngineSection, engine_of
+from orthaug.commands.folder import not_a_result, relative
 from orthaug.commands.lagged_job import LaggedJob, open_lagged
 from orthaug.commands.spec import LearnerSection, Spec, load_spec
 from orthaug.data.regressors import Lags
@@ -105,7 +104,7 @@ def steps_at_most(terms: int | None) -> int:
 def write_selected(selected: Selected, folder: Path, *, force: bool = False) -> None:
     """result.json, spec.toml, table.csv and the figure, whole or not at all."""
     from orthaug.reports.drawing import save
-    from orthaug.reports.selection_plot import selection_figure
+    from orthaug.reports.plots import selection_figure
 
     with whole_folder(folder, not_a_result, force=force) as partial:
         (partial / "result.json").write_text(selected.result.to_json() + "\n", encoding="utf-8")
@@ -210,13 +209,4 @@ def _rebase(table: Any, old: Path, new: Path) -> None:
         if isinstance(value, dict):
             _rebase(value, old, new)
         elif key == "files" and isinstance(value, list):
-            table[key] = [_moved(file, old, new) for file in value]
-
-
-def _moved(file: str, old: Path, new: Path) -> str:
-    if Path(file).is_absolute():
-        return file
-    try:
-        return Path(os.path.relpath((old / file).resolve(), new.resolve())).as_posix()
-    except ValueError:  # on another drive
-        return (old / file).resolve().as_posix()
+            table[key] = [file if Path(file).is_absolute() else relative(old / file, new) for file in value]

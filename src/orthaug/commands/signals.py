@@ -89,7 +89,7 @@ class Watch:
 
     def _end(self, number: int, words: str) -> None:
         try:
-            partials = getattr(sys.modules.get("orthaug._base.partials"), "PARTIALS", None)
+            partials = getattr(sys.modules.get("orthaug._base.folders"), "PARTIALS", None)
             during = self._during()
             if partials is not None:
                 partials.discard_all()

@@ -17,11 +17,9 @@ from pydantic import Field, ValidationError, create_model, model_validator
 
 from orthaug._base.errors import InputError
 from orthaug._base.registry import resolve
-from orthaug.commands.data_sections import Data
-from orthaug.commands.engine_section import EngineSection
+from orthaug.commands.data_sections import Data, EngineSection
 from orthaug.commands.motion_spec import MotionSection
-from orthaug.commands.physical_section import PhysicalSection
-from orthaug.commands.sections import Count, Finite, KindSection, Positive, Section, with_kinds
+from orthaug.commands.sections import Count, Finite, KindSection, PhysicalSection, Positive, Section, with_kinds
 from orthaug.commands.spec_errors import first_message
 from orthaug.data.expressions import SAMPLING_TIME
 from orthaug.data.record import Channel
@@ -129,40 +127,29 @@ class DesignSection(Section):
 class LearnerSection(KindSection):
     """The learned correction."""
 
+    registries = {"kind": LEARNERS}
     kind: str = "mlp"
-
-    @model_validator(mode="after")
-    def _check(self) -> LearnerSection:
-        self.declared(LEARNERS, self.kind)
-        return self
 
 
 class MeasureSection(KindSection):
     """The set of regressor points on which physics and learner are made orthogonal."""
 
+    registries = {"kind": MEASURES}
     kind: str = "training"
-
-    @model_validator(mode="after")
-    def _check(self) -> MeasureSection:
-        self.declared(MEASURES, self.kind)
-        return self
 
 
 class StructureSection(KindSection):
     """How physics and learner share the fitted function."""
 
+    registries = {"kind": STRUCTURES}
     kind: str = "orthogonal"
     measure: MeasureSection = MeasureSection()
-
-    @model_validator(mode="after")
-    def _check(self) -> StructureSection:
-        self.declared(STRUCTURES, self.kind)
-        return self
 
 
 class TrainingSection(KindSection):
     """Solver, criterion and regularisation."""
 
+    registries = {"solver": SOLVERS, "focus": CRITERIA}
     solver: str = "levenberg-marquardt"
     focus: str = "prediction"
     restarts: Positive = 1
@@ -358,11 +345,9 @@ def spec_model() -> type[Spec]:
 
 @lru_cache(maxsize=8)
 def _spec_model(registered: object) -> type[Spec]:
-    learner = with_kinds(LearnerSection, kind=LEARNERS)
-    measure = with_kinds(MeasureSection, kind=MEASURES)
-    structure = with_kinds(StructureSection, {"measure": (measure, measure())}, kind=STRUCTURES)
-    training = with_kinds(TrainingSection, solver=SOLVERS, focus=CRITERIA)
-    sections = {"learner": learner, "structure": structure, "training": training}
+    measure = with_kinds(MeasureSection)
+    structure = with_kinds(StructureSection, measure=(measure, measure()))
+    sections = {"learner": with_kinds(LearnerSection), "structure": structure, "training": with_kinds(TrainingSection)}
     return create_model("Spec", __base__=Spec, **{name: (section, section()) for name, section in sections.items()})  # type: ignore[call-overload]
 
 

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_origin
 
 import numpy as np
 
-from orthaug._base.errors import InputError
+from orthaug._base.checks import check_choice
+from orthaug._base.errors import InputError, KeyedError
+from orthaug._base.registry import Key, keys_of, resolve
 from orthaug._base.warning import Warning
 from orthaug.commands.run import ModelOnData, Reading, record_for
 from orthaug.data.record import Record
 from orthaug.data.tables import check_readable
+from orthaug.inference.kinds import MEASURES
+from orthaug.inference.measure_files import MeasurePlace
 from orthaug.inference.measures import Measure, Support
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
-from orthaug.reports.result import SplitResult, parameter_rows
+from orthaug.reports.result import MeasureResult, SplitResult, parameter_rows
+
+_UNKNOWN = Warning("no_statistics", "no standard errors: training left no statistics.")
 
 
 def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | None) -> ModelOnData:
@@ -29,6 +35,50 @@ def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | Non
     reading = Reading("skip", rows, prepare=True)  # of rows with missing cells none were trained on
     records = [record_for(loaded, path, loaded.outputs, reading) for path in data]
     return ModelOnData(loaded, Record.join(records), data[0])
+
+
+def read_measure(kind: str, given: Mapping[str, Sequence[str]], opened: ModelOnData) -> Measure:
+    """The measure of a kind from the values `given` to each option; the registry says which kind takes which.
+
+    Raises:
+        InputError: an unknown kind, an option of another kind or without what it needs, files that do not fit.
+    """
+    check_choice(kind, MEASURES, "--measure")
+    values = {}
+    for option, texts in given.items():
+        owned = MEASURES.kind_with(option)
+        if not texts or owned is None:
+            continue
+        owner, key = owned
+        if owner != kind:
+            raise InputError(f"--{option}: belongs to --measure {owner}; found --measure {kind}.")
+        values[key.name] = _read(key, option, texts)
+    form = opened.model.form
+    place = MeasurePlace(Path(), [str(lag) for lag in form.used], opened.record, form.first_row)
+    try:
+        return resolve(MEASURES.declare(kind, values), place)
+    except KeyedError as error:
+        key = keys_of(MEASURES[kind]).get(error.key)
+        raise InputError(f"--{(key.option if key else None) or error.key}{error.words}.") from None
+
+
+def _read(key: Key, option: str, texts: Sequence[str]) -> Any:
+    """The value of a key: limits by raw lag for a mapping, the texts themselves otherwise."""
+    if get_origin(key.type) is not Mapping:
+        return tuple(texts)
+    limits: dict[str, tuple[float, float]] = {}
+    for text in texts:
+        lag, equals, both = text.partition("=")
+        try:
+            low, high = (float(limit) for limit in both.split(":"))
+        except ValueError:
+            equals = ""
+        if not equals:
+            raise InputError(f"--{option}: found '{text}'; expected a raw lag and its limits, such as 'u[k]=-0.6:0.6'.")
+        if lag.strip() in limits:
+            raise InputError(f"--{option}: {lag.strip()} is given twice.")
+        limits[lag.strip()] = (low, high)
+    return limits
 
 
 def split_model(opened: ModelOnData, measure: Measure) -> SplitResult:
@@ -52,7 +102,6 @@ def _split_lagged(model: Model, record: Record, measure: Measure) -> SplitResult
     under = split_under(measure, model, support, model.statistics.joint(len(model.theta)))
     std = None if under.covariance is None else np.sqrt(np.diag(under.covariance))
     ci = None if std is None else interval(under.theta, std, model.statistics.freedom)
-    unknown = Warning("no_statistics", "no standard errors: training left no statistics.")
     return SplitResult.model_validate(
         {
             "parameters": parameter_rows(parameters, under.theta, std, ci),
@@ -60,32 +109,25 @@ def _split_lagged(model: Model, record: Record, measure: Measure) -> SplitResult
             "measure": measure.name,
             "measure_detail": under,
             "orthogonality_defect": under.defect,
-            "warnings": [*under.warnings, *([] if std is not None else [unknown])],
+            "warnings": [*under.warnings, *([] if std is not None else [_UNKNOWN])],
         }
     )
 
 
 def _split_motion(model: MotionModel, record: Record, measure: Measure) -> SplitResult:
-    from orthaug.fitting.motion_reopening import reopened
+    from orthaug.fitting.motion_estimation import reopened
 
     fit = reopened(model, record).split(measure)
     split, (parameters, values) = fit.split_by, fit.model.estimated
-    unknown = Warning("no_statistics", "no standard errors: training left no statistics.")
     lacking = fit.std is None and split.slope is not None
     return SplitResult.model_validate(
         {
             "parameters": parameter_rows(parameters, values, fit.std, fit.interval),
             "theta_aux": np.asarray(fit.model.numbers.theta_aux),
             "measure": split.name,
-            "measure_detail": {
-                "name": split.name,
-                "points": len(split.field.x),
-                "support": split.support,
-                "condition": None,
-                "price": None,
-            },
+            "measure_detail": MeasureResult.of_motion(split),
             "orthogonality_defect": split.defect,
-            "warnings": [*fit.warnings, *([unknown] if lacking else [])],
+            "warnings": [*fit.warnings, *([_UNKNOWN] if lacking else [])],
         }
     )
 

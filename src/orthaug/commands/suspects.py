@@ -1,12 +1,14 @@
-"""Suspects as a spec declares them."""
+"""Suspects as a spec declares them, of lagged physics and of a motion."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
+from orthaug.analysis.motion_suspects import MotionSuspect, check_motion_suspects, motion_width
 from orthaug.analysis.suspects import WIDTHS, Suspect, data_width, suspect_columns
 from orthaug.commands.spec import SuspectSection
 from orthaug.data.expressions import SAMPLING_TIME
+from orthaug.physics.motion_problem import MotionProblem
 from orthaug.physics.problem import Problem
 
 
@@ -17,12 +19,10 @@ def declared(sections: Sequence[SuspectSection], problem: Problem) -> tuple[Susp
         InputError: an unknown kind, channel or lag, an expression that cannot be read.
     """
     constants = {SAMPLING_TIME: problem.record.sampling_time} | dict(problem.baseline.constants)
+    only = problem.outputs[0] if len(problem.outputs) == 1 else None
     suspects = []
     for section in sections:
-        width = section.width
-        if width is None and section.kind in WIDTHS and section.on is not None:
-            width = data_width(section.on, problem.rows.x, problem.layout, constants)
-        only = problem.outputs[0] if len(problem.outputs) == 1 else None
+        width = _width(section, lambda on: data_width(on, problem.rows.x, problem.layout, constants))
         output = section.output if section.output is not None else only
         options = {"width": width, "output": output, "coefficient": section.coefficient, "name": section.name}
         suspects.append(Suspect.of(section.kind, section.on, constants=constants, **options))
@@ -32,3 +32,24 @@ def declared(sections: Sequence[SuspectSection], problem: Problem) -> tuple[Susp
 def check_suspects(sections: Sequence[SuspectSection], problem: Problem) -> None:
     """Raise InputError for suspects that cannot be read, or have no value on some training row."""
     suspect_columns(declared(sections, problem), problem.rows.x, problem.layout, problem.outputs)
+
+
+def declared_terms(sections: Sequence[SuspectSection], problem: MotionProblem) -> tuple[MotionSuspect, ...]:
+    """As `declared`, of a motion.
+
+    Raises:
+        InputError: an unknown kind, equation or name, an expression that cannot be read or has no value.
+    """
+    suspects = []
+    for section in sections:
+        kept = ("factor", "equation", "coefficient", "unit", "name")
+        options = {key: getattr(section, key) for key in kept}
+        width = _width(section, lambda on: motion_width(on, problem))
+        suspects.append(MotionSuspect.of(section.kind, section.on, width=width, **options))
+    check_motion_suspects(suspects, problem)
+    return tuple(suspects)
+
+
+def _width(section: SuspectSection, found: Callable[[str], float]) -> float | None:
+    asked = section.width is None and section.kind in WIDTHS
+    return found(section.on) if asked and section.on is not None else section.width

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections.abc import Sequence
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ValidationError
 
 from orthaug._base.errors import InputError
-from orthaug._base.folders import whole_folder
+from orthaug._base.folders import file_digest, whole_folder
 from orthaug._base.warning import Warning
 from orthaug.commands.folder import not_a_result
 from orthaug.commands.run import Reading, record_for
@@ -73,14 +72,13 @@ def open_track(
         check_readable(path)
     loaded = load(model)
     if not isinstance(loaded, Model):
-        from orthaug.fitting.recursive_start import MOTION
+        from orthaug.fitting.recursive_rows import MOTION
 
         raise InputError(f"{model}: {MOTION}")
     records, files = [], []
     for path in data:
         records.append(record_for(loaded, path, loaded.outputs, Reading("skip", prepare=True)))
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()
-        files.append(FileResult(file=str(path), sha256=digest, rows=len(records[-1])))
+        files.append(FileResult(file=str(path), sha256=file_digest(path), rows=len(records[-1])))
     given = open_training(model, training, rows).record if training else None
     return Opened(loaded, Record.join(records), given, tuple(files), _physics_of(model, loaded.sampling_time))
 
@@ -168,12 +166,11 @@ def _result(opened: Opened, online: Recursive) -> TrackResult:
 def write_tracked(tracked: Tracked, folder: Path, text: str, *, force: bool = False) -> None:
     """result.json, report.txt, table.csv, figures/ and the state, whole or not at all."""
     from orthaug.reports.drawing import save
-    from orthaug.reports.tracking_plot import THETA, labels, tracking_figure
+    from orthaug.reports.plots import tracking_figure
 
     online, result = tracked.online, tracked.result
     history = online.history
     physical = None if tracked.physics is None else online.physical_history(tracked.physics)
-    theta, others = labels(result.parameters), labels(result.physical_parameters or ())
     alarms = [alarm.time for alarm in online.alarms]
     with whole_folder(folder, not_a_result, force=force) as partial:
         (partial / "result.json").write_text(result.to_json() + "\n", encoding="utf-8")
@@ -182,6 +179,7 @@ def write_tracked(tracked: Tracked, folder: Path, text: str, *, force: bool = Fa
         if physical is not None:
             physical.to_csv(partial / "physical.csv")
         (partial / "figures").mkdir()
-        save(tracking_figure(history, theta, alarms, THETA, physical, others), partial / "figures" / "parameters.png")
+        figure = tracking_figure(history, result.parameters, alarms, None, physical, result.physical_parameters or ())
+        save(figure, partial / "figures" / "parameters.png")
         (partial / STATE).mkdir()
         online.fill(partial / STATE)

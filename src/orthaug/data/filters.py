@@ -11,7 +11,8 @@ from annotated_types import Ge, Gt
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError, shown
 from orthaug._base.registry import OneOf, check_fields
-from orthaug.data.runs import Channels, Run, stretches
+from orthaug.data.record import unbroken
+from orthaug.data.steps import Channels, Run
 
 _ANTI_ALIAS, _RIPPLE, _CORNER = 8, 0.05, 0.8  # Chebyshev filter of decimation: order, dB, share of the new Nyquist
 
@@ -23,15 +24,15 @@ def _filtered(values: Matrix, sections: Matrix, phase: str, what: str) -> Matrix
     from scipy.signal import sosfilt, sosfilt_zi, sosfiltfilt
 
     result, pad = np.full_like(values, np.nan), 3 * (2 * len(sections) + 1)
-    for part in stretches(values):
-        piece = values[part]
+    for a, b in unbroken(values):
+        piece, part = values[a:b], slice(a, b)
         if phase == "causal":
             start = sosfilt_zi(sections)[:, :, None] * piece[0]
             result[part] = sosfilt(sections, piece, axis=0, zi=start)[0]
         elif len(piece) > pad:
             result[part] = sosfiltfilt(sections, piece, axis=0, padtype="odd", padlen=pad)
     if not np.isfinite(result).all(axis=1).any():
-        longest = max((part.stop - part.start for part in stretches(values)), default=0)
+        longest = max((b - a for a, b in unbroken(values)), default=0)
         raise InputError(
             f"{what}: the longest stretch without a gap has {longest} rows, a filter of zero phase needs {pad + 1}: "
             'fill gaps before, take a lower order, or phase = "causal".'

@@ -10,11 +10,26 @@ import numpy as np
 
 from orthaug._base.checks import check_type
 from orthaug._base.errors import InputError
+from orthaug._base.registry import Registry
 from orthaug._base.warning import Warning
-from orthaug.data.record import Experiment, Prepared, Record, same_step
-from orthaug.data.runs import Run, Step, stretches
-from orthaug.data.steps import STEPS, options_of
+from orthaug.data.filters import Decimate, Highpass, Lowpass
+from orthaug.data.record import Experiment, Prepared, Record, same_step, unbroken
+from orthaug.data.steps import Detrend, Fill, Outliers, Resample, Run, Shift, Step
 
+STEPS = Registry(
+    "step",
+    {
+        "detrend": Detrend,
+        "lowpass": Lowpass,
+        "highpass": Highpass,
+        "decimate": Decimate,
+        "resample": Resample,
+        "outliers": Outliers,
+        "fill": Fill,
+        "shift": Shift,
+    },
+    reserved=("step",),
+)
 _FILTERS = ("lowpass", "highpass", "decimate")
 MENDING = ("outliers", "fill")
 """Steps that leave good samples as they are."""
@@ -34,7 +49,7 @@ def prepare(record: Record, *steps: Any) -> Record:
     Examples:
         >>> import numpy as np
         >>> record = Record.from_arrays(u=np.ones(40), y=np.arange(40.0), sampling_time=0.1)
-        >>> from orthaug.data.steps import Decimate, Detrend
+        >>> from orthaug.data.steps import Detrend
         >>> prepare(record, Detrend(degree=1)).prepared[0].text
         'detrend (degree 1)'
     """
@@ -108,7 +123,14 @@ class _Account:
             self.filled += int((new & ~old).sum())
 
     def told(self) -> Prepared:
-        return Prepared(self.kind, options_of(self.step), self.marked + self.filled)
+        return Prepared(self.kind, _options_of(self.step), self.marked + self.filled)
+
+
+def _options_of(step: Any) -> dict[str, Any]:
+    """The fields of a step that have values."""
+    found = {name: getattr(step, name) for name in type(step).__dataclass_fields__}
+    plain = {name: list(value) if isinstance(value, tuple) else value for name, value in found.items()}
+    return {name: value for name, value in plain.items() if value is not None}
 
 
 def _kind(step: Any) -> str:
@@ -120,8 +142,7 @@ def _pieces(run: Run, place: Experiment, keep: bool) -> list[Experiment]:
     stride = place.stride * run.stride
     line = None if run.moved else place.first_line
     pieces = []
-    for part in stretches(run.values[:, : run.inputs] if keep else run.values):
-        a, b = part.start, part.stop
+    for a, b in unbroken(run.values[:, : run.inputs] if keep else run.values):
         first = a if run.moved else place.first_row + place.stride * run.first + stride * a
         values = run.values[a:b]
         where = (place.source, first, 1 if run.moved else stride, line, float(run.instants[a]), place.offset + a)

@@ -17,9 +17,8 @@ from orthaug._base.checks import Vector, check_choice, check_count, check_type
 from orthaug._base.errors import InputError, MissingSampleError, shown
 from orthaug._base.lines import counted
 from orthaug.data.preparation import check_steps, prepared_experiments
-from orthaug.data.record import Channel, Experiment, Record, as_channels, check_step, same_step
-from orthaug.data.runs import Run
-from orthaug.data.steps import Fill, Outliers, Resample
+from orthaug.data.record import Channel, Experiment, Record, as_channels, check_step, same_step, unbroken
+from orthaug.data.steps import Fill, Outliers, Resample, Run
 from orthaug.data.tables import Table, check_readable, has_column, read_table
 
 RowRange = tuple[int, int] | list[int]
@@ -212,7 +211,6 @@ def _path(path: Any) -> Path:
 
 
 def _columns(channels: Sequence[Sequence[Channel]], columns: Any) -> dict[str, str]:
-    """The file's column for each channel."""
     check_type(columns, Mapping | None, "columns", "this file's column by channel, such as {'y': 'yVal'}")
     given = dict(columns or {})
     for name, column in given.items():
@@ -296,13 +294,10 @@ def _stretches(
         for name in columns:
             if not np.isfinite(table.columns[name][row]) and table.cell(name, row).strip().lower() not in _MISSING:
                 _check_cells(table, [name], row, row + 1)
-    there = np.ones(len(kept), dtype=bool)
-    for name in needed:
-        there &= np.isfinite(table.columns[name][kept])
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int)))
-    if not len(edges):
+    ranges = unbroken(np.column_stack([np.ones(len(kept)), *(table.columns[name][kept] for name in needed)]))
+    if not ranges:
         raise InputError(f"{table.path}: every row from {begin} to {end - 1} has a missing cell; nothing is left.")
-    return [(int(kept[a]), int(kept[b - 1]) + 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return [(int(kept[a]), int(kept[b - 1]) + 1) for a, b in ranges]
 
 
 def _check_cells(table: Table, columns: Sequence[str], start: int, stop: int) -> None:

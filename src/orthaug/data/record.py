@@ -22,6 +22,13 @@ def same_step(step: float, other: float) -> bool:
     return bool(np.isclose(step, other, rtol=1e-3, atol=0.0))
 
 
+def unbroken(values: Matrix) -> list[tuple[int, int]]:
+    """Half-open ranges of rows without a missing sample."""
+    there = np.isfinite(values).all(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int))).tolist()
+    return list(zip(edges[::2], edges[1::2], strict=True))
+
+
 @dataclass(frozen=True)
 class Channel:
     """A named signal with its unit, and how files hold it: `value = scale * cell + offset` of `column`.

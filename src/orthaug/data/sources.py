@@ -13,7 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from orthaug.data.record import Channel, Experiment, Record
+from orthaug.data.record import Channel, Experiment, Record, unbroken
 
 WITNESS_ROWS = 50_000
 """Rows that are kept in memory to look at: for tests of residuals, findings and figures."""
@@ -206,13 +206,10 @@ class RecordSource:
 
 def stretches(experiment: Experiment, lead: int) -> Iterator[Experiment]:
     """A piece without its rows that have a missing sample, cut there: no lag reaches across."""
-    there = np.isfinite(experiment.inputs).all(axis=1) & np.isfinite(experiment.outputs).all(axis=1)
-    if there.all():
-        yield experiment
-        return
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int)))
-    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        if end - begin > lead:
+    for begin, end in unbroken(np.hstack([experiment.inputs, experiment.outputs])):
+        if end - begin == len(experiment):
+            yield experiment
+        elif end - begin > lead:
             yield _later(experiment, begin, end)
 
 

@@ -1,18 +1,16 @@
-"""Steps of preparing data: trends, filters, other sampling, outliers, gaps, delays. Each acts within one experiment."""
+"""Steps of preparing data, each within one experiment: what a step is, trends, sampling, outliers, gaps, delays."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated, Protocol, runtime_checkable
 
 import numpy as np
 from annotated_types import Ge, Gt
 
-from orthaug._base.checks import Vector, check_number, check_type
+from orthaug._base.checks import Matrix, Vector, check_number, check_type, nearest
 from orthaug._base.errors import InputError, shown
-from orthaug._base.registry import OneOf, Registry, check_fields
-from orthaug.data.filters import Decimate, Highpass, Lowpass
-from orthaug.data.runs import Channels, Run
+from orthaug._base.registry import OneOf, check_fields
 
 _MAD = 1.4826  # standard deviations of a normal variable in its median absolute deviation
 _FLOOR = 0.1  # of the usual local deviation: the least that a window is taken to have
@@ -20,7 +18,62 @@ _APART = 3.0  # steps between instants from which on nothing is interpolated
 _SAME = 1e-6  # of a step: instants that lie nearer are one, up to rounding
 _CHUNK = 100_000  # rows of windows at once
 
+Channels = tuple[str, ...] | None
 Method = Annotated[str, OneOf(("linear", "pchip"))]
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """An experiment on its way through the steps: `values` (N, n), NaN where a sample is missing, at `instants` [s]."""
+
+    values: Matrix
+    instants: Vector
+    names: tuple[str, ...]
+    inputs: int
+    """How many of the channels, the first ones, are inputs."""
+    step: float
+    """Sampling time [s]; of uneven instants the usual one."""
+    even: bool = True
+    first: int = 0
+    """Rows that were cut off at the begin."""
+    stride: int = 1
+    moved: bool = False
+    """Whether the samples are no rows of the file any more."""
+
+    def columns(self, channels: Channels, usual: range | None = None) -> list[int]:
+        """Indices of channels; without names the usual ones, which are all unless given."""
+        if channels is None:
+            return list(range(len(self.names)) if usual is None else usual)
+        check_type(channels, tuple | list, "channels", "a list of channel names")
+        for name in channels:
+            if name not in self.names:
+                known = ", ".join(self.names)
+                raise InputError(f"`channels`: no channel '{name}'{nearest(name, self.names)}; there are {known}.")
+        return [self.names.index(name) for name in channels]
+
+    def holding(self, columns: list[int], values: Matrix) -> Run:
+        """The same with other values in some columns."""
+        changed = self.values.copy()
+        changed[:, columns] = values
+        return replace(self, values=changed)
+
+    def check_even(self, what: str) -> None:
+        """Raise InputError where the instants are uneven."""
+        if not self.even:
+            raise InputError(f"{what} needs even sampling; put a step `resample` before it.")
+
+
+@runtime_checkable
+class Step(Protocol):
+    """A step of preparation: a frozen declaration."""
+
+    def apply(self, run: Run) -> Run:
+        """The experiment after the step.
+
+        Raises:
+            InputError: what cannot be done with these samples.
+        """
+        ...
 
 
 @dataclass(frozen=True)
@@ -237,26 +290,3 @@ class Shift:
         values[:, j] = run.values[kept.start - late : kept.stop - late, j]
         first = run.first + run.stride * kept.start
         return replace(run, values=values, instants=run.instants[kept], first=first)
-
-
-STEPS = Registry(
-    "step",
-    {
-        "detrend": Detrend,
-        "lowpass": Lowpass,
-        "highpass": Highpass,
-        "decimate": Decimate,
-        "resample": Resample,
-        "outliers": Outliers,
-        "fill": Fill,
-        "shift": Shift,
-    },
-    reserved=("step",),
-)
-
-
-def options_of(step: Any) -> dict[str, Any]:
-    """The fields of a step that have values."""
-    found = {name: getattr(step, name) for name in type(step).__dataclass_fields__}
-    plain = {name: list(value) if isinstance(value, tuple) else value for name, value in found.items()}
-    return {name: value for name, value in plain.items() if value is not None}

@@ -16,13 +16,12 @@ import numpy as np
 from orthaug._base.checks import Vector, nearest
 from orthaug._base.errors import LONGEST, InputError, shown
 from orthaug.data.expressions import SAMPLING_TIME, is_name
-from orthaug.data.headers import is_time, last_part, split_header, step_of
-from orthaug.data.instants import in_seconds
+from orthaug.data.headers import in_seconds, is_time, last_part, split_header, step_of
+from orthaug.data.layouts import numbers_only
 from orthaug.data.readers import JITTER
 from orthaug.data.record import same_step
 from orthaug.data.steps import Outliers
 from orthaug.data.tables import column_names, read_table, reading_note
-from orthaug.data.text_files import numbers_only
 from orthaug.data.variables import ENDINGS, scalars
 
 _INPUT = re.compile(r"^(u|u_?\d+|in|input|input_?\d+)$", re.IGNORECASE)
@@ -331,7 +330,6 @@ def _by_single_number(path: Path) -> Clock:
 
 
 def _ticking(column: Column, seconds: Vector) -> Clock:
-    """The clock of a column of rising instants."""
     steps = np.diff(seconds[np.isfinite(seconds)])
     usual = float(np.median(steps))
     even = column.missing > 0 or bool((np.abs(steps - usual) <= JITTER * usual).all())

@@ -17,9 +17,8 @@ from orthaug._base.checks import Matrix, Vector, nearest
 from orthaug._base.errors import InputError, MissingColumnError
 from orthaug._base.log import LOG
 from orthaug._base.memory import check_memory
-from orthaug.data.instants import dated, in_seconds
-from orthaug.data.spreadsheets import as_number, read_sheet, text_number
-from orthaug.data.text_files import Layout, layout, numbers_only
+from orthaug.data.headers import dated, in_seconds
+from orthaug.data.layouts import Layout, as_number, layout, numbers_only, read_sheet, text_number
 from orthaug.data.variables import ENDINGS, foreign, read_variables, short, variable_names
 
 _SMALL = 4_000_000  # bytes of a text file that NumPy reads sooner than pandas is imported

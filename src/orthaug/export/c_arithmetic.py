@@ -6,10 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from orthaug.export.activations import ACTIVATIONS
-from orthaug.export.nodes import functions_in, names_in
+from orthaug.export.nodes import ACTIVATIONS, Language, decimal, functions_in, names_in, wrapped
 from orthaug.export.program import Block, Constant, Layer, Program
-from orthaug.export.text import Language, decimal, wrapped
 
 _MATH = {"sin", "cos", "tan", "atan", "atan2", "exp", "log", "sqrt", "floor", "tanh", "expm1", "log1p"}
 _OWN = {
@@ -83,11 +81,7 @@ def _safe(text: str) -> str:
 
 def _used(program: Program) -> list[Constant]:
     """Constants that some block reads: an unused one would be warned of."""
-    read = set[str]()
-    for block in program.blocks:
-        features = block.network.features if block.network is not None else ()
-        for node in (*(node for _, node in block.locals), *features, *block.results):
-            read |= names_in(node)
+    read = set[str]().union(*(names_in(node) for block in program.blocks for node in block.nodes))
     return [constant for constant in program.constants if constant.name in read]
 
 

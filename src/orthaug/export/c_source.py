@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from orthaug.export import c_arithmetic
 from orthaug.export.c_arithmetic import FIELD_WORDS
-from orthaug.export.program import Program, Signal
-from orthaug.export.vectors import Vectors
+from orthaug.export.program import Program, Signal, Vectors
 
 
 @dataclass(frozen=True)
@@ -60,6 +59,11 @@ def fields_of(program: Program) -> list[tuple[str, Signal, int]]:
         taken.add(identifier)
         fields.append((identifier, signal, depth))
     return fields
+
+
+def places_of(fields: list[tuple[str, Signal, int]]) -> list[str]:
+    """Every entry of the state as a member of its struct."""
+    return [f"{name}[{i}]" if depth else name for name, _, depth in fields for i in range(max(depth, 1))]
 
 
 def _header(program: Program, fields: list[tuple[str, Signal, int]]) -> str:
@@ -181,7 +185,7 @@ def _checks(program: Program, following: bool) -> list[str]:
 
 def _lagged_step(program: Program, fields: list[tuple[str, Signal, int]]) -> str:
     """The block in place on the state's fields, then every line moved on by one sample."""
-    place = [f"state->{identifier}[{i}]" for identifier, _, depth in fields for i in range(depth)]
+    place = [f"state->{place}" for place in places_of(fields)]
     lines = [*_step_head(program), "    int i, ok = 1;"]
     lines += c_arithmetic.body(program.output, "y", lambda vector, i: place[i] if vector == "x" else f"{vector}[{i}]")
     lines += _checks(program, following=False)
@@ -215,9 +219,7 @@ def _check(program: Program, fields: list[tuple[str, Signal, int]], vectors: Vec
         )
 
     inputs = vectors.inputs.tolist() if program.inputs else [[0.0]] * rows
-    places = [f"{identifier}[{i}]" for identifier, _, depth in fields for i in range(depth)]
-    places = places or [identifier for identifier, *_ in fields]
-    setting = "\n".join(f"        state.{place} = (real)states[k][{i}];" for i, place in enumerate(places))
+    setting = "\n".join(f"        state.{place} = (real)states[k][{i}];" for i, place in enumerate(places_of(fields)))
     states = vectors.states.tolist() if program.states else [[0.0]] * rows
     return f"""/* Runs the test vectors: `cc -std=c99 -O2 {name}.c check.c -lm -o check && ./check`. */
 #include "{name}.h"

@@ -7,16 +7,18 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from orthaug import __version__
 from orthaug._base.checks import check_type, nearest
 from orthaug._base.errors import InputError, shown
 from orthaug._base.folders import check_replaceable, whole_folder
-from orthaug.export.kinds import TARGETS
+from orthaug._base.jax import jax
+from orthaug.export.kinds import TARGETS, VECTORS, Target
 from orthaug.export.lowering import program_of
-from orthaug.export.program import Program, Signal
-from orthaug.export.target import VECTORS, Target
-from orthaug.export.vectors import Vectors
+from orthaug.export.program import Program, Signal, Vectors
 from orthaug.models import storage
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
@@ -37,6 +39,10 @@ _TAKEN = (
     "control",
     "onnx",
 )
+
+
+_ROWS, _SEED = 64, 0  # of the test vectors
+_HELD = 8  # rows of each level: under a new one in every row an inertia hardly moves
 
 
 def not_an_export(folder: Path, names: Sequence[str]) -> str | None:
@@ -101,7 +107,7 @@ def export(
     check_export(to, folder, name, force=force)
     target: Target = TARGETS[to]()
     program = program_of(model, name, storage.digest(model))
-    vectors = Vectors.of(model, program)
+    vectors = _vectors_of(model, program)
     files = dict(target.files(program, vectors))
     files |= {VECTORS: vectors.csv(program), "README.md": _readme(program, target, len(vectors.outputs))}
     with whole_folder(folder, not_an_export, force=force) as partial:
@@ -155,3 +161,44 @@ def _of_prepared(program: Program) -> str:
 def _listed(head: str, signals: Sequence[Signal]) -> str:
     lines = [f"- `{signal.name}`{f' [{signal.unit}]' if signal.unit else ''}" for signal in signals]
     return "\n".join([head, "", *(lines or ["- none"]), ""])
+
+
+def _vectors_of(model: Any, program: Program) -> Vectors:
+    """A free run under random levels of the inputs, in the range that the model was trained on where that is known.
+
+    It starts from zero, or from one where zero has no output.
+    """
+    rng = np.random.default_rng(_SEED)
+    middle, reach = _range(model, program)
+    drawn = middle + reach * np.repeat(rng.uniform(-1, 1, (_ROWS // _HELD, program.held)), _HELD, axis=0)
+    inputs = drawn if program.ends == 1 else np.concatenate([drawn, np.roll(drawn, -1, axis=0)], axis=1)
+
+    def run(state: Any, rows: Any) -> Any:
+        def one(state: Any, row: Any) -> Any:
+            following, y = model.step(state, row)
+            return following, (state, y)
+
+        return jax.lax.scan(one, state, rows)[1]
+
+    run, count, states, outputs = jax.jit(run), 0, np.zeros(0), np.zeros(0)
+    for start in (np.zeros(len(program.states)), np.ones(len(program.states))):
+        states, outputs = map(np.asarray, run(start, inputs))
+        finite = np.asarray(np.isfinite(np.concatenate([states, outputs], axis=1)).all(axis=1))
+        count = finite.size if finite.all() else int(np.argmin(finite))
+        if count:
+            break
+    return Vectors(inputs[:count], states[:count], outputs[:count])
+
+
+def _range(model: Any, program: Program) -> tuple[Any, Any]:
+    """Middle and half width of each input where the learner saw it by itself; 0 and 1 elsewhere."""
+    middle, reach = np.zeros(program.held), np.ones(program.held)
+    if model.form.bound is None:
+        return middle, reach
+    entries = model.form.features.entries if isinstance(model, Model) else model.form.features
+    names = [signal.name for signal in program.inputs[: program.held]]
+    for entry, centre, width in zip(entries, model.numbers.centre, model.numbers.halfwidth, strict=True):
+        name = entry.text.partition("[")[0]
+        if name in names and (entry.text == name or str(entry.lags[0] if entry.lags else "") == entry.text):
+            middle[names.index(name)], reach[names.index(name)] = float(centre), float(width)
+    return middle, reach

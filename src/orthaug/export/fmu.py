@@ -17,9 +17,8 @@ from xml.sax.saxutils import quoteattr
 
 from orthaug import __version__
 from orthaug._base.errors import InputError
-from orthaug.export.c_source import CSource, fields_of
-from orthaug.export.program import Program
-from orthaug.export.vectors import Vectors
+from orthaug.export.c_source import CSource, fields_of, places_of
+from orthaug.export.program import Program, Vectors
 
 _WRAPPER = Path(__file__).parent / "templates" / "fmi2.c"
 _SOURCES = ("model.c", "fmi2.c")
@@ -113,9 +112,7 @@ def _compiled(sources: Mapping[str, str]) -> tuple[str, str, bytes]:
 
 def _variables(program: Program) -> str:
     """What the wrapper has to know of the model."""
-    fields = fields_of(program)
-    places = [f"{name}[{i}]" for name, _, depth in fields for i in range(depth)] or [name for name, *_ in fields]
-    cases = "\n".join(f"    case {i}: return &state->{place};" for i, place in enumerate(places))
+    cases = "\n".join(f"    case {i}: return &state->{place};" for i, place in enumerate(places_of(fields_of(program))))
     return f"""/* Written by orthaug. */
 #define GUID "{_guid(program)}"
 #define SAMPLING_TIME {program.sampling_time!r}

@@ -10,8 +10,7 @@ import numpy as np
 
 from orthaug.data.writing import symbol
 from orthaug.export.nodes import Apply, Entry, Name, Node, Number
-from orthaug.export.program import Block, Program, Signal
-from orthaug.export.vectors import Vectors
+from orthaug.export.program import Block, Program, Signal, Vectors
 
 _FUNCTIONS = {"atan": r"\arctan", "log": r"\ln", "sign": r"\operatorname{sgn}", "atan2": r"\operatorname{atan2}"}
 _UPRIGHT = {"expm1", "log1p"}

@@ -9,10 +9,10 @@ import numpy as np
 
 from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
-from orthaug.export.activations import ACTIVATIONS
 from orthaug.export.lowering import program_of
-from orthaug.export.nodes import Apply, Entry, Name, Node, Number
+from orthaug.export.nodes import ACTIVATIONS, Apply, Entry, Name, Node, Number
 from orthaug.export.program import Block, Program, Scheme
+from orthaug.models.integrators import runge_kutta
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 
@@ -71,10 +71,9 @@ class NumpyStep:
 
     def _block(self, block: Block) -> Callable[[Vector, Vector], Vector]:
         intermediate = [(name, self._evaluation(node)) for name, node in block.locals]
-        network = block.network
-        features = [self._evaluation(node) for node in network.features] if network is not None else []
+        features = [] if block.network is None else list(map(self._evaluation, block.network.features))
         layers = []
-        for layer in network.layers if network is not None else ():
+        for layer in block.layers:
             bias = np.zeros(len(layer.weight)) if layer.bias is None else layer.bias
             act = None if layer.activation == "identity" else self._evaluation(ACTIVATIONS[layer.activation])
             layers.append((layer.weight, bias, act))
@@ -150,7 +149,7 @@ def _advancing(
     if scheme.kind == "discrete":
         return rate
     h, halves = scheme.step, 2 * scheme.substeps
-    one = _exponential(rate, dict(scheme.matrices)) if scheme.kind == "exact" else _runge_kutta(rate, h)
+    one = _exponential(rate, dict(scheme.matrices)) if scheme.kind == "exact" else runge_kutta(rate, h)
 
     def advance(x: Vector, u: Vector) -> Vector:
         now = u[:held]
@@ -163,17 +162,6 @@ def _advancing(
         return x
 
     return advance
-
-
-def _runge_kutta(rate: Callable[[Vector, Vector], Vector], h: float) -> Callable[..., Vector]:
-    def one(x: Vector, first: Vector, middle: Vector, last: Vector) -> Vector:
-        k1 = rate(x, first)
-        k2 = rate(x + h / 2 * k1, middle)
-        k3 = rate(x + h / 2 * k2, middle)
-        k4 = rate(x + h * k3, last)
-        return x + h / 6 * (k1 + 2 * (k2 + k3) + k4)
-
-    return one
 
 
 def _exponential(rate: Callable[[Vector, Vector], Vector], m: dict[str, Any]) -> Callable[..., Vector]:

@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.errors import InputError
-from orthaug.export.activations import ACTIVATIONS
-from orthaug.export.nodes import Apply, Entry, Name, Node, Number
-from orthaug.export.program import Block, Program
-from orthaug.export.vectors import Vectors
+from orthaug.export.nodes import ACTIVATIONS, Apply, Entry, Name, Node, Number
+from orthaug.export.program import Block, Program, Vectors
 
 _OPERATORS = {"add": "Add", "sub": "Sub", "mul": "Mul", "div": "Div", "power": "Pow", "whole_power": "Pow"}
 _OPERATORS |= {"neg": "Neg", "sin": "Sin", "cos": "Cos", "exp": "Exp", "log": "Log", "sqrt": "Sqrt"}

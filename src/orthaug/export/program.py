@@ -5,6 +5,8 @@ A target writes a `Program`, and knows nothing of models.
 
 from __future__ import annotations
 
+import csv
+import io
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,16 +65,15 @@ class Block:
     results: tuple[Node, ...]
 
     @property
-    def functions(self) -> set[str]:
-        """The functions of all its expressions."""
+    def nodes(self) -> tuple[Node, ...]:
+        """All its expressions."""
         features = self.network.features if self.network is not None else ()
-        nodes = (*(node for _, node in self.locals), *features, *self.results)
-        return set[str]().union(*map(functions_in, nodes))
+        return (*(node for _, node in self.locals), *features, *self.results)
 
     @property
-    def activations(self) -> set[str]:
+    def layers(self) -> tuple[Layer, ...]:
         """Those of its network."""
-        return {layer.activation for layer in self.network.layers} if self.network is not None else set()
+        return self.network.layers if self.network is not None else ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,14 +128,33 @@ class Program:
     @property
     def functions(self) -> set[str]:
         """The functions of all expressions."""
-        return set[str]().union(*(block.functions for block in self.blocks))
+        return set[str]().union(*(functions_in(node) for block in self.blocks for node in block.nodes))
 
     @property
     def activations(self) -> set[str]:
         """Those of all networks."""
-        return set[str]().union(*(block.activations for block in self.blocks))
+        return {layer.activation for block in self.blocks for layer in block.layers}
 
     @property
     def held(self) -> int:
         """Inputs at an instant, of which a step takes `ends`."""
         return len(self.inputs) // self.ends
+
+
+@dataclass(frozen=True, eq=False)
+class Vectors:
+    """Steps by which an export is checked where it runs: inputs, the state before and the outputs, all finite."""
+
+    inputs: Float[np.ndarray, "r nu"]
+    states: Float[np.ndarray, "r n"]
+    outputs: Float[np.ndarray, "r ny"]
+
+    def csv(self, program: Program) -> str:
+        """A column for each input, state and output, with `state:` or `output:` before names that stand twice."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        kinds = {"input": program.inputs, "state": program.states, "output": program.outputs}
+        writer.writerow([f"{kind}:{signal.name}" for kind, signals in kinds.items() for signal in signals])
+        for row in np.concatenate([self.inputs, self.states, self.outputs], axis=1):
+            writer.writerow([repr(float(value)) for value in row])
+        return text.getvalue()

@@ -1,15 +1,14 @@
-"""A program as a Python module, for NumPy and for libraries of symbols alike."""
+"""A program as a Python module, for NumPy and for libraries of symbols alike, such as CasADi for optimal control."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from orthaug.export.activations import ACTIVATIONS
-from orthaug.export.program import Block, Program
-from orthaug.export.text import Language, decimal, wrapped
+from orthaug.export.nodes import ACTIVATIONS, Language, decimal, wrapped
+from orthaug.export.program import Block, Program, Vectors
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ def arithmetic(program: Program, dialect: Dialect) -> str:
 
 def _arrays(block: Block, dialect: Dialect) -> list[str]:
     found = []
-    for i, layer in enumerate(block.network.layers if block.network is not None else (), start=1):
+    for i, layer in enumerate(block.layers, start=1):
         found.append(_array(f"{block.name}_w{i}", layer.weight, dialect))
         if layer.bias is not None:
             found.append(_array(f"{block.name}_b{i}", layer.bias, dialect))
@@ -83,8 +82,8 @@ def _block(block: Block, dialect: Dialect) -> str:
     lines = [f"{name} = {write(node)}" for name, node in block.locals]
     if block.network is not None:
         lines.append(f"z = {_vector([write(node) for node in block.network.features], dialect)}")
-        last = len(block.network.layers)
-        for i, layer in enumerate(block.network.layers, start=1):
+        last = len(block.layers)
+        for i, layer in enumerate(block.layers, start=1):
             target, source = "g" if i == last else f"h{i}", "z" if i == 1 else f"h{i - 1}"
             value = f"{block.name}_w{i} @ {source}" + (f" + {block.name}_b{i}" if layer.bias is not None else "")
             lines.append(f"{target} = {value if layer.activation == 'identity' else f'_{layer.activation}({value})'}")
@@ -98,7 +97,6 @@ def _vector(entries: Sequence[str], dialect: Dialect) -> str:
 
 
 def _advance(program: Program, dialect: Dialect) -> list[str]:
-    """The functions that make the next state."""
     scheme = program.scheme
     if scheme is None:
         joined = dialect.join.format("y, u, x")
@@ -143,3 +141,50 @@ def substep(x, first, middle, last):
     at_b = rest(b, middle)
     c = HALF @ a + HALF1 @ (2 * at_b - begin)
     return WHOLE @ x + FIRST @ begin + MIDDLE @ (at_a + at_b) + LAST @ rest(c, last)"""
+
+
+_SAME = ("sin", "cos", "tan", "atan", "atan2", "exp", "log", "sqrt", "sign", "floor", "tanh", "expm1", "log1p", "power")
+_OTHER = {"abs": "ca.fabs", "min": "ca.fmin", "max": "ca.fmax"}
+CASADI = Dialect(
+    python_language({name: f"ca.{name}" for name in _SAME} | _OTHER),
+    vector="ca.vertcat({})",
+    array="ca.DM({})",
+    join="ca.vertcat({})",
+)
+
+
+@dataclass(frozen=True)
+class CasadiModule:
+    """`NAME.py` with `step()`, a CasADi Function of state and inputs."""
+
+    summary = "a Python module that makes a CasADi Function"
+
+    def files(self, program: Program, vectors: Vectors) -> Mapping[str, str]:
+        head = f'"""{program.name}: one step of a fitted model as a CasADi Function. Written by orthaug."""'
+        step = _STEP.replace("NAME", program.name)
+        text = [head, "", "import casadi as ca", "", declarations(program), "", arithmetic(program, CASADI), step]
+        return {f"{program.name}.py": "\n".join(text)}
+
+    def usage(self, program: Program) -> str:
+        return f"""```python
+import {program.name} as model
+
+step = model.step()                # a casadi.Function: (state, inputs) -> (next_state, outputs)
+state, outputs = step({[0] * len(program.states)}, {[0] * len(program.inputs)})
+run = step.mapaccum(100)           # a free run of 100 steps, inputs in columns
+```
+
+It needs `casadi` (`pip install casadi`; the extra `orthaug[casadi]` installs it too). `step` takes symbols as well as
+numbers, so that it can stand in an optimal control problem: one call for each step of the horizon."""
+
+
+_STEP = '''
+
+def step(name="NAME"):
+    """The next state and the outputs of one sample, as a Function of state and inputs."""
+    state, inputs = ca.SX.sym("state", len(STATES)), ca.SX.sym("inputs", len(INPUTS))
+    outputs = output(state, inputs)
+    following = ca.densify(ca.SX(advance(state, inputs, outputs)))
+    results = [following, ca.densify(ca.SX(outputs))]
+    return ca.Function(name, [state, inputs], results, ["state", "inputs"], ["next_state", "outputs"])
+'''

@@ -1,6 +1,6 @@
+from .conclusion import orthogonalize as orthogonalize
 from .criteria import Prediction as Prediction
 from .criteria import Simulation as Simulation
-from .elsewhere import orthogonalize as orthogonalize
 from .estimates import Estimate as Estimate
 from .estimation import estimate as estimate
 from .motion_estimates import MotionEstimate as MotionEstimate

@@ -13,15 +13,18 @@ block. What the measured state adds counts to the first block of its segment. No
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
+from orthaug._base.errors import InputError
 from orthaug.fitting.colour import correlation_length
-from orthaug.fitting.segments import Segments, block_scores, respond
+from orthaug.fitting.objective import errors_of
+from orthaug.fitting.segments import Segments, block_scores
 from orthaug.models.dynamics import Dynamics, Numbers
+from orthaug.models.statistics import Statistics
 
 _MEMORIES = 3  # times as many steps in a block as the errors' correlation lasts
 
@@ -52,9 +55,7 @@ class FreeRunScores:
 
     def errors(self) -> Float[np.ndarray, "ny s T"]:
         """The errors of each output by segments, 0 where a step is not scored."""
-        run = np.asarray(respond(self.dynamics, self.numbers, self.segments, self.states))
-        scored = np.asarray(self.segments.scored)[:, :, None]
-        errors = np.where(scored, np.asarray(self.segments.target) - run, 0.0)
+        errors = errors_of(self.dynamics, self.numbers, self.states, self.segments)
         return np.moveaxis(errors, 3, 1).reshape(-1, *errors.shape[1:3]).transpose(2, 0, 1)
 
     def block(self) -> int | None:
@@ -95,3 +96,15 @@ class FreeRunScores:
         blocks, rows = len(scores), self.share * self.segments.count * len(self.weight)
         correction = blocks / max(blocks - 1, 1) * rows / max(rows - used, 1.0)
         return self.share * correction * self.unit**2 * scores.T @ scores, blocks
+
+    def robust(self, statistics: Statistics, freedom: float, used: float, steps: int | None) -> Statistics:
+        """The model's statistics for coloured errors, from blocks of so many steps; None for as many as `block` says.
+
+        Raises:
+            InputError: errors that remember each other for too long.
+        """
+        steps = self.block() if steps is None else steps
+        if steps is None:
+            raise InputError("the errors of the free run remember each other for too long to take them in blocks.")
+        middle, blocks = self.middle(steps, used)
+        return replace(statistics, middle=middle, freedom=min(freedom, blocks - 1.0))

@@ -5,23 +5,31 @@ The task's engine makes every sum over rows; no array of N rows is kept.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.warning import Warning
+from orthaug.data.record import Record
+from orthaug.data.regressors import Lags
 from orthaug.fitting.elimination import Fixed, ThetaSplit, directions, eliminate, split_theta
 from orthaug.fitting.estimates import NOT_UNIQUE, Estimate
 from orthaug.fitting.learned import ErrorStatistics, Learned
 from orthaug.fitting.one_step import OneStepTask, Share
 from orthaug.fitting.status import Ending, Status
-from orthaug.fitting.structures import Structure
+from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.inference.covariance import degrees_of_freedom, noise_covariance, theta_covariance
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
+from orthaug.models.learners import Bound, External, Function, Scaling
 from orthaug.models.model import Model
 from orthaug.models.statistics import JointCovariance, Statistics
+from orthaug.physics.baseline import Baseline
 from orthaug.physics.excitation import ILL_CONDITIONED
-from orthaug.physics.problem import Problem
+from orthaug.physics.problem import Problem, pose
 
 
 def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estimate:
@@ -201,3 +209,36 @@ def _warnings(
         )
         told.append(Warning("at_a_bound", text))
     return told
+
+
+def orthogonalize(
+    record: Record, baseline: Baseline, function: Callable[[Any], Any], lags: Lags | None = None
+) -> Estimate:
+    """Split a model trained elsewhere into physics and an orthogonal rest (F2).
+
+    Args:
+        record: the rows over which the rest is made orthogonal, usually the training data.
+        baseline: the physics.
+        function: `g(x)` on NumPy regressors (N, nx) in `Lags` order, giving (N, ny); from any toolbox.
+        lags: the regressor that `function` expects; None for the raw lags of the baseline.
+
+    Returns:
+        An estimate whose model predicts what `function` does, with `θ = Φ⁺G` and the learner `g − φθ`.
+        There are no standard errors: they belong to how `function` was trained.
+    """
+    problem = pose(record, baseline, lags)
+    ny, nz = len(problem.outputs), len(problem.features.entries)
+    external = External(function, ny=ny)
+    values = external.values(problem.feature_rows())  # once; the sums below read what it gave
+    scaling, unit = Scaling(np.zeros(nz), np.ones(nz)), np.ones(ny)
+    task = OneStepTask.of(problem, None)
+    gain = np.broadcast_to(problem.weight.matrix / task.rms, (*values.shape, ny))
+    rows = task.engine.lay(values, problem.projection.q, problem.unexplained / task.rms, gain)
+    task = replace(task, rows=rows, unit=unit, bound=Bound(_GIVEN, ny, ny))
+    concluded = conclude(task, Orthogonal(), Learned(task.bound, np.zeros(0), scaling, unit, elsewhere=True))
+    form = replace(concluded.model.form, bound=Bound(external, nz, ny))
+    return replace(concluded, model=replace(concluded.model, form=form))
+
+
+_GIVEN = Function(lambda w, z: z, lambda key: ())
+"""The learner whose values are its features."""

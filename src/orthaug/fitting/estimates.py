@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -19,10 +19,8 @@ from orthaug.data.regressors import Layout, lag_rows
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.held_out import HeldOut
-from orthaug.fitting.parameter_table import parameter_frame, parameter_lines
 from orthaug.fitting.status import Status
-from orthaug.inference.covariance import interval
-from orthaug.inference.intervals import joint_covariance, robust_covariance, robust_split_covariance
+from orthaug.inference.covariance import interval, joint_covariance, robust_covariance, robust_split_covariance
 from orthaug.inference.learned_terms import equation, learned_terms, term_frame, term_lines
 from orthaug.inference.measures import Measure, Points, Support, Training
 from orthaug.inference.physical import PhysicalEstimate, profile, solve
@@ -37,7 +35,6 @@ from orthaug.physics.streamed import StreamedProblem
 
 if TYPE_CHECKING:
     import pandas as pd
-
 
 NOT_UNIQUE = "theta_not_unique"
 """The code of the warning that a split under a measure makes untrue."""
@@ -59,8 +56,42 @@ class Restart:
     """Mean squared error where nothing was fitted: on the validation record, or on held-out blocks."""
 
 
+class AnyFit(ShownFit):
+    """What fits of lagged models and of motions have in common."""
+
+    model: Any
+    warnings: tuple[Warning, ...]
+
+    @property
+    def theta(self) -> Vector:
+        """θ̂ (nθ,); of a motion the coordinates of p̂ (np,)."""
+        return self.model.theta
+
+    @cached_property
+    def terms(self) -> pd.DataFrame:
+        """Table with a row per term of a learner of terms: coefficient, unit, std, 95 % interval; else empty."""
+        return term_frame(learned_terms(self.model))
+
+    def equation(self, writing: str = "text") -> str:
+        """The fitted equations with their numbers, where the learner is a sum of terms; as "text", "latex", "python".
+
+        Raises:
+            InputError: another learner, physics that are Python functions, another writing.
+        """
+        return equation(self.model, writing)
+
+    def lines(self) -> list[str]:
+        """The lines of `summary` before its warnings."""
+        raise NotImplementedError
+
+    def summary(self) -> str:
+        """A page of text: status, parameters, what is known of them, warnings."""
+        warnings = ["", *(f"warning: {warning}" for warning in self.warnings)] if self.warnings else []
+        return "\n".join(fold([*self.lines(), *warnings]))
+
+
 @dataclass(frozen=True, eq=False)
-class Estimate(ShownFit):
+class Estimate(AnyFit):
     """What `estimate` returns. Print `fit.summary()`; use `fit.model`; read `fit.parameters`."""
 
     model: Model
@@ -104,11 +135,6 @@ class Estimate(ShownFit):
         return lag_rows(record, self.problem.layout)
 
     @property
-    def theta(self) -> Vector:
-        """θ̂ (nθ,)."""
-        return self.model.theta
-
-    @property
     def one_step_theta(self) -> Vector | None:
         """Φ⁺Y (nθ,), what one-step least squares gives, where θ was trained on something else; None otherwise."""
         if self.criterion.flown is None:
@@ -130,19 +156,6 @@ class Estimate(ShownFit):
     def parameters(self) -> pd.DataFrame:
         """Table with a row per parameter: unit, initial, value, std, and the 95 % interval."""
         return parameter_frame(self.problem.baseline.parameters, self.theta, self.std, self.interval)
-
-    @cached_property
-    def terms(self) -> pd.DataFrame:
-        """Table with a row per term of a learner of terms: coefficient, unit, std, 95 % interval; else empty."""
-        return term_frame(learned_terms(self.model))
-
-    def equation(self, writing: str = "text") -> str:
-        """The fitted equations with their numbers, where the learner is a sum of terms; as "text", "latex", "python".
-
-        Raises:
-            InputError: another learner, physics that is a Python function, another writing.
-        """
-        return equation(self.model, writing)
 
     def split(self, measure: Measure) -> Estimate:
         """The same fitted function with θ, θ_aux, components and intervals under a measure, without training (F2).
@@ -226,19 +239,16 @@ class Estimate(ShownFit):
         statistics = self.model.statistics
         if statistics.gram is None or self.model.numbers.tilt is not None:
             raise InputError("the fit has no statistics that robust standard errors could be made of.")
-        steps = self.scores.block() if steps is None else check_count(steps, "lags")
-        if steps is None:
-            raise InputError("the errors of the free run remember each other for too long to take them in blocks.")
-        middle, blocks = self.scores.middle(steps, len(self.theta) + self.effective_weights)
-        freedom = min(self.freedom, blocks - 1.0)
-        statistics = replace(statistics, middle=middle, freedom=freedom)
+        steps = None if steps is None else check_count(steps, "lags")
+        used = len(self.theta) + self.effective_weights
+        statistics = self.scores.robust(statistics, self.freedom, used, steps)
         return replace(
             self,
             model=replace(self.model, statistics=statistics),
             covariance=self._cov_along(statistics, self._slope()),
             plain_covariance=self.covariance if self.plain_covariance is None else self.plain_covariance,
             plain_statistics=self.model.statistics if self.plain_statistics is None else self.plain_statistics,
-            freedom=freedom,
+            freedom=statistics.freedom,
         )
 
     def _cov_along(self, statistics: Statistics, slope: Matrix) -> Matrix | None:
@@ -279,14 +289,34 @@ class Estimate(ShownFit):
         values = ", ".join(f"{n} = {v:.6g}" for n, v in zip(self.problem.baseline.names, self.theta, strict=True))
         return f"Estimate({self.model.structure}, {self.status.code}, loss {self.status.loss:.3g}, {values})"
 
-    def lines(self) -> Sequence[str]:
-        """The lines of `summary` before its warnings."""
-        return summary_lines(self)
-
-    def summary(self) -> str:
-        """A page of text: status, parameters, excitation, warnings."""
-        warnings = ["", *(f"warning: {warning}" for warning in self.warnings)] if self.warnings else []
-        return "\n".join(fold([*self.lines(), *warnings]))
+    def lines(self) -> list[str]:
+        baseline, bound, learner = self.problem.baseline, self.model.form.bound, "none"
+        if bound is not None:
+            learner = f"{bound.learner}, {bound.size} weights, {self.effective_weights:.1f} effective"
+        lines = [
+            f"structure   {self.model.structure}",
+            f"learner     {learner}",
+            f"data        {self.problem.record!r}, {self.problem.count} usable rows",
+            *self.status.lines,
+        ]
+        if self.defect is not None:
+            weight = self.problem.weight
+            lines.append(f"orthogonal  ‖QᵀF̃‖/‖F‖ = {self.defect:.1e}" + ("" if weight.one_output else f", {weight}"))
+        condition = self.excitation.condition
+        lines.append(
+            f"excitation  rank {self.excitation.rank} of {self.excitation.columns}"
+            + (f", condition {condition:.3g}" if condition else "")
+        )
+        if self.measure is not None:
+            lines.append(f"measure     {self.measure}")
+        one_step = self.one_step_theta
+        if one_step is not None:
+            moved = ", ".join(f"{name} {value:.6g}" for name, value in zip(baseline.names, one_step, strict=True))
+            lines.append(f"one step    Φ⁺Y would give {moved}")
+        if self.plain_covariance is not None:
+            lines.append(f"std         {ROBUST if self.criterion.flown is None else ROBUST_FLOWN}")
+        lines += ["", *parameter_lines(baseline.parameters, self.theta, self.std, self.interval)]
+        return [*lines, *term_lines(learned_terms(self.model))]
 
 
 def order_of(physics: PhysicsMap, names: Sequence[str], sampling_time: float) -> list[int]:
@@ -303,36 +333,35 @@ def order_of(physics: PhysicsMap, names: Sequence[str], sampling_time: float) ->
     return [names.index(name) for name in physics.theta_names]
 
 
-def summary_lines(fit: Estimate) -> Sequence[str]:
-    """The lines of `Estimate.summary` before its warnings."""
-    status, baseline = fit.status, fit.problem.baseline
-    bound = fit.model.form.bound
-    learner = (
-        "none" if bound is None else f"{bound.learner}, {bound.size} weights, {fit.effective_weights:.1f} effective"
+def parameter_frame(parameters: Sequence[Any], values: Vector, std: Vector | None, ci: Matrix | None) -> pd.DataFrame:
+    """A row per parameter: unit, initial, value, std, and the 95 % interval; NaN where there is none."""
+    import pandas as pd
+
+    nothing = np.full(len(parameters), np.nan)
+    ci = np.stack([nothing, nothing], axis=-1) if ci is None else ci
+    return pd.DataFrame(
+        {
+            "unit": [p.unit for p in parameters],
+            "initial": [p.initial for p in parameters],
+            "value": values,
+            "std": nothing if std is None else std,
+            "ci95_low": ci[:, 0],
+            "ci95_high": ci[:, 1],
+        },
+        index=pd.Index([p.name for p in parameters], name="parameter"),
     )
-    lines = [
-        f"structure   {fit.model.structure}",
-        f"learner     {learner}",
-        f"data        {fit.problem.record!r}, {fit.problem.count} usable rows",
-        f"status      {status.code}, {status.iterations} iterations, {status.seconds:.2f} s, loss {status.loss:.6g}",
-    ]
-    if status.message:
-        lines.append(f"            {status.message}")
-    if fit.defect is not None:
-        weight = fit.problem.weight
-        lines.append(f"orthogonal  ‖QᵀF̃‖/‖F‖ = {fit.defect:.1e}" + ("" if weight.one_output else f", {weight}"))
-    condition = fit.excitation.condition
-    lines.append(
-        f"excitation  rank {fit.excitation.rank} of {fit.excitation.columns}"
-        + (f", condition {condition:.3g}" if condition else "")
-    )
-    if fit.measure is not None:
-        lines.append(f"measure     {fit.measure}")
-    one_step = fit.one_step_theta
-    if one_step is not None:
-        moved = ", ".join(f"{name} {value:.6g}" for name, value in zip(baseline.names, one_step, strict=True))
-        lines.append(f"one step    Φ⁺Y would give {moved}")
-    if fit.plain_covariance is not None:
-        lines.append(f"std         {ROBUST if fit.criterion.flown is None else ROBUST_FLOWN}")
-    lines += ["", *parameter_lines(baseline.parameters, fit.theta, fit.std, fit.interval)]
-    return [*lines, *term_lines(learned_terms(fit.model))]
+
+
+def parameter_lines(parameters: Sequence[Any], values: Vector, std: Vector | None, ci: Matrix | None) -> list[str]:
+    """The same as lines of text, a heading first; a dash where there is no interval."""
+    width = max([9, *(len(p.name) for p in parameters)])
+    lines = [f"{'parameter':<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  {'initial':>11}  unit"]
+    for i, parameter in enumerate(parameters):
+        spread, reach = f"{'–':>11}", f"{'–':^29}"
+        if std is not None and ci is not None and np.isfinite(std[i]):
+            spread, reach = f"{std[i]:11.4g}", f"[{ci[i, 0]:13.7g}, {ci[i, 1]:13.7g}]"
+        lines.append(
+            f"{parameter.name:<{width}}  {values[i]:14.8g}  {spread}  {reach}  "
+            f"{parameter.initial:11.5g}  {parameter.unit}".rstrip()
+        )
+    return lines

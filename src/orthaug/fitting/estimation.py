@@ -10,12 +10,11 @@ import numpy as np
 
 from orthaug._base.checks import Vector, check_choice, check_count, check_type, is_number
 from orthaug._base.errors import InputError, shown
-from orthaug._base.jax import jax
 from orthaug._base.progress import SILENT, Tell
 from orthaug._base.views import with_progress
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
-from orthaug.data.sources import Source
+from orthaug.data.sources import Source, witness
 from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.conclusion import conclude
 from orthaug.fitting.cost import check_cost
@@ -26,23 +25,22 @@ from orthaug.fitting.independent_terms import independent_terms
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_estimation import DEFAULT, fit_motion, pose_for
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.posing import check_record, posed_on
 from orthaug.fitting.reweighting import reweighted
 from orthaug.fitting.rules import check_solver, checked_starts, tried
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Orthogonal, Structure
-from orthaug.fitting.training import Choice, PlannedRun, train
+from orthaug.fitting.training import Choice, PlannedRun, planned, train
 from orthaug.inference.measures import Training
-from orthaug.models.learners import MLP, Bound, Learner, Scaling
+from orthaug.models.learners import MLP, Learner, Scaling
 from orthaug.models.model import Model
 from orthaug.models.rows import Engine, InMemory
 from orthaug.models.tasks import Tasks, runs_on
 from orthaug.models.terms import over_lags, over_states
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.motion import Motion
-from orthaug.physics.problem import Problem
-from orthaug.physics.streamed import StreamedProblem
+from orthaug.physics.problem import Problem, pose
+from orthaug.physics.streamed import StreamedProblem, pose_streamed
 
 Regularization = str | float
 
@@ -144,6 +142,8 @@ def estimate(
         >>> f"{fit.theta[0]:.3f}"
         '2.000'
     """
+    options: dict[str, Any] = {"structure": structure, "solver": solver, "regularization": regularization, "seed": seed}
+    options |= {"restarts": restarts, "fallback": fallback, "validation": validation, "progress": progress}
     if isinstance(baseline, Motion):
         if lags is not None or initial is not None or ensemble:
             raise InputError("a motion has no `lags`, no `initial` and no `ensemble`; leave them out.")
@@ -151,11 +151,11 @@ def estimate(
         assert isinstance(record, Record)
         learner = over_states(learner, baseline)
         problem = pose_for(record, baseline, learner, output_weights)
-        options = {"structure": structure, "criterion": criterion or DEFAULT, "solver": solver, "fallback": fallback}
-        options |= {"regularization": regularization, "restarts": restarts, "seed": seed, "validation": validation}
-        options |= {"blocks": _check_blocks(blocks), "progress": progress, "engine": engine or InMemory()}
+        options |= {"criterion": criterion or DEFAULT, "blocks": _check_blocks(blocks), "engine": engine or InMemory()}
         return fit_motion(problem, learner=learner, **options)
-    _check_record(record, baseline, lags, learner, initial)
+    check_record(record)
+    _check_types(baseline=baseline, lags=lags, learner=learner)
+    check_type(initial, Estimate | Model | None, "initial", "an Estimate, a Model or None")
     criterion = Prediction() if criterion is None else criterion
     model = initial.model if isinstance(initial, Estimate) else initial
     channels = (tuple(channel.name for channel in group) for group in (record.outputs, record.inputs))
@@ -163,25 +163,10 @@ def estimate(
     inputs = None if learner is None else learner.inputs
     if model is not None:
         inputs = tuple(str(entry) for entry in model.form.features.entries)
-    check_type(criterion, Criterion, "criterion", "Prediction(…) or Simulation(…)")
+    _check_types(criterion=criterion)
     problem, engine = posed_on(record, engine, baseline, lags, inputs, output_weights=output_weights)
-    return fit(
-        problem,
-        learner=learner,
-        structure=structure,
-        criterion=criterion,
-        solver=solver,
-        regularization=regularization,
-        restarts=restarts,
-        seed=seed,
-        ensemble=ensemble,
-        blocks=blocks,
-        fallback=fallback,
-        initial=model,
-        validation=validation,
-        progress=progress,
-        engine=engine,
-    )
+    options |= {"criterion": criterion, "ensemble": ensemble, "blocks": blocks, "initial": model, "engine": engine}
+    return fit(problem, learner=learner, **options)
 
 
 def fit(
@@ -215,7 +200,8 @@ def fit(
     Raises:
         InputError: as `estimate`.
     """
-    _check_choices(learner, structure, criterion, solver, initial, validation)
+    _check_types(learner=learner, structure=structure, criterion=criterion, solver=solver)
+    _check_types(initial=initial, validation=validation)
     _check_splittable(structure, problem.baseline, learner)
     blocks = _check_blocks(blocks)
     conditions = {"linear": problem.baseline.linear, "validated": validation is not None}
@@ -223,7 +209,7 @@ def fit(
     auto = _check_regularizations(regularization, choices, validation is not None or blocks > 0)
     restarts, seed = checked_starts(restarts, seed, warm=initial is not None, ensemble=ensemble)
     check_solver(solver, criterion, () if learner is None else choices)
-    engine = _engine_of(engine, problem, len(choices) * (restarts if initial is None else 1))
+    engine = _for_runs(engine, problem, len(choices) * (restarts if initial is None else 1))
     warm, told = None, ()
     if initial is not None:
         task, weights, warm = _warm_start(problem, initial, engine)
@@ -232,14 +218,13 @@ def fit(
         _check_cost(problem, learner, solver, restarts * len(choices), engine)
         problem, learner, told = independent_terms(problem, learner)
         task = OneStepTask.of(problem, learner, engine=engine)
-        starts = _starts(task.bound, range(seed, seed + restarts), choices)
+        starts = planned(task.bound, range(seed, seed + restarts), choices)
     solved = criterion.one_step and problem.baseline.linear
     ensemble = _check_ensemble(ensemble and task.bound is not None, problem)
     if task.bound is None and solved:
-        estimate = conclude(task, structure, task.physics_learned())
-        estimate = replace(estimate, status=replace(estimate.status, start_loss=estimate.status.loss))
+        estimate = _physics_alone(task, structure)
     else:
-        task = _keeping(task, checkpoints)
+        task = replace(task, checkpoints=None if isinstance(task.engine, Tasks) else checkpoints)  # not a worker's disk
         trained = task if solved else FreeRunTask.of(task, criterion, warm)
         chosen = Choice(validation, blocks if initial is None else 0, fallback, ensemble, scored=auto and solved)
         estimate = train(trained, starts, structure, solver, chosen, progress, runner=engine)
@@ -258,28 +243,21 @@ def fit(
     return reweighted(estimate, again)
 
 
-def _engine_of(engine: Engine, problem: Problem, runs: int) -> Engine:
+def _for_runs(engine: Engine, problem: Problem, runs: int) -> Engine:
     """With a cluster several runs over rows in memory are its tasks."""
     return runs_on(engine) if runs > 1 and not isinstance(problem, StreamedProblem) else engine
 
 
-def _keeping(task: OneStepTask, checkpoints: Checkpoints | None) -> OneStepTask:
-    """With the states of its runs kept, unless they are a cluster's tasks: a worker may have another disk."""
-    return replace(task, checkpoints=None if isinstance(task.engine, Tasks) else checkpoints)
+def _physics_alone(task: OneStepTask, structure: Structure) -> Estimate:
+    """Physics alone, which is solved: it ends at the loss where it starts."""
+    estimate = conclude(task, structure, task.physics_learned())
+    return replace(estimate, status=replace(estimate.status, start_loss=estimate.status.loss))
 
 
 def _check_cost(problem: Problem, learner: Learner | None, solver: Solver, runs: int, engine: Engine) -> None:
     """Raise InputError for what would take more memory or time than there is."""
     sizes = {"rows": problem.count, "features": len(problem.features.entries), "outputs": len(problem.outputs)}
     check_cost(learner, **sizes, held=len(problem.rows), iterations=solver.iterations, runs=runs, room=engine.room())
-
-
-def _starts(bound: Bound | None, seeds: range, choices: Sequence[Regularization]) -> list[PlannedRun]:
-    """A run from every seed with every regularization; one without a learner."""
-    if bound is None:
-        return [PlannedRun(seeds.start, np.zeros(0), "none")]
-    keyed = {seed: bound.init(jax.random.key(seed)) for seed in seeds}
-    return [PlannedRun(seed, w, choice) for choice in choices for seed, w in keyed.items()]
 
 
 def _check_blocks(blocks: int) -> int:
@@ -333,21 +311,23 @@ def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStep
     return task, np.asarray(numbers.weights), model.theta - model.theta_aux
 
 
-def _check_record(record: Any, baseline: Any, lags: Any, learner: Any, initial: Any) -> None:
-    check_record(record)
-    check_type(baseline, Baseline, "baseline", "a Baseline or a Motion")
-    check_type(lags, Lags | None, "lags", "Lags(…) or None")
-    check_type(learner, Learner | None, "learner", "a learner such as MLP(), or None")
-    check_type(initial, Estimate | Model | None, "initial", "an Estimate, a Model or None")
+_TYPES: dict[str, tuple[Any, str]] = {
+    "baseline": (Baseline, "a Baseline or a Motion"),
+    "lags": (Lags | None, "Lags(…) or None"),
+    "learner": (Learner | None, "a learner such as MLP(), or None"),
+    "structure": (Structure, "a structure such as Orthogonal()"),
+    "criterion": (Criterion, "Prediction(…) or Simulation(…)"),
+    "solver": (Solver, "a solver such as LevenbergMarquardt()"),
+    "initial": (Model | None, "a Model or None"),
+    "validation": (Record | None, "a Record or None"),
+}
 
 
-def _check_choices(learner: Any, structure: Any, criterion: Any, solver: Any, initial: Any, validation: Any) -> None:
-    check_type(learner, Learner | None, "learner", "a learner such as MLP(), or None")
-    check_type(structure, Structure, "structure", "a structure such as Orthogonal()")
-    check_type(criterion, Criterion, "criterion", "Prediction(…) or Simulation(…)")
-    check_type(solver, Solver, "solver", "a solver such as LevenbergMarquardt()")
-    check_type(initial, Model | None, "initial", "a Model or None")
-    check_type(validation, Record | None, "validation", "a Record or None")
+def _check_types(**given: Any) -> None:
+    """Raise InputError for an argument of another type."""
+    for name, value in given.items():
+        kind, words = _TYPES[name]
+        check_type(value, kind, name, words)
 
 
 def _check_regularizations(given: Any, choices: Sequence[Any], chosen: bool) -> bool:
@@ -365,3 +345,42 @@ def _check_regularizations(given: Any, choices: Sequence[Any], chosen: bool) -> 
     if not choices:
         raise InputError("`regularization` is empty; give auto, none, evidence, ard or a number.")
     return auto
+
+
+def posed_on(
+    record: Record | Source, engine: Engine | None, baseline: Baseline, *args: Any, **options: Any
+) -> tuple[Problem, Engine]:
+    """The problem with the engine that sums over its rows; further arguments as of `pose`.
+
+    Args:
+        engine: None for what suits the record: memory, a stream of its files, the cluster that holds it.
+
+    Raises:
+        InputError: as `pose`.
+    """
+    if isinstance(record, Record):
+        return pose(record, baseline, *args, **options), InMemory() if engine is None else engine
+    engine = _engine_of(record) if engine is None else engine
+    return pose_streamed(record, witness(record), engine.passes, baseline, *args, **options), engine
+
+
+def _engine_of(source: Source) -> Engine:
+    client = getattr(source, "client", None)
+    if client is not None:
+        from orthaug.models.cluster import Dask
+
+        return Dask(client)
+    from orthaug.models.streaming import Stream
+
+    return Stream()
+
+
+def check_record(record: Any, *, moves: bool = False) -> None:
+    """Raise InputError for what holds no rows, or none in memory where a motion needs them."""
+    if not isinstance(record, Source):
+        check_type(record, Record, "record", "a Record")
+    elif moves and not isinstance(record, Record):
+        raise InputError(
+            "a motion takes a Record, whose segments an engine may share out; read these rows into memory "
+            "(read_record, Record.join), or fit the physics in its lagged form."
+        )

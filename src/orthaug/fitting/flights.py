@@ -57,9 +57,13 @@ class FlightTask(ABC):
     """The `Course`."""
     physics: Flight | None = None
 
-    @property
     @abstractmethod
-    def bound(self) -> Bound | None: ...
+    def flown_alone(self, solver: LevenbergMarquardt, structure: Structure, tell: RunTell) -> tuple[Any, Flight | None]:
+        """The plan and physics alone trained on it; None where it cannot fly."""
+
+    def scaled(self, plan: Any, physics: Flight) -> Any:
+        """The plan with its learner scaled by what physics alone does."""
+        return plan
 
     @abstractmethod
     def places(
@@ -72,6 +76,27 @@ class FlightTask(ABC):
     ) -> list[Place]:
         """Where a run from the weights w may start; arguments as in `estimate`."""
 
+    def prepared(self: Task, solver: LevenbergMarquardt, structure: Structure, progress: RunTell = quiet) -> Task:
+        """The same with physics alone trained.
+
+        Its errors are then the unit of the criterion, in which a ridge counts. Where it runs away over whole
+        experiments, runs are compared over segments.
+        """
+        own = self.plan
+
+        def tell(iteration: int, loss: float) -> None:
+            progress(iteration, loss * own.rms**2 / own.residuals)
+
+        plan, physics = self.flown_alone(solver, structure, tell)
+        if physics is None:
+            return self
+        rms = plan.rms * float(np.sqrt(physics.end.flown.misfit / plan.residuals))
+        plan = replace(plan, rms=max(rms, 1e-10 * plan.rms))
+        if not np.isfinite(physics.mean_square):
+            plan, flown = replace(plan, whole=plan.segments), physics.end.flown
+            physics = physics._replace(mean_square=plan.alone.mean_square(flown.c, flown.w))
+        return replace(self, plan=self.scaled(plan, physics), physics=physics)
+
     def keeping(self: Task, checkpoints: Checkpoints | None) -> Task:
         """The same with the states of its descents kept."""
         return replace(self, plan=replace(self.plan, checkpoints=checkpoints))
@@ -80,6 +105,10 @@ class FlightTask(ABC):
     def problem(self) -> Any:
         """What is estimated, with its record."""
         return self.plan.problem
+
+    @property
+    def bound(self) -> Bound | None:
+        return self.plan.bound
 
     @property
     def criterion(self) -> Criterion:

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Vector
-from orthaug._base.progress import RunTell, quiet
+from orthaug._base.progress import RunTell
 from orthaug.data.record import Record
 from orthaug.fitting.course import Flight
 from orthaug.fitting.criteria import Criterion
-from orthaug.fitting.flight_plan import FlightPlan
+from orthaug.fitting.flight_plan import FlightPlan, StructuredObjective
 from orthaug.fitting.flights import FlightTask, Place
 from orthaug.fitting.initial_states import Start
 from orthaug.fitting.learned import Learned
@@ -24,21 +24,15 @@ from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.physics_alone import fly_alone
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.source_plan import SourcePlan
-from orthaug.fitting.structured_objective import StructuredObjective
 from orthaug.fitting.structures import Structure
-from orthaug.models.learners import Bound
 from orthaug.physics.streamed import StreamedProblem
 
 
 @dataclass(frozen=True, eq=False)
 class FreeRunTask(FlightTask):
-    """A plan of segments, what physics alone does on it, and where an earlier model stands.
-
-    `physics` is None before `prepared`, and where physics alone cannot fly.
-    """
+    """A plan of segments, what physics alone does on it, and where an earlier model stands."""
 
     plan: FlightPlan
-    physics: Flight | None = None
     warm: Vector | None = None
     """c of an earlier model, with whose weights training starts."""
 
@@ -53,49 +47,24 @@ class FreeRunTask(FlightTask):
         return cls(plan.of(task, criterion), None, warm).keeping(task.checkpoints)
 
     @property
-    def task(self) -> OneStepTask:
-        return self.plan.task
-
-    @property
-    def bound(self) -> Bound | None:
-        return self.plan.bound
-
-    @property
     def rows_task(self) -> OneStepTask:
-        return self.task
+        return self.plan.task
 
     def physics_alone(self) -> tuple[OneStepTask, Learned]:
         """The rows without a learner, and what physics alone leaves on them; least squares where it cannot fly."""
         if self.physics is None:
-            return self.task.physics_alone()
+            return self.rows_task.physics_alone()
         plan = self.plan.alone
         return plan.task, replace(self, plan=plan).learned(self.physics)
 
     def on(self, record: Record) -> FreeRunTask:
         """The same problem on another record."""
-        return FreeRunTask.of(self.task.on(record), self.criterion)
+        return FreeRunTask.of(self.rows_task.on(record), self.criterion)
 
-    def prepared(self, solver: LevenbergMarquardt, structure: Structure, progress: RunTell = quiet) -> FreeRunTask:
-        """The same with physics alone trained.
-
-        Its errors are then the unit of the criterion, in which a ridge counts. Where it runs away over whole
-        experiments, runs are compared over segments.
-        """
-        plan = self.plan
-
-        def tell(iteration: int, loss: float) -> None:
-            progress(iteration, loss * plan.rms**2 / plan.residuals)
-
-        physics = fly_alone(plan, solver, structure, tell)
-        if physics is None:
-            return self
-        if not np.isfinite(physics.mean_square):
-            plan = replace(plan, whole=plan.segments)
-            flown = physics.end.flown
-            physics = physics._replace(mean_square=plan.alone.mean_square(flown.c, flown.w))
-        rms = plan.rms * float(np.sqrt(physics.end.flown.misfit / plan.residuals))
-        plan = replace(plan, rms=max(rms, 1e-10 * plan.rms))
-        return replace(self, plan=plan, physics=physics)
+    def flown_alone(
+        self, solver: LevenbergMarquardt, structure: Structure, tell: RunTell
+    ) -> tuple[FlightPlan, Flight | None]:
+        return self.plan, fly_alone(self.plan, solver, structure, tell)
 
     def places(
         self,
@@ -135,7 +104,7 @@ class FreeRunTask(FlightTask):
 
     def median(self, members: list[Learned], best: int) -> Learned:
         """The median of several, with the error of its own free run."""
-        learned = self.task.median(members, best)
+        learned = self.rows_task.median(members, best)
         assert learned.errors is not None and learned.coefficients is not None
         own = self.plan.mean_square(learned.coefficients, learned.weights, learned.tilt)
         return replace(learned, errors=learned.errors._replace(mean_square=own))

@@ -11,28 +11,23 @@ from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError
-from orthaug._base.lines import fold
-from orthaug._base.views import ShownFit
 from orthaug._base.warning import Warning
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion
-from orthaug.fitting.estimates import Restart
+from orthaug.fitting.estimates import AnyFit, Restart, parameter_frame, parameter_lines
 from orthaug.fitting.held_out import HeldOut
-from orthaug.fitting.motion_measures import field_under
-from orthaug.fitting.parameter_table import parameter_frame, parameter_lines
+from orthaug.fitting.motion_measures import field_under, wobble
 from orthaug.fitting.status import Status
-from orthaug.fitting.wobble import wobble
 from orthaug.inference.covariance import interval
-from orthaug.inference.learned_terms import equation, learned_terms, term_frame, term_lines
+from orthaug.inference.learned_terms import learned_terms, term_lines
 from orthaug.inference.measures import Measure, Training
 from orthaug.inference.motion_split import MotionSplit, split_motion
 from orthaug.models.dynamics import Numbers
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.statistics import JointCovariance, column_units
-from orthaug.physics.motion_layout import layout_of
-from orthaug.physics.motion_problem import MotionProblem
+from orthaug.physics.motion_problem import MotionProblem, layout_of
 from orthaug.physics.shared import Shared
 
 if TYPE_CHECKING:
@@ -47,7 +42,7 @@ _ROUNDING = 1e-11  # of the largest eigenvalue of the information with unit colu
 
 
 @dataclass(frozen=True, eq=False)
-class MotionEstimate(ShownFit):
+class MotionEstimate(AnyFit):
     """What `estimate` returns for a motion. Print `fit.summary()`; use `fit.model`; read `fit.parameters`."""
 
     model: MotionModel
@@ -91,11 +86,6 @@ class MotionEstimate(ShownFit):
         return self.model.reach(record)
 
     @property
-    def theta(self) -> Vector:
-        """The coordinates of p̂ (np,)."""
-        return self.model.theta
-
-    @property
     def shared(self) -> Shared:
         """The directions of the parameters' coordinates that the learner could imitate."""
         return self.split_by.shared
@@ -108,16 +98,18 @@ class MotionEstimate(ShownFit):
     @property
     def std(self) -> Vector | None:
         """Standard errors of p̂ (np,), NaN where one has none."""
-        if self.covariance is None:
-            return None
-        return np.sqrt(np.diag(self.covariance)) * np.abs(self.problem.motion.coordinates.slopes(self.theta))
+        return self._std_of(self.covariance)
 
     @property
     def plain_std(self) -> Vector | None:
         """The standard errors for white noise, where those of `std` are robust; None where they are not."""
-        if self.plain_covariance is None:
+        return self._std_of(self.plain_covariance)
+
+    def _std_of(self, covariance: Matrix | None) -> Vector | None:
+        """By the delta method, from a covariance of the coordinates."""
+        if covariance is None:
             return None
-        return np.sqrt(np.diag(self.plain_covariance)) * np.abs(self.problem.motion.coordinates.slopes(self.theta))
+        return np.sqrt(np.diag(covariance)) * np.abs(self.problem.motion.coordinates.slopes(self.theta))
 
     @property
     def interval(self) -> Matrix | None:
@@ -133,19 +125,6 @@ class MotionEstimate(ShownFit):
         motion = self.problem.motion
         table = parameter_frame(motion.parameters, self.values, self.std, self.interval)
         return table.assign(shared=[name not in self.shared.untouched for name in motion.names])
-
-    @cached_property
-    def terms(self) -> pd.DataFrame:
-        """Table with a row per term of a learner of terms: coefficient, unit, std, 95 % interval; else empty."""
-        return term_frame(learned_terms(self.model))
-
-    def equation(self, writing: str = "text") -> str:
-        """The fitted equations, where the learner is a sum of terms; as "text", "latex", "python".
-
-        Raises:
-            InputError: another learner, equations that are Python functions, another writing.
-        """
-        return equation(self.model, writing)
 
     def split(self, measure: Measure, shared: str = "auto") -> MotionEstimate:
         """The same fitted motion with p̂ under another measure over states and inputs, without training.
@@ -181,16 +160,12 @@ class MotionEstimate(ShownFit):
         statistics = self.model.statistics
         if self.scores is None or self.covariance is None or statistics.gram is None:
             raise InputError("the fit has no statistics that robust standard errors could be made of.")
-        steps = self.scores.block() if steps is None else steps
-        if steps is None:
-            raise InputError("the errors of the free run remember each other for too long to take them in blocks.")
-        middle, blocks = self.scores.middle(steps, len(self.theta) + self.effective_weights)
-        freedom = min(self.freedom, blocks - 1.0)
-        statistics = replace(statistics, middle=middle, freedom=freedom)
+        used = len(self.theta) + self.effective_weights
+        statistics = self.scores.robust(statistics, self.freedom, used, steps)
         plain = self.covariance if self.plain_covariance is None else self.plain_covariance
         model = replace(self.model, statistics=statistics)
         kept = tuple(w for w in self.warnings if w.code == "measure_beyond_data")
-        robust = replace(self, model=model, freedom=freedom, plain_covariance=plain)
+        robust = replace(self, model=model, freedom=statistics.freedom, plain_covariance=plain)
         return _with_split(robust, self.split_by, kept)
 
     def __repr__(self) -> str:
@@ -198,13 +173,22 @@ class MotionEstimate(ShownFit):
         return f"MotionEstimate({self.status.code}, loss {self.status.loss:.3g}, {values})"
 
     def lines(self) -> list[str]:
-        """The lines of `summary` before its warnings."""
-        return motion_lines(self)
-
-    def summary(self) -> str:
-        """A page of text: status, parameters, what is shared, warnings."""
-        warnings = ["", *(f"warning: {warning}" for warning in self.warnings)] if self.warnings else []
-        return "\n".join(fold([*self.lines(), *warnings]))
+        motion, bound, form = self.problem.motion, self.model.form.bound, self.model.form
+        seen = ", ".join(str(entry) for entry in form.features)
+        learner = "none"
+        if bound is not None:
+            learner = f"{bound.learner} of {seen}, {bound.size} weights, {self.effective_weights:.1f} effective"
+        steps = f"{form.substeps} substep{'s' * (form.substeps > 1)}"
+        lines = [
+            f"motion      {', '.join(motion.names_of_states)}; {motion.integrator}, {steps}, {motion.hold} hold",
+            f"learner     {learner}",
+            f"data        {self.problem.record!r}",
+            *self.status.lines,
+        ]
+        if bound is not None:
+            lines += [f"shared      {shared_in_words(self.shared)}", f"measure     {self.split_by.name}"]
+        lines += ["", *parameter_lines(motion.parameters, self.values, self.std, self.interval)]
+        return [*lines, *term_lines(learned_terms(self.model))]
 
 
 def fitted_numbers(numbers: Numbers) -> Numbers:
@@ -310,30 +294,6 @@ def _doubts(split: MotionSplit, at_bound: tuple[str, ...], unseen: tuple[str, ..
             )
         told.append(Warning("not_identified", text))
     return told
-
-
-def motion_lines(fit: MotionEstimate) -> list[str]:
-    """The lines of `MotionEstimate.summary` before its warnings."""
-    status, motion, bound, form = fit.status, fit.problem.motion, fit.model.form.bound, fit.model.form
-    seen = ", ".join(str(entry) for entry in form.features)
-    learner = "none"
-    if bound is not None:
-        learner = f"{bound.learner} of {seen}, {bound.size} weights, {fit.effective_weights:.1f} effective"
-    steps = f"{form.substeps} substep{'s' * (form.substeps > 1)}"
-    lines = [
-        f"motion      {', '.join(motion.names_of_states)}; {motion.integrator}, {steps}, {motion.hold} hold",
-        f"learner     {learner}",
-        f"data        {fit.problem.record!r}",
-        f"status      {status.code}, {status.iterations} iterations, {status.seconds:.2f} s, loss {status.loss:.6g}",
-    ]
-    if status.message:
-        lines.append(f"            {status.message}")
-    if bound is not None:
-        told = shared_in_words(fit.shared)
-        lines.append(f"shared      {told}")
-        lines.append(f"measure     {fit.split_by.name}")
-    lines += ["", *parameter_lines(motion.parameters, fit.values, fit.std, fit.interval)]
-    return [*lines, *term_lines(learned_terms(fit.model))]
 
 
 def shared_in_words(shared: Shared) -> str:

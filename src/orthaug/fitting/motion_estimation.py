@@ -1,26 +1,34 @@
-"""Fitting a motion to a record, with a learner beside some of its equations."""
+"""Fitting a motion to a record, with a learner beside some of its equations: training, and the estimate after it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from orthaug._base.checks import check_type
-from orthaug._base.jax import jax
+from orthaug._base.errors import InputError
 from orthaug._base.progress import SILENT, Tell
 from orthaug.data.record import Record
 from orthaug.fitting.checkpoints import Checkpoints
+from orthaug.fitting.conclusion import without_loss
 from orthaug.fitting.criteria import Criterion, Simulation
-from orthaug.fitting.motion_conclusion import conclude_motion
+from orthaug.fitting.learned import Learned
+from orthaug.fitting.motion_course import MotionCourse
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.rules import check_motion_choices, check_solver, checked_starts, tried
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.solver import Solver
+from orthaug.fitting.status import Ending, Status
 from orthaug.fitting.structures import Orthogonal, Structure
-from orthaug.fitting.training import Choice, PlannedRun, train
-from orthaug.models.learners import Learner
+from orthaug.fitting.training import Choice, planned, train
+from orthaug.inference.motion_split import MotionSplit
+from orthaug.models.learners import Learner, Scaling
+from orthaug.models.motion_model import MotionModel, Trained
 from orthaug.models.rows import Engine, InMemory
+from orthaug.models.statistics import Statistics
 from orthaug.models.tasks import Tasks, runs_on
 from orthaug.physics.motion import Motion
 from orthaug.physics.motion_problem import MotionProblem, pose_motion
@@ -73,10 +81,7 @@ def fit_motion(
     engine = runs_on(engine) if restarts * len(choices) > 1 else engine
     kept = None if isinstance(engine, Tasks) else checkpoints
     task = MotionTask.of(problem, learner, criterion, engine).keeping(kept)
-    starts = [PlannedRun(seed, (), "none")]
-    if task.bound is not None:
-        keyed = {s: task.bound.init(jax.random.key(s)) for s in range(seed, seed + restarts)}
-        starts = [PlannedRun(s, w, choice) for choice in choices for s, w in keyed.items()]
+    starts = planned(task.bound, range(seed, seed + restarts), choices)
     chosen = Choice(validation, blocks, fallback)
     return train(task, starts, structure, solver, chosen, progress, conclude_motion, runner=engine)
 
@@ -87,3 +92,127 @@ def without_learner(problem: MotionProblem) -> MotionProblem:
     states = tuple(replace(state, learned=False) for state in motion.states)
     outputs = tuple(replace(output, learned=False) for output in motion.outputs)
     return replace(problem, motion=replace(motion, states=states, outputs=outputs))
+
+
+_WINDOWS = (4, 16)  # times (states + 1): rows of a window to predict from
+_TRIED_ROWS = 1000  # on which windows are compared
+
+
+def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) -> MotionEstimate:
+    """Split the fitted motion and attach statistics."""
+    plan = task.plan
+    assert learned.coefficients is not None and learned.errors is not None
+    states = plan.segments.start if learned.scores is None else learned.scores.states
+    slope = None if learned.scores is None else learned.scores.slope
+    errors = learned.errors
+    alone = np.asarray(learned.coefficients if task.physics is None else task.physics.end.flown.theta)
+    trained = Trained(plan.flown.segment, plan.flown.washout, np.asarray(states), slope, alone)
+    model = replace(_model(plan, structure, learned), trained=trained)
+    fit = MotionEstimate(
+        model=model,
+        status=Status(learned.ending, learned.iterations, learned.seconds, errors.mean_square),
+        restarts=(),
+        covariance=None,
+        freedom=errors.freedom,
+        effective_weights=learned.effective,
+        defect=None,
+        problem=task.problem,
+        criterion=task.criterion,
+        split_by=MotionSplit.none("training", plan.dynamics, learned.coefficients),
+        course=plan,
+        states=states,
+        slope=slope,
+        alone=alone,
+        scores=learned.scores,
+        warnings=tuple(without_loss(errors.mean_square)),
+    )
+    return fit.split(structure.measure, getattr(structure, "shared", "auto")) if learned.ending.usable else fit
+
+
+def _model(plan: MotionCourse, structure: Structure, learned: Learned) -> MotionModel:
+    record = plan.record
+    assert learned.coefficients is not None and learned.errors is not None
+    noise = learned.errors.noise
+    middle = None
+    if noise is not None and learned.gram is not None and learned.middle is not None:
+        middle = learned.middle(plan.problem.weight.whitened(noise))
+    model = MotionModel(
+        form=plan.dynamics,
+        numbers=plan.numbers(learned.coefficients, learned.weights),
+        outputs=record.outputs,
+        inputs=record.inputs,
+        sampling_time=record.sampling_time,
+        structure=structure.name,
+        largest_output=np.max([np.abs(e.outputs).max(axis=0) for e in record.experiments], axis=0),
+        deviation=plan.deviation,
+        weight=plan.weight,
+        loose=plan.loose,
+        window=_WINDOWS[0] * (plan.dynamics.states + 1),
+        time_column=record.time_column,
+        prepared=record.prepared,
+        statistics=Statistics(learned.gram, middle, noise, learned.ridge, learned.errors.freedom, flown=True),
+    )
+    return replace(model, window=_best_window(model, record)) if learned.ending.usable else model
+
+
+def _best_window(model: MotionModel, record: Record) -> int:
+    """The rows to predict from that give the least error one step ahead, on some of the training data."""
+    longest = max(record.experiments, key=len).rows(0, _TRIED_ROWS)
+    tried = [n * (model.form.states + 1) for n in _WINDOWS]
+    best, least = tried[0], np.inf
+    for window in tried:
+        if best != window and 4 * window > len(longest):
+            break
+        part = replace(record, experiments=(longest,))
+        try:
+            response = replace(model, window=window).predict(part)
+        except InputError:  # not even one window fits
+            break
+        (trajectory,) = response.trajectories
+        assert trajectory.measured is not None
+        with np.errstate(all="ignore"):
+            errors = (trajectory.model - trajectory.measured)[tried[-1] if len(longest) > 4 * tried[-1] else window :]
+            square = float(np.mean(np.sum((errors @ model.weight.T) ** 2, axis=1)))
+        if square < 0.98 * least:  # a longer one only where it is clearly better
+            best, least = window, square
+    return best
+
+
+def reopened(model: MotionModel, record: Record) -> MotionEstimate:
+    """The estimate of a saved model with its training data, to split again, less what was told of its training.
+
+    Raises:
+        InputError: other data than the model was trained on.
+    """
+    kept, form, numbers = model.trained, model.form, model.numbers
+    if kept is None:
+        raise InputError("the model was saved without what a split needs; fit it again.")
+    record = model.fitting(record, need_outputs=True)
+    problem = pose_motion(record, form.motion, [entry.text for entry in form.features] or None)
+    problem = replace(problem, weight=replace(problem.weight, matrix=model.weight))
+    criterion = Simulation(kept.segment, kept.washout)
+    course = MotionCourse.of(problem, form.bound, criterion).refined(form.substeps)
+    centre, half = (numbers.centre, numbers.halfwidth) if form.bound is not None else (np.zeros(0), np.ones(0))
+    course = replace(course, scaling=Scaling(np.asarray(centre), np.asarray(half)), unit=np.asarray(numbers.gain))
+    if np.asarray(course.segments.start).shape != np.shape(kept.states):
+        raise InputError(
+            f"the model was trained on other rows: these {len(record)} give other segments than those it keeps the "
+            "starts of. Give the files, and --rows, that it was trained on."
+        )
+    c = np.asarray(numbers.theta - numbers.theta_aux)
+    return MotionEstimate(
+        model=model,
+        status=Status(Ending.EXACT, 0, 0.0, np.nan),
+        restarts=(),
+        covariance=None,
+        freedom=model.statistics.freedom,
+        effective_weights=np.nan,
+        defect=None,
+        problem=problem,
+        criterion=criterion,
+        split_by=MotionSplit.none(model.measure, form, c),
+        course=course,
+        states=kept.states,
+        slope=kept.slope,
+        alone=np.asarray(kept.alone),
+    )

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Vector
-from orthaug._base.progress import RunTell, quiet
+from orthaug._base.progress import RunTell
 from orthaug.data.record import Record
 from orthaug.fitting.course import Flight
 from orthaug.fitting.criteria import Criterion
@@ -22,7 +22,7 @@ from orthaug.fitting.segment_sums import SegmentSums
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Structure
-from orthaug.models.learners import Bound, Learner, Scaling
+from orthaug.models.learners import Bound, Learner
 from orthaug.models.rows import Engine
 from orthaug.models.terms import scaling_of
 from orthaug.physics.motion_problem import MotionProblem
@@ -35,7 +35,6 @@ class MotionTask(FlightTask):
     """A motion's course, and what its physics alone does on it."""
 
     plan: MotionCourse
-    physics: Flight | None = None
 
     @classmethod
     def of(
@@ -49,10 +48,6 @@ class MotionTask(FlightTask):
         states, outputs = problem.motion.learned
         bound = None if learner is None else Bound(learner, len(problem.features), len(states) + len(outputs))
         return cls(MotionCourse.of(problem, bound, criterion, sums=None if engine is None else SegmentSums.of(engine)))
-
-    @property
-    def bound(self) -> Bound | None:
-        return self.plan.bound
 
     @property
     def rows_task(self) -> MotionTask:
@@ -86,25 +81,22 @@ class MotionTask(FlightTask):
         information = objective.eliminated(end.flown, _LOOSER * objective.start_rows)[0]
         return super().learned(run._replace(end=end._replace(linear=end.linear._replace(information=information))))
 
-    def prepared(self, solver: LevenbergMarquardt, structure: Structure, progress: RunTell = quiet) -> MotionTask:
-        """The same with physics alone trained. It gives the learner its scaling, and the criterion its unit."""
-        plan = self.plan
+    def flown_alone(
+        self, solver: LevenbergMarquardt, structure: Structure, tell: RunTell
+    ) -> tuple[MotionCourse, Flight | None]:
+        return fly_motion(self.plan, solver, tell)
 
-        def tell(iteration: int, loss: float) -> None:
-            progress(iteration, loss / plan.residuals)
-
-        plan, physics = fly_motion(plan, solver, tell)
-        if physics is None:
-            return self
-        rms = float(np.sqrt(physics.end.flown.misfit / plan.residuals))
-        plan = replace(plan, rms=max(plan.rms * rms, 1e-10))
-        if not np.isfinite(physics.mean_square):
-            plan = replace(plan, whole=plan.segments)
-            physics = physics._replace(mean_square=plan.alone.mean_square(physics.end.flown.c, ()))
-        if self.bound is not None:
-            scaling, unit = _scaled(plan, physics)
-            plan = replace(plan, scaling=scaling, unit=unit)
-        return replace(self, plan=plan, physics=physics)
+    def scaled(self, plan: MotionCourse, physics: Flight) -> MotionCourse:
+        """The learner's features over the runs of physics alone, and the size of what it is added to."""
+        if plan.bound is None:
+            return plan
+        flown = physics.end.flown
+        x, u = (part.T for part in plan.alone.trajectory(flown.c, (), flown.states))
+        with np.errstate(all="ignore"):
+            features = np.asarray(plan.dynamics.seen(x, u, np)).T
+        finite = features[np.isfinite(features).all(axis=1)]
+        scaling = scaling_of(plan.bound.learner, finite if len(finite) else np.zeros((1, features.shape[1])))
+        return replace(plan, scaling=scaling, unit=sizes_learned(plan, flown.c, x.T, u.T))
 
     def places(
         self,
@@ -122,15 +114,3 @@ class MotionTask(FlightTask):
         states = objective.initial.measured
         loss = objective.fly(p, Start(states)).loss
         return [Place(p, states, loss if np.isfinite(loss) else np.inf, silenced is not None)]
-
-
-def _scaled(plan: MotionCourse, physics: Flight) -> tuple[Scaling, Vector]:
-    """The learner's features over the runs of physics alone, and the size of what it is added to."""
-    flown = physics.end.flown
-    x, u = (part.T for part in plan.alone.trajectory(flown.c, (), flown.states))
-    with np.errstate(all="ignore"):
-        features = np.asarray(plan.dynamics.seen(x, u, np)).T
-    finite = features[np.isfinite(features).all(axis=1)]
-    assert plan.bound is not None
-    scaling = scaling_of(plan.bound.learner, finite if len(finite) else np.zeros((1, features.shape[1])))
-    return scaling, sizes_learned(plan, flown.c, x.T, u.T)

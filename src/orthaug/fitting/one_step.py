@@ -19,7 +19,6 @@ from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.elimination import Elimination, Fixed, eliminate
 from orthaug.fitting.learned import Learned
-from orthaug.fitting.learner_sums import LearnerSums, ResidualGram, row_values
 from orthaug.fitting.normal_equations import Blocks, Hold, OneStep, Summed, linearise
 from orthaug.fitting.paper_criterion import JointOneStep, PaperCriterion, Physics
 from orthaug.fitting.rules import ridge_of
@@ -28,7 +27,7 @@ from orthaug.fitting.solvers.adam_lbfgs import GradientRun
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.inference.covariance import mixing
 from orthaug.models.learners import Bound, Learner, Scaling
-from orthaug.models.rows import Engine, InMemory, MixedGram, Overlap, from_chunks
+from orthaug.models.rows import Engine, InMemory, LearnerSums, MixedGram, Overlap, ResidualGram, from_chunks, row_values
 from orthaug.models.terms import scaling_of
 from orthaug.physics.problem import Problem
 from orthaug.physics.streamed import StreamedProblem

@@ -20,11 +20,10 @@ from orthaug._base.errors import InputError, shown
 from orthaug._base.jax import jax
 from orthaug._base.lines import percent
 from orthaug.data.record import Record
-from orthaug.fitting import recursive_start, recursive_storage
-from orthaug.fitting.estimates import Estimate, order_of
-from orthaug.fitting.parameter_table import parameter_frame, parameter_lines
-from orthaug.fitting.recursive_course import Course, covariances
-from orthaug.fitting.recursive_rows import Lagging, Whitened, joined_rows, whitened_rows
+from orthaug.fitting import recursive_storage
+from orthaug.fitting.estimates import Estimate, order_of, parameter_frame, parameter_lines
+from orthaug.fitting.recursion import Course, covariances
+from orthaug.fitting.recursive_rows import Lagging, Whitened, begin, joined_rows, trained, whitened_rows
 from orthaug.fitting.residual_band import Watch
 from orthaug.inference.covariance import interval
 from orthaug.inference.physical import PhysicalEstimate, solve
@@ -92,9 +91,9 @@ class Recursive:
         check_choice(start, ("fit", "empty"), "`start`")
         if check_number(quiet, "quiet", positive=True) < 1:
             raise InputError(f"`quiet` must be 1 row or more; got {shown(quiet)}.")
-        began = recursive_start.trained(fit, training)
+        began = trained(fit, training)
         factor = forgetting_factor(forgetting, memory, began.model.sampling_time)
-        recursion, reference, inflation = recursive_start.begin(began, factor, quiet, empty=start == "empty")
+        recursion, reference, inflation = begin(began, factor, quiet, empty=start == "empty")
         self._set(began.model, recursion, Watch(reference), inflation, began.used)
 
     def _set(self, model: Model, recursion: Any, watch: Watch, inflation: Matrix | None, used: float) -> None:

@@ -12,13 +12,12 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
-from orthaug.fitting.recursion import Recursion
-from orthaug.fitting.recursive_course import Course
+from orthaug.fitting.recursion import Course, Recursion
 from orthaug.fitting.residual_band import Reference, Watch
 from orthaug.models import storage
 from orthaug.models.learners import Learner
 from orthaug.models.model import Model
-from orthaug.models.packing import pack, read_packed, write_packed
+from orthaug.models.storage import pack, read_packed, write_packed
 from orthaug.physics.baseline import Baseline
 
 FORMAT = 1

@@ -19,7 +19,7 @@ from orthaug.fitting.scikit_learn import (
     learner_of,
     output_names,
 )
-from orthaug.inference.intervals import prediction_std
+from orthaug.inference.covariance import prediction_std
 
 _NOW = Lags(nb=1, nk=0)  # every column, at the row itself
 

@@ -152,16 +152,21 @@ def chunk_sensitivity(dynamics: Dynamics, numbers: Numbers, chunk: tuple[Any, ..
     return Sensitivity(*advance(dynamics, numbers, (state, dynamics.first_slopes(width), *nothing), rows, weight))
 
 
+def _columns(scored: Any, slope: Any, error: Any, weight: Any) -> Any:
+    """Slopes and error of scored steps side by side (ny, n0 + n + 1, …), rows multiplied by `weight`."""
+    columns = jnp.where(scored, jnp.concatenate([slope, error[:, None]], axis=1), 0.0)
+    return jnp.einsum("oi,in...->on...", weight, columns) if len(weight) > 1 else weight[0, 0] * columns
+
+
 def _step_by_step(dynamics: Dynamics, numbers: Numbers, carry: Any, rows: Any, weight: Any) -> tuple[Any, Any]:
     """Gram matrices of one chunk, for dynamics that know how to carry slopes."""
-    n0, ny = dynamics.states, len(dynamics.outputs)
+    n0 = dynamics.states
 
     def step(carry: tuple[Any, ...], row: tuple[Any, ...]) -> tuple[Any, None]:
         state, slopes, shared, own = carry
         inputs, target, scored = row
         state, slopes, value, slope = dynamics.tangents(numbers, state, slopes, inputs)
-        columns = jnp.where(scored, jnp.concatenate([slope, (target - value)[:, None]], axis=1), 0.0)
-        columns = jnp.einsum("oi,inm->onm", weight, columns) if ny > 1 else weight[0, 0] * columns
+        columns = _columns(scored, slope, target - value, weight)
         shared = shared + sum(gram(output[n0:]) for output in columns)
         own = own + sum(output[:n0, None] * output[None] for output in columns)
         return (state, slopes, shared, own), None
@@ -174,7 +179,7 @@ def _steps_at_once(most: int, dynamics: Any, numbers: Numbers, carry: Any, rows:
 
     Only the product of the slopes has to go from step to step. A block is bounded, so nothing has the size of the data.
     """
-    n0, ny, width = dynamics.states, len(dynamics.outputs), carry[0].shape[-1]
+    n0, width = dynamics.states, carry[0].shape[-1]
     n, steps = dynamics.unknowns, len(rows[0])
     count = -(-steps // most)
     size = -(-steps // count)
@@ -196,9 +201,7 @@ def _steps_at_once(most: int, dynamics: Any, numbers: Numbers, carry: Any, rows:
         slopes, before = jax.lax.scan(follow, slopes, tuple(by_step))
         before = jnp.moveaxis(before, 0, -2)  # (n0, n0 + n, size, width)
         slope = sum(to_state[n0:, i, None] * before[None, i] for i in range(n0)) + own_slopes[n0:]
-        error = jnp.moveaxis(target, 0, -2) - value[n0:]
-        columns = jnp.where(scored, jnp.concatenate([slope, error[:, None]], axis=1), 0.0)
-        columns = jnp.einsum("oi,in...->on...", weight, columns) if ny > 1 else weight[0, 0] * columns
+        columns = _columns(scored, slope, jnp.moveaxis(target, 0, -2) - value[n0:], weight)
         shared = shared + sum(gram(output[n0:].reshape(n + 1, -1)) for output in columns)
         own = own + sum((output[:n0, None] * output[None]).sum(axis=-2) for output in columns)
         return (state, slopes, shared, own), None
@@ -229,14 +232,13 @@ def block_scores(
     """
     numbers = dynamics.prepared(numbers)
     _, n0, width = segments.start.shape
-    n, ny = dynamics.unknowns, len(dynamics.outputs)
+    n = dynamics.unknowns
 
     def step(carry: tuple[Any, ...], row: tuple[Any, ...]) -> tuple[Any, None]:
         state, slopes, sums = carry
         inputs, target, scored, block = row
         state, slopes, value, slope = dynamics.tangents(numbers, state, slopes, inputs)
-        columns = jnp.where(scored, jnp.concatenate([slope, (target - value)[:, None]], axis=1), 0.0)
-        columns = jnp.einsum("oi,inm->onm", weight, columns) if ny > 1 else weight[0, 0] * columns
+        columns = _columns(scored, slope, target - value, weight)
         return (state, slopes, sums.at[block].add(jnp.sum(columns[:, :-1] * columns[:, -1:], axis=0))), None
 
     def one_chunk(chunk: tuple[Any, ...]) -> Any:

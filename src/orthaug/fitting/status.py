@@ -90,6 +90,12 @@ class Status:
         return self.ending.message
 
     @property
+    def lines(self) -> list[str]:
+        """The lines of a fit's summary on it."""
+        ended = f"status      {self.code}, {self.iterations} iterations, {self.seconds:.2f} s, loss {self.loss:.6g}"
+        return [ended, f"            {self.message}"] if self.message else [ended]
+
+    @property
     def ok(self) -> bool:
         """Whether there is a usable model."""
         return self.ending.usable

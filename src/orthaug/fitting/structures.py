@@ -67,12 +67,22 @@ class Structure(Protocol):
         ...
 
 
-def _no_rows(nt: int) -> PenaltyRows:
-    return PenaltyRows(np.zeros((0, nt)), np.zeros((0, nt)), np.zeros(0))
+class _Solved:
+    """θ solved for any weights, without rows in the criterion; called what is left beside the learner."""
+
+    projects = False
+    identifies = True
+    from_initial: bool = False
+    measure: Measure = Training()
+    shared: str = "auto"
+
+    def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> PenaltyRows:
+        nt = len(names)
+        return PenaltyRows(np.zeros((0, nt)), np.zeros((0, nt)), np.zeros(0))
 
 
 @dataclass(frozen=True)
-class Orthogonal:
+class Orthogonal(_Solved):
     """ŷ = φ(θ − θ_aux) + f with θ_aux = Φ_μ⁺F_μ (eq:orth_param).
 
     Under the training measure θ̂ = Φ⁺Y for every learner that sees all lags (F1). Under another `measure` training is
@@ -88,29 +98,19 @@ class Orthogonal:
     """
 
     projects = True
-    identifies = True
-    from_initial = False
 
     measure: Measure = field(default=Training(), metadata=LIBRARY_ONLY)  # noqa: RUF009  (frozen)
     shared: Literal["auto", "all"] = "auto"
     name: str = field(default="orthogonal", metadata=LIBRARY_ONLY)
 
-    def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> PenaltyRows:
-        return _no_rows(len(names))
-
 
 @dataclass(frozen=True)
-class Additive:
+class Additive(_Solved):
     """ŷ = φθ + f (eqs:additive_struct): θ takes what this learner happens to leave, so it is not unique.
 
     With `from_initial` θ starts at θ⁰ and is trained with the weights, one step ahead; without, it is solved for any
     weights and never sees θ⁰.
     """
-
-    projects = False
-    identifies = True
-    measure = Training()
-    shared = "auto"
 
     from_initial: bool = False
     name: str = field(default="additive", metadata=LIBRARY_ONLY)
@@ -118,22 +118,13 @@ class Additive:
     def __post_init__(self) -> None:
         check_type(self.from_initial, bool, "from_initial", "true or false")
 
-    def penalty(self, names: Sequence[str], initial: Vector, unit: float) -> PenaltyRows:
-        return _no_rows(len(names))
-
 
 @dataclass(frozen=True)
-class OrthogonalPenalty:
+class OrthogonalPenalty(_Solved):
     """Additive with `λ‖QᵀF‖²` in the criterion (Kon 2022, Györök 2025): drives the learner out of the physics.
 
     `weight` is λ, against the sum of squares in the output's units.
     """
-
-    projects = False
-    identifies = True
-    from_initial = False
-    measure = Training()
-    shared = "auto"
 
     weight: Annotated[float, Ge(0)] = 1.0
     name: str = field(default="orthogonal-penalty", metadata=LIBRARY_ONLY)
@@ -147,17 +138,13 @@ class OrthogonalPenalty:
 
 
 @dataclass(frozen=True)
-class BaselinePenalty:
+class BaselinePenalty(_Solved):
     """Additive with `λ‖(θ − θ⁰)/θ⁰‖²` in the criterion (Bolderman 2022): keeps θ near its initial value.
 
     `weight` is λ, against the sum of squares in the output's units.
     """
 
-    projects = False
     identifies = False
-    from_initial = False
-    measure = Training()
-    shared = "auto"
 
     weight: Annotated[float, Ge(0)] = 1.0
     name: str = field(default="baseline-penalty", metadata=LIBRARY_ONLY)

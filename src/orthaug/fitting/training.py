@@ -27,6 +27,7 @@ from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Structure
+from orthaug.models.learners import Bound
 
 _INFLATION = 1.4  # of the effective weights in cross-validation, against what follows the noise (Kim and Gu 2004)
 FOLD_ITERATIONS = 60  # enough to tell whether a learner helps, on every block of cross-validation
@@ -42,6 +43,14 @@ class PlannedRun(NamedTuple):
     seed: int
     weights: Any
     regularization: str | float
+
+
+def planned(bound: Bound | None, seeds: range, choices: Sequence[str | float]) -> list[PlannedRun]:
+    """A run from every seed with every regularization; one without a learner."""
+    if bound is None:
+        return [PlannedRun(seeds.start, np.zeros(0), "none")]
+    keyed = {seed: bound.init(jax.random.key(seed)) for seed in seeds}
+    return [PlannedRun(seed, w, choice) for choice in choices for seed, w in keyed.items()]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-from .intervals import prediction_std as prediction_std
+from .covariance import prediction_std as prediction_std
 from .measures import Samples as Samples
 from .measures import Symmetrized as Symmetrized
 from .measures import Training as Training

@@ -1,20 +1,35 @@
-"""Statistics of θ: noise covariance, standard errors and intervals under the training measure.
+"""Covariances and intervals: of θ, of θ and weights together, of predictions, robust to coloured or uneven noise.
 
-The calibrated form `(Σψᵀψ)⁻¹(ΣψᵀΣ_eψ)(Σψᵀψ)⁻¹` for the criterion `1/N Σ‖ε‖²` (Ljung 1999, ch. 9): the
-factor 2 of the paper's eq:cov_approx cancels against the second derivative of the criterion.
+The calibrated form `(Σψᵀψ)⁻¹(ΣψᵀΣ_eψ)(Σψᵀψ)⁻¹` for the criterion `1/N Σ‖ε‖²` (Ljung 1999, ch. 9): the factor 2 of the
+paper's eq:cov_approx cancels against the second derivative of the criterion; for plain least squares that form gives
+twice `σ²(ΦᵀΦ)⁻¹`. Learner weights are over-parametrised, so their block is singular. Only functions of the model have
+intervals.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
+import scipy.linalg
 import scipy.special
 from jaxtyping import Float
 
-from orthaug._base.checks import Matrix, Vector
-from orthaug.models.statistics import column_units
+from orthaug._base.checks import Matrix, Vector, check_choice, check_count
+from orthaug._base.errors import InputError
+from orthaug._base.jax import Array, jax, jnp
+from orthaug.data.record import Record
+from orthaug.models.dynamics import Numbers
+from orthaug.models.lagged import Lagged
+from orthaug.models.model import Model
+from orthaug.models.rows import InMemory, chunk_shape, from_chunks, in_chunks, learner_rows, projected_gram
+from orthaug.models.statistics import column_units, half_inverse
+from orthaug.physics.problem import Problem
 from orthaug.physics.projection import Factor
+
+CONVENTIONS = ("calibrated", "paper")
 
 
 def degrees_of_freedom(rows: int, physics: Vector, effective: float) -> Vector:
@@ -83,7 +98,177 @@ def theta_block(information: Matrix, ridge: float, nt: int, fixed: Collection[in
     return covariance
 
 
-def interval(value: Vector, std: Vector, freedom: float, level: float = 0.95) -> Float[np.ndarray, "n 2"]:
-    """Student-t interval of each entry, (n, 2)."""
-    reach = scipy.special.stdtrit(max(freedom, 1.0), 0.5 + level / 2) * std
-    return np.stack([value - reach, value + reach], axis=-1)
+def reach(freedom: float, level: float = 0.95) -> float:
+    """Half the length of a Student-t interval, in standard errors."""
+    return float(scipy.special.stdtrit(max(freedom, 1.0), 0.5 + level / 2))
+
+
+def interval(value: Any, std: Any, freedom: float, level: float = 0.95) -> Float[np.ndarray, "*n 2"]:
+    """Student-t interval of each entry, (…, 2)."""
+    half = reach(freedom, level) * std
+    return np.stack([value - half, value + half], axis=-1)
+
+
+def joint_covariance(problem: Problem, model: Model, convention: str = "calibrated") -> Matrix:
+    """Cov of θ̂ and the learner's weights in the orthogonal structure, from the raw `[Φ J̃]`, J̃ = P⊥J; (nθ + nw)².
+
+    Under the training measure the blocks between θ and weights are zero (`thm:zero_cov`), if all outputs have the same
+    noise or share no θ. One pass over the rows.
+
+    Args:
+        convention: "paper" for eq:cov_approx divided by N, factor 2 and `Σ̂ = (1/N) Σ e eᵀ` included.
+
+    Raises:
+        InputError: an unknown convention, or a model without a learner's gradient.
+    """
+    check_choice(convention, CONVENTIONS, "`convention`")
+    if model.numbers.tilt is not None:
+        raise InputError("an ensemble has no gradient in its weights; use a single learner.")
+    residual = np.concatenate([(t.measured - t.model)[t.start :] for t in model.predict(problem.record).trajectories])
+    noise: Any = residual.T @ residual / len(residual) if convention == "paper" else model.statistics.noise
+    if noise is None:
+        raise InputError("the fit has no noise covariance: there are no degrees of freedom left.")
+    projection, nt, ny = problem.projection, len(problem.baseline.names), len(problem.outputs)
+    engine = InMemory()
+    rows = learner_rows(engine, model.form, model.numbers, problem.rows.x, problem.projection.q, problem.weight.matrix)
+    whitened = problem.weight.whitened(noise)
+    bound, w = model.form.bound, np.asarray(model.numbers.weights)
+    share = problem.count / len(problem.rows)  # of which the rows in memory are a witness
+    outer, middle = (share * projected_gram(engine, bound, w, rows, m) for m in (np.eye(ny), mixing(whitened)))
+    change = np.eye(len(outer))
+    change[:nt, :nt] = projection.r / projection.scale
+    outer, middle = (change.T @ gram @ change for gram in (outer, middle))
+    # block by block, as in the proof: one inverse of both mixes rounding of the weights' singular block into θ's
+    half: Any = scipy.linalg.block_diag(half_inverse(outer[:nt, :nt], nt), half_inverse(outer[nt:, nt:], 0))
+    return (2.0 if convention == "paper" else 1.0) * half @ (half.T @ middle @ half) @ half.T
+
+
+def prediction_std(model: Model, record: Record) -> list[Matrix]:
+    """Standard error of the one-step prediction on every row of every experiment, (N, ny); NaN on the first lags.
+
+    It is that of the fitted function, `√(ψ Cov(c, w) ψᵀ)`. A new measurement adds the noise, whose covariance (ny, ny)
+    is `model.statistics.noise`: its standard deviation is `√(std² + diag(noise))`.
+
+    Args:
+        model: with statistics, as a fit has them.
+        record: inputs and outputs, measured.
+
+    Raises:
+        InputError: a model without statistics, other channels.
+    """
+    joint = model.statistics.joint(len(model.theta))
+    if joint is None or model.numbers.tilt is not None:
+        raise InputError(
+            "the model has no statistics to take standard errors from (an ensemble, or trained elsewhere)."
+        )
+    root = joint.root()
+    record = model.fitting(record, need_outputs=True)
+    deviations = []
+    for experiment in record.experiments:
+        x = model.form.regressors(experiment, record)
+        shape = chunk_shape(len(x))
+        chunks = in_chunks(x, shape, repeat=True)
+        variance = np.asarray(_variances(model.form, model.numbers, chunks, root))
+        values = np.full((len(experiment), len(model.outputs)), np.nan)
+        values[model.form.first_row :] = np.sqrt(np.maximum(from_chunks(variance, len(x)), 0.0))
+        deviations.append(values)
+    return deviations
+
+
+@partial(jax.jit, static_argnames="form")
+def _variances(
+    form: Lagged, numbers: Numbers, x: Float[Array, "k nx m"], root: Float[Array, "n r"]
+) -> Float[Array, "k ny m"]:
+    return jax.lax.map(lambda rows: jnp.sum(_along(form, numbers, rows, root) ** 2, axis=0), x)
+
+
+@partial(jax.jit, static_argnames="form")
+def _changes(
+    form: Lagged, numbers: Numbers, x: Float[Array, "k nx m"], root: Float[Array, "n r"]
+) -> Float[Array, "k ro m"]:
+    """How far each prediction moves along the columns of `root`."""
+
+    def one_chunk(rows: Any) -> Any:
+        moved = _along(form, numbers, rows, root)
+        return moved.reshape(-1, moved.shape[-1])
+
+    return jax.lax.map(one_chunk, x)
+
+
+def _along(form: Lagged, numbers: Numbers, rows: Any, root: Any) -> Float[Array, "r ny m"]:
+    """∂ŷ/∂(c, w) of a chunk of rows along the columns of `root`."""
+    phi = jax.vmap(lambda row: form.baseline.phi(row, form.layout, form.outputs, jnp), -1, -1)(rows)
+    columns = jnp.moveaxis(phi, 1, 0)  # (nt, ny, m)
+    if form.bound is not None:
+        z = form.features.evaluate(rows.T, form.layout, jnp)
+        z = ((z - numbers.centre) / numbers.halfwidth).T
+        gain = jnp.broadcast_to(jnp.diag(numbers.gain)[..., None], (*2 * (len(form.outputs),), rows.shape[-1]))
+        columns = jnp.concatenate([columns, form.bound.jacobian(numbers.weights, z, gain)[1]])
+    return jnp.einsum("nom,nr->rom", columns, root)
+
+
+def newey_west(scores: Sequence[Float[np.ndarray, "N nt"]], lags: int | None = None) -> Matrix:
+    """Σ_k Σ_j w_{|k−j|} s_k s_jᵀ with Bartlett weights (Newey and West 1987), lags never across experiments.
+
+    Args:
+        scores: of every experiment, (N_i, nt).
+        lags: how many; default `⌊4 (N/100)^(2/9)⌋`.
+    """
+    if lags is not None:
+        check_count(lags, "lags", least=0)
+    rows = sum(len(s) for s in scores)
+    lags = int(4 * (rows / 100) ** (2 / 9)) if lags is None else lags
+    total = sum(s.T @ s for s in scores)
+    for lag in range(1, lags + 1):
+        share = sum(s[lag:].T @ s[:-lag] for s in scores if len(s) > lag)
+        total = total + (1 - lag / (lags + 1)) * (share + np.transpose(share))
+    return np.asarray(total)
+
+
+def robust_covariance(problem: Problem, residual: Matrix, used: float, lags: int | None = None) -> Matrix:
+    """Cov θ̂ (nθ, nθ) of `θ̂ = Φ⁺Y` where the noise may be coloured or uneven (Newey-West).
+
+    Args:
+        residual: (N, ny) in the outputs' units, rows as in the problem.
+        used: effective weights of the learner, by which the residual is too small.
+    """
+    projection = problem.projection
+    whitened = problem.weight.rows(residual)
+    scores = np.einsum("kit,ki->kt", projection.q, whitened)
+    factor = projection.covariance_factor()
+    return _correction(problem, residual, used) * factor @ newey_west(by_experiment(problem, scores), lags) @ factor.T
+
+
+def robust_split_covariance(
+    problem: Problem, model: Model, slope: Matrix, residual: Matrix, used: float, lags: int | None = None
+) -> Matrix:
+    """The same of any split `θ = c + θ_aux(w)`, from the influence `[I, ∂θ_aux/∂w] M⁻¹ ψ_k e_k` of every row.
+
+    Args:
+        slope: ∂θ_aux/∂w (nθ, nw).
+    """
+    statistics, nt, ny = model.statistics, len(slope), residual.shape[1]
+    if statistics.gram is None or model.numbers.tilt is not None:
+        raise InputError("the fit has no statistics that robust standard errors could be made of.")
+    prior = np.concatenate([np.zeros(nt), np.full(len(statistics.gram) - nt, statistics.ridge)])
+    half = half_inverse(statistics.gram + np.diag(prior), nt)
+    root = half @ (half.T @ np.column_stack([np.eye(nt), slope]).T)
+    chunks = jnp.asarray(in_chunks(problem.rows.x, chunk_shape(len(residual)), repeat=True))
+    changes = from_chunks(np.asarray(_changes(model.form, model.numbers, chunks, jnp.asarray(root))), len(residual))
+    matrix = problem.weight.matrix
+    weighed = residual @ (matrix.T @ matrix)
+    scores = np.einsum("kro,ko->kr", changes.reshape(len(residual), nt, ny), weighed)
+    return _correction(problem, residual, used) * newey_west(by_experiment(problem, scores), lags)
+
+
+def _correction(problem: Problem, residual: Matrix, used: float) -> float:
+    """For what the fit has used up."""
+    share = problem.count / len(problem.rows)  # of which the residual is a witness
+    samples = residual.size * share
+    return share * samples / max(samples - len(problem.baseline.names) - used, 1.0)
+
+
+def by_experiment(problem: Problem, values: Matrix) -> list[Matrix]:
+    """What each usable row has, (N, m), in a piece per experiment."""
+    ends = np.cumsum([len(experiment) - problem.rows.start for experiment in problem.record.experiments])
+    return np.split(values, ends[:-1])

@@ -1,4 +1,4 @@
-"""Measures: the points, with weights, on which physics and learner are made orthogonal (F3).
+"""Measures: the points, with weights, on which physics and learner are made orthogonal (F3), and the physics there.
 
 θ under a measure is `Φ_μ⁺ G_μ`, the least-squares share of the fitted function g in the physics over those points. The
 paper takes the training set. A function that is orthogonal to the physics under one measure need not be so under
@@ -9,19 +9,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Annotated, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from annotated_types import Len
+from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector, nearest
 from orthaug._base.errors import InputError
 from orthaug._base.registry import LIBRARY_ONLY, Option
 from orthaug.data.expressions import Lag
-from orthaug.data.record import Record
+from orthaug.data.record import Channel, Experiment, Record
 from orthaug.data.regressors import Layout, lag_matrix, largest_lag, stack_rows
+from orthaug.physics.baseline import Baseline
+from orthaug.physics.excitation import Excitation, excitation
+from orthaug.physics.motion import Motion
+from orthaug.physics.motion_problem import layout_of
+from orthaug.physics.output_weights import times
+from orthaug.physics.problem import Problem
+from orthaug.physics.projection import Projection
 
 _NODES = (1 << 20, 512, 64)  # of the rule for one, two and three coordinates, in each of them
 _PANEL = 8  # Gauss-Legendre nodes of a panel
@@ -45,6 +53,18 @@ class Support:
     used: tuple[Lag, ...]
     stacked: Matrix | None = None
     """The training regressors, where they are stacked already."""
+
+    @classmethod
+    def of(cls, problem: Problem) -> Support:
+        """Where a problem is posed."""
+        return cls(problem.record, problem.layout, problem.used, problem.rows.x)
+
+    @classmethod
+    def of_motion(cls, motion: Motion, x: Matrix, u: Matrix) -> Support:
+        """Of a motion's states (M, nx) and inputs (M, nu) at the training rows."""
+        layout, points = layout_of(motion), np.concatenate([x, u], axis=1)
+        channels = tuple(Channel(f"c{i}") for i in range(len(layout)))
+        return cls(Record((), channels, 1.0, (Experiment(points[:, :0], points),)), layout, layout, points)
 
     @cached_property
     def x(self) -> Matrix:
@@ -277,3 +297,48 @@ def _rule(coordinates: int) -> Points:
 
     quasi = 2 * scipy.stats.qmc.Sobol(coordinates, scramble=True, rng=0).random(_QUASI_RANDOM) - 1
     return _even(np.concatenate([quasi, -quasi]))
+
+
+@dataclass(frozen=True, eq=False)
+class Weighed:
+    """A measure's `points`, and the physics there with every row multiplied by `unit` (M, ny, ny).
+
+    The unit is the square root of a point's weight times the matrix of the output weights.
+    """
+
+    measure: Measure
+    points: Points
+    unit: Float[np.ndarray, "M ny ny"]
+    projection: Projection
+    excitation: Excitation
+
+
+def weigh(measure: Measure, support: Support, baseline: Baseline, outputs: tuple[str, ...], weight: Matrix) -> Weighed:
+    """The physics over a measure's points.
+
+    Args:
+        weight: the matrix of the output weights, (ny, ny).
+
+    Raises:
+        InputError: a measure that does not fit the data, or on whose points the physics is not finite.
+    """
+    points = measure.points(support)
+    with np.errstate(all="ignore"):
+        phi = np.asarray(baseline.phi(points.x, support.layout, outputs, np))
+    if not np.isfinite(phi).all():
+        raise InputError(f"the physics is not finite on all points of the {measure.name} measure; narrow it.")
+    unit = np.sqrt(points.weight)[:, None, None] * weight
+    projection = Projection.factor(times(unit, phi))
+    return Weighed(measure, points, unit, projection, excitation(projection.r, baseline.names))
+
+
+def weigh_problem(measure: Measure, problem: Problem) -> Weighed:
+    """The same for a posed problem. Under the training measure it takes the factor that the problem has."""
+    if measure != Training():
+        return weigh(measure, Support.of(problem), problem.baseline, problem.outputs, problem.weight.matrix)
+    rows, own = len(problem.rows), problem.projection
+    even = np.full(rows, 1 / rows)
+    size = np.sqrt(even[0])
+    projection = replace(own, r=own.r * size, phi=own.phi * size)
+    unit = np.sqrt(even)[:, None, None] * problem.weight.matrix
+    return Weighed(measure, Points(problem.rows.x, even), unit, projection, problem.excitation)

@@ -15,13 +15,14 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.models.dynamics import Numbers
 from orthaug.models.motion_field import MotionField
 from orthaug.models.moving import Moving
+from orthaug.physics.motion import Motion
 from orthaug.physics.shared import Shared, agreeing, moves, spanned
 
 _BATCH = 4096  # points at a time
@@ -74,8 +75,7 @@ def shared_of_motion(form: Moving, q: Vector, x: Matrix, u: Matrix) -> Shared:
     function of the features alone.
     """
     names, motion = form.motion.names, form.motion
-    states, outputs = motion.learned
-    if not states and not outputs:
+    if not learned_places(motion):
         return Shared(names, np.zeros((len(names), 0)))
     if form.bound is not None and getattr(form.bound.learner, "linear", False):
         return _spanned(form, q, x, u)
@@ -90,10 +90,7 @@ def shared_of_motion(form: Moving, q: Vector, x: Matrix, u: Matrix) -> Shared:
         if kept.sum() >= _FEWEST * len(names):
             break
     before, after = (part[kept] for part in slopes)  # (M, nx + ny, np)
-    learned = np.array(
-        [i in states for i in range(len(motion.states))] + [i in outputs for i in range(len(motion.outputs))]
-    )
-    after = np.where(np.array(learned)[:, None], after, 0.0)  # what has no learner must not move at all
+    after = np.where(_has_learner(motion)[:, None], after, 0.0)  # what has no learner must not move at all
     size = np.sqrt(np.mean(before**2, axis=(0, 2), keepdims=True))
     size = np.where(size > 0, size, 1.0)
     before, after = (np.concatenate(list(np.moveaxis(part / size, 1, 0))) for part in (before, after))
@@ -104,11 +101,18 @@ def _spanned(form: Moving, q: Vector, x: Matrix, u: Matrix) -> Shared:
     """The directions that move what has a learner by linear combinations of its features, and nothing else."""
     some = slice(None, None, max(1, len(x) // _POINTS))
     slopes = np.moveaxis(np.asarray(slopes_at(form, q, x[some], u[some])), 1, 0)
-    states, outputs = form.motion.learned
-    learned = [i in states for i in range(len(form.motion.states))]
-    learned += [i in outputs for i in range(len(form.motion.outputs))]
     features = np.asarray(form.seen(x[some].T, u[some].T, np)).T
-    return spanned(form.motion.names, slopes, features, np.array(learned))
+    return spanned(form.motion.names, slopes, features, _has_learner(form.motion))
+
+
+def learned_places(motion: Motion) -> list[int]:
+    """The numbers of the equations that have a learner, outputs after states."""
+    states, outputs = motion.learned
+    return [*states, *(len(motion.states) + i for i in outputs)]
+
+
+def _has_learner(motion: Motion) -> Bool[np.ndarray, "r"]:
+    return np.isin(np.arange(len(motion.states) + len(motion.outputs)), learned_places(motion))
 
 
 def nearest(

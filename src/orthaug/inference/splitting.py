@@ -14,8 +14,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug._base.warning import Warning
 from orthaug.data.sources import Partition
-from orthaug.inference.measures import Measure, Points, Support
-from orthaug.inference.weighed import weigh
+from orthaug.inference.measures import Measure, Points, Support, weigh
 from orthaug.models.learners import Bound
 from orthaug.models.model import Model
 from orthaug.models.rows import InMemory, Overlaps, chunk_shape, learner_rows

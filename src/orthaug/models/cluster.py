@@ -25,8 +25,8 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import jax
 from orthaug._base.parallel import Threads
 from orthaug.data.sources import Source
-from orthaug.models.rows import CHUNK_ROWS, Chunk, Room, chunk_shape, in_chunks
-from orthaug.models.streaming import Laid, apart, chunks_of, folded, summed, together
+from orthaug.models.rows import CHUNK_ROWS, Chunk, Room, chunk_shape, laid_out, together
+from orthaug.models.streaming import Laid, apart, chunks_of, folded, summed
 
 _SINGLE_THREADED = {
     "OMP_NUM_THREADS": "1",
@@ -64,8 +64,7 @@ class Dask(Threads):
         """Rows that are in memory here, sent to the workers."""
         workers = self.shares
         shape = chunk_shape(len(z), min(self.limit, -(-len(z) // workers)))
-        pieces = (in_chunks(z, shape, repeat=True), *(in_chunks(piece, shape) for piece in (q, e, gain)))
-        chunks = [Chunk(*parts) for parts in zip(*pieces, strict=True)]
+        chunks = apart(laid_out(z, q, e, gain, shape))
         each = -(-len(chunks) // workers)
         with told():
             groups = [chunks[i : i + each] for i in range(0, len(chunks), each)]

@@ -19,7 +19,7 @@ from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax
 from orthaug._base.memory import available
 from orthaug._base.parallel import Heard, nobody
-from orthaug.models.rows import CHUNK_ROWS, Chunk, Here, Room, all_chunks, brought, chunk_shape, in_chunks, row_fold
+from orthaug.models.rows import CHUNK_ROWS, Chunk, Here, Room, all_chunks, brought, chunk_shape, laid_out, row_fold
 
 _ROWS = "rows"
 _ONE_AT_A_TIME = threading.Lock()  # devices that wait for each other in two programs would wait for ever
@@ -40,15 +40,14 @@ class Devices(Here):
     resident: bool = False
 
     def lay(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Chunk:
-        shape = _even(chunk_shape(-(-len(z) // self.shares), self.limit), self.shares)
-        laid: Any = [in_chunks(np.asarray(part), shape, repeat=j == 0) for j, part in enumerate((z, q, e, gain))]
-        return self.place(Chunk(*laid))
+        count, size = chunk_shape(-(-len(z) // self.shares), self.limit)  # of the chunks of one share
+        return self.place(laid_out(z, q, e, gain, (count * self.shares, size)))
 
     def draw(self, source: Any, laying: Callable[[Any], Any]) -> Chunk:
         return self.lay(*brought(source, laying))
 
     def sum(self, function: Callable[..., Any], rows: Chunk, *arguments: Any) -> Any:
-        return self._run(_total, function, rows, arguments)
+        return self._run(function, rows, arguments, keeps=False)[1]
 
     @property
     def shares(self) -> int:
@@ -70,11 +69,11 @@ class Devices(Here):
         return self.place(jax.tree.map(even, all_chunks(function, partitions)))
 
     def keep(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> tuple[Any, Any]:
-        return self._run(_both, function, rows, arguments)
+        return self._run(function, rows, arguments, keeps=True)
 
-    def _run(self, compiled: Callable[..., Any], function: Any, rows: Any, arguments: tuple[Any, ...]) -> Any:
+    def _run(self, function: Any, rows: Any, arguments: tuple[Any, ...], *, keeps: bool) -> tuple[Any, Any]:
         with _ONE_AT_A_TIME:
-            return jax.block_until_ready(compiled(function, self.count, len(arguments))(rows, *arguments))
+            return jax.block_until_ready(_compiled(function, self.count, len(arguments), keeps)(rows, *arguments))
 
     def map(self, function: Any, given: Any, items: Sequence[Any], heard: Heard = nobody) -> Iterator[Any]:
         """One after another: programs that share devices wait for each other, on all hosts in the same order."""
@@ -90,11 +89,6 @@ class Devices(Here):
         return Room(own[smallest], f"the device {devices[smallest]}", _MATRICES)
 
 
-def _even(shape: tuple[int, int], shares: int) -> tuple[int, int]:
-    """Chunks for all shares of chunks for one."""
-    return shape[0] * shares, shape[1]
-
-
 @cache
 def _mesh(count: int | None) -> tuple[Any, int]:
     devices = jax.devices()[:count]
@@ -102,26 +96,17 @@ def _mesh(count: int | None) -> tuple[Any, int]:
 
 
 @cache
-def _total(function: Callable[..., Any], count: int | None, arguments: int) -> Any:
-    """Each device sums over its own chunks; then all of them have the sum."""
-    return _compiled(lambda *given: (None, function(*given)), count, arguments, second=True)
-
-
-@cache
-def _both(function: Callable[..., Any], count: int | None, arguments: int) -> Any:
-    """The same beside what each device keeps."""
-    return _compiled(function, count, arguments)
-
-
-def _compiled(function: Callable[..., Any], count: int | None, arguments: int, second: bool = False) -> Any:
+def _compiled(function: Callable[..., Any], count: int | None, arguments: int, keeps: bool) -> Any:
+    """Each device sums over its own chunks; then all of them have the sum. With `keeps` beside what each one keeps."""
     spec = jax.sharding.PartitionSpec
-    mesh, _ = _mesh(count)
 
     def share(chunks: Any, *given: Any) -> Any:
-        kept, total = row_fold(lambda chunk: function(chunk, *given), chunks)
-        total = jax.lax.psum(total, _ROWS)
-        return total if second else (kept, total)
+        def pair(chunk: Any) -> tuple[Any, Any]:
+            found = function(chunk, *given)
+            return found if keeps else (None, found)
 
-    specs = (spec(_ROWS), *(spec() for _ in range(arguments)))
-    out = spec() if second else (spec(_ROWS), spec())
-    return jax.jit(jax.shard_map(share, mesh=mesh, in_specs=specs, out_specs=out, check_vma=False))
+        kept, total = row_fold(pair, chunks)
+        return kept, jax.lax.psum(total, _ROWS)
+
+    split = {"in_specs": (spec(_ROWS), *[spec()] * arguments), "out_specs": (spec(_ROWS), spec())}
+    return jax.jit(jax.shard_map(share, mesh=_mesh(count)[0], **split, check_vma=False))

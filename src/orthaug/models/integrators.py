@@ -82,7 +82,7 @@ def advance(field: Field, scheme: Any, x: Any, row: Any, nu: int, step: float, s
         step: the sampling time.
     """
     at, halves, h = input_at(row, nu), 2 * substeps, step / substeps
-    one = _exponential(field, scheme, h) if integrator == "exact" else _runge_kutta(field, h)
+    one = _exponential(field, scheme, h) if integrator == "exact" else runge_kutta(field, h)
     if substeps <= UNROLLED:
         for j in range(substeps):
             x = one(x, at(2 * j, halves), at(2 * j + 1, halves), at(2 * j + 2, halves))
@@ -91,7 +91,9 @@ def advance(field: Field, scheme: Any, x: Any, row: Any, nu: int, step: float, s
     return jax.lax.scan(lambda x, u: (one(x, *u), None), x, (u[:-2:2], u[1:-1:2], u[2::2]))[0]
 
 
-def _runge_kutta(field: Field, h: float) -> Callable[..., Any]:
+def runge_kutta(field: Field, h: float) -> Callable[..., Any]:
+    """A step of length h under inputs at its begin, middle and end, of JAX or NumPy arrays alike."""
+
     def one(x: Any, first: Any, middle: Any, last: Any) -> Any:
         k1 = field(x, first)
         k2 = field(x + h / 2 * k1, middle)

@@ -1,8 +1,8 @@
 """An extended Kalman filter over the rows of a record: where a model stands, told by what is measured.
 
 `x_{k+1} = f(x_k, u_k) + w_k`, `y_k = h(x_k, u_k) + v_k` with Cov w = Q and Cov v = R (Anderson and Moore 1979). A
-lagged model has its disturbance in the equation of its newest output (`models.lagged_filter`), a motion in the rates of
-its states (`models.motion_filter`). Outputs that are NaN are missing: they tell nothing, and the estimate runs free.
+lagged model has its disturbance in the equation of its newest output, a motion in the rates of its states
+(`models.filters`). Outputs that are NaN are missing: they tell nothing, and the estimate runs free.
 """
 
 from __future__ import annotations

@@ -12,10 +12,9 @@ from orthaug._base.errors import InputError
 from orthaug.data.expressions import Expression, Lag
 from orthaug.data.regressors import Features
 from orthaug.models.lagged import Lagged
-from orthaug.models.learner_storage import bound_of, declaration_of
 from orthaug.models.learners import Learner
 from orthaug.models.model import Model
-from orthaug.models.model_arrays import arrays_of, fields_from, said_of
+from orthaug.models.model_arrays import arrays_of, bound_of, declaration_of, fields_from, said_of
 from orthaug.physics.baseline import Baseline, Parameter, Term
 
 

@@ -15,7 +15,7 @@ from orthaug.models.dynamics import Parts
 from orthaug.models.model import Model
 from orthaug.models.on_records import RUNAWAY
 from orthaug.models.response import Response, Scores, scores_of
-from orthaug.physics.moments import Moments
+from orthaug.physics.problem import Moments
 
 
 class Flight(NamedTuple):

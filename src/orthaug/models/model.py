@@ -16,8 +16,8 @@ from orthaug._base.jax import Array, jax, jnp, padded_length
 from orthaug._base.views import Shown
 from orthaug.data.record import Channel, Experiment, Prepared, Record
 from orthaug.models.dynamics import Dynamics, Numbers, Parts
+from orthaug.models.filters import LaggedFilter
 from orthaug.models.lagged import Lagged
-from orthaug.models.lagged_filter import LaggedFilter
 from orthaug.models.on_records import OnRecords, trajectory
 from orthaug.models.response import Response, Trajectory
 from orthaug.models.statistics import Statistics

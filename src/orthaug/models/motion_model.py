@@ -20,8 +20,8 @@ from orthaug._base.jax import Array, jax, padded_length
 from orthaug._base.views import Shown
 from orthaug.data.record import Channel, Experiment, Prepared, Record
 from orthaug.models.dynamics import Numbers, Parts
-from orthaug.models.motion_filter import MotionFilter
-from orthaug.models.motion_parts import parts_at
+from orthaug.models.filters import MotionFilter
+from orthaug.models.motion_field import parts_at
 from orthaug.models.moving import Moving
 from orthaug.models.on_records import RUNAWAY, OnRecords, trajectory
 from orthaug.models.response import Response, Trajectory

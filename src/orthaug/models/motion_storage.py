@@ -11,9 +11,8 @@ import numpy as np
 
 from orthaug._base.errors import InputError
 from orthaug.data.expressions import parse_named
-from orthaug.models.learner_storage import bound_of, declaration_of
 from orthaug.models.learners import Learner
-from orthaug.models.model_arrays import arrays_of, fields_from, said_of
+from orthaug.models.model_arrays import arrays_of, bound_of, declaration_of, fields_from, said_of
 from orthaug.models.motion_model import MotionModel, Trained
 from orthaug.models.moving import Moving
 from orthaug.physics.motion import Motion, Output, State

@@ -18,8 +18,7 @@ from orthaug.models.dynamics import Differentiated, Local, Numbers, Parts
 from orthaug.models.integrators import UNROLLED, Exponentials, advance, held
 from orthaug.models.motion_field import MotionField
 from orthaug.models.motion_tangents import output_slopes, sample_slopes
-from orthaug.physics.motion_layout import layout_of
-from orthaug.physics.starts import guess
+from orthaug.physics.motion_problem import guess, layout_of
 
 
 @dataclass(frozen=True)

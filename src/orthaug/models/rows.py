@@ -145,9 +145,7 @@ class InMemory(Here):
     resident: bool = True
 
     def lay(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Chunk:
-        shape = chunk_shape(len(z), self.limit)
-        padded = in_chunks(z, shape, repeat=True)  # zeros may be where the learner has no value
-        return Chunk(*map(jax.device_put, (padded, *(in_chunks(piece, shape) for piece in (q, e, gain)))))
+        return self.place(laid_out(z, q, e, gain, chunk_shape(len(z), self.limit)))
 
     def draw(self, source: Any, laying: Callable[[Any], Any]) -> Chunk:
         return self.lay(*brought(source, laying))
@@ -184,7 +182,11 @@ def _compiled_sum(function: Callable[..., Any], rows: Chunk, arguments: tuple[An
 
 def all_chunks(function: Callable[[Any], Any], partitions: Sequence[Any]) -> Any:
     """The chunks that a function gives of every partition, (k, …) each."""
-    chunks = [chunk for partition in partitions for chunk in function(partition)]
+    return together([chunk for partition in partitions for chunk in function(partition)])
+
+
+def together(chunks: Sequence[Any]) -> Any:
+    """Chunks of any pytree as one, (k, …) each."""
     return jax.tree.map(lambda *parts: np.stack(parts), *chunks)
 
 
@@ -232,6 +234,13 @@ def in_chunks(
         if repeat and len(piece) < size:
             padded[i, ..., len(piece) :] = values[-1][..., None]
     return padded
+
+
+def laid_out(z: Matrix, q: Any, e: Matrix, gain: Any, shape: tuple[int, int]) -> Chunk:
+    """Rows (N, …) as a chunk (k, …, m) of NumPy arrays."""
+    padded = in_chunks(z, shape, repeat=True)  # zeros may be where the learner has no value
+    pieces: Any = (padded, *(in_chunks(piece, shape) for piece in (q, e, gain)))
+    return Chunk(*pieces)
 
 
 def from_chunks(chunks: Float[np.ndarray, "k ... m"], rows: int) -> Float[np.ndarray, "N ..."]:
@@ -303,3 +312,47 @@ def projected_gram(engine: Engine, bound: Bound | None, w: Any, rows: Any, mix: 
     for _ in range(2):
         overlaps = (*overlaps, engine.sum(_LeftOver(bound), rows, w, overlaps))
     return np.asarray(engine.sum(MixedGram(bound), rows, w, mix, overlaps))
+
+
+@partial(jax.jit, static_argnames="bound")
+def row_values(bound: Bound, w: Float[Array, "nw"], z: Float[Array, "k nz m"]) -> Float[Array, "k ny m"]:
+    """f at every row, in the learner's unit."""
+    one_chunk = jax.vmap(lambda row: bound.values(w, row), in_axes=-1, out_axes=-1)
+    return jax.lax.map(one_chunk, z)
+
+
+def _values(bound: Bound | None, chunk: Chunk, w: Any, tilt: Any) -> Float[Array, "ny m"]:
+    """F of one chunk; of an ensemble the median of its members, each with the physics that it adds."""
+    if bound is None:
+        return jnp.zeros_like(chunk.e)
+
+    def member_values(w: Any) -> Any:
+        values = jax.vmap(lambda z: bound.values(w, z), in_axes=-1, out_axes=-1)(chunk.z)
+        return jnp.sum(chunk.gain * values, axis=1)
+
+    if tilt is None:
+        return member_values(w)
+    return jnp.median(jax.vmap(member_values)(w) + jnp.einsum("otm,it->iom", chunk.q, tilt), axis=0)
+
+
+@dataclass(frozen=True)
+class LearnerSums:
+    """Qᵀ(F − Q shift) and ‖F‖² of one chunk."""
+
+    bound: Bound | None
+
+    def __call__(self, chunk: Chunk, w: Any, tilt: Any, shift: Any) -> tuple[Any, Any]:
+        values = _values(self.bound, chunk, w, tilt)
+        rest = values - jnp.einsum("otm,t->om", chunk.q, shift)
+        return jnp.einsum("otm,om->t", chunk.q, rest), jnp.sum(values**2)
+
+
+@dataclass(frozen=True)
+class ResidualGram:
+    """Σ r rᵀ of one chunk, `r = P⊥Y − F + Q physics`."""
+
+    bound: Bound | None
+
+    def __call__(self, chunk: Chunk, w: Any, tilt: Any, physics: Any) -> Any:
+        residual = chunk.e - _values(self.bound, chunk, w, tilt) + jnp.einsum("otm,t->om", chunk.q, physics)
+        return residual @ residual.T

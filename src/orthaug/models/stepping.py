@@ -42,9 +42,9 @@ class Memory:
     @classmethod
     def of(cls, layout: Layout, outputs: Sequence[str], inputs: Sequence[str]) -> Memory:
         """Of a regressor's layout."""
-        deepest = {name: max((lag.lag for lag in layout if lag.channel == name), default=0) for name in outputs}
-        deepest |= {name: max((lag.lag for lag in layout if lag.channel == name), default=0) for name in inputs}
-        return cls(tuple((name, depth) for name, depth in deepest.items()), layout, tuple(inputs))
+        names = dict.fromkeys((*outputs, *inputs))
+        deepest = ((name, max((lag.lag for lag in layout if lag.channel == name), default=0)) for name in names)
+        return cls(tuple(deepest), layout, tuple(inputs))
 
     @cached_property
     def lags(self) -> Layout:

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax
 from orthaug.data.sources import Source, rows_of
-from orthaug.models.rows import CHUNK_ROWS, Chunk, Here, chunk_shape, in_chunks
+from orthaug.models.rows import CHUNK_ROWS, Chunk, Here, chunk_shape, laid_out, together
 
 _AHEAD = 3  # chunks that wait to be summed
 
@@ -47,9 +47,7 @@ class Stream(Here):
 
     def lay(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> list[Chunk]:
         """Rows that are in memory, in chunks."""
-        shape = chunk_shape(len(z), self.limit)
-        pieces = (in_chunks(z, shape, repeat=True), *(in_chunks(piece, shape) for piece in (q, e, gain)))
-        return [Chunk(*parts) for parts in zip(*pieces, strict=True)]
+        return apart(laid_out(z, q, e, gain, chunk_shape(len(z), self.limit)))
 
     def draw(self, source: Source, laying: Callable[[Any], Iterator[Laid]]) -> Drawn:
         return Drawn(source, laying, chunk_shape(rows_of(source), self.limit)[1])
@@ -102,14 +100,9 @@ class Beside:
 
 
 def apart(chunks: Any) -> list[Any]:
-    """Chunks (k, …) of any pytree one by one."""
+    """The inverse of `together`."""
     leaves, form = jax.tree.flatten(jax.tree.map(np.asarray, chunks))
     return [jax.tree.unflatten(form, parts) for parts in zip(*leaves, strict=True)]
-
-
-def together(chunks: Sequence[Any]) -> Any:
-    """The inverse of `apart`."""
-    return jax.tree.map(lambda *parts: np.stack(parts), *chunks)
 
 
 def folded(function: Callable[..., Any], rows: Iterable[Any], arguments: tuple[Any, ...]) -> tuple[list[Any], Any]:

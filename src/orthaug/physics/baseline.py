@@ -15,8 +15,9 @@ from orthaug._base.checks import check_label, check_type, check_unique, is_numbe
 from orthaug._base.errors import LONGEST, InputError, shown
 from orthaug._base.views import Shown
 from orthaug.data.expressions import RESERVED, SAMPLING_TIME, Expression, Lag, is_identifier, is_name, parse
-from orthaug.data.record import same_step
+from orthaug.data.record import Channel, same_step
 from orthaug.data.regressors import Layout, in_order
+from orthaug.data.writing import coefficient_unit
 
 
 @dataclass(frozen=True)
@@ -251,6 +252,11 @@ class Baseline(Shown):
             return xp.zeros((*x.shape[:-1], len(outputs)))
         return self._matrix(list(fixed), x, layout, outputs, xp) @ xp.asarray(list(fixed.values()))
 
+    def on(self, x: Any, layout: Layout, outputs: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+        """`phi` and `known` by NumPy; not finite where an expression has no value."""
+        with np.errstate(all="ignore"):
+            return np.asarray(self.phi(x, layout, outputs, np)), np.asarray(self.known(x, layout, outputs, np))
+
     def _matrix(self, names: list[str], x: Any, layout: Layout, outputs: Sequence[str], xp: Any) -> Any:
         columns = {lag: x[..., j] for j, lag in enumerate(layout)}
         entries = [[xp.zeros(x.shape[:-1]) for _ in names] for _ in outputs]
@@ -308,7 +314,24 @@ def _agreed(terms: Sequence[Term]) -> list[Term]:
 
 
 def _parameter(term: Term) -> Parameter:
-    """The parameter of a term from `_agreed`."""
     low = -math.inf if term.min is None else float(term.min)
     high = math.inf if term.max is None else float(term.max)
     return Parameter(term.parameter, float(term.initial or 0.0), term.unit or "", low, high)
+
+
+def derived_units(baseline: Baseline, outputs: Sequence[Channel], inputs: Sequence[Channel]) -> dict[str, str]:
+    """The unit of each parameter by its name, "1" where it has none; without those that the channels do not tell.
+
+    Examples:
+        >>> spring = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "u[k-1]")])
+        >>> derived_units(spring, [Channel("y", "mm")], [Channel("u", "N")])
+        {'a': '1', 'b': 'mm/N'}
+    """
+    units, constants = {channel.name: channel.unit for channel in (*outputs, *inputs)}, dict(baseline.constants)
+    found: dict[str, set[str | None]] = {}
+    for term in baseline.terms:
+        own = units[term.output or outputs[0].name]
+        told = coefficient_unit(own, parse(term.regressor, constants), units) if own else None
+        found.setdefault(term.parameter, set()).add("1" if told == "" else told)
+    agreed = {name: next(iter(told)) for name, told in found.items() if len(told) == 1}
+    return {name: unit for name, unit in agreed.items() if unit is not None}

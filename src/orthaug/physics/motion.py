@@ -17,8 +17,7 @@ from orthaug._base.checks import Vector, check_choice, check_label, check_unique
 from orthaug._base.errors import InputError, shown
 from orthaug._base.views import Shown
 from orthaug.data.expressions import FUNCTIONS, SAMPLING_TIME, Expression, is_name, parse_named
-from orthaug.physics.coordinates import Coordinates
-from orthaug.physics.parameters import PhysicalParameter, check_parameters
+from orthaug.physics.parameters import Coordinates, PhysicalParameter, check_parameters
 
 INTEGRATORS = ("rk4", "exact", "discrete")
 HOLDS = ("zero-order", "first-order", "spline")

@@ -1,25 +1,30 @@
-"""The estimation problem of a motion: its record, what the learner sees, and what can be said before any training."""
+"""The estimation problem of a motion: its record, what the learner sees, and what can be said before any training.
+
+Where it may start: states as they are declared, from what is measured about a row. An output and its derivative are
+those of a local polynomial (Savitzky and Golay 1964), what nothing is said of starts at zero. Training and simulation
+go on from there: a start is an unknown.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from orthaug._base.checks import Vector
+from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
-from orthaug.data.expressions import Expression, parse_named
+from orthaug.data.expressions import Expression, Lag, parse_named
 from orthaug.data.record import Record
 from orthaug.physics.motion import MOST_SUBSTEPS, Motion
 from orthaug.physics.output_weights import OutputWeights, check_output_weights, weigh_outputs
-from orthaug.physics.starts import guess
 
 _LOOKED_AT = 200  # rows at which the equations are looked at
 _ANGLE = 0.35  # of the fastest mode in a substep [rad]: Runge-Kutta errs by about 1e-3 of it in a period
 _STEP = 1e-6  # relative, of differences
+_ROWS, _DEGREE = 9, 2  # of a local polynomial
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +128,6 @@ def pose_motion(
 
 
 def _features(motion: Motion, texts: Sequence[str] | None) -> tuple[Expression, ...]:
-    """What the learner sees, as expressions."""
     known = {name: value for name, value in motion.known.items() if name not in motion.names}
     reach = {name for name, expression in motion.definitions if set(expression.names) & set(motion.names)}
     texts = (*motion.names_of_states, *motion.inputs) if texts is None else tuple(texts)
@@ -168,3 +172,45 @@ def _check_start(problem: MotionProblem) -> None:
             f"{problem.fastest:.3g} 1/s: it would take {problem.substeps} substeps, at most {MOST_SUBSTEPS} are made. "
             'Use `integrator = "exact"`, check units and initial values, or leave the fast mode out.'
         )
+
+
+def guess(
+    motion: Motion, outputs: Matrix, rows: Sequence[int] | Int[np.ndarray, "r"], sampling_time: float
+) -> Float[np.ndarray, "r n0"]:
+    """The states at some rows, made of the outputs (N, ny) that were measured about them."""
+    rows = np.asarray(rows, dtype=int)
+    width = min(_ROWS, len(outputs))
+    begin = np.clip(rows - width // 2, 0, len(outputs) - width)
+    level = np.zeros((2, len(rows), outputs.shape[1]))
+    if width:
+        there = outputs[begin[:, None] + np.arange(width)]
+        fitted = _polynomials(width)[rows - begin] @ there  # (r, degree + 1, ny)
+        level[: fitted.shape[1]] = np.moveaxis(fitted[:, :2], 1, 0)
+    names = [output.name for output in motion.outputs]
+    states = np.zeros((len(rows), len(motion.states)))
+    for i, state in enumerate(motion.states):
+        source = state.from_output
+        if source is not None:
+            states[:, i] = level[source[1], :, names.index(source[0])] / sampling_time ** source[1]
+        elif state.start is not None:
+            states[:, i] = float(state.start)
+    return states
+
+
+@cache
+def _polynomials(width: int) -> Float[np.ndarray, "width degree+1 width"]:
+    """What gives the coefficients of a local polynomial about each of its rows from the values of all."""
+    offset = np.arange(width)[None, :] - np.arange(width)[:, None]
+    return np.linalg.pinv(offset[..., None] ** np.arange(min(_DEGREE, width - 1) + 1))
+
+
+class Named(Lag):
+    """A state or an input as a measure names it: at the present instant, without an index."""
+
+    def __str__(self) -> str:
+        return self.channel
+
+
+def layout_of(motion: Motion) -> tuple[Named, ...]:
+    """States, then inputs."""
+    return tuple(Named(name, 0) for name in (*motion.names_of_states, *motion.inputs))

@@ -1,4 +1,7 @@
-"""Physical parameters p (m, ks, cd …) and the baseline's θ: θ = h(p), given as expressions, and dh/dp."""
+"""Physical parameters p (m, ks, cd …), what is estimated of them, and the baseline's θ: θ = h(p), and dh/dp.
+
+Estimated is p itself, or log p where p is positive: that keeps it so without a bound, and steps of it are relative.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector, check_label, check_unique, is_number, nearest
 from orthaug._base.errors import InputError, shown
@@ -19,6 +23,7 @@ from orthaug.physics.excitation import Excitation, excitation
 
 AGREEMENT = 1e-6  # relative difference up to which a term's `initial` is what the physics gives
 
+_SMALLEST = math.exp(-30.0)  # of p⁰: a positive parameter that is smaller is zero
 _STEP = 1e-100  # h relative to p: h² vanishes beside 1, and products with h are far from underflow
 
 
@@ -59,6 +64,42 @@ class PhysicalParameter:
     unit: str = ""
     min: float = -math.inf
     max: float = math.inf
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """The map between parameters p (np,) and what is estimated q (np,)."""
+
+    parameters: tuple[PhysicalParameter, ...]
+
+    @property
+    def positive(self) -> Bool[np.ndarray, "np"]:
+        """Which are estimated as logarithms: those that cannot be negative and start above zero."""
+        return np.array([p.min >= 0 and p.initial > 0 for p in self.parameters], dtype=bool)
+
+    @property
+    def initial(self) -> Vector:
+        """q⁰ (np,)."""
+        return self.of(np.array([p.initial for p in self.parameters], dtype=float))
+
+    def of(self, p: Any) -> Vector:
+        """q of p; logarithms end at the smallest value that counts."""
+        least = np.array([_SMALLEST * abs(parameter.initial) for parameter in self.parameters])
+        p = np.asarray(p, dtype=float)
+        return np.where(self.positive, np.log(np.maximum(np.where(self.positive, p, 1.0), least + 1e-300)), p)
+
+    def physical(self, q: Any, xp: Any = np) -> Any:
+        """p of q, by `xp` (numpy or jax.numpy)."""
+        return xp.where(self.positive, xp.exp(xp.where(self.positive, q, 0.0)), q)
+
+    def slopes(self, q: Vector) -> Vector:
+        """∂p/∂q (np,)."""
+        return np.where(self.positive, self.physical(q), 1.0)
+
+    @property
+    def bounds(self) -> tuple[Vector, Vector]:
+        """Lower and upper bounds of q, each (np,)."""
+        return self.of([p.min for p in self.parameters]), self.of([p.max for p in self.parameters])
 
 
 @dataclass(frozen=True)
@@ -222,7 +263,6 @@ def check_parameters(
 
 
 def _parsed(name: str, text: str, known: Mapping[str, float], parameters: Sequence[str]) -> Expression:
-    """The expression of one θ."""
     where = f"physics.theta '{name}'"
     declare = {SAMPLING_TIME: "; give it in `constants`, {'Ts': record.sampling_time}"}
     expression = parse_named(text, known, where, declare)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -20,7 +21,6 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import Features, Lags, Layout, UsableRows, in_order, lag_matrix, stack_rows
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.excitation import Excitation, excitation, require_rank
-from orthaug.physics.moments import Extent, Moments
 from orthaug.physics.output_weights import OutputWeights, check_output_weights, weigh_outputs
 from orthaug.physics.projection import Projection
 from orthaug.physics.shared import Shared, shared_directions
@@ -28,6 +28,51 @@ from orthaug.physics.shared import Shared, shared_directions
 _LARGEST = 1e120  # size of outputs and regressors whose squares still add up; 1 / _LARGEST is the smallest
 
 _SMALLEST_RESIDUAL = 1e-10  # of an output's deviation: the physics leaves at least rounding
+
+
+class Extent(NamedTuple):
+    """Smallest and largest value of some columns, (n,) each; parts of the rows add up by `|`."""
+
+    low: Vector
+    high: Vector
+
+    @classmethod
+    def of(cls, values: Matrix) -> Extent:
+        return cls(values.min(axis=0, initial=np.inf), values.max(axis=0, initial=-np.inf))
+
+    def __or__(self, other: Extent) -> Extent:
+        return Extent(np.minimum(self.low, other.low), np.maximum(self.high, other.high))
+
+
+class Moments(NamedTuple):
+    """Count, mean and scatter `Σ (v − v̄)(v − v̄)ᵀ` of some columns; parts add up too."""
+
+    count: int
+    mean: Vector
+    scatter: Matrix
+
+    @classmethod
+    def of(cls, values: Matrix) -> Moments:
+        mean = values.mean(axis=0) if len(values) else np.zeros(values.shape[1])
+        return cls(len(values), mean, (values - mean).T @ (values - mean))
+
+    def __or__(self, other: Moments) -> Moments:
+        """Of both together (Chan, Golub and LeVeque 1983)."""
+        count = self.count + other.count
+        if not count:
+            return self
+        apart = other.mean - self.mean
+        scatter = self.scatter + other.scatter + np.outer(apart, apart) * (self.count * other.count / count)
+        return Moments(count, self.mean + apart * (other.count / count), scatter)
+
+    @property
+    def covariance(self) -> Matrix:
+        return self.scatter / max(self.count, 1)
+
+    @property
+    def square(self) -> float:
+        """Sum of all squares."""
+        return float(np.trace(self.scatter) + self.count * self.mean @ self.mean)
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,9 +262,8 @@ def _posed(
     rows = stack_rows(record, layout)
     signals = [np.concatenate([e.outputs, e.inputs], axis=1) for e in record.experiments]
     check_moving(Extent.of(np.concatenate(signals)), record, layout)
+    phi, known = baseline.on(rows.x, layout, outputs)
     with np.errstate(all="ignore"):
-        phi = np.asarray(baseline.phi(rows.x, layout, outputs, np))
-        known = np.asarray(baseline.known(rows.x, layout, outputs, np))
         target = rows.y - known
         deviation = rows.y.std(axis=0)
     check_physics(phi, known, baseline, rows, record)
@@ -239,9 +283,7 @@ def check_defined(problem: Problem, record: Record) -> None:
     for experiment in record.experiments:
         alone = replace(record, experiments=(experiment,))
         rows = UsableRows(lag_matrix(experiment, layout, record, start), experiment.outputs[start:], layout, start)
-        with np.errstate(all="ignore"):
-            phi = np.asarray(problem.baseline.phi(rows.x, layout, outputs, np))
-            known = np.asarray(problem.baseline.known(rows.x, layout, outputs, np))
+        phi, known = problem.baseline.on(rows.x, layout, outputs)
         check_physics(phi, known, problem.baseline, rows, alone)
         feature_rows(problem.features, rows, layout, alone)
 

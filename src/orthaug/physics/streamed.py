@@ -23,9 +23,17 @@ from orthaug.data.regressors import Features, Layout, UsableRows, lag_matrix, la
 from orthaug.data.sources import Partition, Source
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.excitation import excitation, require_rank
-from orthaug.physics.moments import Extent, Moments
 from orthaug.physics.output_weights import OutputWeights, weigh_outputs
-from orthaug.physics.problem import Problem, check_moving, check_physics, check_sizes, feature_rows, pose
+from orthaug.physics.problem import (
+    Extent,
+    Moments,
+    Problem,
+    check_moving,
+    check_physics,
+    check_sizes,
+    feature_rows,
+    pose,
+)
 from orthaug.physics.projection import Projection, powers_of_two
 
 Passes = Callable[[Callable[[Partition], Any], Sequence[Partition]], list[Any]]
@@ -58,10 +66,7 @@ class Form:
                 continue
             x = lag_matrix(piece, self.layout, self.empty, self.lead)
             rows = UsableRows(x, piece.outputs[self.lead :], self.layout, self.lead)
-            with np.errstate(all="ignore"):
-                phi = np.asarray(self.baseline.phi(x, self.layout, self.outputs, np))
-                known = np.asarray(self.baseline.known(x, self.layout, self.outputs, np))
-            yield piece, rows, phi, known
+            yield piece, rows, *self.baseline.on(x, self.layout, self.outputs)
 
     def checked(self, piece: Experiment, rows: UsableRows, phi: np.ndarray, known: np.ndarray) -> Matrix:
         """The learner's features (m, nz), after everything was found to be finite."""
@@ -346,7 +351,7 @@ def _factored(seen: Problem, source: Source, passes: Passes, survey: Survey, for
     back = np.linalg.inv(turn)
     basis = replace(basis, turn=back)
     theta = inverse @ (coordinates + back @ rest)
-    phi = _phi(seen)
+    phi, _ = seen.baseline.on(seen.rows.x, seen.layout, seen.outputs)
     fields = {name: getattr(seen, name) for name in Problem.__dataclass_fields__}
     fields |= {"projection": Projection(turn @ r, scale, weight.rows(phi), basis.rows(phi)), "excitation": excited}
     return StreamedProblem(
@@ -359,9 +364,3 @@ def _factored(seen: Problem, source: Source, passes: Passes, survey: Survey, for
         moments=second.errors,
         freedom=second.freedom,
     )
-
-
-def _phi(seen: Problem) -> np.ndarray:
-    """Φ of the witness, in the outputs' units."""
-    with np.errstate(all="ignore"):
-        return np.asarray(seen.baseline.phi(seen.rows.x, seen.layout, seen.outputs, np))

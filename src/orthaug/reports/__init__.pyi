@@ -1,5 +1,5 @@
+from .figures import FitPlots as FitPlots
 from .figures import plot as plot
-from .fit_plots import FitPlots as FitPlots
 from .result import CheckResult as CheckResult
 from .result import CompareResult as CompareResult
 from .result import DesignResult as DesignResult

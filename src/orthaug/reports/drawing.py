@@ -63,13 +63,17 @@ def axes_for(ax: Axes | None) -> Axes:
     check_type(ax, Axes | None, "ax", "axes of matplotlib, or None")
     if ax is not None:
         return ax
+    made: Callable[..., Figure] = Figure
     if "matplotlib.pyplot" in sys.modules or "ipykernel" in sys.modules:
         from matplotlib import pyplot
 
-        figure = pyplot.figure(figsize=(SIZE[0], SIZE[1] + TOP + BOTTOM), layout="constrained")
-    else:
-        figure = Figure(figsize=(SIZE[0], SIZE[1] + TOP + BOTTOM), layout="constrained")
-    axis = figure.add_subplot()
+        made = pyplot.figure
+    figure = made(figsize=(SIZE[0], SIZE[1] + TOP + BOTTOM), layout="constrained")
+    return ruled(figure.add_subplot())
+
+
+def ruled(axis: Axes) -> Axes:
+    """Axes with a faint grid, and no frame above and beside it."""
     axis.grid(alpha=0.25)
     axis.spines[["top", "right"]].set_visible(False)
     return axis
@@ -106,8 +110,7 @@ def grid(
     place["wspace"] = gap[1] * columns / max(wide - gap[1] * (columns - 1), 0.1)
     axes = figure.subplots(rows, columns, squeeze=False, gridspec_kw=place, **options)
     for axis in axes.flat:
-        axis.grid(alpha=0.25)
-        axis.spines[["top", "right"]].set_visible(False)
+        ruled(axis)
     return axes
 
 

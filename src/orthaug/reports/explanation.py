@@ -1,7 +1,8 @@
-"""What `orthaug explain` tells."""
+"""What `orthaug explain` tells, and its text."""
 
 from __future__ import annotations
 
+from orthaug._base.lines import fold, percent, table
 from orthaug.reports.fields import Content, Flag, Number, WarningResult, Whole
 from orthaug.reports.result import Headed
 
@@ -55,3 +56,52 @@ class ExplainResult(Headed):
     spec: str | None
     text: str
     warnings: list[WarningResult]
+
+
+def explain_text(result: ExplainResult) -> str:
+    """What the learner has found, the terms alone, θ with them in the physics, and what to write into the spec."""
+    blocks = [[_capital(result.text)]]
+    if result.noise is not None:
+        blocks[0] += [f"Of what it adds, {percent(result.noise)} are its own errors, as far as training tells."]
+    if result.terms:
+        blocks += [_term_lines(result), _parameter_lines(result)]
+    if result.singles:
+        rows = [["share", "added to", "each term alone"]]  # which may be long
+        rows += [[_percent(one.share), one.added_to, one.expression] for one in result.singles]
+        blocks.append(table(rows))
+    if result.spec is not None:
+        blocks.append(["Write into the spec, and fit again:", "", *result.spec.splitlines()])
+    elif result.terms:
+        blocks.append(["The physics is a Python function: add the terms there, and fit again."])
+    blocks.append([f"warning: {warning.text}" for warning in result.warnings])
+    blocks = [lines if "" in lines else fold(lines) for lines in blocks]  # what is to be copied stays as it is
+    return "\n\n".join("\n".join(lines) for lines in blocks if lines)
+
+
+def _term_lines(result: ExplainResult) -> list[str]:
+    rows = [["term", "coefficient", "std", "unit", "share", "alone", "added to"]]
+    for term in result.terms:
+        std = "–" if term.std is None else f"{term.std:.2g}"
+        numbers = (f"{term.coefficient:.6g}", std, term.unit or "–", _percent(term.share), _percent(term.alone))
+        rows.append([term.expression, *numbers, term.added_to])
+    lines = table(rows)
+    for term in result.terms:
+        if term.rivals:
+            lines.append(f"nearly as well instead of {term.expression}: {', '.join(term.rivals)}")
+    return lines
+
+
+def _parameter_lines(result: ExplainResult) -> list[str]:
+    rows = [["parameter", "now", "with them in the physics", "unit"]]
+    rows += [[p.name, f"{p.value:.6g}", f"{p.value_with:.6g}", p.unit] for p in result.parameters]
+    return table(rows)
+
+
+def _percent(share: float | None) -> str:
+    return "–" if share is None else percent(share, 3)
+
+
+def _capital(text: str) -> str:
+    """A sentence; one that begins with an expression stays as it is."""
+    first = text.split(" ", 1)[0]
+    return text[:1].upper() + text[1:] if first.isalpha() else text

@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float
 from orthaug._base.checks import Matrix, Vector
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
-from orthaug.models.motion_parts import labels_of, parts_at
+from orthaug.models.motion_field import labels_of, parts_at
+from orthaug.reports.page_blocks import with_unit
 
 if TYPE_CHECKING:
     from orthaug.fitting.motion_estimates import MotionEstimate
@@ -76,7 +77,7 @@ class LearnedPart:
     def of_motion(cls, model: MotionModel, record: Record, reach: Reach | None = None) -> LearnedPart:
         """Of a motion, along the free run of the first experiment."""
         states, inputs = trajectory_of(model, record)
-        chosen = _spread(len(states))
+        chosen = spread(len(states))
         points, size = np.concatenate([states, inputs], axis=1)[chosen], states.shape[1]
 
         def at(x: Matrix) -> Matrix:
@@ -106,7 +107,7 @@ class LearnedPart:
         """Of a lagged model, at the measured regressors of all experiments: `f − φ θ_aux`."""
         form, record = model.form, model.fitting(record, need_outputs=True)
         rows = np.concatenate([form.regressors(experiment, record) for experiment in record.experiments])
-        points = rows[_spread(len(rows))]
+        points = rows[spread(len(rows))]
         of_channel = {channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
         units = {str(lag): of_channel.get(lag.channel, "") for lag in form.layout}
         features = tuple(str(entry) for entry in form.features.entries)
@@ -117,7 +118,7 @@ class LearnedPart:
             return np.asarray(model.parts_at(x[rows]).learner)[: len(x)]
 
         return cls(
-            names=tuple(f"{c.name} [{c.unit}]" if c.unit else c.name for c in model.outputs),
+            names=tuple(with_unit(c.name, c.unit) for c in model.outputs),
             features=features,
             units=tuple(units.get(name, "") for name in features),
             variables=tuple(str(lag) for lag in form.layout),
@@ -233,8 +234,9 @@ def _mean_in_cells(cells: np.ndarray, values: Matrix, size: int) -> Float[np.nda
     return np.where(count[..., None] > 0, total / np.maximum(count, 1)[..., None], np.nan)
 
 
-def _spread(count: int) -> np.ndarray:
-    return np.linspace(0, count - 1, min(count, _MOST_POINTS)).astype(int)
+def spread(count: int, most: int = _MOST_POINTS) -> np.ndarray:
+    """Places of at most so many points, spread evenly over `count`."""
+    return np.linspace(0, count - 1, min(count, most)).astype(int)
 
 
 def trajectory_of(model: MotionModel, record: Record) -> tuple[Matrix, Matrix]:
@@ -251,8 +253,7 @@ def trajectory_of(model: MotionModel, record: Record) -> tuple[Matrix, Matrix]:
 def labels_with_units(model: MotionModel) -> list[str]:
     """Of learned equations and outputs."""
     units = {channel.name: channel.unit for channel in model.outputs}
-    labels = [(name, unit or units.get(name, "")) for name, unit in labels_of(model.form)]
-    return [f"{name} [{unit}]" if unit else name for name, unit in labels]
+    return [with_unit(name, unit or units.get(name)) for name, unit in labels_of(model.form)]
 
 
 def units_of(model: MotionModel) -> dict[str, str]:

@@ -163,9 +163,9 @@ class LinearizeResult(Headed):
         )
 
 
-def gain_unit(view: LinearView, output: str, given: str) -> str:
-    """The unit of an output over that of an input."""
-    upper, lower = view.units.get(output, ""), view.units.get(given, "")
+def gain_unit(view: LinearView, i: int, j: int) -> str:
+    """The unit of output i over that of input j."""
+    upper, lower = view.units.get(view.outputs[i], ""), view.units.get(view.inputs[j], "")
     if not lower:
         return upper
     wrapped = [f"({unit})" if set(unit) & set(" /*·") else unit for unit in (upper or "1", lower)]
@@ -202,12 +202,12 @@ def _matrices(view: LinearView) -> dict[str, Any]:
     return found
 
 
+def _pair(view: LinearView, i: int, j: int) -> dict[str, Any]:
+    return {"output": view.outputs[i], "input": view.inputs[j], "unit": gain_unit(view, i, j)}
+
+
 def _gain(view: LinearView, i: int, j: int) -> dict[str, Any]:
-    output, given = view.outputs[i], view.inputs[j]
-    return {
-        "output": output,
-        "input": given,
-        "unit": gain_unit(view, output, given),
+    return _pair(view, i, j) | {
         "value": None if view.gain is None else view.gain[i, j],
         "ci95": None if view.gain_ci95 is None else view.gain_ci95[i, j],
     }
@@ -229,8 +229,7 @@ def _continuous(view: LinearView) -> dict[str, Any]:
 def _response(view: LinearView, i: int, j: int) -> dict[str, Any]:
     bode = view.bode
     assert bode is not None
-    output, given = view.outputs[i], view.inputs[j]
-    told: dict[str, Any] = {"output": output, "input": given, "unit": gain_unit(view, output, given)}
+    told = _pair(view, i, j)
     for name, band in (("magnitude", bode.magnitude_ci95), ("phase", bode.phase_ci95)):
         told[name] = getattr(bode, name)[:, i, j]
         told[f"{name}_low"] = None if band is None else band[:, i, j, 0]

@@ -48,7 +48,7 @@ def bode_figure(found: Linearization) -> Figure:
         upper, lower = axes[2 * i, j], axes[2 * i + 1, j]
         upper.set_xscale("log")
         upper.set_yscale("log")
-        unit = gain_unit(first, first.outputs[i], first.inputs[j])
+        unit = gain_unit(first, i, j)
         _draw_pair(found, views, upper, lower, (i, j))
         label(upper, y=f"gain [{unit}]" if unit else "gain")
         label(lower, y="phase [°]", x="frequency [Hz]" if i == ny - 1 else None)

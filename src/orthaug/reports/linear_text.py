@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.lines import fold, table
-from orthaug.analysis.continuous_time import Continuous
+from orthaug.analysis.linear_system import Continuous
 from orthaug.analysis.linear_view import COHERENT, Linearization, LinearView, Pole
 from orthaug.reports.linear import gain_unit
 
@@ -63,7 +63,7 @@ def _gains(view: LinearView) -> list[str]:
     rows = [["static gain", "value", "95 % interval", "unit"]]
     for i, j in np.ndindex(*view.gain.shape):
         interval = _interval(None if view.gain_ci95 is None else view.gain_ci95[i, j])
-        unit = gain_unit(view, view.outputs[i], view.inputs[j])
+        unit = gain_unit(view, i, j)
         rows.append([f"{view.outputs[i]} / {view.inputs[j]}", f"{view.gain[i, j]:.6g}", interval, unit])
     return table(rows)
 

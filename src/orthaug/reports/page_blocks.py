@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from orthaug._base import lines
 
 _LARGE = 7  # digits before the point from which a power of ten is written
@@ -83,6 +85,27 @@ def prose(text: str) -> str:
 def with_unit(name: str, unit: str | None) -> str:
     """A name with its unit in brackets."""
     return f"{name} [{unit}]" if unit else name
+
+
+CATEGORIES = {"autorange": "reversed", "automargin": True, "type": "category"}
+"""Plotly's axis of names, the first one at the top."""
+
+
+def titled(x: str, y: str) -> dict[str, Any]:
+    """Plotly's layout of two axes with titles and no legend."""
+    return {"xaxis": {"title": {"text": x}}, "yaxis": {"title": {"text": y}}, "showlegend": False}
+
+
+def area(color: str, **place: Any) -> dict[str, Any]:
+    """Plotly's rectangle behind the curves."""
+    return {"type": "rect", **place, "fillcolor": color, "line": {"width": 0}, "layer": "below"}
+
+
+def rounded(values: Any, digits: int = 6) -> list[Any]:
+    """Numbers, or rows of them, that are drawn only; None for what is not finite."""
+    if np.ndim(values) > 1:
+        return [rounded(row, digits) for row in values]
+    return [float(f"{v:.{digits}g}") if math.isfinite(v) else None for v in np.asarray(values, dtype=float).tolist()]
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from orthaug.reports.findings import SuspectResult
-from orthaug.reports.page_blocks import Plot, percent, with_unit
-from orthaug.reports.residual_tests import ResidualTestResult
+from orthaug.reports.page_blocks import CATEGORIES, Plot, area, percent, rounded, titled, with_unit
+from orthaug.reports.residual_tests import RegressorResult, ResidualTestResult
 from orthaug.reports.result import ParameterResult, PartScores, RestartResult, RowResult
 
 _ROW = 62  # pixels of a parameter
@@ -172,7 +172,7 @@ def score_plot(scores: Mapping[str, Mapping[str, PartScores]], outputs: Sequence
     )
     layout = {
         "xaxis": axis,
-        "yaxis": {"autorange": "reversed", "automargin": True, "type": "category"},
+        "yaxis": CATEGORIES,
         "shapes": shapes,
     }
     return Plot("NRMSE of every part; the table has the numbers.", caption, traces, layout, height=110 + 30 * count)
@@ -188,12 +188,13 @@ def residual_plots(test: ResidualTestResult, what: str, units: Mapping[str, str]
             f"Autocorrelation of the {what} of {test.name}; the band holds 99 % of the values that noise gives."
             f" The largest is {_digits(test.largest_acf)}."
         )
-        layout = _titled("lag [samples]", "autocorrelation") | {"shapes": [_band(test.acf_band)], "showlegend": True}
+        layout = titled("lag [samples]", "autocorrelation") | {"shapes": [_band(test.acf_band)], "showlegend": True}
         plots.append(Plot(f"Autocorrelation of the {what} of {test.name}.", told, [bars], layout, 280, small=True))
-    shown = {name: cross for name, cross in test.cross.items() if cross is not None}
-    if shown:
+    if test.crossed:
         traces = []
-        for (name, cross), color in zip(shown.items(), ("@model", "@physics", "@learner", "@bias") * 9, strict=False):
+        for (name, cross), color in zip(
+            test.crossed.items(), ("@model", "@physics", "@learner", "@bias") * 9, strict=False
+        ):
             reach = len(cross.values) // 2
             traces.append(
                 {
@@ -205,23 +206,18 @@ def residual_plots(test: ResidualTestResult, what: str, units: Mapping[str, str]
                     "marker": {"color": color, "size": 4},
                 }
             )
-        band = max(cross.band or 0.0 for cross in shown.values())
         told = f"Correlation of the {what} of {test.name} with the inputs; beyond the band it is more than noise."
-        layout = _titled("lag behind the input [samples]", "correlation") | {"shapes": [_band(band)]}
+        layout = titled("lag behind the input [samples]", "correlation") | {"shapes": [_band(test.cross_band)]}
         layout["showlegend"] = True
         label = f"Correlation of the {what} of {test.name} with the inputs."
         plots.append(Plot(label, told, traces, layout, 280, small=True))
-    means = _means_plot(test, what, units)
-    return [*plots, means] if means else plots
+    return plots + [_means_plot(test, name, curve, what, units) for name, curve in test.most_telling.items()]
 
 
-def _means_plot(test: ResidualTestResult, what: str, units: Mapping[str, str]) -> Plot | None:
-    """Means over the regressor that tells most; None where none was looked at."""
-    curves = {name: curve for name, curve in test.regressors.items() if curve is not None}
-    if not curves:
-        return None
-    name = max(curves, key=lambda key: curves[key].share or 0.0)
-    curve = curves[name]
+def _means_plot(
+    test: ResidualTestResult, name: str, curve: RegressorResult, what: str, units: Mapping[str, str]
+) -> Plot:
+    """Means over a regressor."""
     errors = [None if e is None else 2.576 * e for e in curve.errors]
     dots = {
         "x": curve.centres,
@@ -236,7 +232,7 @@ def _means_plot(test: ResidualTestResult, what: str, units: Mapping[str, str]) -
         f"{percent(curve.share)} of its variance."
     )
     label = f"Mean of the {what} of {test.name} over {name}."
-    layout = _titled(_lagged(name, units), _lagged(f"residual of {test.name}", units, test.name))
+    layout = titled(_lagged(name, units), _lagged(f"residual of {test.name}", units, test.name))
     return Plot(label, told, [dots], layout, 280, small=True)
 
 
@@ -252,7 +248,7 @@ def bias_plot(suspects: Sequence[SuspectResult]) -> Plot:
         "type": "heatmap",
         "x": names,
         "y": labels,
-        "z": _cells(signed),
+        "z": rounded(signed, 5),
         "zmin": -reach,
         "zmax": reach,
         "text": told,
@@ -262,7 +258,7 @@ def bias_plot(suspects: Sequence[SuspectResult]) -> Plot:
         "hovertemplate": "%{y} on %{x}: %{text}<extra></extra>",
     }
     layout = {
-        "yaxis": {"autorange": "reversed", "automargin": True, "type": "category"},
+        "yaxis": CATEGORIES,
         "xaxis": {"side": "top", "type": "category"},
         "showlegend": False,
     }
@@ -292,7 +288,7 @@ def restart_plot(restarts: Sequence[RestartResult]) -> Plot | None:
     wide = bool(losses) and max(losses) > _DECADES * min(losses) > 0
     seeds = [str(run.seed) for run in restarts]
     names = seeds if len(set(seeds)) == len(seeds) else place
-    layout = _titled("seed" if names is seeds else "seed, regularization", "loss")
+    layout = titled("seed" if names is seeds else "seed, regularization", "loss")
     shown = range(0, len(restarts), 1 + len(restarts) // 12)
     layout["xaxis"] |= {"tickvals": [i + 1 for i in shown], "ticktext": [names[i] for i in shown]}
     layout["yaxis"] = {"title": {"text": "loss"}, "type": "log" if wide else "linear"}
@@ -333,7 +329,7 @@ def parameter_comparison(rows: Sequence[RowResult]) -> list[Plot]:
                 "title": {"text": with_unit(parameter.name, parameter.unit or _other_than_1(parameter))},
                 "nticks": 6,
             },
-            "yaxis": {"autorange": "reversed", "automargin": True, "type": "category"},
+            "yaxis": CATEGORIES,
             "showlegend": False,
         }
         told = f"{parameter.name} by every way of modelling, with its 95 % interval where it has one."
@@ -341,28 +337,9 @@ def parameter_comparison(rows: Sequence[RowResult]) -> list[Plot]:
     return plots
 
 
-def _cells(values: np.ndarray) -> list[list[float | None]]:
-    return [[float(f"{v:.5g}") if np.isfinite(v) else None for v in row] for row in values]
-
-
-def _titled(x: str, y: str) -> dict[str, Any]:
-    return {"xaxis": {"title": {"text": x}}, "yaxis": {"title": {"text": y}}, "showlegend": False}
-
-
 def _band(half: float) -> dict[str, Any]:
-    return {
-        "type": "rect",
-        "xref": "paper",
-        "x0": 0,
-        "x1": 1,
-        "y0": -half,
-        "y1": half,
-        "fillcolor": "@reach",
-        "line": {"width": 0},
-        "layer": "below",
-        "name": "99 % of what noise gives",
-        "showlegend": True,
-    }
+    told = {"name": "99 % of what noise gives", "showlegend": True}
+    return area("@reach", xref="paper", x0=0, x1=1, y0=-half, y1=half, **told)
 
 
 def _lagged(name: str, units: Mapping[str, str], channel: str | None = None) -> str:

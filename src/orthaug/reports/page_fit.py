@@ -11,6 +11,7 @@ import numpy as np
 from orthaug.models.response import Response
 from orthaug.reports.learned_part import LearnedPart
 from orthaug.reports.page_blocks import (
+    CATEGORIES,
     Code,
     Plot,
     Section,
@@ -248,7 +249,7 @@ def _shares(page: FitPage) -> list[Any]:
     layout = {
         "barmode": "stack",
         "xaxis": {"title": {"text": "share of the two RMS [%]"}, "range": [0, 100]},
-        "yaxis": {"autorange": "reversed", "automargin": True, "type": "category"},
+        "yaxis": CATEGORIES,
     }
     caption = "How the RMS of physics and learner divide."
     if result.structure == "orthogonal":

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.checks import Vector
-from orthaug.reports.learned_part import Curve, LearnedPart, curve_limits
-from orthaug.reports.page_blocks import Grid, Plot, Text, percent, with_unit
+from orthaug.reports.learned_part import Curve, LearnedPart, curve_limits, spread
+from orthaug.reports.page_blocks import Grid, Plot, Text, area, percent, rounded, titled, with_unit
 
 _MOST_CURVES = 12
 _CLOUD = 600  # points of a cloud
@@ -52,12 +51,12 @@ def _told(part: LearnedPart, ranked: list[str], shares: Any, measure: str) -> st
 def _curve_plot(part: LearnedPart, k: int, feature: str, share: float) -> Plot:
     j = part.features.index(feature)
     name, axis = part.names[k], with_unit(feature, part.units[j])
-    few = np.linspace(0, len(part.seen) - 1, min(len(part.seen), _CLOUD)).astype(int)
+    few = spread(len(part.seen), _CLOUD)
     cloud = part.seen[few, j], part.values[few, k]
     traces: list[dict[str, Any]] = [
         {
-            "x": _numbers(cloud[0]),
-            "y": _numbers(cloud[1]),
+            "x": rounded(cloud[0]),
+            "y": rounded(cloud[1]),
             "mode": "markers",
             "name": "training data",
             "marker": {"color": "@measured", "size": 4},
@@ -70,7 +69,9 @@ def _curve_plot(part: LearnedPart, k: int, feature: str, share: float) -> Plot:
         traces += _curve_traces(curve, k)
         layout["yaxis"]["range"] = list(curve_limits(curve, k, cloud[1]))
         reach = curve.along[curve.inside]
-        layout["shapes"].append(_stripe(float(reach[0]), float(reach[-1])))
+        told_as = {"name": "reach of the data", "showlegend": True}
+        ends = {"xref": "x", "x0": float(reach[0]), "x1": float(reach[-1])}
+        layout["shapes"].append(area("@reach", **ends, yref="paper", y0=0, y1=1, **told_as))
         told += (", the one input of the learner" if one else ", all else at its median") + ": solid within the shaded"
         told += " reach of the data, dashed beyond; the dots are what it adds along the training data"
         told += ", and the band is its 95 % interval." if curve.half is not None else "."
@@ -78,8 +79,8 @@ def _curve_plot(part: LearnedPart, k: int, feature: str, share: float) -> Plot:
         centres, means = part.means(feature)
         traces.append(
             {
-                "x": _numbers(centres),
-                "y": _numbers(means[:, k]),
+                "x": rounded(centres),
+                "y": rounded(means[:, k]),
                 "mode": "lines+markers",
                 "name": "mean",
                 "line": {"color": "@learner", "width": 2},
@@ -96,16 +97,16 @@ def _curve_traces(curve: Curve, k: int) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = []
     if curve.half is not None:
         edge: dict[str, Any] = {
-            "x": _numbers(along),
+            "x": rounded(along),
             "mode": "lines",
             "line": {"width": 0, "color": "@band"},
             "hoverinfo": "skip",
         }
-        found.append({**edge, "y": _numbers(learned - curve.half[:, k]), "showlegend": False, "name": "lower limit"})
+        found.append({**edge, "y": rounded(learned - curve.half[:, k]), "showlegend": False, "name": "lower limit"})
         found.append(
             {
                 **edge,
-                "y": _numbers(learned + curve.half[:, k]),
+                "y": rounded(learned + curve.half[:, k]),
                 "fill": "tonexty",
                 "name": "95 % interval",
                 "fillcolor": "@learned-band",
@@ -114,8 +115,8 @@ def _curve_traces(curve: Curve, k: int) -> list[dict[str, Any]]:
     line = {"color": "@learner", "width": 2}
     found.append(
         {
-            "x": _numbers(along),
-            "y": _numbers(learned),
+            "x": rounded(along),
+            "y": rounded(learned),
             "mode": "lines",
             "showlegend": False,
             "name": "beyond the data",
@@ -124,26 +125,9 @@ def _curve_traces(curve: Curve, k: int) -> list[dict[str, Any]]:
     )
     inside = curve.inside
     found.append(
-        {"x": _numbers(along[inside]), "y": _numbers(learned[inside]), "mode": "lines", "name": "learner", "line": line}
+        {"x": rounded(along[inside]), "y": rounded(learned[inside]), "mode": "lines", "name": "learner", "line": line}
     )
     return found
-
-
-def _stripe(low: float, high: float) -> dict[str, Any]:
-    return {
-        "type": "rect",
-        "xref": "x",
-        "x0": low,
-        "x1": high,
-        "yref": "paper",
-        "y0": 0,
-        "y1": 1,
-        "fillcolor": "@reach",
-        "line": {"width": 0},
-        "layer": "below",
-        "name": "reach of the data",
-        "showlegend": True,
-    }
 
 
 def _surface_plot(part: LearnedPart, k: int, across: str, along: str) -> Plot:
@@ -154,21 +138,21 @@ def _surface_plot(part: LearnedPart, k: int, across: str, along: str) -> Plot:
     units = dict(zip(part.features, part.units, strict=True))
     heat = {
         "type": "heatmap",
-        "x": _numbers(surface.across),
-        "y": _numbers(surface.along),
+        "x": rounded(surface.across),
+        "y": rounded(surface.along),
         "hoverongaps": False,
-        "z": [[None if not np.isfinite(v) else float(f"{v:.5g}") for v in row] for row in values],
+        "z": rounded(values, 5),
         "zmin": -reach,
         "zmax": reach,
         "colorscale": "@diverging",
         "colorbar": {"title": {"text": part.names[k], "side": "top"}, "thickness": 14},
     }
-    few = np.linspace(0, len(part.seen) - 1, min(len(part.seen), _CLOUD)).astype(int)
+    few = spread(len(part.seen), _CLOUD)
     points = {
-        "x": _numbers(part.seen[few, part.features.index(across)]),
+        "x": rounded(part.seen[few, part.features.index(across)]),
         "mode": "markers",
         "name": "training data",
-        "y": _numbers(part.seen[few, part.features.index(along)]),
+        "y": rounded(part.seen[few, part.features.index(along)]),
         "hoverinfo": "skip",
         "marker": {"color": "@ink", "size": 2, "opacity": 0.45},
     }
@@ -177,14 +161,5 @@ def _surface_plot(part: LearnedPart, k: int, across: str, along: str) -> Plot:
         f"What the learner adds to {part.names[k]} over {across} and {along}, two inputs that tell much of it, "
         f"{how}. It is drawn where training data are near; the dots are these data."
     )
-    layout = {
-        "xaxis": {"title": {"text": with_unit(across, units[across])}},
-        "yaxis": {"title": {"text": with_unit(along, units[along])}},
-        "showlegend": False,
-    }
+    layout = titled(with_unit(across, units[across]), with_unit(along, units[along]))
     return Plot(f"Learned part of {part.names[k]} over {across} and {along}.", caption, [heat, points], layout, 420)
-
-
-def _numbers(values: Vector) -> list[float | None]:
-    """Of six digits, for they are drawn only."""
-    return [float(f"{v:.6g}") if np.isfinite(v) else None for v in np.asarray(values, dtype=float).tolist()]

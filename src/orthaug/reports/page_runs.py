@@ -6,7 +6,7 @@ The page draws of every curve the least and the largest value in each column of 
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,9 +14,8 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug.data.record import Channel
-from orthaug.models.response import Response, Trajectory
-from orthaug.reports.clipping import Left, curves_left, frame_of, marker_of, told_left
-from orthaug.reports.page_blocks import Plot, number, percent, with_unit
+from orthaug.models.response import Response
+from orthaug.reports.page_blocks import Plot, area, number, percent, with_unit
 
 MOST_POINTS = 100_000  # of a curve
 _BUDGET = 560_000  # points of a page: three million letters
@@ -24,6 +23,7 @@ _UPPER, _GAP = 0.64, 0.05  # share of a pair of panels that is the upper one, an
 _PANEL = 330  # pixels of a pair of panels
 _DASHES = ("dash", "solid", "dot", "dashdot")
 _MOST_BREAKS = 40  # between experiments that are marked
+_FAR = 3.0  # times the measured range: a curve that leaves it is cut off at the edge of the panel
 WITHOUT = "model without its learner"  # its name where it is drawn: the physics that is fitted by itself is another
 
 
@@ -59,52 +59,29 @@ def compared_plots(responses: Mapping[str, Mapping[str, Response]]) -> list[Plot
 
 def _compared(part: str, runs: Mapping[str, Response], most: int) -> Plot:
     first = next(iter(runs.values()))
-    step, several = first.sampling_time, len(first.trajectories) > 1
-    start = 0.0 if several else first.trajectories[0].start_time
-    layout: dict[str, Any] = {"shapes": [], "annotations": []}
-    traces: list[dict[str, Any]] = []
-    panels, measured = 2 * len(first.outputs), [t.measured for t in first.trajectories]
-    known = None if any(m is None for m in measured) else joined(first, measured)
-    series: dict[str, Any] = {}
+    panels = _Panels(first, most)
     models = {name: joined(run, [t.model for t in run.trajectories]) for name, run in runs.items()}
-    left: list[Left] = []
-    for i, channel in enumerate(first.outputs):
+    for i in range(len(first.outputs)):
         own = {"yaxis": f"y{2 * i + 1}", "showlegend": i == 0}
-        if known is not None:
-            series[f"measured {i}"] = packed(known[:, i], start, step, most)
-            traces.append(
-                {**own, "series": f"measured {i}", "name": "measured", "line": {"color": "@measured", "width": 3}}
-            )
-        for name, color, dash in zip(
-            models, ("@physics", "@model", "@learner", "@bias") * 9, _DASHES * 9, strict=False
-        ):
+        if panels.measured is not None:
+            key = panels.keep("measured", i, panels.measured)
+            panels.traces.append({**own, "series": key, "name": "measured", "line": {"color": "@measured", "width": 3}})
+        colors = ("@physics", "@model", "@learner", "@bias") * 9
+        for (name, model), color, dash in zip(models.items(), colors, _DASHES * 9, strict=False):
             line = {"color": color, "width": 1.3, "dash": dash}
             given = {"name": name, "legendgroup": name, "line": line}
-            key = f"{name} {i}"
-            series[key] = packed(models[name][:, i], start, step, most)
-            traces.append({**own, **given, "series": key})
-            if known is not None:
-                residual = _residual(series, f"measured {i}", key, known[:, i] - models[name][:, i], most)
-                traces.append({**given, **residual, "yaxis": f"y{2 * i + 2}", "showlegend": False})
-        limits = frame_of(known, list(models.values()), i)
-        left += curves_left({name: model[:, i] for name, model in models.items()}, limits, channel, start, step)
-        layout |= _axes(i, panels, channel, limits)
-    rows = len(next(iter(models.values())))
-    layout["xaxis"] = {
-        "title": {"text": "time [s]"},
-        "range": [start, start + step * (rows - 1)],
-        "anchor": f"y{panels}",
-    }
+            panels.traces.append({**own, **given, "series": panels.keep(name, i, model)})
+            if panels.measured is not None:
+                panels.add_residual(name, i, model, given)
+        panels.finish(i, models)
     lost = [name for name, run in runs.items() if any(t.diverged for t in run.trajectories)]
+    samples = sum(len(t.model) for t in first.trajectories)
     caption = (
-        f"The free runs of {', '.join(runs)} on {part}, all {rows - len(first.trajectories) + 1} samples, with what "
-        "each leaves of the measured output under them."
+        f"The free runs of {', '.join(runs)} on {part}, all {samples} samples, with what each leaves of the measured "
+        "output under them."
     )
     caption += f" The run of {', '.join(lost)} diverges." if lost else ""
-    caption += told_left(left)
-    traces += [marker_of(one, first.outputs) for one in left]
-    label = f"Free runs of every model on {part}, with their residuals below."
-    return Plot(label, caption, traces, layout, 60 + _PANEL * len(first.outputs), series=series)
+    return panels.plot(f"Free runs of every model on {part}, with their residuals below.", caption, "time [s]")
 
 
 def error_band(response: Response) -> dict[str, tuple[float, float]]:
@@ -159,59 +136,138 @@ def joined(response: Response, values: Sequence[Matrix | None]) -> Matrix:
     return np.concatenate([part for piece in pieces for part in (piece, gap)][:-1])
 
 
+class _Panels:
+    """A plot of runs as it is drawn: of each output a panel of curves, and the residuals below.
+
+    `measured` (N, ny) are the measured outputs, experiments one after another; None where there are none.
+    """
+
+    def __init__(self, response: Response, most: int) -> None:
+        self.outputs, self.step, self.most = response.outputs, response.sampling_time, most
+        several = len(response.trajectories) > 1
+        self.start = 0.0 if several else response.trajectories[0].start_time
+        measured = [t.measured for t in response.trajectories]
+        self.measured = None if any(m is None for m in measured) else joined(response, measured)
+        self.rows = sum(len(t.model) + 1 for t in response.trajectories) - 1
+        self.traces: list[dict[str, Any]] = []
+        self.layout: dict[str, Any] = {"shapes": [], "annotations": []}
+        self.series: dict[str, Any] = {}
+        self._left: list[Left] = []
+
+    def keep(self, name: str, i: int, values: Matrix) -> str:
+        """The name by which traces find the curve of output i."""
+        self.series[f"{name} {i}"] = packed(values[:, i], self.start, self.step, self.most)
+        return f"{name} {i}"
+
+    def add_residual(self, name: str, i: int, model: Matrix, drawn: Mapping[str, Any]) -> None:
+        """Measured less a curve that is kept: their difference, or of thinned curves one of its own."""
+        assert self.measured is not None
+        own: dict[str, Any] = {"minus": [f"measured {i}", f"{name} {i}"]}
+        if len(model) > self.most:
+            key = f"measured {i} − {name} {i}"
+            self.series[key] = packed(self.measured[:, i] - model[:, i], self.start, self.step, self.most)
+            own = {"series": key}
+        self.traces.append({**own, **drawn, "yaxis": f"y{2 * i + 2}", "showlegend": False})
+
+    def finish(self, i: int, drawn: Mapping[str, Matrix]) -> None:
+        """The axes of output i, and where what is `drawn` leaves them."""
+        curves = {name: curve[:, i] for name, curve in drawn.items()}
+        limits = None if self.measured is None else frame_of(self.measured[:, i], curves.values())
+        if limits is not None:
+            self._left += curves_left(curves, limits, i, self.start, self.step)
+        self.layout |= _axes(i, 2 * len(self.outputs), self.outputs[i], limits)
+
+    def plot(self, label: str, caption: str, time: str) -> Plot:
+        """All of it; `time` stands at the axis that the panels share."""
+        for one in self._left:
+            channel = self.outputs[one.output]
+            reached = f"{number(one.farthest, 3)} {channel.unit}".strip()
+            caption += f" At {number(one.time, 4)} s {channel.name} of {one.name} leaves the panel, at the triangle;"
+            caption += f" it goes to {reached}."
+        self.layout["xaxis"] = {
+            "title": {"text": time},
+            "range": [self.start, self.start + self.step * (self.rows - 1)],
+            "anchor": f"y{2 * len(self.outputs)}",
+        }
+        traces = [*self.traces, *(one.marker() for one in self._left)]
+        return Plot(label, caption, traces, self.layout, 60 + _PANEL * len(self.outputs), series=self.series)
+
+
+@dataclass(frozen=True)
+class Left:
+    """A curve that leaves its panel: the output, the instant [s], the edge it leaves by, and the value farthest out."""
+
+    name: str
+    output: int
+    time: float
+    edge: float
+    above: bool
+    farthest: float
+
+    def marker(self) -> dict[str, Any]:
+        """A triangle at the edge."""
+        return {
+            "x": [self.time],
+            "y": [self.edge],
+            "yaxis": f"y{2 * self.output + 1}",
+            "type": "scatter",
+            "mode": "markers",
+            "name": f"{self.name} leaves the panel",
+            "cliponaxis": False,
+            "showlegend": False,
+            "marker": {"color": "@bad", "size": 12, "symbol": "triangle-up" if self.above else "triangle-down"},
+        }
+
+
+def frame_of(measured: Vector, curves: Iterable[Vector]) -> list[float] | None:
+    """What the upper panel shows where a curve leaves what was measured by far; None for all of it."""
+    low, high = float(np.nanmin(measured)), float(np.nanmax(measured))
+    width = max(high - low, 1e-300)
+    for curve in curves:
+        inside = curve[np.isfinite(curve)]
+        if len(inside) and (inside.min() < low - _FAR * width or inside.max() > high + _FAR * width):
+            return [low - width, high + width]
+    return None
+
+
+def curves_left(
+    curves: Mapping[str, Vector], limits: Sequence[float], output: int, start: float, step: float
+) -> list[Left]:
+    """The curves that are cut off at the edge of a panel, in the order of the drawing."""
+    found: list[Left] = []
+    for name, curve in curves.items():
+        with np.errstate(invalid="ignore"):
+            outside = np.flatnonzero((curve < limits[0]) | (curve > limits[1]))
+        if len(outside):
+            row, above = int(outside[0]), bool(curve[outside[0]] > limits[1])
+            farthest = curve[outside][np.argmax(np.abs(curve[outside] - np.mean(limits)))]
+            found.append(Left(name, output, start + step * row, limits[above], above, float(farthest)))
+    return found
+
+
 def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
-    response, step = run.response, run.response.sampling_time
-    several = len(response.trajectories) > 1
-    start = 0.0 if several else response.trajectories[0].start_time
+    response, panels = run.response, _Panels(run.response, most)
     model = joined(response, [t.model for t in response.trajectories])
-    measured = [t.measured for t in response.trajectories]
-    known = None if any(m is None for m in measured) else joined(response, measured)
     alone = None if run.alone is None else joined(response, [t.model for t in run.alone.trajectories])
-    traces: list[dict[str, Any]] = []
-    layout: dict[str, Any] = {"shapes": [], "annotations": []}
-    panels = 2 * len(response.outputs)
-    series: dict[str, Any] = {}
-    left: list[Left] = []
+    curves = {"measured": panels.measured, "physics": alone, "model": model}
+    drawn = {"the model": model} | ({} if alone is None else {f"the {WITHOUT}": alone})
     for i, channel in enumerate(response.outputs):
-        curves = {"measured": known, "physics": alone, "model": model}
-        series |= {f"{k} {i}": packed(v[:, i], start, step, most) for k, v in curves.items() if v is not None}
+        for name, curve in curves.items():
+            if curve is not None:
+                panels.keep(name, i, curve)
         limits = band.get(channel.name)
-        traces += _upper([k for k, v in curves.items() if v is not None], i, limits)
-        if known is not None:
-            given = _residual(series, f"measured {i}", f"model {i}", known[:, i] - model[:, i], most)
-            line = {"color": "@residual", "width": 1}
-            traces.append(
-                {**given, "name": "measured − model", "yaxis": f"y{2 * i + 2}", "line": line, "showlegend": False}
-            )
+        panels.traces += _upper([name for name, curve in curves.items() if curve is not None], i, limits)
+        if panels.measured is not None:
+            told = {"name": "measured − model", "line": {"color": "@residual", "width": 1}}
+            panels.add_residual("model", i, model, told)
             if limits is not None:
-                layout["shapes"].append(_stripe(limits, 2 * i + 2))
-        drawn = {"the model": model} | ({} if alone is None else {f"the {WITHOUT}": alone})
-        frame = frame_of(known, list(drawn.values()), i)
-        left += curves_left({name: curve[:, i] for name, curve in drawn.items()}, frame, channel, start, step)
-        layout |= _axes(i, panels, channel, frame)
-    end = start + step * (len(model) - 1)
-    layout["xaxis"] = {
-        "title": {"text": "time [s]" if not several else "time, experiments one after another [s]"},
-        "range": [start, end],
-        "anchor": f"y{panels}",
-    }
-    _mark(layout, run, start, step)
-    return Plot(
-        _label(run),
-        _caption(run, most) + told_left(left),
-        [*traces, *(marker_of(one, response.outputs) for one in left)],
-        layout,
-        60 + _PANEL * len(response.outputs),
-        series=series,
-    )
-
-
-def _residual(series: dict[str, Any], measured: str, model: str, residual: Vector, most: int) -> dict[str, Any]:
-    """A residual as the page reads it: the difference of two curves, or of thinned ones a curve of its own."""
-    if len(residual) <= most:
-        return {"minus": [measured, model]}
-    series[f"{measured} − {model}"] = packed(residual, series[model]["x0"], series[model]["step"], most)
-    return {"series": f"{measured} − {model}"}
+                low, high = limits
+                place = {"xref": "paper", "x0": 0, "x1": 1, "yref": f"y{2 * i + 2}"}
+                panels.layout["shapes"].append(area("@band", **place, y0=low, y1=high))
+        panels.finish(i, drawn)
+    _mark(panels.layout, run, panels.start, panels.step)
+    time = "time [s]" if len(response.trajectories) == 1 else "time, experiments one after another [s]"
+    return panels.plot(_label(run), _caption(run, most), time)
 
 
 def _upper(curves: Sequence[str], i: int, limits: tuple[float, float] | None) -> list[dict]:
@@ -248,28 +304,14 @@ def _axes(i: int, panels: int, channel: Channel, limits: list[float] | None) -> 
     return {f"yaxis{2 * i + 1}" if i else "yaxis": upper, f"yaxis{2 * i + 2}": lower}
 
 
-def _stripe(limits: tuple[float, float], axis: int) -> dict[str, Any]:
-    return {
-        "type": "rect",
-        "xref": "paper",
-        "x0": 0,
-        "x1": 1,
-        "yref": f"y{axis}",
-        "y0": limits[0],
-        "y1": limits[1],
-        "fillcolor": "@band",
-        "line": {"width": 0},
-        "layer": "below",
-    }
-
-
 def _mark(layout: dict[str, Any], run: Run, start: float, step: float) -> None:
     """Lines where an experiment begins, and where a run left all bounds."""
     row, breaks = 0, len(run.response.trajectories) <= _MOST_BREAKS
     for i, trajectory in enumerate(run.response.trajectories):
         if i and breaks:
             layout["shapes"].append(_line(start + step * (row - 0.5), "@grid", "dot"))
-        for name, told in (("free run", trajectory), (f"the {WITHOUT}", _of(run.alone, i))):
+        alone = None if run.alone is None else run.alone.trajectories[i]
+        for name, told in (("free run", trajectory), (f"the {WITHOUT}", alone)):
             if told is not None and told.diverged:
                 at = start + step * (row + told.diverged[0])
                 layout["shapes"].append(_line(at, "@bad", "solid"))
@@ -287,10 +329,6 @@ def _mark(layout: dict[str, Any], run: Run, start: float, step: float) -> None:
                     }
                 )
         row += len(trajectory.model) + 1
-
-
-def _of(response: Response | None, i: int) -> Trajectory | None:
-    return None if response is None else response.trajectories[i]
 
 
 def _line(x: float, color: str, dash: str) -> dict[str, Any]:

@@ -27,7 +27,7 @@ _NAMED = 0.5  # share of what was learned from which its cause is what to do fir
 _MOST_DOUBTS = 3  # that are told in the first sentence
 _WORSE = 1.5  # times the error on the training data: a Gaussian error then leaves the 95 % band on a fifth of the rows
 _STOPPED = ("iteration_limit", "no_descent", "stopped")
-_RAN_AWAY = ("free_run_diverged",)
+_RAN_AWAY = "free_run_diverged"
 _TIED = ("orthogonal", "physics alone")  # of models that are as good as each other these are taken first
 
 
@@ -49,7 +49,7 @@ def fit_verdict(result: FitResult) -> PageVerdict:
     """Of a fit, from its own findings."""
     doubts = list(_doubts(result, result.data))
     error, part = _worst(result.scores)
-    bad = _ran_away(result) or (error is not None and error > _POOR) or _code(result) == "hurts"
+    bad = _warned(result, _RAN_AWAY) or (error is not None and error > _POOR) or _code(result) == "hurts"
     level = "bad" if bad else "care" if doubts else "good"
     opening = {
         "good": "The model is to be trusted",
@@ -163,17 +163,13 @@ def _code(result: FitResult | RowResult) -> str | None:
     return None if result.validation is None or _warned(result, "physics_alone") else result.validation.verdict
 
 
-def _warned(result: FitResult | RowResult, *codes: str) -> bool:
-    return any(warning.code in codes for warning in result.warnings)
-
-
-def _ran_away(result: FitResult) -> bool:
-    return _warned(result, *_RAN_AWAY)
+def _warned(result: FitResult | RowResult, code: str) -> bool:
+    return any(warning.code == code for warning in result.warnings)
 
 
 def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
     """What speaks against the model, the gravest first."""
-    runaway = [w.text.split(":")[0] for w in result.warnings if w.code in _RAN_AWAY]
+    runaway = [w.text.split(":")[0] for w in result.warnings if w.code == _RAN_AWAY]
     if runaway:
         yield f"its free run diverges on {_joined(runaway)}"
     if _code(result) == "hurts":
@@ -285,7 +281,7 @@ def _then(result: FitResult) -> str:
         return f"{_change(changes[0])}."
     if cause is not None:
         return _advised(cause, result.motion is not None)
-    if _ran_away(result):
+    if _warned(result, _RAN_AWAY):
         return 'Train on the free run (`focus = "simulation"`), or record data over the range that it leaves.'
     if not result.data.tests and not result.data.validation:
         return "Hold out a test part (`[data.tests.NAME]`), on which the model can be judged."
@@ -321,9 +317,8 @@ def _advised(cause: BiasResult, moves: bool) -> str:
 
 def _undecided(result: FitResult) -> bool:
     """Whether physics alone was handed over although the learner may help."""
-    fell_back = any(warning.code == "physics_alone" for warning in result.warnings)
     ratio = None if result.validation is None else result.validation.ratio
-    return fell_back and ratio is not None and (ratio.value or 1.0) < 1 < (ratio.high or 0.0)
+    return _warned(result, "physics_alone") and ratio is not None and (ratio.value or 1.0) < 1 < (ratio.high or 0.0)
 
 
 def _change(change: object) -> str:

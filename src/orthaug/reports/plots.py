@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from orthaug._base.lines import percent
+from orthaug.data.record import Record
+from orthaug.models.motion_field import parts_at
 from orthaug.models.response import Response
 from orthaug.reports.drawing import (
     BLACK,
@@ -28,35 +31,56 @@ from orthaug.reports.drawing import (
     outline,
     panels,
     plain,
+    ruled,
     save,
     window,
 )
 from orthaug.reports.findings import SuspectResult
+from orthaug.reports.learned_part import LearnedPart, curve_limits, labels_with_units, trajectory_of
+from orthaug.reports.page_blocks import with_unit
 from orthaug.reports.residual_tests import ResidualTestResult
 from orthaug.reports.result import RowResult
+from orthaug.reports.selection import SelectResult
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from orthaug.models.motion_model import MotionModel
 
 __all__ = ["save"]
 
 _CYCLE = (BLUE, ORANGE, GREEN, BLACK)
 _KINDS = ("prediction", "simulation")
+_BESIDE = 3  # panels beside each other
 _MOST_NUMBERS = 200  # in a heat map: of more the colours alone are shown
+_SIZES = {"orders": "linear lags", "terms": "terms beside the physics", "learner": "weights of the network"}
+_WIDE = 5.0  # ratio of scores from which their axis is logarithmic
+_OVER_TIME = "parameters over time with 95 % bands; vertical lines: the residual left its band"
 
 
 @plain
-def output_figure(response: Response, title: str) -> Figure:
-    """Measured output against the model, and below it their difference, from the first value on."""
+def output_figure(response: Response, title: str, *, learns: bool = False) -> Figure:
+    """Measured output against the model, and below it their difference, from the first value on.
+
+    Args:
+        learns: draw the free run of a motion without its learner, too.
+    """
     trajectory = response.trajectories[0]
     time, rows = window(response)
     figure, axes = panels(response, f"{title}: {extent(response, rows)}", heights=(2, 1))
+    drawn = [("model without its learner", trajectory.baseline, ORANGE, ORANGE, "--")] if learns else []
+    drawn.append(("model", trajectory.model, BLACK, BLUE, "-"))
     for i, channel in enumerate(response.outputs):
         upper, lower = axes[2 * i], axes[2 * i + 1]
         if trajectory.measured is not None:
             upper.plot(time, trajectory.measured[rows, i], color=GREY, linewidth=2.6, label="measured")
-            error = trajectory.measured[rows, i] - trajectory.model[rows, i]
-            lower.plot(time, error, color=BLUE, linewidth=0.9)
-        upper.plot(time, trajectory.model[rows, i], color=BLACK, linewidth=0.9, label="model")
+        for name, values, color, of_error, style in drawn:
+            upper.plot(time, values[rows, i], style, color=color, linewidth=0.9, label=name)
+            if trajectory.measured is not None:
+                error = trajectory.measured[rows, i] - values[rows, i]
+                lower.plot(time, error, style, color=of_error, linewidth=0.9)
         label(upper, y=channel.label)
-        label(lower, y="difference" + (f" [{channel.unit}]" if channel.unit else ""))
+        label(lower, y=with_unit("difference", channel.unit))
         legend(upper)
     label(axes[-1], x="time [s]")
     return figure
@@ -85,7 +109,6 @@ def components_figure(response: Response, title: str) -> Figure:
     trajectory = response.trajectories[0]
     figure, axes = panels(response, f"{title}: {extent(response, rows)}", heights=(1, 1))
     for i, channel in enumerate(response.outputs):
-        unit = f" [{channel.unit}]" if channel.unit else ""
         for axis, values, color, part, formula in (
             (axes[2 * i], trajectory.baseline, BLUE, "baseline", "φ θ"),
             (axes[2 * i + 1], trajectory.learner, GREEN, "learner", "f − φ θ_aux"),
@@ -93,9 +116,80 @@ def components_figure(response: Response, title: str) -> Figure:
             axis.plot(
                 time, values[rows, i], color=color, linewidth=1.1, label=f"{part} part of {channel.name}, {formula}"
             )
-            label(axis, y=part + unit)
+            label(axis, y=with_unit(part, channel.unit))
             legend(axis)
     label(axes[-1], x="time [s]")
+    return figure
+
+
+@plain
+def states_figure(model: MotionModel, record: Record, title: str) -> Figure:
+    """Every state along the free run of the first experiment."""
+    states, _ = trajectory_of(model, record)
+    motion = model.form.motion
+    rows = slice(0, min(len(states), 250))
+    time = np.arange(rows.stop) * model.sampling_time
+    figure, axes = _stacked(len(motion.states), f"{title}: samples 0 to {rows.stop - 1}")
+    for axis, state, values in zip(axes, motion.states, states.T, strict=True):
+        axis.plot(time, values[rows], color=BLUE, linewidth=1.1)
+        label(axis, y=with_unit(state.name, state.unit))
+    label(axes[-1], x="time [s]")
+    return figure
+
+
+@plain
+def parts_figure(model: MotionModel, record: Record, title: str) -> Figure:
+    """Of each learned equation and output what the physics gives, and what is learned beside it, along the free run."""
+    states, inputs = trajectory_of(model, record)
+    rows = slice(0, min(len(states), 250))
+    physics, learner = parts_at(model.form, model.numbers, states[rows], inputs[rows])
+    names = labels_with_units(model)
+    time = np.arange(rows.stop) * model.sampling_time
+    figure, axes = _stacked(2 * len(names), f"{title}: samples 0 to {rows.stop - 1}")
+    for i, name in enumerate(names):
+        axes[2 * i].plot(time, physics[:, i], color=BLUE, linewidth=1.1, label="physics")
+        axes[2 * i + 1].plot(time, learner[:, i], color=GREEN, linewidth=1.1, label="learner")
+        for axis in axes[2 * i : 2 * i + 2]:
+            label(axis, y=name)
+            legend(axis)
+    label(axes[-1], x="time [s]")
+    return figure
+
+
+@plain
+def learner_figure(part: LearnedPart, title: str) -> Figure:
+    """What was learned over each input of the learner: along the training run, and as a curve where that is one.
+
+    The curve of a state or input is drawn with all others at their medians, dashed beyond the reach of the data.
+    """
+    values, names, seen = part.values, part.names, part.features
+    columns = min(len(seen), _BESIDE)
+    rows = len(names) * -(-len(seen) // columns)
+    figure = Figure(figsize=(SIZE[0] * (1 if columns == 1 else 1.3), TOP + 2.4 * rows))
+    axes = grid(figure, rows, columns, gap=(0.75, 0.85))
+    headline(figure, title)
+    curves = [part.curve(feature) for feature in seen]
+    for k, name in enumerate(names):
+        for j, feature in enumerate(seen):
+            row, column = divmod(j, columns)
+            axis = axes[k * (rows // len(names)) + row, column]
+            axis.plot(part.seen[:, j], values[:, k], ".", color=GREY, markersize=6, label="training run")
+            curve = curves[j]
+            if curve is not None:
+                along, inside, learned = curve.along, curve.inside, curve.learned[:, k]
+                if curve.half is not None:
+                    half = curve.half[:, k]
+                    band = learned - half, learned + half
+                    axis.fill_between(along, *band, color=GREEN, alpha=0.2, linewidth=0, label="95 % interval")
+                axis.set_ylim(*curve_limits(curve, k, values[:, k]))
+                axis.axvspan(along[inside][0], along[inside][-1], color=GREY, alpha=0.15, linewidth=0, zorder=0)
+                axis.plot(along, learned, "--", color=GREEN, linewidth=1.0)
+                axis.plot(along[inside], learned[inside], color=GREEN, linewidth=1.2, label="learner")
+            label(axis, x=with_unit(feature, part.units[j]), y=None if column else name)
+    for axis in axes.flat:
+        axis.set_visible(bool(axis.lines))
+    told = max(axes[0], key=lambda axis: len(axis.get_legend_handles_labels()[1]))
+    legend(axes[0, -1] if axes[0, -1].lines else told, *told.get_legend_handles_labels())
     return figure
 
 
@@ -110,25 +204,20 @@ def residual_analysis_figure(tests: Sequence[ResidualTestResult], title: str) ->
             row[0].bar(np.arange(1, len(test.acf)), _floats(test.acf[1:]), color=BLUE, width=0.6)
             row[0].axhspan(-test.acf_band, test.acf_band, color=GREY, alpha=0.5)
         label(row[0], x="lag", y=f"residual of {test.name}", title="autocorrelation")
-        shown = [(name, cross) for name, cross in test.cross.items() if cross is not None]
-        for (name, cross), color in zip(shown, _CYCLE, strict=False):
+        for (name, cross), color in zip(test.crossed.items(), _CYCLE, strict=False):
             reach = len(cross.values) // 2
             row[1].plot(
                 np.arange(-reach, reach + 1), _floats(cross.values), ".-", color=color, linewidth=0.8, label=name
             )
-        if shown:
-            band = max(cross.band or 0.0 for _, cross in shown)
-            row[1].axhspan(-band, band, color=GREY, alpha=0.5)
+        if test.crossed:
+            row[1].axhspan(-test.cross_band, test.cross_band, color=GREY, alpha=0.5)
             row[1].legend(fontsize=8, frameon=False)
         label(row[1], x="lag behind the input", title="correlation with the inputs")
-        curves = {name: (curve.share or 0.0, curve) for name, curve in test.regressors.items() if curve is not None}
-        if curves:
-            name = max(curves, key=lambda key: curves[key][0])
-            share, curve = curves[name]
+        for name, curve in test.most_telling.items():
             centres, means, errors = (_floats(values) for values in (curve.centres, curve.means, curve.errors))
             row[2].errorbar(centres, means, 2.576 * errors, fmt="o", color=GREEN, markersize=3)
             row[2].axhline(0.0, color=BLACK, linewidth=0.6)
-            label(row[2], x=name, title=f"mean over {name}, {percent(share)} explained")
+            label(row[2], x=name, title=f"mean over {name}, {percent(curve.share or 0.0)} explained")
     return figure
 
 
@@ -187,15 +276,86 @@ def comparison_figure(rows: Sequence[RowResult]) -> Figure:
             if interval:
                 axis.plot([i, i], interval, "_-", color=GREEN, markersize=14)
             axis.plot([i], [entry.value], "o", color=GREEN, markerfacecolor=GREEN if interval else "white")
-        axis.set_ylabel(f"{parameter.name} [{parameter.unit}]" if parameter.unit else parameter.name)
+        axis.set_ylabel(with_unit(parameter.name, parameter.unit))
     for axis in axes:
-        axis.margins(y=0.15)
-        axis.grid(alpha=0.25)
-        axis.spines[["top", "right"]].set_visible(False)
+        ruled(axis).margins(y=0.15)
     axes[-1].set_xticks(place, names, rotation=15, ha="right")
     axes[-1].set_xlim(-0.5, len(rows) - 0.5)
     figure.align_ylabels()
     return figure
+
+
+@plain
+def selection_figure(result: SelectResult, unit: str) -> Figure:
+    """Score against size, a panel for each stage, the choice marked."""
+    stages = list(dict.fromkeys(row.stage for row in result.models))
+    figure = Figure(figsize=(SIZE[0], TOP + SIZE[1] * len(stages)))
+    axes = grid(figure, len(stages), 1, gap=(0.55, 0.0))[:, 0]
+    headline(figure, "error of free runs on blocks that were held out")
+    for axis, stage in zip(axes, stages, strict=True):
+        rows = [row for row in result.models if row.stage == stage and row.score is not None]
+        size, score = (np.array([getattr(row, name) for row in rows], dtype=float) for name in ("size", "score"))
+        error = np.array([row.standard_error or 0.0 for row in rows])
+        within, chosen = (np.array([getattr(row, name) for row in rows], dtype=bool) for name in ("within", "chosen"))
+        axis.errorbar(size, score, error, fmt="none", ecolor=GREY, elinewidth=0.8)
+        axis.plot(size[~within], score[~within], "o", ms=4, color=BLACK, mfc="white", label="worse")
+        axis.plot(size[within], score[within], "o", ms=4, color=BLUE, label="as good as the best")
+        axis.plot(size[chosen], score[chosen], "s", ms=9, color=ORANGE, mfc="none", mew=1.6, label="chosen")
+        if len(score) and score.max() > _WIDE * score.min() > 0:
+            axis.set_yscale("log", subs=(2, 5))
+            axis.yaxis.set_major_formatter("{x:g}")
+            axis.yaxis.set_minor_formatter("{x:g}")
+        label(axis, x=_SIZES[stage], y=with_unit("RMS error", unit))
+    legend(axes[0])
+    return figure
+
+
+@plain
+def tracking_figure(
+    course: pd.DataFrame,
+    parameters: Sequence[Any],
+    alarms: Sequence[float],
+    title: str | None = None,
+    physical: pd.DataFrame | None = None,
+    physical_parameters: Sequence[Any] = (),
+) -> Figure:
+    """A panel for each parameter with its 95 % band, and the alarm below; vertical lines are where it was raised.
+
+    Args:
+        course: `Recursive.history`.
+        parameters: θ, each with name and unit.
+        alarms: instants [s].
+        physical: `Recursive.physical_history`, drawn above θ, of the `physical_parameters`.
+    """
+    panels = [(physical, p) for p in physical_parameters if physical is not None]
+    panels += [(course, p) for p in parameters]
+    figure = Figure(figsize=(SIZE[0], TOP + 1.25 * (len(panels) + 1)))
+    axes = grid(figure, len(panels) + 1, 1, sharex=True, gap=(0.16, 0.0))[:, 0]
+    headline(figure, _OVER_TIME if title is None else title)
+    for axis, (frame, parameter) in zip(axes, panels, strict=False):
+        _band(axis, frame, parameter.name)
+        label(axis, y=with_unit(parameter.name, parameter.unit))
+    level = course["alarm"].to_numpy(dtype=float)
+    axes[-1].plot(*outline(course["time"].to_numpy(), level), color=BLACK, linewidth=0.8)
+    axes[-1].axhline(1.0, color=ORANGE, linewidth=0.9, linestyle="--")
+    axes[-1].set_ylim(0, max(1.2, 1.05 * level.max(initial=0.0)))
+    label(axes[-1], x="time [s]", y="alarm (limit 1)")
+    for axis in axes:
+        for instant in alarms:
+            axis.axvline(instant, color=ORANGE, linewidth=0.9)
+    return figure
+
+
+def _band(axis: Any, frame: pd.DataFrame, name: str) -> None:
+    """A parameter over time, as wide as what most of it needs: the first rows of an empty start are wild."""
+    time, value, low, high = (frame[key].to_numpy() for key in ("time", name, f"{name}_low", f"{name}_high"))
+    axis.fill_between(time, low, high, color=GREY, alpha=0.6, linewidth=0)
+    axis.plot(time, value, color=BLUE, linewidth=1.1)
+    seen = np.concatenate([part[np.isfinite(part)] for part in (value, low, high)])
+    if len(seen):
+        bottom, top = np.percentile(seen, [0.5, 99.5])
+        margin = 0.1 * (top - bottom) or 0.1 * abs(top) or 1.0
+        axis.set_ylim(bottom - margin, top + margin)
 
 
 def _mean_nrmse(row: RowResult, kind: str) -> float:
@@ -209,3 +369,11 @@ def _mean_nrmse(row: RowResult, kind: str) -> float:
 def _floats(values: Sequence[float | None]) -> np.ndarray:
     """The numbers of a result, NaN for None."""
     return np.array(values, dtype=float)
+
+
+def _stacked(count: int, title: str) -> tuple[Figure, list]:
+    """Panels below each other."""
+    figure = Figure(figsize=(SIZE[0], TOP + 1.6 * count))
+    axes = grid(figure, count, 1, sharex=True)[:, 0]
+    headline(figure, title)
+    return figure, list(axes)

@@ -65,6 +65,23 @@ class ResidualTestResult(Content):
     largest_cross: Number
     largest_share: Number
 
+    @property
+    def crossed(self) -> dict[str, CrossResult]:
+        """The inputs that it was held against."""
+        return {name: cross for name, cross in self.cross.items() if cross is not None}
+
+    @property
+    def cross_band(self) -> float:
+        """The widest band of theirs."""
+        return max((cross.band or 0.0 for cross in self.crossed.values()), default=0.0)
+
+    @property
+    def most_telling(self) -> dict[str, RegressorResult]:
+        """The regressor that explains most of it, by its name; none where none was looked at."""
+        curves = {name: curve for name, curve in self.regressors.items() if curve is not None}
+        best = max(curves, key=lambda name: curves[name].share or 0.0, default=None)
+        return {} if best is None else {best: curves[best]}
+
 
 class RunningTestResult(Content):
     """Whiteness and independence of one output's residual, from running sums over all rows."""

@@ -27,6 +27,7 @@ from orthaug.reports.residual_tests import RunningTestResult
 if TYPE_CHECKING:
     from orthaug.analysis.budget import ParameterBias
     from orthaug.analysis.design import Design
+    from orthaug.inference.motion_split import MotionSplit
     from orthaug.inference.physical import PhysicalEstimate
 
 SCHEMA = 2
@@ -150,6 +151,12 @@ class MeasureResult(Content):
     support: Number
     condition: Number
     std_over_training: Numbers | None = Field(validation_alias="price")
+
+    @classmethod
+    def of_motion(cls, split: MotionSplit) -> MeasureResult:
+        """Of a motion, which has neither a condition of Φ nor a price."""
+        own = {"name": split.name, "points": len(split.field.x), "support": split.support}
+        return cls.model_validate({**own, "condition": None, "price": None})
 
 
 class OutputWeightsResult(Content):

@@ -163,7 +163,6 @@ def _unit_of_first(inner: str, units: dict[str, str]) -> str:
 
 
 def _closed(text: str) -> str:
-    """A product's factor; in brackets where it is a sum."""
     depth = 0
     for i, character in enumerate(text):
         depth += (character in "([") - (character in ")]")

@@ -69,12 +69,8 @@ class _Known:
     @classmethod
     def of(cls, runs: TermRuns) -> _Known:
         """Of the physics alone."""
-        problem, phi, target = runs.problem, [], []
-        for experiment in problem.record.experiments:
-            x = runs.menu.regressors(experiment, problem.record)
-            phi.append(np.asarray(problem.baseline.phi(x, runs.menu.layout, runs.menu.outputs, np))[:, 0])
-            known = np.asarray(problem.baseline.known(x, runs.menu.layout, runs.menu.outputs, np))
-            target.append((experiment.outputs[runs.menu.first_row :] - known)[:, 0])
+        every = (runs.physics(*runs.rows(experiment)) for experiment in runs.problem.record.experiments)
+        phi, target = zip(*every, strict=True)
         return cls(np.zeros((sum(map(len, target)), 0)), np.concatenate(target)).beside(np.concatenate(phi))
 
     def beside(self, columns: Float[np.ndarray, "N m"]) -> _Known:
@@ -104,7 +100,6 @@ class _Known:
 
 
 def _chunks(runs: TermRuns, chosen: Sequence[int] | np.ndarray) -> Iterator[tuple[slice, Float[np.ndarray, "K m"]]]:
-    """Some terms over all rows, a chunk at a time."""
     numbers, begin = runs.library.numbers[np.asarray(chosen, dtype=int)], 0
     for experiment in runs.problem.record.experiments:
         factors = runs.factors(experiment)

@@ -212,7 +212,6 @@ def _grown(space: Space, chosen: list[Candidate]) -> list[Candidate]:
 
 
 def _best_single(space: Space, chosen: Sequence[Candidate]) -> list[Candidate]:
-    """The terms that explain most beside those that are chosen."""
     gains = space.gains([space.column(one) for one in chosen])
     found: dict[Any, Candidate] = {}
     for i in np.argsort(-gains, kind="stable"):
@@ -251,7 +250,6 @@ def _best_pairs(space: Space, others: Sequence[Candidate]) -> list[tuple[Candida
 
 
 def _refined(space: Space, chosen: list[Candidate], within: float = _FINE) -> list[Candidate]:
-    """Widths moved to where the terms together explain most."""
     for i, candidate in enumerate(chosen):
         if candidate.width is None:
             continue

@@ -20,27 +20,22 @@ from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.models.learners import MLP
 from orthaug.physics.problem import Problem
 from orthaug.selection.nonlinearity import Nonlinearity
-from orthaug.selection.term_path import Judged, Rung, Told, judge_all
+from orthaug.selection.term_path import Rung, Search, Told
 from orthaug.selection.term_runs import Point
 
 _ITERATIONS = 40  # of a network on a fold
 
 
 @dataclass(frozen=True, eq=False)
-class LearnerSearch:
-    """All networks that were judged, physics alone first, with the choice."""
+class LearnerSearch(Search):
+    """Networks, physics alone first."""
 
     learners: tuple[MLP | None, ...]
-    rungs: tuple[Rung, ...]
-
-    def judged(self) -> tuple[Judged, ...]:
-        """Every one beside the best."""
-        return judge_all(self.rungs)
 
     @property
     def chosen(self) -> MLP | None:
-        """The smallest within one standard error of the best; None for physics alone."""
-        return next(learner for learner, one in zip(self.learners, self.judged(), strict=True) if one.chosen)
+        """That of the choice; None for physics alone."""
+        return self.learners[self.place]
 
 
 def search_learners(
@@ -79,7 +74,7 @@ def search_learners(
             told(rungs[-1])
         except KeyboardInterrupt:
             break
-    return LearnerSearch(tuple(tried[: len(rungs)]), tuple(rungs))
+    return LearnerSearch(tuple(rungs), tuple(tried[: len(rungs)]))
 
 
 def _largest(lags: Lags) -> int:

@@ -91,15 +91,13 @@ def nonlinearity(problem: Problem, lags: Sequence[str], draws: int = _DRAWS) -> 
 
 def _rows(runs: TermRuns, linear: int) -> tuple[Matrix, Matrix, Vector]:
     """Physics and linear lags, their functions, and what the fixed terms leave of the output."""
-    problem, known, functions, target = runs.problem, [], [], []
-    for experiment in problem.record.experiments:
-        x, terms = runs.menu.regressors(experiment, problem.record), runs.factors(experiment).T
-        phi = np.asarray(problem.baseline.phi(x, runs.menu.layout, runs.menu.outputs, np))[:, 0]
-        fixed = np.asarray(problem.baseline.known(x, runs.menu.layout, runs.menu.outputs, np))
+    known, functions, targets = [], [], []
+    for experiment in runs.problem.record.experiments:
+        (phi, target), terms = runs.physics(*runs.rows(experiment)), runs.factors(experiment).T
         known.append(np.column_stack([phi, terms[:, :linear]]))
         functions.append(terms[:, linear:])
-        target.append((experiment.outputs[runs.menu.first_row :] - fixed)[:, 0])
-    return np.concatenate(known), np.concatenate(functions), np.concatenate(target)
+        targets.append(target)
+    return np.concatenate(known), np.concatenate(functions), np.concatenate(targets)
 
 
 def _basis(columns: Float[np.ndarray, "N k"]) -> Float[np.ndarray, "N r"]:

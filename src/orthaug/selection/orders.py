@@ -17,7 +17,7 @@ from orthaug.data.record import Record
 from orthaug.data.terms import TermLibrary
 from orthaug.fitting.criteria import Criterion
 from orthaug.physics.problem import Problem
-from orthaug.selection.term_path import Blocks, Judged, Rung, Told, judge_all
+from orthaug.selection.term_path import Blocks, Rung, Search, Told, judge_all
 from orthaug.selection.term_runs import TermRuns
 
 _SURE = 1.96  # standard errors of a cross-correlation of white signals
@@ -73,20 +73,15 @@ class Delay:
 
 
 @dataclass(frozen=True, eq=False)
-class OrderSearch:
-    """All orders that were judged, with the choice."""
+class OrderSearch(Search):
+    """Models of linear lags."""
 
     orders: tuple[Orders, ...]
-    rungs: tuple[Rung, ...]
-
-    def judged(self) -> tuple[Judged, ...]:
-        """Every one beside the best."""
-        return judge_all(self.rungs)
 
     @property
     def chosen(self) -> Orders:
-        """The smallest within one standard error of the best."""
-        return next(orders for orders, one in zip(self.orders, self.judged(), strict=True) if one.chosen)
+        """Those of the choice."""
+        return self.orders[self.place]
 
 
 def search_orders(
@@ -139,7 +134,7 @@ def search_orders(
         except KeyboardInterrupt:
             if not found:
                 raise
-    return OrderSearch(tuple(found), tuple(found.values()))
+    return OrderSearch(tuple(found.values()), tuple(found))
 
 
 def _shrink(found: dict[Orders, Rung], judge: Callable[[Iterable[Orders]], None], least: Orders) -> None:

@@ -83,6 +83,22 @@ def judge_all(rungs: Sequence[Rung]) -> tuple[Judged, ...]:
     return tuple(found)
 
 
+@dataclass(frozen=True, eq=False)
+class Search:
+    """All models that were judged, with the choice: the smallest within one standard error of the best."""
+
+    rungs: tuple[Rung, ...]
+
+    def judged(self) -> tuple[Judged, ...]:
+        """Every model beside the best."""
+        return judge_all(self.rungs)
+
+    @property
+    def place(self) -> int:
+        """The number of the choice."""
+        return next(i for i, one in enumerate(self.judged()) if one.chosen)
+
+
 class Blocks:
     """The folds of blocked cross-validation, laid out once: what is left to fit, and the block's rows to fly over."""
 
@@ -131,20 +147,15 @@ def _on_fold(given: _Given, item: tuple[Point, int], tell: Callable[..., None]) 
 
 
 @dataclass(frozen=True, eq=False)
-class TermPath:
-    """All models that were judged, with the choice among them."""
+class TermPath(Search):
+    """Models of terms."""
 
     runs: TermRuns
-    rungs: tuple[Rung, ...]
-
-    def judged(self) -> tuple[Judged, ...]:
-        """Every model beside the best."""
-        return judge_all(self.rungs)
 
     @property
     def chosen(self) -> Rung:
-        """The smallest within one standard error of the best."""
-        return next(one.rung for one in self.judged() if one.chosen)
+        """The choice."""
+        return self.rungs[self.place]
 
     def shares(self) -> dict[str, float]:
         """Of every term of the choice, how often it is chosen over random halves of the data (stability selection).
@@ -188,11 +199,11 @@ def climb(
 
         try:
             _forward(runs, most, judged)
-            _backward(TermPath(runs, tuple(rungs)), judged)
+            _backward(TermPath(tuple(rungs), runs), judged)
         except KeyboardInterrupt:
             if not rungs:
                 raise
-    return TermPath(runs, tuple(rungs))
+    return TermPath(tuple(rungs), runs)
 
 
 def steps(most: int) -> int:

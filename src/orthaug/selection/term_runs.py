@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Vector
+from orthaug._base.checks import Matrix, Vector
 from orthaug.data.expressions import parse
 from orthaug.data.record import Record
 from orthaug.data.regressors import Features, in_order
@@ -98,6 +98,15 @@ class TermRuns:
         with np.errstate(all="ignore"):
             return np.asarray(self.menu.features.evaluate(x, self.menu.layout, np)).T / self.sizes[:, None]
 
+    def rows(self, experiment: Any) -> tuple[Float[np.ndarray, "T nx"], Float[np.ndarray, "T 1"]]:
+        """Regressors and outputs along an experiment."""
+        return self.menu.regressors(experiment, self.problem.record), experiment.outputs[self.menu.first_row :]
+
+    def physics(self, x: Matrix, y: Matrix) -> tuple[Float[np.ndarray, "T nt"], Vector]:
+        """Φ along some of these rows, and what the fixed terms leave of the output."""
+        phi, known = self.problem.baseline.on(x, self.menu.layout, self.menu.outputs)
+        return phi[:, 0], (y - known)[:, 0]
+
     def on(self, record: Record) -> TermRuns:
         """The same on another record."""
         return TermRuns.of(self.problem.on(record), self.library, self.criterion, like=self)
@@ -150,17 +159,15 @@ class TermRuns:
     @cached_property
     def step_blocks(self) -> tuple[Equations, ...]:
         """The normal equations one step ahead of physics and all terms, by chunks of rows, in the output's unit."""
-        problem, found = self.problem, []
-        for experiment in problem.record.experiments:
-            x = self.menu.regressors(experiment, problem.record)
-            y, factors = experiment.outputs[self.menu.first_row :], self.factors(experiment)
+        found = []
+        for experiment in self.problem.record.experiments:
+            (x, y), factors = self.rows(experiment), self.factors(experiment)
             for a in range(0, len(x), _CHUNK):
                 rows = slice(a, a + _CHUNK)
-                phi = np.asarray(problem.baseline.phi(x[rows], self.menu.layout, self.menu.outputs, np))[:, 0]
-                known = np.asarray(problem.baseline.known(x[rows], self.menu.layout, self.menu.outputs, np))
+                phi, target = self.physics(x[rows], y[rows])
                 with np.errstate(all="ignore"):
                     terms = products_of(factors[:, rows], self.library.numbers, np)
-                columns, target = np.concatenate([phi.T, terms]), (y[rows] - known)[:, 0]
+                columns = np.concatenate([phi.T, terms])
                 found.append(Equations(columns @ columns.T, columns @ target, float(target @ target), len(target)))
         return tuple(found)
 

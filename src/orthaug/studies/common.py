@@ -1,9 +1,13 @@
-"""Shared by the studies of the paper: its pipeline, its structures and records, colours and axes."""
+"""Shared by the studies of the paper: what an entry of `orthaug reproduce` is, its pipelines, structures and records.
+
+An entry has its runs, its figures, and its numbers beside those of the paper and of its scripts.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,6 +21,7 @@ from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive, Orthogonal, Structure
 from orthaug.inference.measures import Samples
 from orthaug.studies import published
+from orthaug.studies.study import Study
 from orthaug.studies.synthetic import NOISE_30_DB, Example, static
 
 if TYPE_CHECKING:
@@ -63,6 +68,67 @@ UNIFORM = Samples({"u[k]": 0.6 * _NODES[0]}, weights=_NODES[1], name="uniform")
 """Uniform on [−0.6, 0.6]: `measures.Uniform` with fewer nodes, which changes no digit shown and is quicker."""
 
 
+class Finding(NamedTuple):
+    """A quantity, each counted once, beside what the paper prints and what its scripts gave when they were run."""
+
+    quantity: str
+    ours: str
+    verdict: str
+    """What the numbers say, in words."""
+    published: str = ""
+    scripts: str = ""
+    as_published: bool | None = None
+    """Whether ours agrees with the paper; None where the paper has nothing to compare with."""
+    as_scripts: bool | None = None
+    """Whether ours agrees with the scripts' runs; None where they have nothing to compare with."""
+
+    @property
+    def beyond(self) -> bool:
+        """Whether there is nothing to compare with, so that the row is neither met nor missed."""
+        return self.as_published is None and self.as_scripts is None
+
+
+class Counts(NamedTuple):
+    """Comparisons that are met, and all of them, apart by what ours is compared with; rows beyond the paper."""
+
+    published_met: int
+    published: int
+    scripts_met: int
+    scripts: int
+    beyond: int
+
+    @classmethod
+    def of(cls, findings: Iterable[Finding]) -> Counts:
+        rows = list(findings)
+        paper = [row.as_published for row in rows if row.as_published is not None]
+        scripts = [row.as_scripts for row in rows if row.as_scripts is not None]
+        return cls(sum(paper), len(paper), sum(scripts), len(scripts), sum(row.beyond for row in rows))
+
+
+class Drawing(NamedTuple):
+    """A figure, one sentence on what it shows, and sentences on how to read it."""
+
+    figure: Figure
+    shows: str
+    reading: str = ""
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """One entry of `orthaug reproduce`.
+
+    `study(pipeline, small)` declares the runs: `pipeline` is one of `reproduction.PIPELINES`; `small` for the reduced
+    size of the tests. `figures(table)` draws, by file name; `findings(table)` compares. `text` says what is run.
+    """
+
+    name: str
+    title: str
+    text: str
+    study: Callable[[str, bool], Study]
+    figures: Callable[[pd.DataFrame], Mapping[str, Drawing]]
+    findings: Callable[[pd.DataFrame], list[Finding]]
+
+
 def trained(
     example: Example,
     which: str,
@@ -98,9 +164,16 @@ def drawn(data_set: int, *, samples: int = 1024, draw: int = 0, noise: bool = Fa
     return Example(Record.from_arrays(u, y), example.test, example.baseline, example.theta)
 
 
-def pick(table: pd.DataFrame, rows: Any) -> pd.DataFrame:
-    """Rows of a table, in the table's order."""
-    return table.loc[rows]
+def rows_of(table: pd.DataFrame, **values: Any) -> pd.DataFrame:
+    """The rows of a table that have these values in the columns of these names, in the table's order."""
+    for column, value in values.items():
+        table = table.loc[table[column] == value]
+    return table
+
+
+def mean_errors(rows: pd.DataFrame) -> pd.DataFrame:
+    """The mean error of θ per number of samples."""
+    return rows.groupby("samples").theta_error.mean().reset_index()
 
 
 def slope(samples: Any, errors: Any) -> float:
@@ -136,6 +209,14 @@ def legend(figure: Figure, axes: Axes | Iterable[Axes], ncols: int = 4) -> None:
         unique.update(dict(zip(labels, handles, strict=True)))
     ncols = min(ncols, len(unique))
     figure.legend(unique.values(), unique.keys(), loc="outside upper center", ncols=ncols, frameon=False, fontsize=8)
+
+
+def against_samples(axis: Axes, title: str) -> None:
+    """Both axes logarithmic, over N."""
+    axis.set_xscale("log")
+    axis.set_yscale("log")
+    axis.set_xlabel("samples N")
+    axis.set_title(title, fontsize=9)
 
 
 def extremes(rows: pd.DataFrame, by: str, column: str) -> pd.DataFrame:

@@ -13,25 +13,27 @@ from orthaug.studies.common import (
     LARGEST_TRAINED,
     STRUCTURES,
     UNIFORM,
+    Drawing,
+    Finding,
+    Reproduction,
+    against_samples,
     drawn,
     extremes,
     legend,
+    mean_errors,
     panels,
-    pick,
+    rows_of,
     signed,
     slope,
     span,
     trained,
     whiskers,
 )
-from orthaug.studies.data_length import limit
-from orthaug.studies.entry import Drawing, Finding, Reproduction
+from orthaug.studies.data_length import SIZES, limit
 from orthaug.studies.study import Study
 
 if TYPE_CHECKING:
     import pandas as pd
-
-SIZES = (1_000_000, 262_144, 65_536, 16_384, 4096, 1024, 256)
 
 
 def one(data_set: int, samples: int, curve: str, run: int, pipeline: str) -> dict[str, Any]:
@@ -70,29 +72,18 @@ def study(pipeline: str, small: bool) -> Study:
     return Study("consistency", one, grid, where=_runs)
 
 
-def _of(table: pd.DataFrame, data_set: int, curve: str) -> pd.DataFrame:
-    return pick(table, (table.data_set == data_set) & (table.curve == curve))
-
-
-def _means(table: pd.DataFrame, data_set: int, curve: str) -> pd.DataFrame:
-    return _of(table, data_set, curve).groupby("samples").theta_error.mean().reset_index()
-
-
 def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
     """Figure "theta_error": sets 1 and 3, all curves."""
     figure, axes = panels(2, sharey=True, height=3.4)
     for axis, data_set in zip(axes, (1, 3), strict=True):
         for i, curve in enumerate(("additive", "orthogonal", "uniform")):
-            errors = extremes(_of(table, data_set, curve), "samples", "theta_error")
+            errors = extremes(rows_of(table, data_set=data_set, curve=curve), "samples", "theta_error")
             if len(errors):
                 label = "orthogonal, training measure" if curve == "orthogonal" else ""
                 whiskers(axis, errors.samples * 1.08 ** (i - 1), errors, curve, label=label)
         if data_set == 3:
             axis.axhline(limit(3), linestyle="--", linewidth=0.9, color="black", label="limit of set 3, N → ∞")
-        axis.set_xscale("log")
-        axis.set_yscale("log")
-        axis.set_xlabel("samples N")
-        axis.set_title(f"data set {data_set}, 30 dB", fontsize=9)
+        against_samples(axis, f"data set {data_set}, 30 dB")
     axes[0].set_ylabel("‖θ* − θ̂‖")
     legend(figure, axes)
     return {
@@ -115,19 +106,19 @@ def findings(table: pd.DataFrame) -> list[Finding]:
         (1, "uniform", ""),
         (3, "uniform", ""),
     ):
-        means = _means(table, data_set, curve)
+        means = mean_errors(rows_of(table, data_set=data_set, curve=curve))
         rate = slope(means.samples, means.theta_error)
         met = {"converges to 0": -0.65 < rate < -0.35, "does not converge": rate > -0.25}.get(published)
         first, last = (f"{means.theta_error.iloc[i]:.2g} at N = {means.samples.iloc[i]}" for i in (0, -1))
         why = f"the mean goes from {first} to {last}; 1/√N is −0.5"
         quantity = f"set {data_set}, 30 dB, {curve}: exponent of ‖θ* − θ̂‖ in N"
         compared.append(Finding(quantity, signed(rate), why, published, as_published=met))
-    last = _means(table, 3, "orthogonal").iloc[-1]
+    last = mean_errors(rows_of(table, data_set=3, curve="orthogonal")).iloc[-1]
     quantity = f"set 3, 30 dB, orthogonal: ‖θ* − θ̂‖ at N = {int(last.samples)}"
     away = 100 * abs(last.theta_error / limit(3) - 1)
     why = f"{percent(away / 100)} from the limit without noise, {limit(3):.4g}: it does not go to 0"
     compared.append(Finding(quantity, f"{last.theta_error:.4g}", why))
-    rows = table[(table.data_set == 1) & (table.curve == "uniform") & (table.samples == 1024)]
+    rows = rows_of(table, data_set=1, curve="uniform", samples=1024)
     prices = np.array([price for price in rows.price if price is not None], dtype=float)
     text = f"θ₁ {span(prices[:, 0])}, θ₃ {span(prices[:, 1])}"
     quantity = "set 1, 30 dB, N = 1024, uniform measure: standard error over the training measure's"

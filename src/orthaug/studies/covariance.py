@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orthaug.studies.common import panels, trained
-from orthaug.studies.entry import Drawing, Finding, Reproduction
+from orthaug.studies.common import Drawing, Finding, Reproduction, panels, trained
 from orthaug.studies.study import Study
 from orthaug.studies.synthetic import static
 

@@ -12,8 +12,7 @@ from orthaug.data.record import Record
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.inference.covariance import interval
-from orthaug.studies.common import COLOURS, UNIFORM, legend, panels
-from orthaug.studies.entry import Drawing, Finding, Reproduction
+from orthaug.studies.common import COLOURS, UNIFORM, Drawing, Finding, Reproduction, legend, panels, rows_of
 from orthaug.studies.study import Study
 from orthaug.studies.synthetic import NOISE_30_DB, static
 
@@ -63,8 +62,7 @@ def study(pipeline: str, small: bool) -> Study:
 
 
 def _shares(table: pd.DataFrame, data_set: int, kind: str) -> np.ndarray:
-    rows = table[table.data_set == data_set]
-    return np.mean(np.array(rows[f"{kind}_holds"].tolist(), dtype=float), axis=0)
+    return np.mean(np.array(rows_of(table, data_set=data_set)[f"{kind}_holds"].tolist(), dtype=float), axis=0)
 
 
 def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
@@ -98,7 +96,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
 
 
 def _draws(table: pd.DataFrame) -> int:
-    return int((table.data_set == 1).sum())
+    return len(rows_of(table, data_set=1))
 
 
 def _band(table: pd.DataFrame) -> tuple[float, float]:
@@ -108,7 +106,7 @@ def _band(table: pd.DataFrame) -> tuple[float, float]:
 
 
 def _widths(table: pd.DataFrame, data_set: int, kind: str) -> np.ndarray:
-    return np.mean(table[table.data_set == data_set][f"{kind}_width"].tolist(), axis=0)
+    return np.mean(rows_of(table, data_set=data_set)[f"{kind}_width"].tolist(), axis=0)
 
 
 def findings(table: pd.DataFrame) -> list[Finding]:

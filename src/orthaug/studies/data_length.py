@@ -13,17 +13,21 @@ from orthaug.studies.common import (
     COLOURS,
     LARGEST_TRAINED,
     UNIFORM,
+    Drawing,
+    Finding,
+    Reproduction,
+    against_samples,
     drawn,
     extremes,
     legend,
+    mean_errors,
     panels,
-    pick,
+    rows_of,
     signed,
     slope,
     trained,
     whiskers,
 )
-from orthaug.studies.entry import Drawing, Finding, Reproduction
 from orthaug.studies.study import Study
 
 if TYPE_CHECKING:
@@ -69,32 +73,21 @@ def limit(data_set: int) -> float:
     return float(np.linalg.norm(np.linalg.lstsq(phi, delta, rcond=None)[0]))
 
 
-def _of(table: pd.DataFrame, data_set: int, measure: str) -> pd.DataFrame:
-    return pick(table, (table.data_set == data_set) & (table.measure == measure))
-
-
-def _means(table: pd.DataFrame, data_set: int, measure: str) -> pd.DataFrame:
-    return _of(table, data_set, measure).groupby("samples").theta_error.mean().reset_index()
-
-
 def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
     """Figure "theta_error": a panel per data set, both measures."""
     figure, axes = panels(2, sharey=True, height=3.3)
     for axis, data_set in zip(axes, (2, 3), strict=True):
         for measure, name in (("training", "orthogonal"), ("uniform", "uniform")):
-            errors = extremes(_of(table, data_set, measure), "samples", "theta_error")
+            errors = extremes(rows_of(table, data_set=data_set, measure=measure), "samples", "theta_error")
             label = "orthogonal, training measure" if measure == "training" else ""
             whiskers(axis, errors.samples, errors, name, label=label)
-        own = _of(table, data_set, "training")
-        own = pick(own, own.draw == 0).sort_values("samples")
+        own = rows_of(table, data_set=data_set, measure="training")
+        own = rows_of(own, draw=0).sort_values("samples")
         style = {"color": COLOURS["orthogonal"], "linewidth": 1.0, "label": "the paper's record"}
         axis.plot(own.samples, own.theta_error, ":", **style)
         if data_set == 3:
             axis.axhline(limit(3), linestyle="--", linewidth=0.9, color=COLOURS["truth"], label="limit, N → ∞")
-        axis.set_xscale("log")
-        axis.set_yscale("log")
-        axis.set_xlabel("samples N")
-        axis.set_title(f"data set {data_set}, no noise", fontsize=9)
+        against_samples(axis, f"data set {data_set}, no noise")
     axes[0].set_ylabel("‖θ* − θ̂‖")
     legend(figure, axes)
     return {
@@ -110,7 +103,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
 def findings(table: pd.DataFrame) -> list[Finding]:
     """The two trends, and what the uniform measure makes of them. The paper's own record is in `static_errors`."""
     compared = []
-    two, three = (_means(table, data_set, "training") for data_set in (2, 3))
+    two, three = (mean_errors(rows_of(table, data_set=data_set, measure="training")) for data_set in (2, 3))
     rate = slope(two.samples, two.theta_error)
     first, last = (float(two.theta_error.iloc[i]) for i in (0, -1))
     why = f"the mean falls from {first:.2g} to {last:.2g} between N = {two.samples.iloc[0]} and {two.samples.iloc[-1]}"
@@ -123,8 +116,8 @@ def findings(table: pd.DataFrame) -> list[Finding]:
     text, met = f"{last:.4g}", bool(abs(away) < 0.25)
     compared.append(Finding(quantity, text, why, "converges to a fixed number", as_published=met))
     for data_set in (2, 3):
-        worst = float(_of(table, data_set, "uniform").theta_error.max())
-        ratio = worst / float(_of(table, data_set, "training").theta_error.max())
+        worst = float(rows_of(table, data_set=data_set, measure="uniform").theta_error.max())
+        ratio = worst / float(rows_of(table, data_set=data_set, measure="training").theta_error.max())
         quantity = f"set {data_set}, no noise, uniform measure: largest ‖θ* − θ̂‖ over all N"
         compared.append(Finding(quantity, f"{worst:.2g}", f"{ratio:.1g} times the largest under the training measure"))
     return compared

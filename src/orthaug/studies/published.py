@@ -84,7 +84,6 @@ _value_and_gradient = jax.jit(jax.value_and_grad(loss), static_argnames=("bound"
 
 @partial(jax.jit, static_argnames=("bound", "projects", "iterations"))
 def _adam(start: Any, data: Data, bound: Bound, projects: bool, iterations: int) -> Any:
-    """The best iterate of Adam."""
     import optax
 
     optimizer = optax.adam(LEARNING_RATE, b2=SECOND_MOMENT)

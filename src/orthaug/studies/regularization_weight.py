@@ -16,17 +16,18 @@ from orthaug.studies import references
 from orthaug.studies.common import (
     COLOURS,
     LABELS,
+    Drawing,
+    Finding,
+    Reproduction,
     agreement,
     extremes,
     legend,
     panels,
-    pick,
     scripts_bars,
     span,
     trained,
     whiskers,
 )
-from orthaug.studies.entry import Drawing, Finding, Reproduction
 from orthaug.studies.study import Study
 from orthaug.studies.synthetic import mass_spring_damper
 
@@ -92,7 +93,7 @@ def _of(table: pd.DataFrame, structure: str, weight: float | None = None) -> pd.
     kept = table.structure == structure
     if structure == "baseline-penalty":
         kept |= (table.structure == "orthogonal-penalty") & (table.weight == 0)
-    return pick(table, kept if weight is None else kept & (table.weight == weight))
+    return table.loc[kept if weight is None else kept & (table.weight == weight)]
 
 
 def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
@@ -231,7 +232,6 @@ def _mean(structure: str, weight: float) -> float:
 
 
 def _weights(table: pd.DataFrame) -> list[Finding]:
-    """Each weight that the scripts ran too."""
     compared = []
     for structure, limit in zip(PENALTIES, _limits(), strict=True):
         for weight in sorted(table.weight[table.structure == structure].unique()):

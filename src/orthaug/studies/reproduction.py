@@ -20,8 +20,17 @@ from orthaug._base.checks import check_choice, nearest
 from orthaug._base.errors import InputError
 from orthaug._base.folders import check_replaceable, whole_folder
 from orthaug.reports import plots
-from orthaug.studies.catalogue import catalogue
-from orthaug.studies.entry import Counts, Drawing, Finding, Reproduction
+from orthaug.studies import (
+    consistency,
+    covariance,
+    coverage,
+    data_length,
+    regularization_weight,
+    solver_times,
+    static_errors,
+    static_noise,
+)
+from orthaug.studies.common import Counts, Drawing, Finding, Reproduction
 from orthaug.studies.study import Run, as_table, runs
 from orthaug.studies.theory import THEORY
 
@@ -52,6 +61,21 @@ class Reproduced:
     figures: dict[str, Drawing]
     findings: list[Finding]
     small: bool = False
+
+
+def catalogue() -> dict[str, Reproduction]:
+    """The paper's figures and tables, one file each, in its order."""
+    modules: list[Any] = [
+        static_errors,
+        data_length,
+        static_noise,
+        covariance,
+        consistency,
+        regularization_weight,
+        coverage,
+        solver_times,
+    ]
+    return {module.REPRODUCTION.name: module.REPRODUCTION for module in modules}
 
 
 def chosen(name: str | None) -> list[Reproduction]:
@@ -184,7 +208,6 @@ def _marked(reference: str, met: bool | None) -> str:
 
 
 def _page(reproduced: Sequence[Reproduced], pipeline: str) -> str:
-    """One HTML file with its figures inside."""
     source = files("orthaug.studies").joinpath("templates/reproduction.html").read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     environment.filters["whole"] = lambda words: words.replace("e-", f"e{HYPHEN}")

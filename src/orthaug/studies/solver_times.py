@@ -15,8 +15,7 @@ from orthaug.fitting.structures import Orthogonal
 from orthaug.models.learners import MLP
 from orthaug.physics.problem import pose
 from orthaug.studies import references
-from orthaug.studies.common import PIPELINES, extremes, legend, panels, pick
-from orthaug.studies.entry import Drawing, Finding, Reproduction
+from orthaug.studies.common import PIPELINES, Drawing, Finding, Reproduction, extremes, legend, panels, rows_of
 from orthaug.studies.study import Study
 from orthaug.studies.synthetic import mass_spring_damper, static
 
@@ -72,7 +71,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
     figure, axes = panels(len(examples), height=3.6)
     for axis, example in zip(axes, examples, strict=True):
         for solver in table.solver.unique():
-            rows = pick(table, (table.example == example) & (table.solver == solver))
+            rows = rows_of(table, example=example, solver=solver)
             _line(axis, rows.assign(error=np.sqrt(rows.loss)), *SOLVERS[solver])
         axis.set_xscale("log")
         # a factor of a hundredth and one of a millionth need other axes
@@ -103,14 +102,14 @@ def _line(axis: Axes, rows: pd.DataFrame, label: str, colour: str, marker: str) 
 def findings(table: pd.DataFrame) -> list[Finding]:
     """Each solver at its full length, medians over starts; a time that differs from start to start is marked."""
     compared = []
-    full = pick(table, table.share == table.share.max())
+    full = rows_of(table, share=table.share.max())
     full = full.assign(error=np.sqrt(full.loss), each=full.seconds / full.iterations)
     for example in table.example.unique():
-        rows = pick(full, full.example == example)
-        best = float(rows[rows.solver == "levenberg-marquardt"].error.median())
+        rows = rows_of(full, example=example)
+        best = float(rows_of(rows, solver="levenberg-marquardt").error.median())
         shortest, longest = references.seconds(example)
         for solver in table.solver.unique():
-            own = rows[rows.solver == solver]
+            own = rows_of(rows, solver=solver)
             error, ratio = float(own.error.median()), float(own.each.max() / own.each.min())
             text = f"{own.seconds.median():.3g} s, relative training error {error:.3g}"
             why = f"{error / best:.4g} times the error of Levenberg-Marquardt"

@@ -14,15 +14,17 @@ from orthaug.studies.common import (
     COLOURS,
     LABELS,
     MARKERS,
+    Drawing,
+    Finding,
+    Reproduction,
     agreement,
     legend,
     panels,
-    pick,
+    rows_of,
     scripts_bars,
     span,
     trained,
 )
-from orthaug.studies.entry import Drawing, Finding, Reproduction
 from orthaug.studies.study import Study
 from orthaug.studies.synthetic import static
 
@@ -120,14 +122,14 @@ def _errors(table: pd.DataFrame) -> Figure:
         kinds = [(structure, _of_scripts(structure, table)) for structure in _shown(table)]
         places = iter(np.linspace(-0.36, 0.36, 1 + sum(1 + (of is not None) for _, of in kinds)))
         for structure, of in kinds:
-            rows = table[table.structure == structure]
+            rows = rows_of(table, structure=structure)
             style = {"color": COLOURS[structure], "alpha": 0.6, "markersize": 4.5, "label": _label(structure, table)}
             axis.plot(rows.data_set + next(places), np.maximum(rows[column], FLOOR), MARKERS[structure], **style)
             if of is not None:
                 spreads = [references.static(data_set, of, column) for data_set in (1, 2, 3)]
                 scripts_bars(axis, sets + next(places), spreads, structure)
         if column == "theta_error":
-            rows = table[table.structure == "orthogonal"]
+            rows = rows_of(table, structure="orthogonal")
             style = {"color": COLOURS["uniform"], "alpha": 0.6, "markersize": 4.5, "label": LABELS["uniform"]}
             axis.plot(rows.data_set + next(places), np.maximum(rows.uniform_error, FLOOR), MARKERS["uniform"], **style)
             if table.theta_error.min() <= FLOOR:
@@ -146,15 +148,15 @@ def _errors(table: pd.DataFrame) -> Figure:
 def _theta(table: pd.DataFrame) -> Figure:
     figure, axes = panels(3, sharex=True, sharey=True, height=3.2)
     for axis, data_set in zip(axes, (1, 2, 3), strict=True):
-        rows = pick(table, table.data_set == data_set)
+        rows = rows_of(table, data_set=data_set)
         for place, truth in ((axis.axvline, 1.0), (axis.axhline, 0.1)):
             place(truth, linestyle="--", linewidth=0.8, color=COLOURS["truth"], label="true θ")
         axis.plot(*static(data_set).baseline.initial, "x", color=COLOURS["truth"], label="initial θ⁰", zorder=5)
         for structure in _shown(table):
-            theta = np.array(rows[rows.structure == structure].theta.tolist())
+            theta = np.array(rows_of(rows, structure=structure).theta.tolist())
             style = {"color": COLOURS[structure], "alpha": 0.7, "markersize": 5, "label": _label(structure, table)}
             axis.plot(*theta.T, MARKERS[structure], **style)
-        uniform = np.array(rows[rows.structure == "orthogonal"].theta_uniform.tolist())
+        uniform = np.array(rows_of(rows, structure="orthogonal").theta_uniform.tolist())
         axis.plot(*uniform.T, MARKERS["uniform"], color=COLOURS["uniform"], markersize=4, label=LABELS["uniform"])
         axis.set_title(f"data set {data_set}", fontsize=9)
         axis.set_xlabel("θ₁")
@@ -167,7 +169,7 @@ def _learner(table: pd.DataFrame) -> Figure:
     shown = list(reversed(_shown(table)))
     figure, axes = panels(len(shown), sharey=True)
     for axis, structure in zip(axes, shown, strict=True):
-        rows = table[(table.data_set == 1) & (table.structure == structure)]
+        rows = rows_of(table, data_set=1, structure=structure)
         style = {"color": COLOURS[structure], "alpha": 0.6, "linewidth": 1.0}
         for values in rows.learner:
             axis.plot(GRID, values, label=f"{_label(structure, table)}, each start", **style)
@@ -188,7 +190,7 @@ def findings(table: pd.DataFrame) -> list[Finding]:
             compared.append(_rmse_finding(table, data_set, structure))
             compared.append(_theta_finding(table, data_set, structure))
     for data_set in (2, 3):
-        rows = table[(table.data_set == data_set) & (table.structure == "orthogonal")]
+        rows = rows_of(table, data_set=data_set, structure="orthogonal")
         ratio = float(rows.uniform_error.max() / rows.theta_error.mean())
         why = f"the largest is {ratio:.1g} times the error of the same fits under the training measure"
         quantity = f"set {data_set}, no noise, uniform measure: ‖θ* − θ̂‖"
@@ -197,11 +199,11 @@ def findings(table: pd.DataFrame) -> list[Finding]:
 
 
 def _rmse_finding(table: pd.DataFrame, data_set: int, structure: str) -> Finding:
-    of_set = pick(table, table.data_set == data_set)
-    errors = of_set[of_set.structure == structure].test_rmse
+    of_set = rows_of(table, data_set=data_set)
+    errors = rows_of(of_set, structure=structure).test_rmse
     quantity, of = f"set {data_set}, no noise, {_label(structure, table)}: test RMSE", _of_scripts(structure, table)
     if of is None:
-        other = float(of_set[of_set.structure == "orthogonal"].test_rmse.mean())
+        other = float(rows_of(of_set, structure="orthogonal").test_rmse.mean())
         return Finding(quantity, span(errors), f"mean {errors.mean() / other:.3g} times the orthogonal structure's")
     scripts = references.static(data_set, of, "test_rmse")
     met, why = scripts.beside(errors, smaller_is_better=True)
@@ -209,8 +211,8 @@ def _rmse_finding(table: pd.DataFrame, data_set: int, structure: str) -> Finding
 
 
 def _theta_finding(table: pd.DataFrame, data_set: int, structure: str) -> Finding:
-    of_set = pick(table, table.data_set == data_set)
-    errors = of_set[of_set.structure == structure].theta_error
+    of_set = rows_of(table, data_set=data_set)
+    errors = rows_of(of_set, structure=structure).theta_error
     quantity, of = f"set {data_set}, no noise, {_label(structure, table)}: ‖θ* − θ̂‖", _of_scripts(structure, table)
     apart = f"differs by up to {errors.max() - errors.min():.3g} from start to start"
     if of is None:
@@ -219,7 +221,7 @@ def _theta_finding(table: pd.DataFrame, data_set: int, structure: str) -> Findin
     # of the orthogonal structure on set 1 the true value is 0, so that less is better
     met, beside = scripts.beside(errors, smaller_is_better=(structure, data_set) == ("orthogonal", 1))
     if structure != "orthogonal":
-        other = float(of_set[of_set.structure == "orthogonal"].theta_error.mean())
+        other = float(rows_of(of_set, structure="orthogonal").theta_error.mean())
         published, as_published = "on average larger than of the orthogonal one", bool(errors.mean() > other)
         example = static(data_set)
         why = f"{apart}, of θ⁰ it is {np.linalg.norm(example.baseline.initial - example.theta):.3g}"
@@ -227,7 +229,7 @@ def _theta_finding(table: pd.DataFrame, data_set: int, structure: str) -> Findin
         published, as_published = "zero within numerical error", bool(errors.max() <= NUMERICAL)
         why = f"the largest is {errors.max():.1g}"
     else:
-        theta = np.array(of_set[of_set.structure == structure].theta.tolist())
+        theta = np.array(rows_of(of_set, structure=structure).theta.tolist())
         published = "the same for every start, but not zero"
         as_published = bool(np.ptp(theta, axis=0).max() <= NUMERICAL < errors.min())
         why = agreement(theta)

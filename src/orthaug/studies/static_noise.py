@@ -14,14 +14,16 @@ from orthaug.studies.common import (
     LABELS,
     MARKERS,
     STRUCTURES,
+    Drawing,
+    Finding,
+    Reproduction,
     agreement,
     legend,
     panels,
-    pick,
+    rows_of,
     span,
     trained,
 )
-from orthaug.studies.entry import Drawing, Finding, Reproduction
 from orthaug.studies.study import Study
 from orthaug.studies.synthetic import static
 
@@ -65,7 +67,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
     for axis, quantity, scale in zip(axes, ("test_rmse", "theta_error"), (1e3, 1.0), strict=True):
         for i, structure in enumerate(STRUCTURES):
             for j, kind in enumerate(kinds):
-                rows = table[(table.structure == structure) & (table.regularization == kind)]
+                rows = rows_of(table, structure=structure, regularization=kind)
                 place = np.full(len(rows), j + 0.24 * (i - 0.5))
                 style = {"color": COLOURS[structure], "alpha": 0.6, "markersize": 4.5, "label": LABELS[structure]}
                 axis.plot(place, scale * rows[quantity], MARKERS[structure], **style)
@@ -95,9 +97,9 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
 def findings(table: pd.DataFrame) -> list[Finding]:
     """The table's four numbers from the fits as published, without regularization; what regularization changes."""
     compared = []
-    plain = pick(table, table.regularization == "none")
+    plain = rows_of(table, regularization="none")
     for structure in ("additive", "orthogonal"):
-        rows = plain[plain.structure == structure]
+        rows = rows_of(plain, structure=structure)
         where, scripts = f"set 1, 30 dB, {structure}", _scripts(structure)
         squares, printed = TEST_SAMPLES * rows.test_rmse**2, SQUARES[structure]
         met, why = _beside_printed(squares, printed)
@@ -131,7 +133,7 @@ def _beside_printed(values: pd.Series, printed: float) -> tuple[bool, str]:
 
 def _theta_finding(rows: pd.DataFrame, structure: str) -> Finding:
     """Error of θ; of the orthogonal structure over every regularization, because none changes it."""
-    errors, printed = rows[rows.structure == structure].theta_error, ERRORS[structure]
+    errors, printed = rows_of(rows, structure=structure).theta_error, ERRORS[structure]
     scripts = _scripts(structure)["theta_error"]
     as_scripts, beside = scripts.beside(errors)
     quantity = f"set 1, 30 dB, {structure}: ‖θ* − θ̂‖"
@@ -153,11 +155,12 @@ def _theta_finding(rows: pd.DataFrame, structure: str) -> Finding:
 
 def _regularized(table: pd.DataFrame, kind: str) -> list[Finding]:
     """What a regularization makes of the errors without any; one row where both structures predict the same."""
-    of = {structure: pick(table, table.structure == structure) for structure in ("additive", "orthogonal")}
-    alike = bool(np.allclose(of["additive"].test_rmse, of["orthogonal"].test_rmse, rtol=1e-6))
+    own = {structure: rows_of(table, structure=structure) for structure in ("additive", "orthogonal")}
+    alike = bool(np.allclose(own["additive"].test_rmse, own["orthogonal"].test_rmse, rtol=1e-6))
     compared = []
-    for structure in ("both structures",) if alike else tuple(of):
-        rows, plain = (_under(of["additive" if alike else structure], which) for which in (kind, "none"))
+    for structure in ("both structures",) if alike else tuple(own):
+        every = own["additive" if alike else structure]
+        rows, plain = (rows_of(every, regularization=which) for which in (kind, "none"))
         weights = (f"{float(part.effective_weights.mean()):.3g}" for part in (rows, plain))
         why = (
             f"{float(rows.test_rmse.mean()) / float(plain.test_rmse.mean()):.3g} times that without, "
@@ -166,14 +169,10 @@ def _regularized(table: pd.DataFrame, kind: str) -> list[Finding]:
         )
         quantity = f"set 1, 30 dB, {structure}, regularization {kind}: test RMSE"
         compared.append(Finding(quantity, span(rows.test_rmse), why))
-    errors = _under(of["additive"], kind).theta_error
+    errors = rows_of(own["additive"], regularization=kind).theta_error
     why = f"differs by up to {errors.max() - errors.min():.3g} from start to start"
     compared.append(Finding(f"set 1, 30 dB, additive, regularization {kind}: ‖θ* − θ̂‖", span(errors), why))
     return compared
-
-
-def _under(rows: pd.DataFrame, kind: str) -> pd.DataFrame:
-    return pick(rows, rows.regularization == kind)
 
 
 REPRODUCTION = Reproduction(

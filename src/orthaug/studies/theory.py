@@ -143,7 +143,7 @@ THEORY: tuple[Statement, ...] = (
     Statement(
         "eq:cov_approx",
         "The covariance of θ and the weights from the Jacobian, with a factor 2 in the middle.",
-        "inference.intervals.joint_covariance, convention “paper”; the default leaves the 2 out, which cancels "
+        "inference.covariance.joint_covariance, convention “paper”; the default leaves the 2 out, which cancels "
         "(Ljung 1999)",
         "test_uncertainty.test_the_papers_convention_is_eq_cov_approx; study coverage: 95 % intervals hold in 95 % "
         "without the factor, in 99 % with it",
@@ -152,7 +152,7 @@ THEORY: tuple[Statement, ...] = (
         "thm:zero_cov",
         "Cov of θ̂ and the learner's weights is zero. It holds for the sum over rows, not per row as the proof has it; "
         "outputs that share θ need Σ_e = σ²I, not only a diagonal one.",
-        "inference.intervals.joint_covariance",
+        "inference.covariance.joint_covariance",
         "test_uncertainty.test_theta_and_the_learner_are_uncorrelated, "
         "test_outputs_that_share_theta_need_equal_noise_for_zero_covariance; study covariance",
     ),

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from orthaug._base.errors import InputError
-from orthaug._base.partials import PARTIALS
+from orthaug._base.folders import PARTIALS
 from orthaug.commands import streams
 from orthaug.commands.app.gate import Gate
 from orthaug.commands.app.session import Sessions

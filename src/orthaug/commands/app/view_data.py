@@ -29,8 +29,8 @@ from orthaug.commands.app.widgets import (
     table,
     text,
 )
+from orthaug.data.preparation import STEPS
 from orthaug.data.record import check_step
-from orthaug.data.steps import STEPS
 
 _STEPS = ("data", "prepare")
 _LISTED = 40  # columns

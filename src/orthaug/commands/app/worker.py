@@ -19,13 +19,12 @@ import numpy as np
 
 from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
-from orthaug.commands import check as checking
 from orthaug.commands import init as starting
 from orthaug.commands.job import Job
-from orthaug.commands.opening import open_job
+from orthaug.commands.kinds import kind_of, open_job
 from orthaug.data.record import Channel, check_step
 from orthaug.data.survey import Column, Survey
-from orthaug.physics.derived_units import derived_units
+from orthaug.physics.baseline import derived_units
 
 MOST = 3000
 """Points of a curve that are drawn."""
@@ -152,8 +151,8 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
             from orthaug._base.jax import use_compilation_cache
 
             use_compilation_cache()
-        result = checking.check_job(job)
-        refused = checking.refusal(job, result)
+        result = kind_of(job).checked(job)
+        refused = kind_of(job).refused(job, result)
         bias = [{"name": one.name, "removed_by": one.removed_by, "percent": one.percent} for one in result.bias or ()]
         told = {"check": json.loads(result.to_json()), "bias": bias}
         told["refusal"] = None if refused is None else str(refused)

@@ -93,9 +93,8 @@ class AdamLBFGS:
             (self.lbfgs_iterations, optax.lbfgs(memory_size=_MEMORY)),
         )
         for limit, optimizer in phases:
-            state = _GradientState(
-                state.unknowns, optimizer.init(state.unknowns), state.loss, jnp.asarray(0), jnp.asarray(0)
-            )
+            begun = {"iteration": jnp.asarray(0), "small": jnp.asarray(0)}
+            state = state._replace(optimizer=optimizer.init(state.unknowns), **begun)
             burst, second = 1, optimizer is phases[1][1]
             while int(state.iteration) < limit and bool(_going(state)) and not enough:
                 tick = training_clock()

@@ -271,9 +271,18 @@ def _trial(
 
 
 def _next_ridge(objective: SquaredResiduals, iterate: _Iterate) -> float:
-    flown, samples = iterate.flown, objective.samples(iterate.flown)
-    physics, hessian = objective.physics, iterate.linear.hessian
-    return _evidence(samples, flown.p, hessian, flown.loss, iterate.ridge, physics, iterate.coloured)
+    """MacKay's fixed point `α = γσ²/(κ‖w‖²)`, κ the share of the residuals that is independent.
+
+    Residuals of a free run are coloured: N of them say as much as κN independent ones. So the data weigh less against
+    the prior.
+    """
+    flown, physics = iterate.flown, objective.physics
+    count, share = objective.samples(flown)
+    share = share if iterate.coloured else 1.0
+    effective = effective_weights(iterate.linear.hessian, iterate.ridge, physics)
+    variance = flown.loss / max(count - effective / share, 1.0)
+    size = float(np.sum(flown.p[physics:] ** 2))
+    return float(np.clip(effective * variance / (share * max(size, 1e-300)), 1e-12, 1e12))
 
 
 def _step(
@@ -327,19 +336,3 @@ def effective_weights(hessian: Matrix, ridge: float, physics: int) -> float:
     floor = len(hessian) * np.finfo(float).eps * np.max(np.diag(hessian)[physics:])
     seen = values[values > floor]
     return float(np.sum(seen / (seen + ridge)))
-
-
-def _evidence(
-    samples: tuple[float, float], p: Vector, hessian: Matrix, loss: float, ridge: float, physics: int, coloured: bool
-) -> float:
-    """MacKay's fixed point `α = γσ²/(κ‖w‖²)`, κ the share of the residuals that is independent.
-
-    Residuals of a free run are coloured: N of them say as much as κN independent ones. So the data weigh less against
-    the prior.
-    """
-    count, share = samples
-    share = share if coloured else 1.0
-    effective = effective_weights(hessian, ridge, physics)
-    variance = loss / max(count - effective / share, 1.0)
-    size = float(np.sum(p[physics:] ** 2))
-    return float(np.clip(effective * variance / (share * max(size, 1e-300)), 1e-12, 1e12))

@@ -1,0 +1,212 @@
+"""When the inputs of a motion act: physics alone, fitted under each hold between samples and with inputs delayed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.errors import InputError
+from orthaug._base.warning import Warning
+from orthaug.data.record import Record
+from orthaug.fitting.course import Flight
+from orthaug.fitting.criteria import Criterion
+from orthaug.fitting.motion_course import MotionCourse
+from orthaug.fitting.motion_task import MotionTask
+from orthaug.fitting.structures import Structure
+from orthaug.models.learners import Learner
+from orthaug.physics.motion import HOLDS, Motion
+from orthaug.physics.motion_problem import MotionProblem
+
+ROWS = 4000  # at most
+_CLEARLY = 0.02  # lower, of the residual: another hold
+_LATE = 0.2  # lower: a delay; missing friction or a small lag gains less by one
+_LONGEST = 20  # rows of the record to one of delay
+_REFITTED = 30  # iterations from where the declared hold ended
+
+
+@dataclass(frozen=True)
+class Held:
+    """The residual of physics alone under a hold, RMS in deviations of the outputs; None where it has no run."""
+
+    hold: str
+    residual: float | None
+    declared: bool
+    parameters: dict[str, float] | None = None
+    """What physics alone is fitted with under it."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Physics alone on the first rows of the longest experiment: its substeps, and every hold's residual."""
+
+    rows: int
+    substeps: int | None
+    holds: tuple[Held, ...]
+    task: MotionTask = field(repr=False, compare=False)
+    """With physics alone trained."""
+
+    @property
+    def best(self) -> str | None:
+        """The hold that explains the data clearly better than the declared one."""
+        own = next((h.residual for h in self.holds if h.declared), None)
+        known = [h for h in self.holds if h.residual is not None]
+        if own is None or len(known) < 2:
+            return None
+        least = min(known, key=lambda h: h.residual or 0.0)
+        return least.hold if least.residual is not None and least.residual < (1 - _CLEARLY) * own else None
+
+
+def try_holds(
+    problem: MotionProblem, criterion: Criterion, solver: Any, structure: Structure, learner: Learner | None = None
+) -> Trial:
+    """Fit physics alone with the declared hold, and go on from there with every other.
+
+    One hold alone is tried where the motion is discrete or has no inputs.
+
+    Args:
+        learner: what the trial's task has beside the physics; it is not trained.
+    """
+    task = on_longest(problem, criterion, solver, structure, learner)
+    motion, flight = problem.motion, task.physics
+    found = [_held(task.plan, flight, declared=True)]
+    several = motion.integrator != "discrete" and bool(motion.inputs) and flight is not None
+    for hold in HOLDS if several else ():
+        if hold != motion.hold:
+            found.append(_under(hold, task, solver))
+    substeps = None if flight is None else task.plan.dynamics.substeps
+    return Trial(len(task.problem.record), substeps, tuple(found), task)
+
+
+def on_longest(
+    problem: MotionProblem, criterion: Criterion, solver: Any, structure: Structure, learner: Learner | None = None
+) -> MotionTask:
+    """Physics alone trained on the first rows of the longest experiment; arguments as in `try_holds`."""
+    longest = max(problem.record.experiments, key=len)
+    record = replace(problem.record, experiments=(longest.rows(0, ROWS),))
+    return MotionTask.of(problem.on(record), learner, criterion).prepared(solver, structure)
+
+
+def _under(hold: str, task: MotionTask, solver: Any) -> Held:
+    assert task.physics is not None
+    try:
+        motion = replace(task.problem.motion, hold=hold)
+        return _held(*refitted(task, task.physics, motion, task.problem.record, solver), declared=False)
+    except InputError:
+        return Held(hold, None, False)
+
+
+def refitted(
+    task: MotionTask, flight: Flight, motion: Motion, record: Record, solver: Any
+) -> tuple[MotionCourse, Flight | None]:
+    """Physics alone, trained on from where a flight ended, with another motion or record; None without a usable end.
+
+    Raises:
+        InputError: the motion does not take the record.
+    """
+    plan = task.plan
+    motion = replace(motion, substeps=plan.dynamics.substeps)
+    course = MotionCourse.of(replace(plan.problem, motion=motion, record=record), None, plan.criterion)
+    course = course.from_states(flight.end.flown.states)
+    again = course.descend(course.objective(), flight.end.flown.theta, solver.at_most(_REFITTED))
+    return course, again if again.ending.usable else None
+
+
+def residual_of(course: MotionCourse, flight: Flight | None) -> float:
+    """RMS of what a flight leaves, in deviations of the outputs; inf without a flight."""
+    if flight is None:
+        return float("inf")
+    value = float(np.sqrt(np.sum((flight.end.flown.errors / course.deviation[:, None]) ** 2) / course.residuals))
+    return value if np.isfinite(value) else float("inf")
+
+
+def _held(course: MotionCourse, flight: Flight | None, *, declared: bool) -> Held:
+    motion, value = course.problem.motion, residual_of(course, flight)
+    if flight is None or value == float("inf"):
+        return Held(motion.hold, None, declared)
+    p = motion.coordinates.physical(flight.end.flown.theta)
+    return Held(motion.hold, value, declared, dict(zip(motion.names, map(float, p), strict=True)))
+
+
+@dataclass(frozen=True)
+class DeadTime:
+    """An input that acts `samples` later: what physics alone then leaves, and leaves without, in deviations."""
+
+    input: str
+    samples: int
+    residual: float
+    undelayed: float
+
+    @property
+    def gain(self) -> str:
+        """What a delay explains, in words."""
+        late = f"{self.samples} sample{'s' * (self.samples > 1)}"
+        return (
+            f"with a delay of {late} physics alone leaves {self.residual:.3g} deviations of the output instead of "
+            f"{self.undelayed:.3g}"
+        )
+
+    @property
+    def warning(self) -> Warning:
+        """With what to write into the spec."""
+        return Warning(
+            "dead_time",
+            f"{self.input} seems to act late: {self.gain}, and its parameters are others. If there is a dead time, "
+            f'delay the input by [[data.prepare]] with step = "shift", channel = "{self.input}", samples = '
+            f"{self.samples}; a lag of its drive belongs into the equations.",
+        )
+
+
+def dead_times(task: MotionTask, solver: Any) -> tuple[DeadTime, ...]:
+    """The inputs that act clearly later than they do in the equations, and by how many samples.
+
+    Each input is delayed in turn, by 1, 2, 4, … samples while that explains the data better, then by what lies
+    between; physics alone is refitted each time from where the last one ended.
+
+    Args:
+        task: with physics alone trained; what it leaves is set against.
+    """
+    motion, record = task.problem.motion, task.problem.record
+    first = task.physics
+    if first is None:
+        return ()
+    found = []
+    for number, name in enumerate(motion.inputs):
+        tried = {0: (residual_of(task.plan, first), first)}
+
+        def leaves(samples: int, number: int = number, tried: dict = tried) -> float:
+            if samples not in tried:
+                nearest = tried[min(tried, key=lambda known: (abs(known - samples), tried[known][0]))][1]
+                course, flight = refitted(task, nearest, motion, _delayed(record, number, samples), solver)
+                tried[samples] = (residual_of(course, flight), flight or first)
+            return tried[samples][0]
+
+        best = _least(leaves, len(record) // _LONGEST)
+        if leaves(best) < (1 - _LATE) * leaves(0):
+            found.append(DeadTime(name, best, leaves(best), leaves(0)))
+    return tuple(found)
+
+
+def _least(leaves: Callable[[int], float], most: int) -> int:
+    """Where a function of whole numbers from 0 on that falls and rises is least."""
+    best, step = 0, 1
+    while step <= most and leaves(step) < leaves(best):
+        best, step = step, 2 * step
+    step = best // 2
+    while step:
+        best = min((best - step, best, best + step), key=leaves)
+        step //= 2
+    return best
+
+
+def _delayed(record: Record, number: int, samples: int) -> Record:
+    """An input later by so many samples; what it was before the record is its first value."""
+
+    def moved(inputs: np.ndarray) -> np.ndarray:
+        column = inputs[:, number]
+        late = np.concatenate([np.full(min(samples, len(column)), column[0]), column])[: len(column)]
+        return np.where(np.arange(inputs.shape[1]) == number, late[:, None], inputs)
+
+    return replace(record, experiments=tuple(replace(e, inputs=moved(e.inputs)) for e in record.experiments))

@@ -1,0 +1,171 @@
+"""Fitted models as filters: of a lagged model the noise of its equation disturbs, of a motion that of its rates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.jax import jax, jnp
+from orthaug.data.record import Experiment, Record
+from orthaug.models.dynamics import Numbers, Parts
+from orthaug.models.kalman import Belief, Filter, Noise, Told, corrected, slope, without_gaps
+from orthaug.models.lagged import Lagged
+from orthaug.models.moving import Moving
+from orthaug.models.stepping import Memory
+
+
+@dataclass(frozen=True)
+class LaggedFilter:
+    """A lagged model without its numbers as a filter: `Filter`. Its state is what its regressor remembers.
+
+    `y_k = g(x_k) + e_k` with Cov e = Q goes on in the lags, and `y_k + v_k` with Cov v = R is measured. With R = 0 the
+    estimate of a measured output is what was measured, and the prediction that of `predict`.
+    """
+
+    form: Lagged
+    memory: Memory
+
+    hidden = False
+
+    @property
+    def first_row(self) -> int:
+        return self.form.first_row
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.memory.names
+
+    @property
+    def disturbances(self) -> int:
+        return len(self.form.outputs)
+
+    def inputs(self, experiment: Experiment, record: Record) -> Matrix:
+        return experiment.inputs[self.first_row :]
+
+    def start(self, experiment: Experiment, record: Record, row: int, noise: Noise, size: Vector) -> Belief:
+        """The lags before a row: outputs with the sensors' noise, or unknown by their `size` (ny,) where missing."""
+        outputs, lags = list(self.form.outputs), self.memory.lags
+        before = Experiment(experiment.inputs[:row], without_gaps(experiment.outputs[:row]))
+        mean = self.memory.at(before, record, row)
+        variance = np.zeros((len(lags), len(lags)))
+        for i, lag in enumerate(lags):
+            if lag.channel not in outputs:
+                continue
+            own = outputs.index(lag.channel)
+            if not np.isfinite(experiment.outputs[row - lag.lag, own]):
+                variance[i, i] = size[own] ** 2
+                continue
+            for j, other in enumerate(lags):
+                if other.lag == lag.lag and other.channel in outputs:
+                    there = np.isfinite(experiment.outputs[row - lag.lag, outputs.index(other.channel)])
+                    variance[i, j] = noise.output[own, outputs.index(other.channel)] if there else 0.0
+        return Belief(mean, variance)
+
+    def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
+        parts = self.form.at(numbers, jnp.concatenate([state, inputs])[self.memory.read])
+        return jnp.concatenate([parts.total, inputs, state])[self.memory.following], parts
+
+    def row(self, numbers: Numbers, noise: Noise, belief: Belief, inputs: Any, measured: Any) -> tuple[Belief, Told]:
+        n, ny = len(self.memory.lags), len(self.form.outputs)
+        value, derivative = slope(_both(self, numbers, inputs), belief.state)
+        enters = jnp.concatenate([jnp.asarray(self._newest), jnp.eye(ny)])
+        covariance = derivative @ belief.covariance @ derivative.T + enters @ noise.state @ enters.T
+        mean, after, spread, square, likelihood = corrected(value, covariance, noise.output, measured)
+        told = Told(value[n:], spread, mean[n:], after[n:, n:], mean[:n], after[:n, :n], square, likelihood)
+        return Belief(told.state, told.state_covariance), told
+
+    @property
+    def _newest(self) -> Matrix:
+        """Where an output goes in the next state, (n, ny)."""
+        place = np.zeros((len(self.memory.lags), len(self.form.outputs)))
+        for i, lag in enumerate(self.memory.lags):
+            if lag.channel in self.form.outputs and lag.lag == 1:
+                place[i, self.form.outputs.index(lag.channel)] = 1.0
+        return place
+
+    def unit(self, noise: Matrix, size: Vector) -> Matrix:
+        """A disturbance (ny, ny) in proportion to the error of the outputs."""
+        return noise
+
+    def linearised(self, numbers: Numbers) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+        """A (n, n), C (ny, n) at the origin, and how a disturbance enters state (n, ny) and outputs (ny, ny)."""
+        slopes = _at_origin(self, numbers, np.zeros(len(self.memory.inputs)), len(self.memory.lags))
+        return *slopes, self._newest, np.eye(len(self.form.outputs))
+
+
+@dataclass(frozen=True)
+class MotionFilter:
+    """A motion without its numbers as a filter: `Filter`."""
+
+    form: Moving
+
+    first_row = 0
+    hidden = True
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.form.motion.names_of_states
+
+    @property
+    def disturbances(self) -> int:
+        return self.form.states
+
+    @property
+    def alone(self) -> MotionFilter:
+        """That of the motion without its learner."""
+        return MotionFilter(self.form.alone)
+
+    def inputs(self, experiment: Experiment, record: Record) -> Matrix:
+        return self.form.inputs(experiment, record)
+
+    def start(self, experiment: Experiment, record: Record, row: int, noise: Noise, size: Vector) -> Belief:
+        """The state as it is guessed from what is measured about a row, unknown by the `size` (nx,) of all."""
+        return Belief(self.form.start(without_gaps(experiment.outputs), [row])[0], np.diag(size**2))
+
+    def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
+        return self.form.step(numbers, state, inputs)
+
+    def row(self, numbers: Numbers, noise: Noise, belief: Belief, inputs: Any, measured: Any) -> tuple[Belief, Told]:
+        n = self.form.states
+        value, seen = slope(lambda x: self.step(numbers, x, inputs)[1].total, belief.state)
+        both = jnp.concatenate([jnp.eye(n), seen])
+        covariance = both @ belief.covariance @ both.T
+        mean = jnp.concatenate([belief.state, value])
+        mean, after, spread, square, likelihood = corrected(mean, covariance, noise.output, measured)
+        following, moved = slope(lambda x: self.step(numbers, x, inputs)[0], mean[:n])
+        own = after[:n, :n]
+        told = Told(value, spread, mean[n:], after[n:, n:], mean[:n], own, square, likelihood)
+        return Belief(following, moved @ own @ moved.T + noise.state), told
+
+    def unit(self, noise: Matrix, size: Vector) -> Matrix:
+        """A disturbance (nx, nx) as large as the states; none where a rate is another state: that is exact."""
+        known = [state.derivative in self.names and not state.learned for state in self.form.motion.states]
+        return np.diag(np.where(known, 0.0, size**2))
+
+    def linearised(self, numbers: Numbers) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+        """A (nx, nx), C (ny, nx) at the origin, and how a disturbance enters state (nx, nx) and outputs (ny, nx)."""
+        n = self.form.states
+        nothing = Experiment(np.zeros((4, len(self.form.motion.inputs))), np.zeros((4, len(self.form.outputs))))
+        inputs = np.zeros(self.form.inputs(nothing, None).shape[1])  # type: ignore[arg-type]
+        return *_at_origin(self, numbers, inputs, n), np.eye(n), np.zeros((len(self.form.outputs), n))
+
+
+def _both(form: Filter, numbers: Numbers, inputs: Any) -> Callable[[Any], Any]:
+    """The next state and the outputs as one function of the state."""
+
+    def both(state: Any) -> Any:
+        following, parts = form.step(numbers, state, inputs)
+        return jnp.concatenate([following, parts.total])
+
+    return both
+
+
+def _at_origin(form: Filter, numbers: Numbers, inputs: Vector, n: int) -> tuple[Matrix, Matrix]:
+    """A (n, n) and C (ny, n)."""
+    both = _both(form, numbers, inputs)
+    derivative = np.asarray(jax.jit(lambda x: slope(both, x)[1])(np.zeros(n)))
+    return derivative[:n], derivative[n:]
