@@ -14,7 +14,7 @@ from orthaug.commands.spec import load_spec
 from orthaug.data.expressions import parse_named
 from orthaug.physics.motion import Output, State
 from orthaug.selection.added_physics import Added, added_to_motion
-from orthaug.selection.explained_ground import MotionResponse
+from orthaug.selection.explained_ground import MotionResponse, _moved
 from orthaug.selection.explaining import _written
 
 ROWS = 600
@@ -170,6 +170,15 @@ def test_the_response_of_a_motion_has_its_transpose(half):
     terms, values = rng.normal(size=(7, 3, 2)), rng.normal(size=(7, 4))
     back = np.einsum("mnk,mnj->kj", response.adjoint(values), terms)
     assert back == pytest.approx(values.T @ response.forward(terms))
+
+
+def test_a_step_of_parameters_ends_at_their_bounds_but_at_no_zero_that_is_divided_by():
+    parameters = [oa.PhysicalParameter("c", 0.5, min=0), oa.PhysicalParameter("m", 2.0, min=0, max=3.0)]
+    motion = oa.Motion.from_equations([State("v", "(u - c*v)/m")], [Output("y", "v")], parameters, ["u"])
+    x, u, q = np.ones((3, 1)), np.ones((3, 1)), motion.coordinates.of([0.5, 2.0])
+    assert _moved(motion, q, np.array([-0.4, 0.1]), x, u) == pytest.approx([0.3, 2.2])
+    assert _moved(motion, q, np.array([-1.1, 0.6]), x, u) == pytest.approx([0.0, 3.0])
+    assert _moved(motion, q, np.array([0.0, -1.1]), x, u) == pytest.approx([0.5, 2.0 * np.exp(-1.1)])
 
 
 @pytest.fixture(scope="module")
