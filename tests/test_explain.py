@@ -14,8 +14,8 @@ from orthaug.commands.spec import load_spec
 from orthaug.data.expressions import parse_named
 from orthaug.physics.motion import Output, State
 from orthaug.selection.added_physics import Added, added_to_motion
-from orthaug.selection.explained_ground import MotionResponse, _moved
-from orthaug.selection.explaining import _written
+from orthaug.selection.explained_ground import MotionResponse, _moved, ground_of
+from orthaug.selection.explaining import _written, candidates_of
 
 ROWS = 600
 SPEC = """
@@ -101,6 +101,25 @@ def test_a_function_from_another_toolbox_is_explained_as_it_is():
     assert term.expression == "y[k-1]**3" and term.coefficient == pytest.approx(-0.3) and term.std is None
     assert told.share == pytest.approx(1) and told.p is None and told.noise is None
     assert [moved.value_with for moved in told.parameters] == pytest.approx(list(TRUE.values()))
+
+
+def test_of_a_level_a_root_is_tried_and_no_friction_and_of_a_velocity_the_reverse():
+    rng = np.random.default_rng(4)
+    kinds = {}
+    for low in (0.0, -1.0):
+        u, y = rng.uniform(low, 1, ROWS), np.zeros(ROWS)
+        for k in range(1, ROWS):
+            y[k] = 0.8 * y[k - 1] + 0.5 * u[k - 1] - 0.1 * np.sign(y[k - 1]) * np.sqrt(abs(y[k - 1]))
+        baseline = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("g", "u[k-1]")])
+        plant = lambda x: (x @ [0.8, 0.5] - 0.1 * np.sign(x[:, 0]) * np.sqrt(np.abs(x[:, 0])))[:, None]  # noqa: E731
+        fit = oa.orthogonalize(oa.Record.from_arrays(u, y), baseline, plant)
+        tried = candidates_of(ground_of(fit.model, fit.problem.record), 2, (), ())
+        kinds[low] = {one.kind for one in tried if one.on == "y[k-1]"}
+        if low == 0.0:
+            (term,) = oa.explain(fit).terms
+            assert term.expression == "sign(y[k-1])*sqrt(abs(y[k-1]))" and term.coefficient == pytest.approx(-0.1)
+    assert kinds[0.0] ^ kinds[-1.0] == {"square_root", "coulomb", "stribeck", "stribeck_gauss"}
+    assert "square_root" in kinds[0.0] and "coulomb" in kinds[-1.0]
 
 
 def friction(rows: int = 2000) -> oa.Record:

@@ -273,7 +273,7 @@ def usual_suspects(problem: Problem) -> tuple[Suspect, ...]:
         first = str(lags[0])
         pairs += [(kind, first) for kind in (_POSITION if channel in outputs else _INPUT)]
         values = problem.rows.x[:, layout.index(lags[0])]
-        if channel in outputs and values.min() >= -_BELOW * values.max():
+        if channel in outputs and is_level(values):
             pairs.append(("square_root", first))
         if channel in outputs and len(lags) > 1:
             pairs += [(kind, f"{first} - {lags[1]}") for kind in _VELOCITY]
@@ -294,6 +294,11 @@ def changes_sign(values: Vector) -> bool:
     """Whether values (N,) lie clearly on both sides of zero; otherwise what jumps there is as good as a constant."""
     edge = _CLEARLY * np.abs(values).max(initial=0.0)
     return bool(np.min(values, initial=0.0) < -edge and np.max(values, initial=0.0) > edge)
+
+
+def is_level(values: Vector) -> bool:
+    """Whether values (N,) are positive but for noise, so that a root of them may be missing."""
+    return bool(np.min(values) >= -_BELOW * np.max(values))
 
 
 def usual_terms(problem: Problem) -> tuple[Suspect, ...]:
