@@ -151,6 +151,30 @@ def test_theta_without_physical_parameters_gives_bounds_or_no_interval():
     assert p.ci95 == pytest.approx([0.01 / (gain.ci95[1] - inside), 7.0]) and codes == ["biased"]
 
 
+@pytest.mark.parametrize("missing", ["coulomb", "tanh", "cubic"])
+def test_what_is_missing_of_a_speed_is_named_or_told_with_what_explains_as_much(missing):
+    """One lag: friction, friction that turns round slowly as a saturation does, and hardening, each as what it is."""
+    form = {
+        "coulomb": lambda v: 0.05 * np.sign(v),
+        "tanh": lambda v: 0.1 * np.tanh(v / 0.4),
+        "cubic": lambda v: 0.1 * v**3,
+    }
+    rng = np.random.default_rng(0)
+    u, y = np.repeat(rng.uniform(-1, 1, 188), 8)[:1500], np.zeros(1500)
+    for k in range(1, 1500):
+        y[k] = 0.9 * y[k - 1] + 0.3 * u[k - 1] - form(y[k - 1]) + 0.003 * rng.normal()
+    physics = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "u[k-1]")])
+    solver, learner = LevenbergMarquardt(100), MLP((8,), inputs=("y[k-1]",))
+    found = bias_budget(estimate(Record.from_arrays(u, y), physics, learner=learner, solver=solver))
+    (low, high), text = found.of("a").ci95, found.warnings[0].text
+    assert low < 0.9 < high
+    if missing == "tanh":
+        assert "dead_zone of y[k-1]" in text and "saturation of y[k-1]" in text and "coulomb" not in text
+        assert "explains as much and would move them elsewhere" in text
+    else:
+        assert text.startswith(f"{missing} of y[k-1] explains") and found.share > 0.99 and high - low < 0.01
+
+
 def tank(rows=1500, zone=0.0):
     """A tank with a free outflow, whose level is measured with noise; the pump starts at `zone`."""
     rng = np.random.default_rng(5)

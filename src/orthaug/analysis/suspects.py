@@ -49,6 +49,7 @@ WIDTHS = tuple(kind for kind, entry in _KINDS.items() if entry.width)  # the kin
 ODD_JUMPS = ("coulomb", "stribeck", "stribeck_gauss")  # the kinds that jump where their argument changes sign
 _VELOCITY = ("coulomb", "stribeck", "quadratic_drag", "cubic")
 _POSITION = ("cubic", "dead_zone")
+_SINGLE = (*_POSITION, "saturation", "coulomb")  # of an output read at one lag only, which may be a velocity
 _CLEARLY = 0.05  # of the largest value
 _BELOW = 0.05  # of the largest value: what is only so far below 0 counts as positive, for it is noise
 _MULTIPLIED = 6  # lags at most, of which products are tried
@@ -271,7 +272,8 @@ def usual_suspects(problem: Problem) -> tuple[Suspect, ...]:
     for channel in dict.fromkeys(lag.channel for lag in layout):
         lags = sorted(lag for lag in layout if lag.channel == channel)
         first = str(lags[0])
-        pairs += [(kind, first) for kind in (_POSITION if channel in outputs else _INPUT)]
+        kinds = _POSITION if len(lags) > 1 else _SINGLE
+        pairs += [(kind, first) for kind in (kinds if channel in outputs else _INPUT)]
         values = problem.rows.x[:, layout.index(lags[0])]
         if channel in outputs and is_level(values):
             pairs.append(("square_root", first))
