@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
-from orthaug._base.jax import jax
+from orthaug._base.jax import jax, jnp
 from orthaug.data.expressions import SAMPLING_TIME, Expression, parse, parse_named
 from orthaug.data.record import Record
 from orthaug.data.regressors import lag_matrix, stack_rows
@@ -168,7 +168,6 @@ def _of_motion(model: MotionModel, record: Record) -> Ground:
     known = motion.values(x.T, u.T, coordinates.physical(model.theta), np)
     own = tuple(dict.fromkeys(str(entry) for entry in form.features))
     z = np.asarray(form.seen(x.T, u.T, np)).T
-    low, high = coordinates.bounds
     units = {channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
     units |= {parameter.name: parameter.unit for parameter in motion.parameters}
     return Ground(
@@ -182,7 +181,7 @@ def _of_motion(model: MotionModel, record: Record) -> Ground:
         units=units | {state.name: state.unit for state in motion.states} | {SAMPLING_TIME: "s"},
         parse=lambda text: parse_named(text, motion.known, "the term"),
         evaluate=lambda expression: expression.value(known, np),
-        moved=lambda along: np.asarray(coordinates.physical(np.clip(model.theta + along[:count], low, high))),
+        moved=lambda along: _moved(motion, model.theta, along[:count], x, u),
         parameters=coordinates.parameters,
         values=np.asarray(coordinates.physical(model.theta)),
         physics=motion,
@@ -331,6 +330,19 @@ def _places(model: MotionModel) -> tuple[tuple[str, str], ...]:
     names = [motion.states[i].name for i in states] + [motion.outputs[i].name for i in outputs]
     units = [unit for _, unit in labels_of(model.form)][: len(states)] + [model.outputs[i].unit for i in outputs]
     return tuple(zip(names, units, strict=True))
+
+
+def _moved(motion: Motion, q: Vector, along: Vector, x: Matrix, u: Matrix) -> Vector:
+    """The parameters after a step of their coordinates q (np,), along a line of the parameters themselves.
+
+    A step of logarithms where that would end at a zero that the equations divide by.
+    """
+    coordinates = motion.coordinates
+    low, high = ([getattr(p, end) for p in motion.parameters] for end in ("min", "max"))
+    p = np.clip(coordinates.physical(q) + coordinates.slopes(q) * along, low, high)
+    if np.isfinite(jax.vmap(lambda x, u: motion.rates(x, u, p, jnp))(x, u)).all():
+        return p
+    return np.asarray(coordinates.physical(np.clip(q + along, *coordinates.bounds)))
 
 
 def _rates_of_change(outputs: Sequence[str], seen: Sequence[str]) -> list[str]:
