@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from orthaug._base.checks import check_type
+from orthaug._base.checks import Matrix, check_type
 from orthaug._base.errors import InputError
 from orthaug._base.progress import SILENT, Tell
 from orthaug.data.record import Record
@@ -152,7 +152,19 @@ def _model(plan: MotionCourse, structure: Structure, learned: Learned) -> Motion
         prepared=record.prepared,
         statistics=Statistics(learned.gram, middle, noise, learned.ridge, learned.errors.freedom, flown=True),
     )
-    return replace(model, window=_best_window(model, record)) if learned.ending.usable else model
+    if not learned.ending.usable:
+        return model
+    model = replace(model, window=_best_window(model, record))
+    return model if model.form.bound is None else replace(model, seen=_seen(model, record))
+
+
+def _seen(model: MotionModel, record: Record) -> Matrix | None:
+    """Least and largest (2, nz) of the learner's features over the free run; None where it has no finite ones."""
+    states, inputs = np.split(model.reach(record), [model.form.states], axis=1)
+    with np.errstate(all="ignore"):
+        features = np.asarray(model.form.seen(states.T, inputs.T, np))
+    finite = features[:, np.isfinite(features).all(axis=0)]
+    return np.stack([finite.min(axis=1), finite.max(axis=1)]) if finite.size else None
 
 
 def _best_window(model: MotionModel, record: Record) -> int:

@@ -35,7 +35,6 @@ MOST_CELLS = 10_000
 """Values of the learner that are looked at: a smooth function needs no more, and candidates are kept beside them."""
 FEWEST = 20  # of them
 MOST_WEIGHTS = 2000  # of a learner whose tangent is looked at
-_WITHIN = 1e-9  # of a feature's half width: the largest of training is no extrapolation
 
 
 class Tangent(NamedTuple):
@@ -360,8 +359,7 @@ def _beyond(model: Any, z: Matrix) -> float:
     """Share of the points at which a feature lies outside those of training."""
     if not model.form.bound.differentiable or not len(z):
         return 0.0
-    scaled = (z - np.asarray(model.numbers.centre)) / np.asarray(model.numbers.halfwidth)
-    return float(np.mean((np.abs(scaled) > 1 + _WITHIN).any(axis=1)))
+    return float(np.mean(model.beyond(z)))
 
 
 def _tangent(model: Any, z: Matrix, weight: Matrix, response: Response | None) -> Tangent | None:
