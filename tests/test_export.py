@@ -167,7 +167,7 @@ MODELS: dict[str, Callable[[], Model | MotionModel]] = {
             outputs=[oa.Output("y", "x")],
             parameters=[oa.PhysicalParameter("k", 12.0)],
         ),
-        ("v",),
+        ("v", "sin(x)"),
         oa.MLP((3,)),
     ),
     "motion, first-order hold": lambda: moving(
