@@ -285,8 +285,10 @@ def _nothing(search: Search, starts: Matrix, unit: Vector) -> str:
     if not search.free.any():
         moves = ", ".join(search.step.rest)
         return f"the model does not rest{at}: {moves} would move. Fix less, so that the rest can be found."
+    found = f"no equilibrium was found{at}, from {len(starts)} starts: either the model"
+    if not search.step.inputs:
+        return f"{found} never rests, or these values exclude each other. Give others, or fix less."
     return (
-        f"no equilibrium was found{at}, from {len(starts)} starts: either the model integrates (it rests at other "
-        "inputs only), or these values exclude each other. Give other inputs, or data whose mean inputs are held, or "
-        "fix an output and leave inputs open."
+        f"{found} integrates (it rests at other inputs only), or these values exclude each other. Give other inputs, "
+        "or data whose mean inputs are held, or fix an output and leave inputs open."
     )

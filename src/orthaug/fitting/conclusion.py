@@ -19,7 +19,7 @@ from orthaug.fitting.elimination import Fixed, ThetaSplit, directions, eliminate
 from orthaug.fitting.estimates import NOT_UNIQUE, Estimate
 from orthaug.fitting.learned import ErrorStatistics, Learned
 from orthaug.fitting.one_step import OneStepTask, Share
-from orthaug.fitting.status import Ending, Status
+from orthaug.fitting.status import ALONE, Ending, Status
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.inference.covariance import degrees_of_freedom, noise_covariance, theta_covariance
 from orthaug.models.dynamics import Numbers
@@ -58,9 +58,10 @@ def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estim
     if known and errors.covariance is None and learned.errors is None:
         text = "no standard errors: beside a learner that sees only some features, an ensemble or a bound leaves none."
         told.append(Warning("no_standard_errors", text))
+    reason = ALONE.get(ending, "") if learned.bound is None else ""
     return Estimate(
         model=_model(problem, structure, learned, ThetaSplit(theta, theta_aux, fixed), errors, noise),
-        status=Status(ending, learned.iterations, learned.seconds, errors.mean_square),
+        status=Status(ending, learned.iterations, learned.seconds, errors.mean_square, reason=reason),
         restarts=(),
         excitation=problem.excitation,
         covariance=errors.covariance if known else None,

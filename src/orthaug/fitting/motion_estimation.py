@@ -21,7 +21,7 @@ from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.rules import check_motion_choices, check_solver, checked_starts, tried
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.solver import Solver
-from orthaug.fitting.status import Ending, Status
+from orthaug.fitting.status import ALONE, Ending, Status
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.fitting.training import Choice, planned, train
 from orthaug.inference.motion_split import MotionSplit
@@ -108,9 +108,12 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) ->
     alone = np.asarray(learned.coefficients if task.physics is None else task.physics.end.flown.theta)
     trained = Trained(plan.flown.segment, plan.flown.washout, np.asarray(states), slope, alone)
     model = replace(_model(plan, structure, learned), trained=trained)
+    reason = ALONE.get(learned.ending, "") if learned.bound is None or task.physics is None else ""
+    if reason and not learned.ending.usable and (where := task.problem.without_value(np.any)):
+        reason = f"{where}; mend it, or bound what it reads"
     fit = MotionEstimate(
         model=model,
-        status=Status(learned.ending, learned.iterations, learned.seconds, errors.mean_square),
+        status=Status(learned.ending, learned.iterations, learned.seconds, errors.mean_square, reason=reason),
         restarts=(),
         covariance=None,
         freedom=errors.freedom,

@@ -54,7 +54,8 @@ def check_text(result: CheckResult) -> str:
     data, physics = result.excitation, result.identifiability
     condition = f"{data.condition:.4g}" if data.condition is not None else "infinite"
     moves = result.motion is not None
-    where = "with rich inputs" if moves else "at random points"
+    driven = result.motion is None or len(result.regressor) > len(result.motion.states)
+    where = ("with rich inputs" if driven else "from other starts") if moves else "at random points"
     lines = [
         f"parameters       {', '.join(result.parameters) or 'none'}",
         f"{'states, inputs  ' if moves else 'regressor       '} {', '.join(result.regressor)}",
