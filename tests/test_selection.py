@@ -142,7 +142,7 @@ def test_blocks_judge_no_terms_that_they_helped_to_choose(seed):
         [oa.Term(f"{s}{i}", f"{s}[k-{i}]") for s, i in itertools.product("yu", (1, 2))],
     )
     one = oa.select(oa.Record.from_arrays(u=u, y=y), physics, lags=LAGS, criterion=oa.Prediction(), most=MOST)
-    assert one.learner is None and len(one.terms.rungs) > 3
+    assert one.learner is None and len(one.terms.rungs) > 1
 
 
 @pytest.mark.parametrize(

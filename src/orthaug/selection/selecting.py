@@ -220,7 +220,7 @@ def select(
         runs, notes = _terms(problem, learner, largest, criterion)
         path = climb(runs, blocks, min(most, len(problem.rows) // 10), heard.of("terms"), runner)
         if not path.chosen.point.chosen:
-            notes.append(Warning("nothing_helps", "no term lowers the error on the blocks that were held out."))
+            notes.append(Warning("nothing_helps", "no term lowers the error on blocks without which it was picked."))
     elif isinstance(learner, MLP) and not heard.stopped:
         told = heard.of("learner")
         found = search_learners(problem, chosen, tested, learner, widths, criterion, blocks, told, runner)

@@ -1,9 +1,9 @@
 """How many terms, and which: a path of models, judged by free runs on blocks that were held out.
 
 Forward the terms come by what they lower the error by; from the best model on backward they go, the least missed first.
-Without each block the same path is gone again on the rows that are left, so that no block had a say in the terms that
-it judges: held-out blocks say how many terms, all rows which. The choice is the smallest model that is within one
-standard error of the best (Breiman et al. 1984), block by block in pairs, or worse by less than is worth a term.
+The choice is the smallest model that is within one standard error of the best (Breiman et al. 1984), block by block in
+pairs, or worse by less than is worth a term. Blocks that had a say in the terms judge them too well: so the path is
+gone anew without each block, and a choice has no more terms than lower the errors there.
 """
 
 from __future__ import annotations
@@ -67,12 +67,12 @@ class Judged:
     chosen: bool
 
 
-def judge_all(rungs: Sequence[Rung]) -> tuple[Judged, ...]:
-    """Every model beside the best, block by block in pairs; the choice is the smallest that is as good."""
-    best, found = min(rungs, key=lambda rung: rung.score), []
+def judge_all(rungs: Sequence[Rung], most: float = np.inf) -> tuple[Judged, ...]:
+    """Every model up to a size beside the best, block by block in pairs; the choice is the smallest that is as good."""
+    best, found = min((rung for rung in rungs if rung.size <= most), key=lambda rung: rung.score), []
     for rung in rungs:
         count = len(rung.held)
-        finite = bool(np.isfinite(rung.held).all())
+        finite = bool(np.isfinite(rung.held).all()) and rung.size <= most
         worse = rung.held - best.held if finite else np.full(count, np.inf)
         tolerated = worse.std(ddof=1) / np.sqrt(count) if finite else 0.0
         within = finite and (float(worse.mean()) <= tolerated or rung.score <= (1 + WORTH) * best.score)
@@ -115,10 +115,9 @@ class Blocks:
         self.given = runs, self.folds
 
     def along(self, points: Sequence[Point | None], count: int) -> tuple[list[Point], Vector]:
-        """A step of the path without each block, and the mean squared errors on the blocks."""
-        points, errors = zip(
-            *self.runner.map(_along, self.given, [(*one, count) for one in enumerate(points)]), strict=True
-        )
+        """The path anew without each block, by as many terms; and the mean squared errors on the blocks."""
+        items = [(i, point, count) for i, point in enumerate(points)]
+        points, errors = zip(*self.runner.map(_along, self.given, items), strict=True)
         return list(points), np.array(errors)
 
     def judge(self, points: Sequence[Point]) -> Iterator[tuple[Vector, float]]:
@@ -155,38 +154,25 @@ def _on_fold(given: _Given, item: tuple[Point, int], tell: Callable[..., None]) 
 
 
 def _along(given: _Given, item: tuple[int, Point | None, int], tell: Callable[..., None]) -> tuple[Point, float]:
-    """A step of the path on all rows but those of a block, by their own terms; and the mean squared error there."""
+    """Physics alone, or some terms more, picked without a block; and the mean squared error on the block."""
     number, point, count = item
     runs, held = given[1][number]
-    point = _moved(runs, point, count)
-    return point, runs.errors(point, held) if np.isfinite(point.loss) else np.inf
-
-
-def _moved(runs: TermRuns, point: Point | None, count: int) -> Point:
-    """A step of the path: to physics alone, by `count` terms more, or the least missed less."""
     if point is None:
-        return runs.fit(runs.start(), ())
-    if not np.isfinite(point.loss):
-        return point
-    nt, equations = len(point.c), runs.equations(point)
-    if count > 0:
-        known = [*range(nt), *(nt + i for i in point.chosen)]
-        new = [pick.column - nt for pick in forward(equations, known, count, least=_LEAST)]
-        return runs.fit(point, (*point.chosen, *new)) if new else point
-    own = equations.of([*range(nt), *(nt + i for i in point.chosen)]).scaled()
-    inverse = np.linalg.pinv(own.hessian, rcond=1e-13, hermitian=True)
-    missed = (inverse @ own.right)[nt:] ** 2 / np.maximum(np.diag(inverse)[nt:], 1e-300)
-    gone = point.chosen[int(np.argmin(missed))] if point.chosen else None
-    left = tuple(i for i in point.chosen if i != gone)
-    p = equations.of([*range(nt), *(nt + i for i in left)]).solve()  # the others take over what it did
-    return runs.fit(point._replace(chosen=left, c=p[:nt], w=p[nt:]), left)
+        point = runs.fit(runs.start(), ())
+    elif np.isfinite(point.loss):
+        point = _grown(runs, point, count)
+    return point, runs.errors(point, held) if np.isfinite(point.loss) else np.inf
 
 
 @dataclass(frozen=True, eq=False)
 class TermPath(Search):
-    """Models of terms."""
+    """Models of terms, of which those up to `most` may be chosen."""
 
     runs: TermRuns
+    most: float = np.inf
+
+    def judged(self) -> tuple[Judged, ...]:
+        return judge_all(self.rungs, self.most)
 
     @property
     def chosen(self) -> Rung:
@@ -224,14 +210,23 @@ def climb(
         InputError: too few rows for so many blocks.
     """
     with one_blas_thread():
-        way = _Way(runs, Blocks(runs, blocks, runner), told)
+        folds, rungs, held_out = Blocks(runs, blocks, runner), [], np.inf
+
+        def judged(point: Point, change: Sequence[str], began: float) -> Rung:
+            held, _ = next(folds.judge([point]))
+            rung = Rung(point, tuple(change), held, time.monotonic() - began, len(point.chosen))
+            rungs.append(rung)
+            told(rung)
+            return rung
+
         try:
-            way.forward(most)
-            way.backward()
+            _forward(runs, most, judged)
+            held_out = _most(folds, TermPath(tuple(rungs), runs).chosen.size)
+            _backward(TermPath(tuple(rungs), runs, held_out), judged)
         except KeyboardInterrupt:
-            if not way.rungs:
+            if not rungs:
                 raise
-    return way.path
+    return TermPath(tuple(rungs), runs, held_out)
 
 
 def steps(most: int) -> int:
@@ -247,51 +242,64 @@ def _added_to(size: int) -> int:
     return 1 if size < _ONE_BY_ONE else max(1, size // 8)
 
 
-class _Way:
-    """The path as it is gone, on all rows and without each block."""
+def _forward(runs: TermRuns, most: int, judged: Any) -> None:
+    texts, began = runs.library.texts, time.monotonic()
+    point = runs.fit(runs.start(), ())
+    best, waited = judged(point, (), began).score, 0
+    while len(point.chosen) < most and waited < _PATIENCE and np.isfinite(point.loss):
+        began = time.monotonic()
+        count = min(_added_to(len(point.chosen)), most - len(point.chosen))
+        before, point = point, _grown(runs, point, count)
+        new = point.chosen[len(before.chosen) :]
+        if not new or not point.loss < before.loss:
+            break
+        rung = judged(point, [f"+ {texts[i]}" for i in new], began)
+        waited = 0 if rung.score < (1 - _BETTER) * best else waited + 1
+        best = min(best, rung.score)
 
-    def __init__(self, runs: TermRuns, folds: Blocks, told: Told) -> None:
-        self.runs, self.folds, self.told = runs, folds, told
-        self.rungs: list[Rung] = []
-        self.without: list[list[Point]] = []
-        """Of each rung, the points that were reached without each block."""
 
-    @property
-    def path(self) -> TermPath:
-        return TermPath(tuple(self.rungs), self.runs)
+def _grown(runs: TermRuns, point: Point, count: int) -> Point:
+    """With the terms more that lower the error most; the point itself where none does."""
+    nt = len(point.c)
+    known = [*range(nt), *(nt + i for i in point.chosen)]
+    new = [pick.column - nt for pick in forward(runs.equations(point), known, count, least=_LEAST)]
+    return runs.fit(point, (*point.chosen, *new)) if new else point
 
-    def step(self, place: int | None, count: int) -> bool:
-        """One step from a rung, or the first one; whether there was one."""
-        began, texts = time.monotonic(), self.runs.library.texts
-        before = None if place is None else self.rungs[place].point
-        point = _moved(self.runs, before, count)
-        old, new = set(() if before is None else before.chosen), set(point.chosen)
-        if before is not None and (new == old or (count > 0 and not point.loss < before.loss)):
-            return False
-        change = [f"+ {texts[i]}" for i in point.chosen if i not in old]
-        change += [f"− {texts[i]}" for i in sorted(old - new)]
-        start = [None] * len(self.folds.folds) if place is None else self.without[place]
-        reached, held = self.folds.along(start, count)
-        self.without.append(reached)
-        self.rungs.append(Rung(point, tuple(change), held, time.monotonic() - began, len(new)))
-        self.told(self.rungs[-1])
-        return True
 
-    def forward(self, most: int) -> None:
-        self.step(None, 0)
-        best, waited = self.rungs[0].score, 0
-        while (size := self.rungs[-1].size) < most and waited < _PATIENCE:
-            if not self.step(-1, min(_added_to(size), most - size)):
-                break
-            score = self.rungs[-1].score
-            waited = 0 if score < (1 - _BETTER) * best else waited + 1
-            best = min(best, score)
+def _most(folds: Blocks, size: int) -> float:
+    """How many terms lower the error on blocks without which they were picked; infinite where it falls up to `size`.
 
-    def backward(self) -> None:
-        """From the choice on, as long as what is left is as good."""
-        place = self.path.place
-        while self.rungs[place].size > 1 and self.path.place == place and self.step(place, -1):
-            place = len(self.rungs) - 1
+    0 where physics alone is as good.
+    """
+    points: Sequence[Point | None] = [None] * len(folds.folds)
+    rungs: list[Rung] = []
+    while size and (not rungs or rungs[-1].size < size):
+        before = rungs[-1].size if rungs else 0
+        count = min(_added_to(before), size - before) if rungs else 0
+        points, held = folds.along(points, count)
+        rungs.append(Rung(Point((), held, held), (), held, 0.0, before + count))
+    if not size or judge_all(rungs)[0].chosen:
+        return 0
+    best = min(rungs, key=lambda rung: rung.score).size
+    return best if best < size else np.inf
+
+
+def _backward(path: TermPath, judged: Any) -> None:
+    """From the choice on, as long as what is left is as good."""
+    runs, rung = path.runs, path.chosen
+    nt, texts = len(rung.point.c), runs.library.texts
+    while rung.size > 1 and path.chosen is rung:
+        began, point = time.monotonic(), rung.point
+        equations = runs.equations(point)
+        own = equations.of([*range(nt), *(nt + i for i in point.chosen)]).scaled()
+        inverse = np.linalg.pinv(own.hessian, rcond=1e-13, hermitian=True)
+        missed = (inverse @ own.right)[nt:] ** 2 / np.maximum(np.diag(inverse)[nt:], 1e-300)
+        gone = point.chosen[int(np.argmin(missed))]
+        left = tuple(i for i in point.chosen if i != gone)
+        p = equations.of([*range(nt), *(nt + i for i in left)]).solve()  # the others take over what it did
+        point = runs.fit(point._replace(chosen=left, c=p[:nt], w=p[nt:]), left)
+        rung = judged(point, [f"− {texts[gone]}"], began)
+        path = replace(path, rungs=(*path.rungs, rung))
 
 
 def _parts(runs: TermRuns, point: Point) -> list[Equations]:
