@@ -14,7 +14,7 @@ from orthaug import MLP, LevenbergMarquardt
 from orthaug._base.jax import jax, jnp
 from orthaug.fitting.normal_equations import Hold, OneStep
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.solvers.compiled import Options, _advance, _start
+from orthaug.fitting.solvers.compiled import Options, _advance, _begun, linearise
 from orthaug.models.rows import Overlap
 from orthaug.physics.problem import pose
 from orthaug.studies import synthetic
@@ -41,7 +41,7 @@ def main() -> None:
         @jax.jit
         def batched(ws: object, criterion=criterion, arguments=arguments, overlap=overlap, options=options) -> object:
             def one(w: object) -> object:
-                state = _start(criterion, w, arguments, overlap, jnp.asarray(0.0))
+                state = _begun(w, linearise(criterion, w, arguments, overlap), jnp.asarray(0.0))
                 return _advance(criterion, state, arguments, options, jnp.asarray(ITERATIONS))
 
             return jax.vmap(one)(ws)  # noqa: B023

@@ -26,8 +26,7 @@ from orthaug._base.errors import InputError
 from orthaug.commands.app import spec_text
 from orthaug.commands.app.gate import Gate
 from orthaug.commands.app.processes import Command, Desk
-from orthaug.commands.app.session import Session
-from orthaug.commands.app.sessions import Sessions
+from orthaug.commands.app.session import Session, Sessions
 from orthaug.commands.app.worker import thinned
 from orthaug.commands.parts import expanded
 
@@ -114,7 +113,7 @@ def test_forms_change_a_spec_and_nothing_else(tmp_path):
     steps = ("data", "prepare")
     spec = spec_text.with_row(SPEC, steps, {"step": "detrend"})
     spec = spec_text.with_row(spec, steps, {"step": "lowpass", "cutoff": 2.0})
-    spec = spec_text.with_cell(spec, steps, 1, "order", 2)
+    spec = spec_text.with_told(spec, steps, 1, "order", "2")
     assert spec_text.rows_of(spec, steps) == [{"step": "detrend"}, {"step": "lowpass", "cutoff": 2.0, "order": 2}]
     spec = spec_text.without_row(spec_text.without_row(spec, steps, 0), steps, 0)
     assert tomllib.loads(spec) == tomllib.loads(SPEC) and "# kept too" in spec
@@ -219,6 +218,7 @@ class Server:
 
     def __init__(self, folder: Path, *arguments: object) -> None:
         setting = {k: v for k, v in os.environ.items() if k != "PYTEST_CURRENT_TEST"} | {"TMPDIR": str(folder)}
+        setting |= {"XDG_STATE_HOME": str(folder / "state")}
         program = [sys.executable, "-c", MAIN, "app", "--no-browser", *map(str, arguments)]
         pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
         self.process = subprocess.Popen(program, cwd=folder, env=setting, **pipes)
@@ -352,7 +352,8 @@ def test_from_a_file_to_code_with_the_numbers_of_the_command_line(server, browse
     page.get_by_role("tab", name="Data").focus()
     page.keyboard.press("ArrowRight")
     assert page.evaluate("document.activeElement.innerText.trim()") == "Model"
-    page.get_by_label("add a step").select_option("detrend")
+    page.get_by_label("step to add").select_option("detrend")
+    page.get_by_role("button", name="Add", exact=True).click()
     page.wait_for_selector("text=Done: detrend")
     tab.check("Model")
     assert page.get_by_text("Unit of").count() == 0
@@ -424,6 +425,158 @@ def test_from_a_file_to_code_with_the_numbers_of_the_command_line(server, browse
     tab.close()
 
 
+class Keys:
+    """A person at the keyboard: goes from control to control by Tab, and sees where the focus is."""
+
+    NOW = """() => {
+      const now = document.activeElement, box = now.getBoundingClientRect(), style = getComputedStyle(now);
+      const top = document.querySelector(".tabs").getBoundingClientRect().bottom;
+      const frame = now.closest(".q-field__control");
+      return {
+        name: now.ariaLabel ?? (now.closest(".card") === now ? now.querySelector("h2").innerText : now.innerText),
+        group: now.closest("[role=group]")?.ariaLabel ?? "",
+        lost: now === document.body,
+        seen: now.closest(".tabs, .drop") || (box.bottom > top && box.top < innerHeight),
+        marked: now.id === "dropped" || style.outlineStyle === "solid" || style.boxShadow !== "none" ||
+          (frame && getComputedStyle(frame, "::after").borderTopWidth === "2px"),
+      };
+    }"""
+
+    def __init__(self, page) -> None:
+        self.page, self.press = page, page.keyboard.press
+
+    def to(self, name: str, group: str = "", back: bool = False) -> None:
+        """Until the control has the focus; on the way each one is seen, and shows that it has it."""
+        for _ in range(60):
+            self.press("Shift+Tab" if back else "Tab")
+            now = self.page.evaluate(self.NOW)
+            if now["name"] == name and now["group"] == group:
+                assert now["seen"], now
+                self.page.wait_for_function(f"({self.NOW})().marked")  # a frame takes its colour in a moment
+                return
+        raise AssertionError(f"{name} is not reached by Tab")
+
+    def part(self, name: str, steps: str) -> None:
+        """Shift+Tab to the tabs, arrows, Enter."""
+        while self.page.evaluate("document.activeElement.role") != "tab":
+            self.press("Shift+Tab")
+        for step in steps.split():
+            self.press(step)
+        self.press("Enter")
+        self.page.wait_for_selector(f"[role=tab][aria-selected=true]:has-text('{name}')")
+
+    def write(self, text: str, first: str = "Control+a") -> None:
+        self.page.evaluate("document.querySelectorAll('.note').forEach(note => note.dataset.old = '1')")
+        self.press(first)
+        self.page.keyboard.type(text)
+        self.press("Enter")
+
+    def act(self, key: str, then: str) -> None:
+        """Press a key, after which this has the focus: another control, or the same drawn anew."""
+        self.page.evaluate("document.activeElement.dataset.left = '1'")
+        self.press(key)
+        there = f"(name) => ({self.NOW})().name === name && !document.activeElement.dataset.left"
+        self.page.wait_for_function(there, arg=then)
+
+    def checked(self, told: str) -> None:
+        """Until this stands in the spec, and the spec was checked."""
+        self.page.wait_for_function(
+            "(told) => document.querySelector('.editor textarea').value.includes(told)", arg=told
+        )
+        self.page.wait_for_selector(".note.good:not([data-old])")
+
+
+@browsed
+def test_the_whole_path_by_keyboard_alone(server, browser, csv, tmp_path):
+    (tmp_path / "rig.csv").write_text(csv.read_text().replace("u,y", "left,right"))
+    tab = Tab(browser, server)
+    page, keys = tab.page, Keys(tab.page)
+    page.keyboard.press("Tab")
+    keys.to("or its path on this machine")
+    keys.write(str(tmp_path / "rig.csv"))
+    page.wait_for_selector("text=use of left")
+    keys.to("use of left")
+    keys.press("ArrowDown")
+    keys.to("use of right")
+    page.keyboard.type("output")
+    keys.to("Begin with these channels")
+    keys.act("Enter", "Begin anew with these channels")  # its label has changed, its place has not
+    page.wait_for_selector("text=Rows that are used")
+
+    # a choice by arrows adds nothing yet
+    keys.to("step to add")
+    page.keyboard.type("fill")
+    keys.to("Add")
+    keys.act("Enter", "Add")
+    page.wait_for_selector("text=Done: fill")
+    keys.to("rows at most", "step 1", back=True)
+    keys.write("2")
+    page.wait_for_selector("text=Done: fill (most 2")
+    keys.to("Remove step 1", "step 1")
+    keys.act("Space", "Preparation")  # the step has gone, so its card has the focus
+
+    keys.part("Model", "ArrowRight")
+    keys.to("Remove term 1", "term 1")
+    keys.act("Enter", "Remove term 1")  # of the next one
+    keys.to("Add a term")
+    keys.act("Enter", "Add a term")
+    last = f"term {page.locator('.term').count()}"
+    for key, told in (("unit", "1"), ("regressor", "left[k-1]*right[k-1]"), ("parameter", "own")):
+        keys.to(key, last, back=True)
+        keys.write(told)
+    keys.checked('regressor = "left[k-1]*right[k-1]"')
+    keys.to("learner")
+    keys.act("ArrowDown", "learner")
+    page.wait_for_selector("text=highest degree")
+    keys.act("ArrowUp", "learner")
+    keys.to("starts")
+    keys.write("200")
+    keys.to("iterations")
+    keys.write("4000")
+    keys.checked("iterations = 4000")
+    keys.to("spec in TOML")
+    keys.write("# by hand", "Control+End")
+    keys.checked("# by hand")
+
+    keys.part("Training", "ArrowRight")
+    keys.to("Train")
+    keys.act("Enter", "Train")  # the card: the button is off now
+    page.wait_for_selector("text=iteration")
+    keys.to("Stop")
+    keys.act("Enter", "Train")
+    page.wait_for_selector("text=Training was stopped")
+    keys.part("Model", "ArrowLeft")
+    for key, told in (("starts", "1"), ("iterations", "3")):
+        keys.to(key)
+        keys.write(told)
+    keys.checked("iterations = 3")
+    keys.part("Training", "ArrowRight")
+    for name, told in (("Train", "Training is done"), ("Compare structures", "Comparison is done")):
+        keys.to(name)
+        keys.act("Enter", "Train")
+        page.wait_for_selector(f"text={told}")
+
+    keys.part("Report", "ArrowRight")
+    frame = page.frame_locator("iframe")
+    frame.locator("h1").wait_for()
+    keys.to("report")
+    keys.act("ArrowDown", "report")
+    frame.locator("a:has-text('Models')").wait_for()
+    keys.to("Download")
+    keys.press("Tab")
+    page.wait_for_function("document.activeElement.tagName === 'IFRAME'")
+    while page.evaluate("document.activeElement.tagName") == "IFRAME":
+        keys.press("Tab")  # and out of it again
+    keys.part("Export", "ArrowRight")
+    for target in ("c", "casadi"):
+        keys.to(f"Write {target}")
+        keys.act("Enter", f"{target}.zip")
+        with page.expect_download() as came:
+            keys.press("Enter")
+        assert f"{target}/README.md" in zipfile.ZipFile(came.value.path()).namelist()
+    tab.close()
+
+
 @browsed
 def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
     tab = Tab(browser, server)
@@ -453,7 +606,8 @@ def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
     tab.go("Model")
     kept = tab.write(lambda _: broken.replace("[learner", "[learner]"))
     tab.go("Data")
-    page.get_by_label("add a step").select_option("lowpass")
+    page.get_by_label("step to add").select_option("lowpass")
+    page.get_by_role("button", name="Add", exact=True).click()
     page.wait_for_selector("text=Done: lowpass (cutoff 0.1")
     page.get_by_label("cutoff").fill("2")
     page.get_by_label("cutoff").press("Enter")
@@ -466,6 +620,8 @@ def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
     assert tomllib.loads(added)["data"]["tests"].pop("own") == {"files": ["own.csv"]} and kept.splitlines()[0] in added
     assert tab.get("spec.toml?show=true").headers["content-disposition"][:10] == "attachment"
     assert tab.fetch("../x") and tab.get("result.zip").status == 404
+    gone = tab.context.request.get(f"{server.base}session/absent")
+    assert gone.status == 404 and "not open any more" in gone.text()
     tab.close()
 
 
@@ -501,6 +657,51 @@ def test_a_wrong_sampling_time_is_told_under_it_and_takes_nothing_away(server, b
     page.go_forward()
     page.wait_for_selector("[role=tab][aria-selected=true]:has-text('Model')")
     tab.close()
+
+
+def test_the_latest_specs_are_kept_whole(tmp_path, monkeypatch):
+    monkeypatch.setattr("platformdirs.user_state_path", lambda name: tmp_path / name)
+    for i in range(25):
+        spec_text.keep("rig.csv", f"{i:012d}"[::-1], f"restarts = {i}")
+        os.utime(spec_text.earlier()[0], (i, i))
+    spec_text.keep("rig.csv", f"{24:012d}"[::-1], "restarts = 99")
+    kept = spec_text.earlier()
+    assert len(kept) == 20 and kept[0].read_text() == "restarts = 99"
+    assert {spec_text.kept_title(place) for place in kept} == {"rig.csv"}
+    assert [file.suffix for file in kept[0].parent.iterdir()] == [".toml"] * 20
+    monkeypatch.setattr("platformdirs.user_state_path", lambda name: kept[0])  # no folder
+    spec_text.keep("rig.csv", "key", "restarts = 1")
+    assert spec_text.earlier() == []
+
+
+@browsed
+def test_the_spec_of_a_server_that_was_killed_is_offered_by_the_next(browser, csv, tmp_path):
+    killed = Server(tmp_path)
+    tab = Tab(browser, killed)
+    assert "earlier work" not in tab.page.inner_text("body")
+    tab.drop(csv)
+    tab.go("Model")
+    spec = tab.write(lambda text: text.replace("restarts = 3", "restarts = 7").replace("[learner]", "[learner"))
+    assert '"plant.csv"' in spec and "Broken TOML" in tab.page.inner_text(".note.bad")
+    killed.process.kill()
+    killed.process.communicate()
+    tab.context.close()
+    assert [p.stat().st_mode & 0o77 for p in (tmp_path / "state").rglob("*")] == [0, 0, 0]
+
+    server = Server(tmp_path)
+    tab = Tab(browser, server)
+    tab.page.get_by_role("button", name="plant.csv, 20").click()
+    tab.go("Model")
+    tab.page.wait_for_selector("text=Broken TOML")
+    assert tab.page.get_by_label("spec in TOML").input_value() == spec
+    tab.write(lambda text: text.replace("[learner", "[learner]"))
+    assert "plant.csv: no such file" in tab.page.inner_text(".note.bad")  # what was dropped is dropped again
+    tab.go("Data")
+    tab.drop(csv)
+    tab.go("Model")
+    tab.page.wait_for_selector(".note.good")
+    tab.close()
+    server.end()
 
 
 @browsed

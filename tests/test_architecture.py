@@ -310,3 +310,19 @@ def test_every_name_of_a_face_is_there(room: str) -> None:
         assert getattr(face, name) is not None
     if not room:
         assert set(orthaug.__all__) >= {"estimate", "Record", "Baseline", "load", "synthetic"}
+
+
+def _imported(path: Path) -> Iterator[tuple[str, str]]:
+    """Modules and names of orthaug that a program imports."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "orthaug":
+            yield from ((node.module or "", alias.name) for alias in node.names)
+
+
+@pytest.mark.parametrize("folder", ["benchmarks", "examples"])
+def test_programs_beside_the_package_import_what_is_there(folder: str) -> None:
+    """Most of them run by command only."""
+    for path in sorted((SOURCE.parents[1] / folder).glob("*.py")):
+        for module, name in _imported(path):
+            found = importlib.import_module(module)
+            assert hasattr(found, name) or importlib.import_module(f"{module}.{name}"), (path.name, module, name)

@@ -114,24 +114,16 @@ def test_the_solver_of_scipy_agrees():
 @pytest.mark.parametrize(
     ("solver", "ny"), [(LevenbergMarquardt(8), 1), (LevenbergMarquardt(8), 2), (AdamLBFGS(5, 5), 2)], ids=str
 )
-def test_orthogonal_structure_is_bounded_least_squares(ny, solver):
-    found = estimate(record(ny), physics(BOX, ny), learner=MLP(hidden=(3,)), structure=Orthogonal(), solver=solver)
-    np.testing.assert_allclose(found.theta, bounded(*raw_rows(ny), *limits(BOX)), rtol=1e-9)
-    np.testing.assert_array_equal(found.model.theta_aux[[0, 2]], 0.0)
-    assert set(found.at_bound) == {"a", "c"} and found.defect < 1e-12
-
-
-@pytest.mark.parametrize("solver", [LM, GRADIENT], ids=["lm", "adam-lbfgs"])
-def test_the_learner_of_an_orthogonal_structure_is_that_beside_a_fixed_term(solver):
-    found = joint(Orthogonal(), solver)
-    terms = [
-        Term(t.parameter, t.regressor, found.at_bound.get(t.parameter, t.initial), fixed=t.parameter in found.at_bound)
-        for t in physics().terms
+def test_orthogonal_structure_is_bounded_least_squares_and_its_learner_does_not_know(ny, solver):
+    both = [
+        estimate(record(ny), physics(box, ny), learner=MLP(hidden=(3,)), structure=Orthogonal(), solver=solver)
+        for box in (BOX, {})
     ]
-    known = estimate(record(), Baseline.from_terms(terms), learner=LINEAR, solver=LM, regularization="none")
-    both = [fit.model.predict(record()).trajectories[0].model for fit in (found, known)]
-    np.testing.assert_allclose(both[0], both[1], atol=1e-5 if solver is GRADIENT else 1e-9)
-    np.testing.assert_allclose(found.theta[1], known.theta[0], rtol=1e-10)
+    np.testing.assert_allclose(both[0].theta, bounded(*raw_rows(ny), *limits(BOX)), rtol=1e-9)
+    np.testing.assert_array_equal(both[0].model.numbers.weights, both[1].model.numbers.weights)
+    np.testing.assert_array_equal(both[0].model.theta_aux, both[1].model.theta_aux)
+    assert both[0].defect < 1e-12
+    assert set(both[0].at_bound) == {"a", "c"} and not both[1].at_bound
 
 
 # --- where θ does not decouple: the joint problem of a learner that is linear in its weights

@@ -16,8 +16,10 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.structures import Orthogonal
 from orthaug.inference.measures import Training, Uniform, weigh_problem
 from orthaug.models.learners import MLP
+from orthaug.models.terms import Terms
 from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.parameters import PhysicalParameter, PhysicsMap
 from orthaug.physics.problem import pose
@@ -111,6 +113,66 @@ def test_a_declared_suspect_comes_first_and_learner_inputs_are_named_where_they_
     assert stiffness.value == pytest.approx(fit.theta[:2].sum() - 0.7, rel=0.3)
     (warning,) = found.warnings
     assert f'set learner.inputs = ["{VELOCITY}"] for' in warning.text and "s" in warning.text.rpartition("for ")[0]
+
+
+@cache
+def hardening():
+    """y = 2u + u³: the gain has taken 0.6 of the cubic."""
+    rng = np.random.default_rng(0)
+    u = rng.uniform(-1, 1, 300)
+    record = Record.from_arrays(u, 2 * u + u**3 + 0.05 * rng.normal(size=300))
+    gain = Baseline.from_terms([Term("gain", "u[k]")])
+    return estimate(record, gain, learner=Terms(("u[k]**3",)), structure=Orthogonal(shared="all"))
+
+
+def told_of(text, **limits):
+    """The budget's rows of the gain and of p, and its codes, where gain = text."""
+    physics = PhysicsMap.of([PhysicalParameter("p", 0.4, **limits)], {"gain": text})
+    found = bias_budget(hardening(), [Suspect("cubic", "u[k]**3")], physics=physics)
+    return found.of("gain"), found.of("p"), [warning.code for warning in found.warnings]
+
+
+def test_an_interval_of_a_physical_parameter_is_that_of_theta_mapped():
+    gain, p, codes = told_of("1/p", min=0)
+    assert p.ci95 == pytest.approx([1 / gain.ci95[1], 1 / gain.ci95[0]], rel=1e-8) and codes == ["biased"]
+    assert p.ci95[0] < 0.5 < p.ci95[1] and p.value == pytest.approx(1 / hardening().theta[0] - 0.5, abs=0.01)
+    centre = 1 / np.mean(gain.ci95)
+    for limits in ({"max": 0.999 * centre}, {"max": 1.001 * centre}):
+        assert told_of("1/p", min=0, **limits)[1].ci95 == pytest.approx([1 / gain.ci95[1], limits["max"]])
+
+
+def test_theta_without_physical_parameters_gives_bounds_or_no_interval():
+    gain, _, _ = told_of("1/p")
+    inside, above = gain.ci95[0] + 0.002, gain.ci95[1] + 0.002
+    for limit, named in ((inside, True), (above, False)):  # no p has a smaller gain than that
+        _, p, codes = told_of(f"{limit!r} + 0.01/p", min=0)
+        assert codes == ["biased", "physics_not_met"] and (p is not None) == named and (p is None or p.ci95 is None)
+    _, p, codes = told_of(f"{inside!r} + 0.01/p", min=0, max=7.0)
+    assert p.ci95 == pytest.approx([0.01 / (gain.ci95[1] - inside), 7.0]) and codes == ["biased"]
+
+
+@pytest.mark.parametrize("missing", ["coulomb", "tanh", "cubic"])
+def test_what_is_missing_of_a_speed_is_named_or_told_with_what_explains_as_much(missing):
+    """One lag: friction, friction that turns round slowly as a saturation does, and hardening, each as what it is."""
+    form = {
+        "coulomb": lambda v: 0.05 * np.sign(v),
+        "tanh": lambda v: 0.1 * np.tanh(v / 0.4),
+        "cubic": lambda v: 0.1 * v**3,
+    }
+    rng = np.random.default_rng(0)
+    u, y = np.repeat(rng.uniform(-1, 1, 188), 8)[:1500], np.zeros(1500)
+    for k in range(1, 1500):
+        y[k] = 0.9 * y[k - 1] + 0.3 * u[k - 1] - form(y[k - 1]) + 0.003 * rng.normal()
+    physics = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "u[k-1]")])
+    solver, learner = LevenbergMarquardt(100), MLP((8,), inputs=("y[k-1]",))
+    found = bias_budget(estimate(Record.from_arrays(u, y), physics, learner=learner, solver=solver))
+    (low, high), text = found.of("a").ci95, found.warnings[0].text
+    assert low < 0.9 < high
+    if missing == "tanh":
+        assert "dead_zone of y[k-1]" in text and "saturation of y[k-1]" in text and "coulomb" not in text
+        assert "explains as much and would move them elsewhere" in text
+    else:
+        assert text.startswith(f"{missing} of y[k-1] explains") and found.share > 0.99 and high - low < 0.01
 
 
 def tank(rows=1500, zone=0.0):

@@ -455,6 +455,16 @@ def test_several_files_are_one_measure(inside):
     assert found["measure_detail"]["points"] == 118 + 58
 
 
+@pytest.mark.parametrize("files", [["steps.csv"], ["run.csv", "steps.csv"]])
+def test_a_split_of_other_files_is_warned_of(inside, files):
+    """By their checksums, whatever the name: a copy of the training file is it."""
+    (told,) = finite_json(run("split", "out/model", *files, "--json").out)["warnings"]
+    assert told["code"] == "other_training_data" and "trained on run.csv; by" in told["text"]
+    assert f"given ({', '.join(files)})" in told["text"]
+    Path("copy.csv").write_bytes(Path("run.csv").read_bytes())
+    assert finite_json(run("split", "out", "copy.csv", "--json").out)["warnings"] == []
+
+
 def test_the_measure_of_the_spec_is_that_of_split(inside, tmp_path):
     text = (
         SPEC.replace('kind = "none"\n', MLP)

@@ -14,8 +14,8 @@ from orthaug.commands.spec import load_spec
 from orthaug.data.expressions import parse_named
 from orthaug.physics.motion import Output, State
 from orthaug.selection.added_physics import Added, added_to_motion
-from orthaug.selection.explained_ground import MotionResponse
-from orthaug.selection.explaining import _written
+from orthaug.selection.explained_ground import MotionResponse, _moved, ground_of
+from orthaug.selection.explaining import _written, candidates_of
 
 ROWS = 600
 SPEC = """
@@ -103,6 +103,25 @@ def test_a_function_from_another_toolbox_is_explained_as_it_is():
     assert [moved.value_with for moved in told.parameters] == pytest.approx(list(TRUE.values()))
 
 
+def test_of_a_level_a_root_is_tried_and_no_friction_and_of_a_velocity_the_reverse():
+    rng = np.random.default_rng(4)
+    kinds = {}
+    for low in (0.0, -1.0):
+        u, y = rng.uniform(low, 1, ROWS), np.zeros(ROWS)
+        for k in range(1, ROWS):
+            y[k] = 0.8 * y[k - 1] + 0.5 * u[k - 1] - 0.1 * np.sign(y[k - 1]) * np.sqrt(abs(y[k - 1]))
+        baseline = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("g", "u[k-1]")])
+        plant = lambda x: (x @ [0.8, 0.5] - 0.1 * np.sign(x[:, 0]) * np.sqrt(np.abs(x[:, 0])))[:, None]  # noqa: E731
+        fit = oa.orthogonalize(oa.Record.from_arrays(u, y), baseline, plant)
+        tried = candidates_of(ground_of(fit.model, fit.problem.record), 2, (), ())
+        kinds[low] = {one.kind for one in tried if one.on == "y[k-1]"}
+        if low == 0.0:
+            (term,) = oa.explain(fit).terms
+            assert term.expression == "sign(y[k-1])*sqrt(abs(y[k-1]))" and term.coefficient == pytest.approx(-0.1)
+    assert kinds[0.0] ^ kinds[-1.0] == {"square_root", "coulomb", "stribeck", "stribeck_gauss"}
+    assert "square_root" in kinds[0.0] and "coulomb" in kinds[-1.0]
+
+
 def friction(rows: int = 2000) -> oa.Record:
     """A mass of 1 kg on 2 N s/m and 100 N/m, with Coulomb friction of 0.8 N that starts at 1.6 N (backward Euler)."""
     step, rng = 0.01, np.random.default_rng(3)
@@ -170,6 +189,15 @@ def test_the_response_of_a_motion_has_its_transpose(half):
     terms, values = rng.normal(size=(7, 3, 2)), rng.normal(size=(7, 4))
     back = np.einsum("mnk,mnj->kj", response.adjoint(values), terms)
     assert back == pytest.approx(values.T @ response.forward(terms))
+
+
+def test_a_step_of_parameters_ends_at_their_bounds_but_at_no_zero_that_is_divided_by():
+    parameters = [oa.PhysicalParameter("c", 0.5, min=0), oa.PhysicalParameter("m", 2.0, min=0, max=3.0)]
+    motion = oa.Motion.from_equations([State("v", "(u - c*v)/m")], [Output("y", "v")], parameters, ["u"])
+    x, u, q = np.ones((3, 1)), np.ones((3, 1)), motion.coordinates.of([0.5, 2.0])
+    assert _moved(motion, q, np.array([-0.4, 0.1]), x, u) == pytest.approx([0.3, 2.2])
+    assert _moved(motion, q, np.array([-1.1, 0.6]), x, u) == pytest.approx([0.0, 3.0])
+    assert _moved(motion, q, np.array([0.0, -1.1]), x, u) == pytest.approx([0.5, 2.0 * np.exp(-1.1)])
 
 
 @pytest.fixture(scope="module")

@@ -160,11 +160,22 @@ MODELS: dict[str, Callable[[], Model | MotionModel]] = {
         LINEAR, ("tanh(y[k-1])", "u[k-1]**2"), Terms(("tanh(y[k-1])", "u[k-1]**2")), ("y",), ("u",)
     ),
     "network": lambda: lagged(LINEAR, ("y[k-1]", "u[k-1]"), oa.MLP((16,)), ("y",), ("u",)),
+    "network of one input": lambda: lagged(LINEAR, ("y[k-1]",), oa.MLP((16, 1, 4)), ("y",), ("u",)),
     "physics alone, no feedback": lambda: lagged([oa.Term("a", "double[k]")], (), None, ("flag",), ("double",)),
+    "motion without inputs": lambda: moving(
+        oa.Motion.from_equations(
+            states=[oa.State("x", "v", start=0), oa.State("v", "9 - k*sin(x) - 0.3*v", start=0, learned=True)],
+            outputs=[oa.Output("y", "x")],
+            parameters=[oa.PhysicalParameter("k", 12.0)],
+        ),
+        ("v", "sin(x)"),
+        oa.MLP((3,)),
+    ),
     "motion, first-order hold": lambda: moving(
         spring(hold="first-order"), ("v", "x*u"), oa.MLP((5, 4), "silu"), substeps=2
     ),
     "motion, exact": lambda: moving(spring(integrator="exact"), ("v", "w"), oa.MLP((5,)), substeps=1),
+    "motion, one scaled input": lambda: moving(spring(), ("v/3",), oa.MLP((5,)), substeps=1),
     "motion, discrete, no inputs": lambda: moving(DISCRETE, substeps=1),
 }
 

@@ -201,17 +201,11 @@ def bounded(structure):
 
 
 def reparametrised(found, orthogonal):
-    """(residual, Jacobian) of the segments' errors over (θ, w), with `c = θ − Φ⁺F(w)` where θ is orthogonal.
-
-    What stands at a bound is a known term: Φ⁺ is that of the other columns.
-    """
+    """(residual, Jacobian) of the segments' errors over (θ, w), with `c = θ − Φ⁺F(w)` where θ is orthogonal."""
     problem = found.problem
     flown = FlightPlan.of(OneStepTask.of(problem, MLP((2,))), SMALL)
     phi = problem.baseline.phi(problem.rows.x, problem.layout, ("y",), np)[:, 0]
-    free = [i for i, name in enumerate(problem.baseline.names) if name not in found.at_bound]
-    pseudo = np.zeros_like(phi.T)
-    pseudo[free] = np.linalg.pinv(phi[:, free])
-    z = jnp.asarray(flown.task.scaling(problem.feature_rows()))
+    pseudo, z = np.linalg.pinv(phi), jnp.asarray(flown.task.scaling(problem.feature_rows()))
 
     def residual(p):
         theta, w = p[:3], p[3:]
@@ -243,8 +237,6 @@ def test_bounds_on_the_free_run(structure):
     start = np.concatenate([one_step.theta, np.asarray(one_step.model.numbers.weights)])
     low, high = (np.concatenate([side, np.full(len(w), end)]) for side, end in
                  zip(found.problem.baseline.bounds, (-np.inf, np.inf), strict=True))  # fmt: skip
-    if orthogonal:
-        low[0] = found.theta[0] - 1e-7  # held where it ended; scipy wants some room
     mine = np.sum(residual(at) ** 2)
     for begin in (at, start):
         other = scipy.optimize.least_squares(

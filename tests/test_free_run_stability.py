@@ -34,11 +34,11 @@ from orthaug.reports.findings import StabilityResult
 FEW = LevenbergMarquardt(iterations=5)
 
 
-def model_of(terms: list[Term], theta, outputs=("y",), largest: float = 10.0) -> Model:
+def model_of(terms: list[Term], theta, outputs=("y",), largest: float = 10.0, inputs=("u",)) -> Model:
     """Physics alone with a given θ; `largest` is its largest training output."""
     rng = np.random.default_rng(0)
     y = 20 * rng.normal(size=(500, len(outputs)))
-    record = Record.from_arrays(rng.normal(size=500), y, outputs=list(outputs))
+    record = Record.from_arrays(rng.normal(size=(500, len(inputs))), y, inputs=list(inputs), outputs=list(outputs))
     model = estimate(record, Baseline.from_terms(terms), learner=None).model
     numbers = model.numbers._replace(theta=np.asarray(theta, dtype=float))
     return replace(model, numbers=numbers, largest_output=np.full(len(outputs), largest))
@@ -287,6 +287,18 @@ def test_a_threshold_that_is_known():
     model = model_of([Term("c", "y[k-1]"), Term("a", "max(y[k-1] - 10, 0)"), Term("b", "u[k-1]")], [0.5, 10.0, 1.0])
     u = 3 + np.tile(np.repeat([1.0, -1.0], 50), 4)
     assert 2 < divergence_scaling(model, driven(model, u)) <= 2.1
+
+
+def test_a_model_without_inputs_has_none_to_scale():
+    """y[k] = a y[k-1] decays or explodes from where it starts."""
+    for a, says in (
+        (0.5, "stays within all bounds; it has no inputs"),
+        (3.0, "leaves all bounds from where it starts"),
+    ):
+        model = model_of([Term("a", "y[k-1]")], [a], inputs=[])
+        found = stability(model, Record.from_arrays(None, np.ones(60)))
+        assert says in found.text and "deviations from their means" not in found.text
+        assert ("small_margin" in dict(found.warnings)) == (a > 1)
 
 
 def test_small_margin_warns(duffing):

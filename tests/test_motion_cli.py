@@ -152,6 +152,14 @@ def test_a_fit_finds_mass_and_stiffness_beside_the_friction(result):
     assert rows["c"]["value"] > C + 5 * rows["c"]["std"]  # the nearest viscous friction has a share of Coulomb's
 
 
+def test_what_a_learner_that_helps_may_hold_of_a_parameter_is_told_where_no_suspect_is_declared(printed, result):
+    assert result["validation"]["verdict"] == "helps" and [p["name"] for p in result["parameters"] if p["shared"]] == [
+        "c"
+    ]
+    told = " ".join(printed.split())
+    assert "No suspect explains half of what the learner found: a part of that may belong to c, and" in told
+
+
 def test_a_result_has_what_a_motion_has_and_null_for_the_rest(result):
     status = result["status"]
     assert status["loss"] < 0.5 * status["start_loss"]
@@ -421,6 +429,7 @@ def test_suspects_are_weighed_before_a_fit_and_after_it(folder, result):
     assert rows["c"]["ci95_with_bias"][0] < C < rows["c"]["ci95_with_bias"][1] < rows["c"]["ci95"][0]
     assert rows["c"]["bias"]["cause"] == "friction"
     assert rows["m"]["ci95_with_bias"] == pytest.approx(rows["m"]["ci95"], rel=1e-3)
+    assert "No suspect explains" not in out
     assert "of what the learner found is friction" in out and "biased" in [w["code"] for w in told["warnings"]]
     assert (folder / "suspects" / "figures" / "bias.png").exists()
 

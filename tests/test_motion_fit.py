@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from orthaug.data.expressions import parse_named
 from orthaug.inference.motion_split import shared_of_motion
 from orthaug.models.learners import Bound
 from orthaug.models.moving import Moving
+from orthaug.selection.explained_ground import ground_of
 
 TS = 0.05
 WHOLE = oa.Simulation(0, 0)
@@ -101,6 +104,22 @@ def test_mass_and_stiffness_are_told_from_a_learner_of_the_velocity(fitted: oa.M
     alone = oa.estimate(data(), spring(), learner=None, criterion=WHOLE)
     assert fitted.status.loss < 0.1 * alone.status.loss and fitted.status.start_loss == alone.status.loss
     assert fitted.defect is not None and fitted.defect < 1e-8
+
+
+def test_on_its_training_data_a_motion_does_not_extrapolate(fitted: oa.MotionEstimate, tmp_path) -> None:
+    """What training reached is that of the fitted run; the learner is scaled over that of physics alone."""
+    oa.save(fitted.model, tmp_path / "model")
+    for model in (fitted.model, oa.load(tmp_path / "model")):
+        assert isinstance(model, oa.MotionModel)
+        (run,) = model.simulate(data()).trajectories
+        assert run.outside is not None and not run.outside.any()
+        assert ground_of(model, data()).outside == 0
+        (wider,) = model.simulate(oa.Record.from_arrays(u=100 * np.ones(40), sampling_time=TS), "zero").trajectories
+        assert wider.outside is not None and wider.outside.any()
+    before = replace(fitted.model, seen=None)  # as a file of an earlier version gives it
+    oa.save(before, tmp_path / "before")
+    (run,) = oa.load(tmp_path / "before").simulate(data()).trajectories
+    assert run.outside is not None and run.outside.any()
 
 
 def test_the_damping_is_that_of_the_nearest_physics(fitted: oa.MotionEstimate) -> None:
@@ -310,6 +329,7 @@ def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(fitted:
     alone = oa.estimate(data(), spring(), learner=None, criterion=WHOLE)
     found = diagnose_motion(alone, alone.model.simulate(data()))
     assert found is not None and found.verdict == "unmodelled" and found.predictable[0].own_past > 0.5
+    assert "Intervals count noise alone" in dict(found.warnings)["coloured_residual"]
     assert found.missing is not None and found.missing.p < 1e-4
     term = found.missing.terms[0]
     assert (term.equation, term.variable, term.shape) == ("v", "v", "jump") and term.share > 0.5

@@ -85,6 +85,14 @@ def test_a_term_that_the_learner_sees_moves_what_it_could_imitate_alone(learned:
     assert hardening.explained < 0.1
 
 
+def test_explain_tells_the_parameters_with_the_term_in_the_physics(learned: oa.MotionEstimate) -> None:
+    """c is fitted as a logarithm: a step of that as long as the bias would end at 0.83."""
+    told = oa.explain(learned, suspects=[FRICTION])
+    assert [term.expression for term in told.terms] == [FRICTION.expression]
+    assert [moved.value_with for moved in told.parameters] == pytest.approx(TRUTH, rel=0.005)
+    assert told.physics.initial[1] == pytest.approx(TRUTH[1], rel=0.005)
+
+
 def test_what_the_learner_does_not_see_biases_as_data_with_it(learned: oa.MotionEstimate) -> None:
     _, hardening = oa.suspected_bias(learned, SUSPECTS)
     assert refitted(learned, 0.6, 0.05) == pytest.approx(hardening.per_unit, rel=0.05)

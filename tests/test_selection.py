@@ -131,6 +131,20 @@ def test_where_nothing_helps_nothing_is_chosen():
     assert one.nonlinearity is not None and not one.nonlinearity.found
 
 
+@pytest.mark.parametrize("seed", [2, 12, 15])
+def test_blocks_judge_no_terms_that_they_helped_to_choose(seed):
+    """Noise in the equation of linear data looks like a term on the rows that it is picked on, and on no others."""
+    rng = np.random.default_rng(seed)
+    u, y = rng.normal(size=300), np.zeros(300)
+    for k in range(2, 300):
+        y[k] = 1.5 * y[k - 1] - 0.7 * y[k - 2] + 0.5 * u[k - 1] + 0.2 * u[k - 2] + 0.1 * rng.normal()
+    physics = oa.Baseline.from_terms(
+        [oa.Term(f"{s}{i}", f"{s}[k-{i}]") for s, i in itertools.product("yu", (1, 2))],
+    )
+    one = oa.select(oa.Record.from_arrays(u=u, y=y), physics, lags=LAGS, criterion=oa.Prediction(), most=MOST)
+    assert one.learner is None and len(one.terms.rungs) > 3
+
+
 @pytest.mark.parametrize(
     ("b", "a", "orders"),
     [

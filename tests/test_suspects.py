@@ -178,3 +178,14 @@ def test_a_difference_that_keeps_its_sign_has_no_friction(rising, named):
     problem = pose(record, Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("g", "u[k]")]))
     kinds = {suspect.name.split(" of ")[0] for suspect in usual_suspects(problem) if "y[k-1] - y[k-2]" in suspect.name}
     assert kinds == {"quadratic_drag", "cubic"} | ({"coulomb", "stribeck"} if named else set())
+
+
+@pytest.mark.parametrize(("shift", "lags", "named"), [(0, 1, True), (9, 1, False), (0, 2, False)])
+def test_friction_of_an_output_that_is_read_at_one_lag_and_changes_its_sign(shift, lags, named):
+    """A measured speed; a position has its velocity at two lags."""
+    rng = np.random.default_rng(2)
+    record = Record.from_arrays(rng.normal(size=60), rng.normal(size=60) + shift)
+    terms = [Term(f"a{lag}", f"y[k-{lag}]") for lag in range(1, lags + 1)]
+    problem = pose(record, Baseline.from_terms([*terms, Term("g", "u[k]")]))
+    names = [suspect.name for suspect in usual_suspects(problem)]
+    assert ("coulomb of y[k-1]" in names) == named and ("saturation of y[k-1]" in names) == (lags == 1)

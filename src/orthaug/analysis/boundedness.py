@@ -54,8 +54,17 @@ def divergence_scaling(model: Model | MotionModel, record: Record, largest: floa
     return _bisected(growing[high - 1], growing[high], diverges) if high else _below_one(diverges)
 
 
-def margin(factor: float | None, searched: float) -> tuple[str, str]:
-    """Such a factor, or that there is none up to `searched`, in a sentence; with the code of a warning, or nothing."""
+def margin(factor: float | None, searched: float, driven: bool) -> tuple[str, str]:
+    """Such a factor, or that there is none up to `searched`, in a sentence; with the code of a warning, or nothing.
+
+    A model that is not `driven`, by inputs, has none to scale: its own run leaves the bounds or does not.
+    """
+    if not driven:
+        stays = "stays within all bounds" if factor is None else "leaves all bounds from where it starts"
+        return (
+            f"The free run {stays}; it has no inputs that could be larger.",
+            "small_margin" if factor is not None else "",
+        )
     stays, times = ("stays within", searched) if factor is None else ("leaves", factor)
     told = f"The free run {stays} all bounds with the inputs' deviations from their means {times:.4g} times as large."
     return told, "small_margin" if factor is not None and factor < _MARGIN else ""

@@ -21,7 +21,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.lines import percent, plain_number
 from orthaug._base.warning import Warning
 from orthaug.analysis.bias import SuspectedBias
-from orthaug.analysis.measure_bias import Ground, physical_of
+from orthaug.analysis.measure_bias import Ground, physical_with_bias
 from orthaug.analysis.motion_bias import TermBias
 from orthaug.analysis.remedies import remedies
 from orthaug.analysis.suspects import Suspect, usual_suspects, usual_terms
@@ -134,21 +134,19 @@ def budget_on(ground: Ground, fit: Estimate, suspects: Sequence[Suspect]) -> Bud
     share, coefficient = cause.explained, cause.coefficient_found
     rest, bias = left_over(ground, cause, suspects), coefficient * np.array(cause.bias)
     std = np.full(len(bias), np.nan) if fit.std is None else fit.std
-    names, rows = ground.problem.baseline.names, ()
-
-    def told(names: Sequence[str], value: Vector, std: Vector, bias: Vector, rest: Vector) -> tuple[ParameterBias, ...]:
-        ends = with_bias(value, std, fit.freedom, bias, rest)
-        return parameter_biases(names, value, std, bias, ends, cause.suspect.name, share)
-
-    parameters = told(names, fit.theta, std, bias, rest[: len(names)])
+    ends = with_bias(fit.theta, std, fit.freedom, bias, np.linalg.norm(rest, axis=0))
+    names, why = ground.problem.baseline.names, (cause.suspect.name, share)
+    parameters, rows, warnings = parameter_biases(names, fit.theta, std, bias, ends, *why), (), []
     if ground.physics is not None:
         physical = fit.physical(ground.physics)
         own = np.array([np.nan if s is None else s for s in physical.std])
-        moved = _physical(ground.physics, fit, bias)
-        rows = told(physical.names, np.array(physical.value), own, moved, rest[len(names) :])
+        spread = rest.T @ rest + (0.0 if fit.covariance is None else fit.covariance)
+        moved, ends = physical_with_bias(ground, bias, fit.covariance, spread, fit.freedom)
+        rows = parameter_biases(physical.names, physical.value, own, moved, ends, *why)
+        warnings += _unbounded(physical.names, own, ends)
     found = Budget(cause, share, parameters, rows, ())
-    warning = _warning(ground, found, rival_of(ground, cause, suspects), near_causes(ground, cause, suspects))
-    return found if warning is None else replace(found, warnings=(warning,))
+    biased = _warning(ground, found, rival_of(ground, cause, suspects), near_causes(ground, cause, suspects))
+    return replace(found, warnings=(*([] if biased is None else [biased]), *warnings))
 
 
 def named_cause(ground: Ground, suspects: Sequence[Suspect], least: float = LEAST_SHARE) -> SuspectedBias | None:
@@ -187,13 +185,12 @@ def rival_of(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) 
         return None
     equal = [entry for entry in _usual(ground) if _explains(entry) >= AS_MUCH * cause.explained]
     to_coordinates, own = ground.weighed.projection.to_coordinates, _moved(cause)
-    nt = len(cause.names)
 
     def apart(entry: SuspectedBias) -> float:
-        return float(np.linalg.norm(to_coordinates @ (_moved(entry) - own)[:nt]))
+        return float(np.linalg.norm(to_coordinates @ (_moved(entry) - own)))
 
     farthest = max(equal, key=apart, default=None)
-    return farthest if farthest and apart(farthest) > 0.5 * np.linalg.norm(to_coordinates @ own[:nt]) else None
+    return farthest if farthest and apart(farthest) > 0.5 * np.linalg.norm(to_coordinates @ own) else None
 
 
 def near_causes(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) -> list[SuspectedBias]:
@@ -209,8 +206,8 @@ def near_causes(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect
     return list(best.values())[:_MOST_RIVALS]
 
 
-def left_over(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) -> Vector:
-    """Standard deviations of the bias that the cause does not tell, of θ and physical parameters.
+def left_over(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) -> Float[np.ndarray, "k nt"]:
+    """Standard deviations of the bias of θ that the cause does not tell: k directions, each of one unknown size.
 
     What it leaves of the learner counts as biased by as much for its size as the cause, of unknown sign; beside that by
     what the next best cause makes of it, and by how far a rival of the cause would move θ elsewhere.
@@ -218,15 +215,15 @@ def left_over(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect])
     assert cause.explained
     rest, others = ground.without(cause), tuple(suspect for suspect in suspects if suspect != cause.suspect)
     found = [best for group in {others, ()} if (best := named_cause(rest, group, 0.0)) is not None]
-    own = _moved(cause) * np.sqrt((1 - cause.explained) / cause.explained)
-    next_best = _moved(max(found, key=_explains)) if found else 0.0
+    rows = [_moved(cause) * np.sqrt((1 - cause.explained) / cause.explained)]
+    rows += [_moved(max(found, key=_explains))] if found else []
     rival = rival_of(ground, cause, suspects)
-    return np.sqrt(own**2 + next_best**2 + (0.0 if rival is None else _moved(rival) - _moved(cause)) ** 2)
+    return np.array([*rows, *([] if rival is None else [_moved(rival) - _moved(cause)])])
 
 
 def _moved(cause: SuspectedBias) -> Vector:
-    """What a cause of the size found makes of θ and, to first order, of the physical parameters."""
-    return (cause.coefficient_found or 0.0) * np.array([*cause.bias, *(bias for _, bias in cause.physical or ())])
+    """What a cause of the size found makes of θ."""
+    return (cause.coefficient_found or 0.0) * np.array(cause.bias)
 
 
 def with_bias(value: Vector, std: Vector, freedom: float, bias: Vector, rest: Vector) -> Float[np.ndarray, "n 2"]:
@@ -251,13 +248,13 @@ def parameter_biases(
     return tuple(found)
 
 
-def _physical(physics: PhysicsMap, fit: Estimate, bias: Vector) -> Vector:
-    """p of θ̂ less p of θ̂ without the bias; NaN where that has no p."""
-    try:
-        biased, free = (physical_of(physics, fit.problem, t, fit.covariance) for t in (fit.theta, fit.theta - bias))
-    except InputError:
-        return np.full(len(physics.names), np.nan)
-    return biased - free
+def _unbounded(names: Sequence[str], std: Vector, ends: Matrix) -> list[Warning]:
+    """Which physical parameters have an interval, but none with their bias."""
+    none = [name for name, s, e in zip(names, std, ends, strict=True) if np.isfinite(s) and not np.isfinite(e).all()]
+    if not none:
+        return []
+    told = f"no interval of {', '.join(none)} counts the bias: some theta within those that do have"
+    return [Warning("physics_not_met", f"{told} no physical parameters.")]
 
 
 def _warning(

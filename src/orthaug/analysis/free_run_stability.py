@@ -71,12 +71,12 @@ def stability(
     contracts = contraction(model, record, box=box, along=run)
     factor = divergence_scaling(model, record, largest)
     checks = Stability(run, contracts, factor, float(largest), gradients, (), "")
-    says = list(_sentences(checks))
+    says = list(_sentences(checks, bool(model.inputs)))
     warnings = tuple(Warning(code, sentence) for sentence, code in says if code)
     return replace(checks, warnings=warnings, text="\n".join(sentence for sentence, _ in says))
 
 
-def _sentences(checks: Stability) -> Iterator[tuple[str, str]]:
+def _sentences(checks: Stability, driven: bool) -> Iterator[tuple[str, str]]:
     """What the checks say, sentence by sentence; with the code of a warning, or nothing."""
     run, contracts = checks.feedback, checks.contraction
     if checks.lipschitz:
@@ -106,4 +106,4 @@ def _sentences(checks: Stability) -> Iterator[tuple[str, str]]:
         share = f"{percent(1 - contracts.share, 3)} of the {contracts.samples} sampled points"
         worst = f"worst at {contracts.worst}, rate {contracts.rate:.4g}"
         yield f"At {share} the free run does not contract in the best metric that was found, {worst}.", ""
-    yield margin(checks.diverges_at, checks.searched)
+    yield margin(checks.diverges_at, checks.searched, driven)

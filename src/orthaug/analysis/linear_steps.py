@@ -67,14 +67,13 @@ class LaggedStep:
         y = self.advance(numbers, self.state_at(rest, inputs), inputs)[1]
         return y - rest, y
 
-    def seen(self, numbers: Numbers, rest: Vector, inputs: Vector) -> Vector | None:
-        """The learner's features at rest, in [-1, 1] over the training data; None where that is not known."""
+    def seen(self, rest: Vector, inputs: Vector) -> Vector | None:
+        """The learner's features at rest; None where there is no telling what training reached of them."""
         if self.form.bound is None or not self.form.differentiable:
             return None
         now = dict(zip((*self.rest, *self.inputs), (*rest, *inputs), strict=True))
         x = np.array([[now[lag.channel] for lag in self.form.layout]])
-        z = np.asarray(self.form.features.evaluate(x, self.form.layout, np))[0]
-        return (z - numbers.centre) / numbers.halfwidth
+        return np.asarray(self.form.features.evaluate(x, self.form.layout, np))[0]
 
 
 @dataclass(frozen=True)
@@ -119,11 +118,10 @@ class MotionStep:
         rates, y = self.field(numbers, rest, inputs)
         return (rates if self.continuous else rates - rest), y
 
-    def seen(self, numbers: Numbers, rest: Vector, inputs: Vector) -> Vector | None:
+    def seen(self, rest: Vector, inputs: Vector) -> Vector | None:
         if self.form.bound is None or not self.form.differentiable:
             return None
-        z = np.asarray(self.form.seen(rest[:, None], inputs[:, None], np))[:, 0]
-        return (z - numbers.centre) / numbers.halfwidth
+        return np.asarray(self.form.seen(rest[:, None], inputs[:, None], np))[:, 0]
 
 
 Step = LaggedStep | MotionStep

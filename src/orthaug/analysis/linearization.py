@@ -16,7 +16,6 @@ from orthaug.analysis.linear_steps import (
     MotionStep,
     difference_widths,
     one_sided,
-    sizes_of,
     slope_along,
     slope_at,
     step_of,
@@ -94,7 +93,7 @@ def linearize(
     if record is not None and record.inputs:
         held = np.concatenate([experiment.inputs for experiment in record.experiments]).mean(axis=0)
     outputs = [channel.name for channel in model.outputs]
-    search = Search.of(step, model.numbers, sizes_of(model), outputs, given, held)
+    search = Search.of(step, model, outputs, given, held)
     points, warnings = operating_points(search)
     spread, told = _spread(model, fit)
     warnings += told

@@ -13,14 +13,16 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug.analysis.absorbed import Absorbed, absorbed
 from orthaug.analysis.bias import SuspectedBias, bias_table
 from orthaug.analysis.suspects import Suspect, suspect_columns, usual_suspects
+from orthaug.inference.covariance import reach
 from orthaug.inference.measures import Weighed
-from orthaug.inference.physical import solve
+from orthaug.inference.physical import PhysicalEstimate, solve
 from orthaug.physics.output_weights import times
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import Problem
 from orthaug.physics.shared import seen
 
 CERTIFIED_ROWS = 200_000  # of a measure at most, over which certificates are sought for suspects that no one named
+_ROUNDING = 1e-9  # of a parameter: an end of its interval that lies so little on the wrong side
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,9 +160,54 @@ def physical_slopes(
 
 def physical_of(physics: PhysicsMap, problem: Problem, theta: Vector, covariance: Matrix | None = None) -> Vector:
     """p of θ, weighted by its covariance where that is given."""
+    return _solved(physics, problem, theta, covariance).value
+
+
+def _solved(physics: PhysicsMap, problem: Problem, theta: Vector, covariance: Matrix | None) -> PhysicalEstimate:
     order = _order(physics, problem)
     covariance = None if covariance is None else covariance[np.ix_(order, order)]
-    return solve(physics, theta[order], covariance, freedom=np.inf).value
+    return solve(physics, theta[order], covariance, freedom=np.inf)
+
+
+def physical_with_bias(
+    ground: Ground, bias: Vector, covariance: Matrix | None, spread: Matrix, freedom: float
+) -> tuple[Vector, Matrix]:
+    """Biases of the physical parameters (np,), and ends (np, 2) of 95 % intervals that cover bias and noise.
+
+    The interval of p is that of θ in the direction in which p moves most, mapped: p of both of its ends, or p's bound
+    where an end has none. Biases are NaN where θ̂ less its bias has no p.
+
+    Args:
+        bias: of θ̂.
+        covariance: of θ̂, by which p is weighted; `spread` counts also what is not known of the bias.
+    """
+    physics, problem = ground.physics, ground.problem
+    assert physics is not None
+    centre, order = ground.theta - bias, _order(physics, problem)
+    now, free = (_solved(physics, problem, theta, covariance) for theta in (ground.theta, centre))
+    ends = np.full((len(free.value), 2), np.nan)
+    if not _met(free):
+        return ends[:, 0], ends
+    if free.sensitivities is None or covariance is None:
+        return now.value - free.value, ends
+    slopes, at_bounds = np.zeros((len(free.value), len(centre))), physical_slopes(physics, problem, centre)
+    assert at_bounds is not None
+    with np.errstate(all="ignore"):
+        slopes[:, order] = free.sensitivities * free.value[:, None] / centre[order]
+    for i, row in enumerate(slopes):
+        row = row if np.isfinite(row).all() and row.any() else at_bounds[0][physics.names[i]]
+        size = np.sqrt(row @ spread @ row)
+        step = reach(freedom) * spread @ row / (size if size > 0 else 1.0)
+        for side, sign in enumerate((-1.0, 1.0) if np.isfinite(step).all() else ()):
+            end = _solved(physics, problem, centre + sign * step, covariance)
+            beyond = sign * (end.value[i] - free.value[i]) >= -_ROUNDING * abs(free.value[i])
+            ends[i, side] = end.value[i] if _met(end) and beyond else physics.bounds[side][i]
+    return now.value - free.value, ends
+
+
+def _met(found: PhysicalEstimate) -> bool:
+    """Whether there is p that gives θ."""
+    return all(warning.code != "physics_not_met" for warning in found.warnings)
 
 
 def _order(physics: PhysicsMap, problem: Problem) -> list[int]:

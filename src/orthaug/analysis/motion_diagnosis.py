@@ -67,7 +67,7 @@ def diagnose_motion(fit: MotionEstimate, free_run: Response) -> Diagnosis | None
     verdict = "unmodelled" if told or late else "white" if white else "equation_noise"
     text = _words(verdict, fit, tests, shares, followed, curved, lacks, late)
     warnings = [one.warning for one in late]
-    warnings += [] if white else [Warning("coloured_residual", _COLOURED)]
+    warnings += [] if white else [Warning("coloured_residual", _COLOURED + (_UNCOUNTED if told else ""))]
     return Diagnosis(verdict, text, (), tests, None, None, tuple(warnings), shares, (), missing)
 
 
@@ -81,6 +81,7 @@ _COLOURED = (
     "the errors of the free run are coloured: held-out errors say how good the model is, and standard errors are "
     "robust only where there are rows enough."
 )
+_UNCOUNTED = " Intervals count noise alone: what is missing may have moved the parameters by more than that."
 
 
 def _predictable(i: int, test: ResidualTest, errors: list, inputs: list, every: int) -> Predictable:
@@ -109,8 +110,9 @@ def _words(
         return f"What the free run leaves ({sizes}) is white: noise on the outputs, which is what it is trained for."
     if verdict == "equation_noise":
         learner = "that the learner does not see" if fit.model.form.bound is not None else "(a learner would tell)"
+        no_input = "no input, " if fit.problem.motion.inputs else ""
         return (
-            f"What the free run leaves ({sizes}) is coloured ({_colour(tests, shares)}), and follows no input, no "
+            f"What the free run leaves ({sizes}) is coloured ({_colour(tests, shares)}), and follows {no_input}no "
             "state at the same instant, and no simple term that an equation could lack: disturbances, or physics "
             f"missing in an equation {learner}."
         )
@@ -125,10 +127,9 @@ def _words(
     what += [f"{name} is not flat over {', '.join(given)}" for name, given in curved.items()]
     what = what or [f"{100 * max(s.inputs for s in shares):.0f} % follows from the inputs"]
     learner = "let the learner see more" if fit.model.form.bound is not None else "add a learner where it acts"
-    return (
-        f"What the free run leaves ({sizes}) holds more than noise: {'; '.join(what)}. Physics is missing; {learner}, "
-        'try another hold of the inputs, or delay one (step = "shift" of data.prepare).'
-    )
+    holds = ', try another hold of the inputs, or delay one (step = "shift" of data.prepare)'
+    remedy = f"{learner}{holds if fit.problem.motion.inputs else ''}"
+    return f"What the free run leaves ({sizes}) holds more than noise: {'; '.join(what)}. Physics is missing; {remedy}."
 
 
 def _colour(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) -> str:

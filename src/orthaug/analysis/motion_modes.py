@@ -71,7 +71,7 @@ def motion_stability(model: MotionModel, x: Matrix, u: Matrix, record: Record | 
     if record is None or not record.inputs:
         return checks
     factor = divergence_scaling(model, record, _LARGEST)
-    told, code = margin(factor, _LARGEST)
+    told, code = margin(factor, _LARGEST, driven=True)
     text, warnings = f"{checks.text}\n{told}", (*checks.warnings, *((Warning(code, told),) if code else ()))
     return replace(checks, text=text, warnings=warnings, diverges_at=factor, searched=_LARGEST)
 

@@ -65,7 +65,8 @@ def sensitivities(
     form = course.dynamics
     runs = np.moveaxis(course.runs(numbers.theta, numbers.weights, fit.states), -1, 1)  # (k, m, T, n0)
     segments = [np.moveaxis(np.asarray(part), -1, 1) for part in course.segments[1:]]
-    x, u, target, scored = (part.reshape(-1, *part.shape[2:]) for part in (runs, *segments))
+    k, m = runs.shape[:2]
+    x, u, target, scored = (part.reshape(k * m, *part.shape[2:]) for part in (runs, *segments))
     n0, n, q = form.states, form.unknowns, count * len(equations)
     steps = min(x.shape[1], max(_NUMBERS // (target.shape[2] * (n0 + n + q)), 1))
     there = np.flatnonzero(scored[:, :steps].any(axis=1))

@@ -6,7 +6,7 @@ fixes are looked for with the rest.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,8 +16,10 @@ from jaxtyping import Bool, Float
 from orthaug._base.checks import Matrix, Vector, is_number, nearest
 from orthaug._base.errors import InputError, shown
 from orthaug._base.warning import Warning
-from orthaug.analysis.linear_steps import Step, at_rest, difference_widths
+from orthaug.analysis.linear_steps import Step, at_rest, difference_widths, sizes_of
 from orthaug.models.dynamics import Numbers
+from orthaug.models.model import Model
+from orthaug.models.motion_model import MotionModel
 
 _STARTS = 32  # points of a Halton sequence in the box of the training data, beside the middle
 _SOLVED = 1e-9  # of what is zero at rest over the starts
@@ -111,10 +113,12 @@ class Search:
     wanted: dict[int, float]
     middle: Vector
     """Where the search starts, of rest and inputs."""
+    beyond: Callable[[Matrix], Any]
+    """Where features (N, nz) lie outside of what training reached."""
 
     @classmethod
     def of(
-        cls, step: Step, numbers: Numbers, size: Vector, outputs: Sequence[str], at: Mapping[str, float], held: Vector
+        cls, step: Step, model: Model | MotionModel, outputs: Sequence[str], at: Mapping[str, float], held: Vector
     ) -> Search:
         """`held` (nu,) are the inputs that nobody fixes.
 
@@ -138,7 +142,8 @@ class Search:
         if not trims:
             given[ne:] = np.where(np.isnan(given[ne:]), held, given[ne:])
         middle = np.concatenate([np.zeros(ne), held])
-        return cls(step, numbers, size, given, wanted, np.where(np.isnan(given), middle, given))
+        middle = np.where(np.isnan(given), middle, given)
+        return cls(step, model.numbers, sizes_of(model), given, wanted, middle, model.beyond)
 
     @property
     def free(self) -> Bool[np.ndarray, "k"]:
@@ -261,9 +266,9 @@ def _point(search: Search, point: Vector) -> OperatingPoint:
     _, slope, y = search.equations(point)
     outputs = dict(zip(step.form.outputs, map(float, y), strict=True))
     values = dict(zip((*step.rest, *step.inputs), map(float, point), strict=True))
-    seen = step.seen(search.numbers, rest, inputs)
-    beyond = np.abs(seen) > 1 + 1e-9 if seen is not None else np.zeros(0, dtype=bool)
-    outside = bool(np.any(np.abs(rest) > search.size) or beyond.any())
+    seen = step.seen(rest, inputs)
+    beyond = seen is not None and bool(search.beyond(seen[None])[0])
+    outside = beyond or bool(np.any(np.abs(rest) > search.size))
     free = search.free
     scaled = slope[:, free] * search.scale[free]
     sizes = np.linalg.svd(scaled, compute_uv=False) if scaled.size else np.ones(1)
@@ -280,8 +285,10 @@ def _nothing(search: Search, starts: Matrix, unit: Vector) -> str:
     if not search.free.any():
         moves = ", ".join(search.step.rest)
         return f"the model does not rest{at}: {moves} would move. Fix less, so that the rest can be found."
+    found = f"no equilibrium was found{at}, from {len(starts)} starts: either the model"
+    if not search.step.inputs:
+        return f"{found} never rests, or these values exclude each other. Give others, or fix less."
     return (
-        f"no equilibrium was found{at}, from {len(starts)} starts: either the model integrates (it rests at other "
-        "inputs only), or these values exclude each other. Give other inputs, or data whose mean inputs are held, or "
-        "fix an output and leave inputs open."
+        f"{found} integrates (it rests at other inputs only), or these values exclude each other. Give other inputs, "
+        "or data whose mean inputs are held, or fix an output and leave inputs open."
     )

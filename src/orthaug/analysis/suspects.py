@@ -49,6 +49,7 @@ WIDTHS = tuple(kind for kind, entry in _KINDS.items() if entry.width)  # the kin
 ODD_JUMPS = ("coulomb", "stribeck", "stribeck_gauss")  # the kinds that jump where their argument changes sign
 _VELOCITY = ("coulomb", "stribeck", "quadratic_drag", "cubic")
 _POSITION = ("cubic", "dead_zone")
+_SINGLE = (*_POSITION, "saturation", "coulomb")  # of an output read at one lag only, which may be a velocity
 _CLEARLY = 0.05  # of the largest value
 _BELOW = 0.05  # of the largest value: what is only so far below 0 counts as positive, for it is noise
 _MULTIPLIED = 6  # lags at most, of which products are tried
@@ -271,9 +272,10 @@ def usual_suspects(problem: Problem) -> tuple[Suspect, ...]:
     for channel in dict.fromkeys(lag.channel for lag in layout):
         lags = sorted(lag for lag in layout if lag.channel == channel)
         first = str(lags[0])
-        pairs += [(kind, first) for kind in (_POSITION if channel in outputs else _INPUT)]
+        kinds = _POSITION if len(lags) > 1 else _SINGLE
+        pairs += [(kind, first) for kind in (kinds if channel in outputs else _INPUT)]
         values = problem.rows.x[:, layout.index(lags[0])]
-        if channel in outputs and values.min() >= -_BELOW * values.max():
+        if channel in outputs and is_level(values):
             pairs.append(("square_root", first))
         if channel in outputs and len(lags) > 1:
             pairs += [(kind, f"{first} - {lags[1]}") for kind in _VELOCITY]
@@ -294,6 +296,11 @@ def changes_sign(values: Vector) -> bool:
     """Whether values (N,) lie clearly on both sides of zero; otherwise what jumps there is as good as a constant."""
     edge = _CLEARLY * np.abs(values).max(initial=0.0)
     return bool(np.min(values, initial=0.0) < -edge and np.max(values, initial=0.0) > edge)
+
+
+def is_level(values: Vector) -> bool:
+    """Whether values (N,) are positive but for noise, so that a root of them may be missing."""
+    return bool(np.min(values) >= -_BELOW * np.max(values))
 
 
 def usual_terms(problem: Problem) -> tuple[Suspect, ...]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from orthaug._base.errors import InputError
 from orthaug._base.folders import check_new_file, check_replaceable, whole_file
@@ -31,6 +32,13 @@ def not_a_result(folder: Path, names: Sequence[str]) -> str | None:
     except (OSError, ValueError, RecursionError):
         ours = False
     return (strange or [None if ours else names[0]])[0]
+
+
+def results_beside(model: Path) -> Iterator[Any]:
+    """What is read from result.json in the folder of a model, or the one above; for the caller to check."""
+    for folder in (model, model.parent):
+        with suppress(OSError, ValueError, RecursionError):
+            yield json.loads((folder / "result.json").read_text(encoding="utf-8"))
 
 
 def check_folder(folder: Path, *, force: bool = False) -> None:

@@ -68,6 +68,7 @@ class ModelOnData:
     source: Path
     rows: int = 0
     notes: tuple[str, ...] = ()
+    warnings: tuple[Warning, ...] = ()
 
 
 def read_rows(text: str | None) -> tuple[int, int] | None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, get_origin
 
@@ -10,8 +11,10 @@ import numpy as np
 
 from orthaug._base.checks import check_choice
 from orthaug._base.errors import InputError, KeyedError
+from orthaug._base.folders import file_digest
 from orthaug._base.registry import Key, keys_of, resolve
 from orthaug._base.warning import Warning
+from orthaug.commands.folder import results_beside
 from orthaug.commands.run import ModelOnData, Reading, record_for
 from orthaug.data.record import Record
 from orthaug.data.tables import check_readable
@@ -34,7 +37,22 @@ def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | Non
     loaded = load(model)
     reading = Reading("skip", rows, prepare=True)  # of rows with missing cells none were trained on
     records = [record_for(loaded, path, loaded.outputs, reading) for path in data]
-    return ModelOnData(loaded, Record.join(records), data[0])
+    return ModelOnData(loaded, Record.join(records), data[0], warnings=tuple(_other_files(model, data)))
+
+
+def _other_files(model: Path, data: Sequence[Path]) -> Iterator[Warning]:
+    """One where the files are not those that the result of a model has the checksums of."""
+    for content in results_beside(model):
+        with suppress(KeyError, TypeError):
+            kept = {file["sha256"]: file["file"] for file in content["data"]["train"]}
+            if kept.keys() != set(map(file_digest, data)):
+                text = (
+                    f"the model was trained on {', '.join(kept.values())}; by the checksums in its result.json that is "
+                    f"not what was given ({', '.join(path.name for path in data)}). Give the files that it was trained "
+                    "on: a split over other data does not belong to the fit."
+                )
+                yield Warning("other_training_data", text)
+            return
 
 
 def read_measure(kind: str, given: Mapping[str, Sequence[str]], opened: ModelOnData) -> Measure:
@@ -87,10 +105,10 @@ def split_model(opened: ModelOnData, measure: Measure) -> SplitResult:
     Raises:
         InputError: a θ at a bound, a measure that does not fit the model, other data than those of its training.
     """
-    return _SPLITS[type(opened.model)](opened.model, opened.record, measure)
+    return _SPLITS[type(opened.model)](opened.model, opened.record, measure, opened.warnings)
 
 
-def _split_lagged(model: Model, record: Record, measure: Measure) -> SplitResult:
+def _split_lagged(model: Model, record: Record, measure: Measure, told: Sequence[Warning]) -> SplitResult:
     from orthaug.inference.covariance import interval
     from orthaug.inference.splitting import split_under
 
@@ -112,12 +130,12 @@ def _split_lagged(model: Model, record: Record, measure: Measure) -> SplitResult
             "measure": measure.name,
             "measure_detail": under,
             "orthogonality_defect": under.defect,
-            "warnings": [*under.warnings, *([] if std is not None else [_UNKNOWN])],
+            "warnings": [*told, *under.warnings, *([] if std is not None else [_UNKNOWN])],
         }
     )
 
 
-def _split_motion(model: MotionModel, record: Record, measure: Measure) -> SplitResult:
+def _split_motion(model: MotionModel, record: Record, measure: Measure, told: Sequence[Warning]) -> SplitResult:
     from orthaug.fitting.motion_estimation import reopened
 
     fit = reopened(model, record).split(measure)
@@ -130,9 +148,9 @@ def _split_motion(model: MotionModel, record: Record, measure: Measure) -> Split
             "measure": split.name,
             "measure_detail": MeasureResult.of_motion(split),
             "orthogonality_defect": split.defect,
-            "warnings": [*fit.warnings, *([_UNKNOWN] if lacking else [])],
+            "warnings": [*told, *fit.warnings, *([_UNKNOWN] if lacking else [])],
         }
     )
 
 
-_SPLITS: dict[type, Callable[[Any, Record, Measure], SplitResult]] = {Model: _split_lagged, MotionModel: _split_motion}
+_SPLITS: dict[type, Callable[..., SplitResult]] = {Model: _split_lagged, MotionModel: _split_motion}

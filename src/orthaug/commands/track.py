@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pydantic import ValidationError
-
 from orthaug._base.errors import InputError
 from orthaug._base.folders import file_digest, whole_folder
 from orthaug._base.warning import Warning
-from orthaug.commands.folder import not_a_result
+from orthaug.commands.folder import not_a_result, results_beside
 from orthaug.commands.run import Reading, record_for
 from orthaug.commands.split import open_training
 from orthaug.data.record import Record
@@ -87,12 +85,9 @@ def _physics_of(model: Path, sampling_time: float) -> PhysicsMap | None:
     """What θ is made of, from the result beside a model; None where there is none."""
     from orthaug.commands.spec import spec_model
 
-    for folder in (model, model.parent):
-        try:
-            content = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+    for content in results_beside(model):
+        with suppress(ValueError, KeyError, TypeError):
             return spec_model().model_validate(content["spec"]).physics_map(sampling_time)
-        except (OSError, ValueError, KeyError, TypeError, RecursionError, ValidationError):
-            continue
     return None
 
 

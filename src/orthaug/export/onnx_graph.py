@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError
 from orthaug.export.nodes import ACTIVATIONS, Apply, Entry, Name, Node, Number
 from orthaug.export.program import Block, Program, Vectors
@@ -105,11 +106,17 @@ class _Graph:
         if block.network is not None:
             z = self.joined([self.node(node, known) for node in block.network.features])
             for layer in block.network.layers:
-                z = self.add("MatMul", self.table(layer.weight), z)
+                z = self.product(layer.weight, z)
                 z = z if layer.bias is None else self.add("Add", z, self.table(layer.bias))
                 z = z if layer.activation == "identity" else self.node(ACTIVATIONS[layer.activation], {"a": z})
             known["g"] = z
         return self.joined([self.node(node, known) for node in block.results])
+
+    def product(self, weight: Matrix, z: str) -> str:
+        """W z. Of one entry it is no matrix product: runtimes would draw its scaling in, in single precision."""
+        if weight.shape[1] == 1:
+            return self.add("Mul", self.table(weight[:, 0]), z)
+        return self.add("MatMul", self.table(weight), z)
 
     def node(self, node: Node, known: Mapping[str, str]) -> str:
         """A node of the program as a vector of one entry, or of a layer's entries."""

@@ -19,7 +19,7 @@ from orthaug.fitting.elimination import Fixed, ThetaSplit, directions, eliminate
 from orthaug.fitting.estimates import NOT_UNIQUE, Estimate
 from orthaug.fitting.learned import ErrorStatistics, Learned
 from orthaug.fitting.one_step import OneStepTask, Share
-from orthaug.fitting.status import Ending, Status
+from orthaug.fitting.status import ALONE, Ending, Status
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.inference.covariance import degrees_of_freedom, noise_covariance, theta_covariance
 from orthaug.models.dynamics import Numbers
@@ -58,9 +58,10 @@ def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estim
     if known and errors.covariance is None and learned.errors is None:
         text = "no standard errors: beside a learner that sees only some features, an ensemble leaves none."
         told.append(Warning("no_standard_errors", text))
+    reason = ALONE.get(ending, "") if learned.bound is None else ""
     return Estimate(
         model=_model(problem, structure, learned, ThetaSplit(theta, theta_aux, fixed), errors, noise),
-        status=Status(ending, learned.iterations, learned.seconds, errors.mean_square),
+        status=Status(ending, learned.iterations, learned.seconds, errors.mean_square, reason=reason),
         restarts=(),
         excitation=problem.excitation,
         covariance=errors.covariance if known else None,
@@ -86,6 +87,8 @@ def _model(
     record, scaling = problem.record, learned.scaling
     numbers = (parameters.theta, parameters.theta_aux, learned.weights, scaling.centre, scaling.halfwidth, learned.unit)
     middle = _middle(problem, learned, noise)
+    decoupled = structure.projects and directions(structure, problem) is None
+    held = {} if decoupled else parameters.fixed
     return Model(
         form=Lagged(problem.baseline, problem.features, problem.layout, problem.outputs, learned.bound),
         numbers=Numbers(*numbers, learned.tilt),
@@ -100,8 +103,8 @@ def _model(
         weight=problem.weight.matrix,
         shared=directions(structure, problem, parameters.fixed),
         statistics=Statistics(
-            None if learned.gram is None else _beside(parameters.fixed, learned.gram),
-            None if middle is None else _beside(parameters.fixed, middle),
+            None if learned.gram is None else _beside(held, learned.gram),
+            None if middle is None else _beside(held, middle),
             noise,
             learned.ridge,
             errors.freedom,
@@ -231,7 +234,7 @@ def _warnings(
             f"at a bound: {names}. What stands at a bound is a known term, as with `fixed = true`: it has no standard "
             "error, and the others and theirs hold with it there; "
         )
-        if structure.projects and learned.bound is not None:
+        if structure.projects and learned.bound is not None and directions(structure, problem) is not None:
             text += "the learner is not made orthogonal to it; "
         text += "data that contradict a bound contradict the physics or the bound."
         told.append(Warning("at_a_bound", text))

@@ -23,8 +23,8 @@ class Elimination:
 
     P, `taken`, is the projector onto what a split moves from the learner to θ: all in the paper's structure, nothing in
     the additive one. `(A, B, e)` are the structure's rows. An active set meets the bounds: some entries of θ stand at a
-    bound, and the others minimise the rest. They are known terms then, which a split moves nothing to: P is that of
-    the `shared` directions that leave them alone.
+    bound, and the others minimise the rest. Where the learner can imitate part of the physics only, they are known
+    terms then, which a split moves nothing to: P is that of the `shared` directions that leave them alone.
     """
 
     to_coordinates: Matrix
@@ -45,6 +45,11 @@ class Elimination:
     def projects(self) -> bool:
         """Whether anything is moved from the learner to θ."""
         return bool(self.taken.any())
+
+    @property
+    def decoupled(self) -> bool:
+        """Whether θ does not depend on the learner, nor the learner on bounds (F1)."""
+        return not self._learner({}).any()
 
     def taken_beside(self, fixed: Fixed) -> Matrix:
         """P (nθ, nθ) where some entries of θ stand at a bound."""
@@ -125,7 +130,7 @@ class Elimination:
         Args:
             run: trains with some entries held, and gives the learner's coordinates f; None to leave it at that.
         """
-        fixed = self.active(np.zeros_like(self.outputs))
+        fixed = {} if self.decoupled else self.active(np.zeros_like(self.outputs))
         tried = [fixed]
         while (f := run(fixed)) is not None:
             active = self.active(f)
@@ -157,7 +162,8 @@ def eliminate(structure: Structure, problem: Problem) -> Elimination:
     """The elimination of θ from a problem's criterion with a structure's rows and the baseline's bounds."""
     baseline, projection = problem.baseline, problem.projection
     nt = len(baseline.names)
-    bounded = structure.projects and np.isfinite(baseline.bounds).any()
+    shared = _shared(structure, problem)
+    partly = structure.projects and np.isfinite(baseline.bounds).any() and not shared.all
     return Elimination(
         to_coordinates=projection.to_coordinates,
         outputs=problem.target_coordinates,
@@ -165,7 +171,7 @@ def eliminate(structure: Structure, problem: Problem) -> Elimination:
         rows=structure.penalty(baseline.names, baseline.initial, problem.weight.unit),
         lower=baseline.bounds[0],
         upper=baseline.bounds[1],
-        shared=_shared(structure, problem) if bounded else None,
+        shared=shared if partly else None,
     )
 
 
@@ -180,8 +186,8 @@ def directions(structure: Structure, problem: Problem, fixed: Iterable[int] = ()
     Args:
         fixed: entries of θ that stand at a bound, which no direction moves.
     """
-    shared = _shared(structure, problem).leaving(fixed)
-    return None if shared.all else shared.basis
+    shared = _shared(structure, problem)
+    return None if shared.all else shared.leaving(fixed).basis
 
 
 class ThetaSplit(NamedTuple):
@@ -208,12 +214,15 @@ def split_theta(
     baseline, factor = problem.baseline, problem.projection
     elimination = eliminate(structure, problem)
     if coefficients is not None and fixed is None:  # an iterate need not satisfy what only its end satisfies
-        inside = np.clip(coefficients, *baseline.bounds)
-        fixed = elimination.active(share) | {i: value for i, value in enumerate(inside) if value != coefficients[i]}
+        apart = elimination.shared is not None  # nothing is moved to what stands at a bound
+        reached = coefficients + (0.0 if apart else factor.from_coordinates(elimination.taken @ share))
+        inside = np.clip(reached, *baseline.bounds)
+        fixed = elimination.active(share) | {i: value for i, value in enumerate(inside) if value != reached[i]}
     fixed = elimination.active(share) if fixed is None else fixed
     taken = elimination.taken_beside(fixed) @ share
     aux = factor.from_coordinates(taken)
-    aux[list(fixed)] = 0.0  # but for rounding it is
+    if elimination.shared is not None:
+        aux[list(fixed)] = 0.0  # but for rounding it is
     if coefficients is not None:
         theta = np.array([fixed.get(i, value) for i, value in enumerate(coefficients + aux)])
     elif fixed or len(elimination.rows.target):

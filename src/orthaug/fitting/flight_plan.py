@@ -138,6 +138,11 @@ class StructuredObjective(FreeRunObjective):
         """Whether c follows θ, `c = θ − θ_aux(w)`."""
         return self.elimination.projects and self.elimination.bounded and self.task.bound is not None
 
+    @property
+    def apart(self) -> bool:
+        """Whether what stands at a bound becomes a known term beside the learner."""
+        return self.follows and self.elimination.shared is not None
+
     def begin(self, w: Vector) -> Vector:
         """p of the one-step θ for the weights w."""
         f = self.task.share_of(w)

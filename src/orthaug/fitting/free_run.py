@@ -82,7 +82,7 @@ class FreeRunTask(FlightTask):
         """
         fixed: Fixed = {}
         alone: Any = self.physics
-        if alone is not None and self.plan.objective(structure).follows:
+        if alone is not None and self.plan.objective(structure).apart:
             fixed = alone.objective.held(alone.end)
         seconds, tried = 0.0, [fixed]
         while True:
@@ -90,7 +90,7 @@ class FreeRunTask(FlightTask):
             flight = super(FreeRunTask, own).run(solver, w, structure, regularization, progress)
             seconds += flight.seconds
             objective: Any = flight.objective
-            if not (flight.end.ending.usable and objective.follows):
+            if not (flight.end.ending.usable and objective.apart):
                 break
             held = objective.held(flight.end)
             held = held | fixed if held in tried else held

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from orthaug._base.checks import check_type
+from orthaug._base.checks import Matrix, check_type
 from orthaug._base.errors import InputError
 from orthaug._base.progress import SILENT, Tell
 from orthaug.data.record import Record
@@ -21,7 +21,7 @@ from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.rules import check_motion_choices, check_solver, checked_starts, tried
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.solver import Solver
-from orthaug.fitting.status import Ending, Status
+from orthaug.fitting.status import ALONE, Ending, Status
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.fitting.training import Choice, planned, train
 from orthaug.inference.motion_split import MotionSplit
@@ -108,9 +108,12 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) ->
     alone = np.asarray(learned.coefficients if task.physics is None else task.physics.end.flown.theta)
     trained = Trained(plan.flown.segment, plan.flown.washout, np.asarray(states), slope, alone)
     model = replace(_model(plan, structure, learned), trained=trained)
+    reason = ALONE.get(learned.ending, "") if learned.bound is None or task.physics is None else ""
+    if reason and not learned.ending.usable and (where := task.problem.without_value(np.any)):
+        reason = f"{where}; mend it, or bound what it reads"
     fit = MotionEstimate(
         model=model,
-        status=Status(learned.ending, learned.iterations, learned.seconds, errors.mean_square),
+        status=Status(learned.ending, learned.iterations, learned.seconds, errors.mean_square, reason=reason),
         restarts=(),
         covariance=None,
         freedom=errors.freedom,
@@ -152,7 +155,19 @@ def _model(plan: MotionCourse, structure: Structure, learned: Learned) -> Motion
         prepared=record.prepared,
         statistics=Statistics(learned.gram, middle, noise, learned.ridge, learned.errors.freedom, flown=True),
     )
-    return replace(model, window=_best_window(model, record)) if learned.ending.usable else model
+    if not learned.ending.usable:
+        return model
+    model = replace(model, window=_best_window(model, record))
+    return model if model.form.bound is None else replace(model, seen=_seen(model, record))
+
+
+def _seen(model: MotionModel, record: Record) -> Matrix | None:
+    """Least and largest (2, nz) of the learner's features over the free run; None where it has no finite ones."""
+    states, inputs = np.split(model.reach(record), [model.form.states], axis=1)
+    with np.errstate(all="ignore"):
+        features = np.asarray(model.form.seen(states.T, inputs.T, np))
+    finite = features[:, np.isfinite(features).all(axis=0)]
+    return np.stack([finite.min(axis=1), finite.max(axis=1)]) if finite.size else None
 
 
 def _best_window(model: MotionModel, record: Record) -> int:

@@ -24,6 +24,7 @@ _SHORTEST = 15  # steps of a segment
 _LONGER = 8  # times, from one length of the segments to the next; every length compiles its own programs
 _POOR = 0.5  # of the output's deviation: what is left above it may not be the best minimum
 _SHORT_ITERATIONS = 15  # over segments that are not the last
+_SETTLING = 200  # steps at most by which starts follow the outputs: a descent damps no step of theirs
 _FINE = 0.01  # of the residual: how much the outputs may move when the substeps are doubled
 
 
@@ -79,7 +80,7 @@ def _descended(
     objective = course.objective()
     places = []
     for q in starts:
-        states = course.settled(q)
+        states = course.settled(q, iterations=_SETTLING)
         places.append((objective.fly(q, Start(states)).loss, q, states))
     loss, q, states = min(places, key=lambda place: place[0])
     if not np.isfinite(loss):

@@ -107,8 +107,7 @@ class MotionTask(FlightTask):
         regularization: str | float,
     ) -> list[Place]:
         """Physics alone with a silent learner; a learner that cannot be silenced starts as it is."""
-        assert self.bound is not None
-        silenced = self.bound.silent(w)
+        silenced = w if self.bound is None else self.bound.silent(w)  # no learner: physics alone did not fly
         q = self.problem.motion.coordinates.initial if self.physics is None else self.physics.end.flown.theta
         p = np.concatenate([q, w if silenced is None else silenced])
         states = objective.initial.measured

@@ -181,11 +181,13 @@ class OneStepTask:
         def share(fixed: Fixed) -> Vector | None:
             """QᵀF at the end of a run with these held; None where nothing follows from it."""
             runs.append(self._run_held(solver, w, structure, elimination, fixed, regularization, tell))
-            return self.coordinates(runs[-1]) if elimination.bounded and runs[-1].ending.usable else None
+            reach = elimination.bounded and not elimination.decoupled
+            return self.coordinates(runs[-1]) if reach and runs[-1].ending.usable else None
 
         fixed = elimination.settled(share)
         held = bool(elimination.hold(fixed)[0].any())
-        return runs[-1]._replace(seconds=sum(run.seconds for run in runs), held=held, fixed=fixed)
+        known = None if elimination.decoupled else fixed
+        return runs[-1]._replace(seconds=sum(run.seconds for run in runs), held=held, fixed=known)
 
     def coordinates(self, run: compiled.TrainingRun) -> Vector:
         """QᵀF (nθ,) in whitened outputs, at the end of a run."""
@@ -299,7 +301,7 @@ class OneStepTask:
         are taken from the `best` member.
         """
         coefficients = [
-            split_theta(Additive(), self.problem, self.share(member).coordinates, fixed=member.fixed).theta
+            split_theta(Additive(), self.problem, self.share(member).coordinates, fixed=member.fixed or {}).theta
             if member.coefficients is None
             else member.coefficients
             for member in members

@@ -212,7 +212,8 @@ def _steps_at_once(most: int, dynamics: Any, numbers: Numbers, carry: Any, rows:
 
 
 def _flat(part: Float[Array, "T n m"]) -> Float[Array, "n T*m"]:
-    return jnp.moveaxis(part, 0, 1).reshape(part.shape[1], -1)
+    steps, n, m = part.shape
+    return jnp.moveaxis(part, 0, 1).reshape(n, steps * m)  # n = 0 of a motion without inputs
 
 
 @partial(jax.jit, static_argnames=("dynamics", "blocks"))

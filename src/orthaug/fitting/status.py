@@ -63,6 +63,15 @@ class Ending(IntEnum):
         return self is not Ending.NON_FINITE
 
 
+ALONE = {
+    Ending.NO_DESCENT: "no step of the physics' parameters lowered the loss: the start is already a minimum, or the "
+    "free run is too steep about it. Try other initial values, or a shorter `segment`",
+    Ending.NON_FINITE: "physics alone has no finite free run from its initial values. Give others, or bounds that "
+    "keep it from running away",
+}
+"""The messages of a training without a learner, where others speak of one."""
+
+
 @dataclass(frozen=True)
 class Status:
     """How training ended.
@@ -77,6 +86,8 @@ class Status:
     """Of training, without compiling its programs."""
     loss: float
     start_loss: float | None = None
+    reason: str = ""
+    """Cause and remedy, where more is known than how training ended."""
 
     def __repr__(self) -> str:
         return f"Status({self.code}, {self.iterations} iterations, {self.seconds:.2f} s, loss {self.loss:.6g})"
@@ -87,7 +98,7 @@ class Status:
 
     @property
     def message(self) -> str:
-        return self.ending.message
+        return self.reason or self.ending.message
 
     @property
     def lines(self) -> list[str]:

@@ -94,6 +94,7 @@ class _Fit:
         with np.errstate(all="ignore"):
             return self.whiten @ (theta - self.target), self.whiten @ jacobian
 
+    @np.errstate(all="ignore")  # where there is no solution p goes to infinity
     def descend(self, p: Vector) -> tuple[float, Vector]:
         """Cost and p of the minimum that Levenberg-Marquardt finds from p; cost inf where θ has no value at p.
 

@@ -18,13 +18,12 @@ from orthaug.data.record import Channel, Experiment, Prepared, Record
 from orthaug.models.dynamics import Dynamics, Numbers, Parts
 from orthaug.models.filters import LaggedFilter
 from orthaug.models.lagged import Lagged
-from orthaug.models.on_records import OnRecords, trajectory
+from orthaug.models.on_records import WITHIN, OnRecords, trajectory
 from orthaug.models.response import Response, Trajectory
 from orthaug.models.statistics import Statistics
 from orthaug.models.stepping import Memory, checked_row, one_experiment, step_lagged
 from orthaug.physics.baseline import Parameter
 
-_WITHIN = 1e-9  # of a feature's half width: the largest of training is no extrapolation
 _BATCH = 1024  # rows per compiled call: longer records share the program, of a free run too
 _WINDOW_CELLS = 8_000_000  # input cells of a batch of multi-step predictions
 
@@ -276,7 +275,7 @@ class Model(OnRecords, Shown):
             z = self.form.scaled_features(self.numbers, start, np.asarray(parts.total), inputs)
             if z is None:
                 return None
-            beyond = ~(np.abs(z) <= 1 + _WITHIN).all(axis=1)
+            beyond = ~(np.abs(z) <= 1 + WITHIN).all(axis=1)
         return np.concatenate([np.zeros(self.form.first_row, dtype=bool), beyond])
 
 

@@ -21,6 +21,7 @@ from orthaug._base.views import Shown
 from orthaug.data.record import Channel, Experiment, Prepared, Record
 from orthaug.models.dynamics import Numbers, Parts
 from orthaug.models.filters import MotionFilter
+from orthaug.models.learners import Scaling
 from orthaug.models.motion_field import parts_at
 from orthaug.models.moving import Moving
 from orthaug.models.on_records import RUNAWAY, OnRecords, trajectory
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 FIRST_ROWS = 64  # that tell where a free run starts
-_WITHIN = 1e-9  # of a feature's half width: the largest of training is no extrapolation
 _SIDE_BY_SIDE = 2048  # windows of predictions
 _GUESS_ITERATIONS, _WINDOW_ITERATIONS = 30, 6
 
@@ -105,6 +105,8 @@ class MotionModel(OnRecords, Shown):
     measure: str = field(default="training", kw_only=True)
     time_column: str | None = None
     trained: Trained | None = field(default=None, repr=False)
+    seen: Matrix | None = field(default=None, kw_only=True, repr=False)
+    """Least and largest (2, nz) of the learner's features over the fitted run of the training data."""
     statistics: Statistics = Statistics()  # noqa: RUF009  (frozen)
     prepared: tuple[Prepared, ...] = field(default=(), kw_only=True, repr=False)
     """What the training data went through before."""
@@ -238,6 +240,11 @@ class MotionModel(OnRecords, Shown):
         """The model as a filter: its dynamics, its numbers, and how large an unknown state is (nx,)."""
         return MotionFilter(self.form), self._stepping, np.asarray(self.loose) / LOOSE
 
+    @property
+    def reached(self) -> Scaling:
+        """What training reached of the learner's features; of a model saved without it, what physics alone did."""
+        return super().reached if self.seen is None else Scaling.fit(self.seen)
+
     def reach(self, record: Record) -> Matrix:
         """The states and inputs (N, nx + nu) of the free run on a record, where they are finite."""
         states = self.states(record)[list(self.form.motion.names_of_states)].to_numpy()
@@ -290,9 +297,7 @@ class MotionModel(OnRecords, Shown):
         if self.form.bound is None:
             return None
         with np.errstate(all="ignore"):
-            seen = np.asarray(self.form.seen(states.T, inputs.T, np)).T
-            scaled = (seen - self.numbers.centre) / self.numbers.halfwidth
-            return ~(np.abs(scaled) <= 1 + _WITHIN).all(axis=1)
+            return self.beyond(np.asarray(self.form.seen(states.T, inputs.T, np)).T)
 
     def _start(self, experiment: Experiment, initial: str | Any, record: Record) -> Vector:
         """The state at the first row."""

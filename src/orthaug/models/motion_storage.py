@@ -35,6 +35,7 @@ def declare(model: MotionModel) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         "trained": None if trained is None else {"segment": trained.segment, "washout": trained.washout},
     }
     arrays = arrays_of(model) | {"loose": np.asarray(model.loose)}
+    arrays |= {} if model.seen is None else {"seen": np.asarray(model.seen)}
     if trained is not None:
         arrays |= {"trained.states": np.asarray(trained.states), "trained.alone": np.asarray(trained.alone)}
         arrays |= {} if trained.slope is None else {"trained.slope": np.asarray(trained.slope)}
@@ -70,6 +71,7 @@ def rebuild(
         loose=arrays["loose"],
         window=int(declared["window"]),
         trained=trained,
+        seen=arrays.get("seen"),
     )
 
 

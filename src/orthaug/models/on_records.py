@@ -6,21 +6,26 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError, shown
 from orthaug.data.preparation import steps_again
 from orthaug.data.record import Channel, Experiment, Prepared, Record, same_step
-from orthaug.models.dynamics import Dynamics, Parts
+from orthaug.models.dynamics import Dynamics, Numbers, Parts
+from orthaug.models.learners import Scaling
 from orthaug.models.response import Trajectory
 
 RUNAWAY = 1e6  # times the largest training output: a free run beyond this has diverged
+
+WITHIN = 1e-9  # of a feature's half width: the largest of training is no extrapolation
 
 
 class OnRecords:
     """A model of some channels at a sampling time."""
 
     form: Dynamics
+    numbers: Numbers
     outputs: tuple[Channel, ...]
     inputs: tuple[Channel, ...]
     sampling_time: float
@@ -31,6 +36,15 @@ class OnRecords:
     def preparation(self) -> tuple[Any, ...]:
         """The steps that the training data went through, for `prepare` and `read_record` of other data."""
         return steps_again(self.prepared, [c.name for c in (*self.inputs, *self.outputs)], self.sampling_time)[0]
+
+    @property
+    def reached(self) -> Scaling:
+        """What training reached of the learner's features."""
+        return Scaling(np.asarray(self.numbers.centre), np.asarray(self.numbers.halfwidth))
+
+    def beyond(self, features: Matrix) -> Bool[np.ndarray, "N"]:
+        """Where one of the learner's features (N, nz) lies outside of what training reached."""
+        return ~(np.abs(self.reached(features)) <= 1 + WITHIN).all(axis=1)
 
     def bounded(self, parts: Parts, experiment: Experiment, measured: Matrix | None) -> Trajectory:
         """A free run cut where it left all bounds."""

@@ -7,9 +7,10 @@ go on from there: a start is an unknown.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -61,6 +62,36 @@ class MotionProblem:
             states.append(guess(self.motion, experiment.outputs, rows, self.record.sampling_time))
             inputs.append(experiment.inputs[rows])
         return np.concatenate(states).T, np.concatenate(inputs).T
+
+    def without_value(self, over: Callable[[Any], Any]) -> str:
+        """The first equation or output that has no value at the start, in words, at all guessed states or at any.
+
+        Args:
+            over: np.all or np.any.
+
+        Raises:
+            InputError: functions that return another shape.
+        """
+        motion, (x, u) = self.motion, self.looked_at
+        with np.errstate(all="ignore"):
+            rates = np.asarray(motion.rates(x, u, motion.initial, np), dtype=float)
+            outputs = np.asarray(motion.observed(x, u, motion.initial, np), dtype=float)
+        for names, values, what, first in (
+            (motion.names_of_states, rates, "the equation of", 0),
+            (self.outputs, outputs, "the output", len(rates)),
+        ):
+            if values.shape != (len(names), x.shape[1]):
+                raise InputError(f"the motion's functions return shape {values.shape}; expected ({len(names)}, …).")
+            for i, name in enumerate(names):
+                lost = ~np.isfinite(values[i])
+                if over(lost):
+                    k = int(np.argmax(lost))
+                    at = zip((*motion.names_of_states, *motion.inputs), (*x[:, k], *u[:, k]), strict=True)
+                    where = ", ".join(f"{n} = {v:.4g}" for n, v in at)
+                    term = motion.term_without_value(first + i, x[:, k], u[:, k])
+                    told = f": {term}" if term else ""
+                    return f"{what} '{name}' is not finite at the start ({where}, initial parameters){told}"
+        return ""
 
     @cached_property
     def fastest(self) -> float:
@@ -145,27 +176,9 @@ def _features(motion: Motion, texts: Sequence[str] | None) -> tuple[Expression, 
 
 def _check_start(problem: MotionProblem) -> None:
     """Raise InputError where the equations have no value at the initial parameters, or modes that are too fast."""
-    motion, (x, u) = problem.motion, problem.looked_at
-    with np.errstate(all="ignore"):
-        rates = np.asarray(motion.rates(x, u, motion.initial, np), dtype=float)
-        outputs = np.asarray(motion.observed(x, u, motion.initial, np), dtype=float)
-    for names, values, what, first in (
-        (motion.names_of_states, rates, "the equation of", 0),
-        (problem.outputs, outputs, "the output", len(rates)),
-    ):
-        if values.shape != (len(names), x.shape[1]):
-            raise InputError(f"the motion's functions return shape {values.shape}; expected ({len(names)}, …).")
-        for i, name in enumerate(names):
-            if not np.isfinite(values[i]).any():
-                k = int(np.argmax(~np.isfinite(values[i])))
-                at = zip((*motion.names_of_states, *motion.inputs), (*x[:, k], *u[:, k]), strict=True)
-                where = ", ".join(f"{n} = {v:.4g}" for n, v in at)
-                term = motion.term_without_value(first + i, x[:, k], u[:, k])
-                told = f": {term}" if term else ""
-                raise InputError(
-                    f"{what} '{name}' is not finite at the start ({where}, initial parameters){told}; mend it, or "
-                    "start elsewhere."
-                )
+    motion, where = problem.motion, problem.without_value(np.all)
+    if where:
+        raise InputError(f"{where}; mend it, or start elsewhere.")
     if motion.integrator == "rk4" and problem.substeps > MOST_SUBSTEPS:
         raise InputError(
             f"the sampling time of {problem.record.sampling_time:g} s is too long for the fastest mode of the motion, "

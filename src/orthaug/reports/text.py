@@ -54,7 +54,8 @@ def check_text(result: CheckResult) -> str:
     data, physics = result.excitation, result.identifiability
     condition = f"{data.condition:.4g}" if data.condition is not None else "infinite"
     moves = result.motion is not None
-    where = "with rich inputs" if moves else "at random points"
+    driven = result.motion is None or len(result.regressor) > len(result.motion.states)
+    where = ("with rich inputs" if driven else "from other starts") if moves else "at random points"
     lines = [
         f"parameters       {', '.join(result.parameters) or 'none'}",
         f"{'states, inputs  ' if moves else 'regressor       '} {', '.join(result.regressor)}",
@@ -184,7 +185,7 @@ def _bias_lines(result: FitResult) -> list[str]:
     """The bias of every parameter by what the learner found, and the interval that covers it."""
     rows = [row for row in (*result.parameters, *(result.physical_parameters or ())) if row.bias is not None]
     if not rows or rows[0].bias is None:
-        return []
+        return _unexplained(result)
     cause, share, width = rows[0].bias.cause, rows[0].bias.share or 0.0, _width(rows)
     what = "learner found" if result.motion is None or result.shared is not None else "free run leaves"
     lines = [f"{100 * share:.0f} % of what the {what} is {cause}. The bias that implies:"]
@@ -201,6 +202,18 @@ def _bias_lines(result: FitResult) -> list[str]:
             limits = f"[{_limit(reach[0])}, {_limit(reach[1])}]" if reach else f"{'–':^29}"
             lines.append(f"{row.name:<{width}}  {bias:+11.3g}  {errors}  {part}  {limits}".rstrip())
     return lines
+
+
+def _unexplained(result: FitResult) -> list[str]:
+    """That a learner which matters may bias what it could imitate, where no cause tells by how much."""
+    shared = [row.name for row in (*result.parameters, *(result.physical_parameters or ())) if row.shared]
+    if not shared or result.validation is None or result.validation.verdict != "helps":
+        return []
+    names = ", ".join(shared)
+    return [
+        f"No suspect explains half of what the learner found: a part of that may belong to {names}, and no interval "
+        "counts it. `orthaug explain` looks for its terms; [[suspects]] declares them."
+    ]
 
 
 def _rounded(share: float) -> float:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
-from orthaug._base.jax import jax
+from orthaug._base.jax import jax, jnp
 from orthaug.data.expressions import SAMPLING_TIME, Expression, parse, parse_named
 from orthaug.data.record import Record
 from orthaug.data.regressors import lag_matrix, stack_rows
@@ -35,7 +35,6 @@ MOST_CELLS = 10_000
 """Values of the learner that are looked at: a smooth function needs no more, and candidates are kept beside them."""
 FEWEST = 20  # of them
 MOST_WEIGHTS = 2000  # of a learner whose tangent is looked at
-_WITHIN = 1e-9  # of a feature's half width: the largest of training is no extrapolation
 
 
 class Tangent(NamedTuple):
@@ -168,7 +167,6 @@ def _of_motion(model: MotionModel, record: Record) -> Ground:
     known = motion.values(x.T, u.T, coordinates.physical(model.theta), np)
     own = tuple(dict.fromkeys(str(entry) for entry in form.features))
     z = np.asarray(form.seen(x.T, u.T, np)).T
-    low, high = coordinates.bounds
     units = {channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
     units |= {parameter.name: parameter.unit for parameter in motion.parameters}
     return Ground(
@@ -182,7 +180,7 @@ def _of_motion(model: MotionModel, record: Record) -> Ground:
         units=units | {state.name: state.unit for state in motion.states} | {SAMPLING_TIME: "s"},
         parse=lambda text: parse_named(text, motion.known, "the term"),
         evaluate=lambda expression: expression.value(known, np),
-        moved=lambda along: np.asarray(coordinates.physical(np.clip(model.theta + along[:count], low, high))),
+        moved=lambda along: _moved(motion, model.theta, along[:count], x, u),
         parameters=coordinates.parameters,
         values=np.asarray(coordinates.physical(model.theta)),
         physics=motion,
@@ -333,6 +331,19 @@ def _places(model: MotionModel) -> tuple[tuple[str, str], ...]:
     return tuple(zip(names, units, strict=True))
 
 
+def _moved(motion: Motion, q: Vector, along: Vector, x: Matrix, u: Matrix) -> Vector:
+    """The parameters after a step of their coordinates q (np,), along a line of the parameters themselves.
+
+    A step of logarithms where that would end at a zero that the equations divide by.
+    """
+    coordinates = motion.coordinates
+    low, high = ([getattr(p, end) for p in motion.parameters] for end in ("min", "max"))
+    p = np.clip(coordinates.physical(q) + coordinates.slopes(q) * along, low, high)
+    if np.isfinite(jax.vmap(lambda x, u: motion.rates(x, u, p, jnp))(x, u)).all():
+        return p
+    return np.asarray(coordinates.physical(np.clip(q + along, *coordinates.bounds)))
+
+
 def _rates_of_change(outputs: Sequence[str], seen: Sequence[str]) -> list[str]:
     """The velocity of each output of which the learner sees two lags, one after the other."""
     found = []
@@ -348,8 +359,7 @@ def _beyond(model: Any, z: Matrix) -> float:
     """Share of the points at which a feature lies outside those of training."""
     if not model.form.bound.differentiable or not len(z):
         return 0.0
-    scaled = (z - np.asarray(model.numbers.centre)) / np.asarray(model.numbers.halfwidth)
-    return float(np.mean((np.abs(scaled) > 1 + _WITHIN).any(axis=1)))
+    return float(np.mean(model.beyond(z)))
 
 
 def _tangent(model: Any, z: Matrix, weight: Matrix, response: Response | None) -> Tangent | None:

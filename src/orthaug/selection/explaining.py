@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
-from orthaug.analysis.suspects import WIDTHS, written
+from orthaug.analysis.suspects import ODD_JUMPS, WIDTHS, changes_sign, is_level, written
 from orthaug.data.terms import CONSTANT, TermLibrary, outside_brackets
 from orthaug.selection.as_shown import Shown, basis_of, least_squares, without
 from orthaug.selection.explained_ground import Ground
@@ -25,7 +25,7 @@ from orthaug.selection.explained_ground import Ground
 MOST_CANDIDATES = 3000
 TERM = "term"
 """The kind of a product of what the learner sees."""
-_PLAIN = ("coulomb", "quadratic_drag", "cubic")
+_PLAIN = ("coulomb", "quadratic_drag", "cubic", "square_root")
 _WIDE = tuple(kind for kind in ("stribeck", "stribeck_gauss", "dead_zone", "saturation") if kind in WIDTHS)
 _WIDTHS = tuple(2.0 ** (i / 2) for i in range(-8, 3))  # times the median size of what a term acts on
 _REFINED = 2.0  # how far, as a factor, a width is moved from where it was found
@@ -140,9 +140,11 @@ def candidates_of(
         InputError: more than can be kept in memory.
     """
     library = TermLibrary.of(ground.signals[: ground.seen], degree, functions)
-    plain = {_written(kind, on) for kind in _PLAIN for on in ground.signals}
-    texts = [text for text in library.texts if text != CONSTANT and text not in plain]
-    wide = [(kind, on, width) for kind in _WIDE for on in ground.signals for width in _grid(ground, on)]
+    plain = [(kind, on) for kind in _PLAIN for on in ground.signals if _likely(ground, kind, on)]
+    known = {_written(kind, on) for kind, on in plain}
+    texts = [text for text in library.texts if text != CONSTANT and text not in known]
+    wide = [(kind, on) for kind in _WIDE for on in ground.signals if _likely(ground, kind, on)]
+    wide = [(kind, on, width) for kind, on in wide for width in _grid(ground, on)]
     places = range(len(ground.places))
     count = (len(texts) + len(wide)) * len(places)
     if count > MOST_CANDIDATES:
@@ -152,17 +154,29 @@ def candidates_of(
         )
     found = [Candidate(TERM, None, None, place, text) for text, place in suspects]
     for place in places:
-        found += [Candidate(kind, on, None, place, _written(kind, on)) for kind in _PLAIN for on in ground.signals]
+        found += [Candidate(kind, on, None, place, _written(kind, on)) for kind, on in plain]
         found += [Candidate(TERM, None, None, place, CONSTANT)]
         found += [Candidate(TERM, None, None, place, text) for text in texts]
         found += [Candidate(kind, on, width, place, _written(kind, on, width)) for kind, on, width in wide]
     return tuple(found)
 
 
+def _likely(ground: Ground, kind: str, on: str) -> bool:
+    """Friction only of what changes its sign, a root only of what has one."""
+    if kind not in (*ODD_JUMPS, "square_root"):
+        return True
+    values = _values(ground, on)
+    return bool(np.isfinite(values).all()) and (is_level if kind == "square_root" else changes_sign)(values)
+
+
+def _values(ground: Ground, on: str) -> Vector:
+    with np.errstate(all="ignore"):
+        return np.asarray(ground.evaluate(ground.parse(on)), dtype=float)
+
+
 def _grid(ground: Ground, on: str) -> Iterator[float]:
     """Widths that the data could tell; none for what is zero, or has no value somewhere."""
-    with np.errstate(all="ignore"):
-        size = np.abs(np.asarray(ground.evaluate(ground.parse(on)), dtype=float))
+    size = np.abs(_values(ground, on))
     if np.isfinite(size).all() and np.any(size > 0):
         yield from (float(f"{share * np.median(size[size > 0]):.4g}") for share in _WIDTHS)
 

@@ -1,8 +1,9 @@
 """How many terms, and which: a path of models, judged by free runs on blocks that were held out.
 
 Forward the terms come by what they lower the error by; from the best model on backward they go, the least missed first.
-The choice is the smallest model that is within one standard error of the best (Breiman et al. 1984), block by block in
-pairs, or worse by less than is worth a term.
+Without each block the same path is gone again on the rows that are left, so that no block had a say in the terms that
+it judges: held-out blocks say how many terms, all rows which. The choice is the smallest model that is within one
+standard error of the best (Breiman et al. 1984), block by block in pairs, or worse by less than is worth a term.
 """
 
 from __future__ import annotations
@@ -113,6 +114,13 @@ class Blocks:
             self.folds.append((runs.on(kept), laid))
         self.given = runs, self.folds
 
+    def along(self, points: Sequence[Point | None], count: int) -> tuple[list[Point], Vector]:
+        """A step of the path without each block, and the mean squared errors on the blocks."""
+        points, errors = zip(
+            *self.runner.map(_along, self.given, [(*one, count) for one in enumerate(points)]), strict=True
+        )
+        return list(points), np.array(errors)
+
     def judge(self, points: Sequence[Point]) -> Iterator[tuple[Vector, float]]:
         """Mean squared errors of free runs on each block of the same terms, fitted without it; and what it took [s]."""
         items = [(point._replace(states=None), i) for point in points for i in range(len(self.folds))]
@@ -144,6 +152,34 @@ def _on_fold(given: _Given, item: tuple[Point, int], tell: Callable[..., None]) 
     runs, held = given[1][number]
     own = point._replace(states=None if runs.laid is None else np.asarray(runs.laid.start))
     return runs.errors(runs.fit(own, point.chosen, _FOLD_ITERATIONS), held), time.monotonic() - began
+
+
+def _along(given: _Given, item: tuple[int, Point | None, int], tell: Callable[..., None]) -> tuple[Point, float]:
+    """A step of the path on all rows but those of a block, by their own terms; and the mean squared error there."""
+    number, point, count = item
+    runs, held = given[1][number]
+    point = _moved(runs, point, count)
+    return point, runs.errors(point, held) if np.isfinite(point.loss) else np.inf
+
+
+def _moved(runs: TermRuns, point: Point | None, count: int) -> Point:
+    """A step of the path: to physics alone, by `count` terms more, or the least missed less."""
+    if point is None:
+        return runs.fit(runs.start(), ())
+    if not np.isfinite(point.loss):
+        return point
+    nt, equations = len(point.c), runs.equations(point)
+    if count > 0:
+        known = [*range(nt), *(nt + i for i in point.chosen)]
+        new = [pick.column - nt for pick in forward(equations, known, count, least=_LEAST)]
+        return runs.fit(point, (*point.chosen, *new)) if new else point
+    own = equations.of([*range(nt), *(nt + i for i in point.chosen)]).scaled()
+    inverse = np.linalg.pinv(own.hessian, rcond=1e-13, hermitian=True)
+    missed = (inverse @ own.right)[nt:] ** 2 / np.maximum(np.diag(inverse)[nt:], 1e-300)
+    gone = point.chosen[int(np.argmin(missed))] if point.chosen else None
+    left = tuple(i for i in point.chosen if i != gone)
+    p = equations.of([*range(nt), *(nt + i for i in left)]).solve()  # the others take over what it did
+    return runs.fit(point._replace(chosen=left, c=p[:nt], w=p[nt:]), left)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,22 +224,14 @@ def climb(
         InputError: too few rows for so many blocks.
     """
     with one_blas_thread():
-        folds, rungs = Blocks(runs, blocks, runner), []
-
-        def judged(point: Point, change: Sequence[str], began: float) -> Rung:
-            held, _ = next(folds.judge([point]))
-            rung = Rung(point, tuple(change), held, time.monotonic() - began, len(point.chosen))
-            rungs.append(rung)
-            told(rung)
-            return rung
-
+        way = _Way(runs, Blocks(runs, blocks, runner), told)
         try:
-            _forward(runs, most, judged)
-            _backward(TermPath(tuple(rungs), runs), judged)
+            way.forward(most)
+            way.backward()
         except KeyboardInterrupt:
-            if not rungs:
+            if not way.rungs:
                 raise
-    return TermPath(tuple(rungs), runs)
+    return way.path
 
 
 def steps(most: int) -> int:
@@ -219,42 +247,51 @@ def _added_to(size: int) -> int:
     return 1 if size < _ONE_BY_ONE else max(1, size // 8)
 
 
-def _forward(runs: TermRuns, most: int, judged: Any) -> None:
-    nt, texts = len(runs.problem.baseline.names), runs.library.texts
-    began = time.monotonic()
-    point = runs.fit(runs.start(), ())
-    best, waited = judged(point, (), began).score, 0
-    while len(point.chosen) < most and waited < _PATIENCE and np.isfinite(point.loss):
-        began = time.monotonic()
-        count = min(_added_to(len(point.chosen)), most - len(point.chosen))
-        known = [*range(nt), *(nt + i for i in point.chosen)]
-        picks = forward(runs.equations(point), known, count, least=_LEAST)
-        new = [pick.column - nt for pick in picks]
-        tried = runs.fit(point, (*point.chosen, *new)) if new else point
-        if not new or not tried.loss < point.loss:
-            break
-        point = tried
-        rung = judged(point, [f"+ {texts[i]}" for i in new], began)
-        waited = 0 if rung.score < (1 - _BETTER) * best else waited + 1
-        best = min(best, rung.score)
+class _Way:
+    """The path as it is gone, on all rows and without each block."""
 
+    def __init__(self, runs: TermRuns, folds: Blocks, told: Told) -> None:
+        self.runs, self.folds, self.told = runs, folds, told
+        self.rungs: list[Rung] = []
+        self.without: list[list[Point]] = []
+        """Of each rung, the points that were reached without each block."""
 
-def _backward(path: TermPath, judged: Any) -> None:
-    """From the choice on, as long as what is left is as good."""
-    runs, rung = path.runs, path.chosen
-    nt, texts = len(rung.point.c), runs.library.texts
-    while rung.size > 1 and path.chosen is rung:
-        began, point = time.monotonic(), rung.point
-        equations = runs.equations(point)
-        own = equations.of([*range(nt), *(nt + i for i in point.chosen)]).scaled()
-        inverse = np.linalg.pinv(own.hessian, rcond=1e-13, hermitian=True)
-        missed = (inverse @ own.right)[nt:] ** 2 / np.maximum(np.diag(inverse)[nt:], 1e-300)
-        gone = point.chosen[int(np.argmin(missed))]
-        left = tuple(i for i in point.chosen if i != gone)
-        p = equations.of([*range(nt), *(nt + i for i in left)]).solve()  # the others take over what it did
-        point = runs.fit(point._replace(chosen=left, c=p[:nt], w=p[nt:]), left)
-        rung = judged(point, [f"− {texts[gone]}"], began)
-        path = replace(path, rungs=(*path.rungs, rung))
+    @property
+    def path(self) -> TermPath:
+        return TermPath(tuple(self.rungs), self.runs)
+
+    def step(self, place: int | None, count: int) -> bool:
+        """One step from a rung, or the first one; whether there was one."""
+        began, texts = time.monotonic(), self.runs.library.texts
+        before = None if place is None else self.rungs[place].point
+        point = _moved(self.runs, before, count)
+        old, new = set(() if before is None else before.chosen), set(point.chosen)
+        if before is not None and (new == old or (count > 0 and not point.loss < before.loss)):
+            return False
+        change = [f"+ {texts[i]}" for i in point.chosen if i not in old]
+        change += [f"− {texts[i]}" for i in sorted(old - new)]
+        start = [None] * len(self.folds.folds) if place is None else self.without[place]
+        reached, held = self.folds.along(start, count)
+        self.without.append(reached)
+        self.rungs.append(Rung(point, tuple(change), held, time.monotonic() - began, len(new)))
+        self.told(self.rungs[-1])
+        return True
+
+    def forward(self, most: int) -> None:
+        self.step(None, 0)
+        best, waited = self.rungs[0].score, 0
+        while (size := self.rungs[-1].size) < most and waited < _PATIENCE:
+            if not self.step(-1, min(_added_to(size), most - size)):
+                break
+            score = self.rungs[-1].score
+            waited = 0 if score < (1 - _BETTER) * best else waited + 1
+            best = min(best, score)
+
+    def backward(self) -> None:
+        """From the choice on, as long as what is left is as good."""
+        place = self.path.place
+        while self.rungs[place].size > 1 and self.path.place == place and self.step(place, -1):
+            place = len(self.rungs) - 1
 
 
 def _parts(runs: TermRuns, point: Point) -> list[Equations]:

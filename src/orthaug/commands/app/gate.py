@@ -13,10 +13,11 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 _NAMES = ("127.0.0.1", "localhost")
+PLAIN = "<!doctype html><html lang='en'><title>orthaug</title><body style='font:1rem system-ui;margin:3rem'>"
+"""How a page begins that only says something."""
 _REFUSED = (
-    "<!doctype html><html lang='en'><title>orthaug</title><body style='font:1rem system-ui;margin:3rem'>"
-    "<h1>This page needs its token</h1><p>Open the address that <code>orthaug app</code> printed in the terminal. "
-    "It ends in <code>?token=…</code>.</p></body></html>"
+    f"{PLAIN}<h1>This page needs its token</h1><p>Open the address that <code>orthaug app</code> printed in the "
+    "terminal. It ends in <code>?token=…</code>.</p></body></html>"
 )
 _HEADERS = {
     "referrer-policy": "no-referrer",

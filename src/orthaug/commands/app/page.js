@@ -64,6 +64,27 @@ async function fit(plot) {
   if (width && Math.abs(plot._fullLayout.width - width) > 1) Plotly.relayout(plot, { autosize: true, width });
 }
 
+// Where the control that had the focus is drawn anew, gone or disabled, its successor or else its card has it next.
+let held = null;
+const called = (control) =>
+  `${control.closest("[role=group]")?.ariaLabel} ${control.dataset.place ?? control.ariaLabel ?? control.innerText}`;
+const alive = (control) => control.isConnected && !control.disabled && control.getClientRects().length;
+const CONTROLS = "a, button, input, select, textarea";
+addEventListener("focusin", (event) => {
+  const target = event.target.closest(CONTROLS);
+  held = target && { target, name: called(target), card: target.closest(".card") };
+});
+setInterval(() => {
+  if (!held || document.activeElement !== document.body || alive(held.target)) return;
+  const { name, card } = held;
+  const all = [...document.querySelectorAll(CONTROLS)];
+  const next = all.find((control) => called(control) === name && alive(control));
+  if (next) return next.focus();
+  const place = card?.isConnected ? card : document.querySelector("[role=tab][aria-selected=true]");
+  if (place.tabIndex < 0) place.tabIndex = -1;
+  place.focus({ preventScroll: true });
+}, 100);
+
 // The part that is shown stands behind # in the address, so that Back and Forward go through the parts.
 function shown(part, first) {
   if (location.hash === `#${part}`) return;

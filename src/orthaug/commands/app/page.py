@@ -19,10 +19,12 @@ from orthaug.commands.app.widgets import sentence, text
 
 _OFTEN = 0.25  # s between looks at what has changed
 _PARTS = ("Data", "Model", "Training", "Report", "Export")
-_LOGO = (
-    "<svg viewBox='0 0 32 32' aria-hidden='true'><rect width='32' height='32' rx='7' fill='currentColor'/>"
-    "<path d='M9 7v16h16' class='axes'/><path d='M9 17h6v6' class='angle'/></svg>"
+MARK = (
+    "<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'><rect width='32' height='32' rx='7' fill='#0550ae'/>"
+    "<path d='M9 7v16h16' stroke='#fff' stroke-width='3.4' fill='none' stroke-linecap='round'/>"
+    "<path d='M9 17h6v6' stroke='#9cc8ff' stroke-width='2.2' fill='none'/></svg>"
 )
+"""The mark of the program, as a picture."""
 
 
 class Page:
@@ -34,32 +36,24 @@ class Page:
         self.training, self.report, self.export = TrainingView(session), ReportView(session), ExportView(session)
         self.seen = dict(session.versions)
 
-    @staticmethod
-    def gone() -> None:
-        """A session that is not open any more."""
-        _dress()
-        text("This work is not open any more", "h1")
-        text("orthaug app was ended since, and what was not taken away went with it.")
-        text("Begin anew", "a").props('href="/"')
-
     def draw(self) -> None:
-        """All of it."""
-        _dress()
+        place = files("orthaug.commands.app")
+        for tag, name in (("style", "page.css"), ("script", "page.js")):
+            ui.add_head_html(f"<{tag}>{(place / name).read_text(encoding='utf-8')}</{tag}>")
         ui.context.client.on_exception(self._complain)
-        text("Skip to the content", "a", "skip").props('href="#parts"')
         with ui.element("div").classes("head"):
-            ui.html(_LOGO, sanitize=False, tag="span").classes("logo")
+            ui.html(MARK, sanitize=False, tag="span").classes("logo").props("aria-hidden=true")
             text("orthaug", "h1")
             self.title = text("", "p", "hint")
         with ui.tabs().props("no-caps align=left active-color=tab indicator-color=tab dense").classes("tabs") as tabs:
-            made = {name: ui.tab(name) for name in _PARTS}
+            for name in _PARTS:
+                ui.tab(name)
         start = "Training" if self.session.commands else "Data"
         self._keep_history(tabs, start)
-        panels = ui.tab_panels(tabs, value=made[start]).props("id=parts animated=false").classes("parts")
         parts = (self.data, self.model, self.training, self.report, self.export)
-        with panels:
+        with ui.tab_panels(tabs, value=start).props("animated=false").classes("parts"):
             for name, part in zip(_PARTS, parts, strict=True):
-                with ui.tab_panel(made[name]):
+                with ui.tab_panel(name):
                     part.draw()
         self._name()
         ui.timer(_OFTEN, self.follow)
@@ -111,9 +105,3 @@ class Page:
     def _complain(self, error: Exception) -> None:
         told = str(error) if isinstance(error, InputError) else f"this did not work ({type(error).__name__})."
         ui.notify(sentence(told), type="negative")
-
-
-def _dress() -> None:
-    place = files("orthaug.commands.app")
-    ui.add_head_html(f"<style>{(place / 'page.css').read_text(encoding='utf-8')}</style>")
-    ui.add_head_html(f"<script>{(place / 'page.js').read_text(encoding='utf-8')}</script>")

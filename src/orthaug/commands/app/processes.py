@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from orthaug._base.errors import InputError
@@ -32,7 +31,6 @@ class Command:
     """The last that was told: `run`, `runs`, `iteration`, `loss`, `done` (share)."""
     losses: list[tuple[int, int, float]] = field(default_factory=list)
     """(run, iteration, loss) as told."""
-    output: str = ""
     lines: list[str] = field(default_factory=list)
     began: float = 0.0
     ended: float | None = None
@@ -46,11 +44,6 @@ class Command:
     def running(self) -> bool:
         """Whether it has not ended yet."""
         return self.code is None
-
-    @property
-    def asked(self) -> bool:
-        """Whether it was asked to end, in one way or the other."""
-        return self.stopping or self.ending
 
     @property
     def seconds(self) -> float:
@@ -69,33 +62,28 @@ class Command:
         """Start it and follow it to its end; one that cannot start has failed."""
         self.began = time.monotonic()
         try:
-            self.output, self.code = await self._followed()
+            self.code = await self._followed()
         except OSError as error:
             self.lines, self.code = [f"error: the command cannot start ({error.strerror})."], 2
         self.ended = time.monotonic()
         self.changed()
 
-    async def _followed(self) -> tuple[str, int]:
-        """What it wrote to standard output, and the code that it ended with."""
+    async def _followed(self) -> int:
+        """The code that it ended with."""
         program = [sys.executable, "-m", "orthaug.commands.app.child", *self.arguments]
         self.process = await asyncio.create_subprocess_exec(
             *program,
             stdin=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.PIPE,
             limit=_LONGEST,
             env={**os.environ, TOLD_AS: "json", "PYTHONIOENCODING": "utf-8", "NO_COLOR": "1"},
         )
-        assert self.process.stdout is not None
+        assert self.process.stderr is not None
         if self.stopping:
             self.stop()
         elif self.ending:
             self.finish()
-        output, _ = await asyncio.gather(self.process.stdout.read(), self._told())
-        return output.decode("utf-8", "replace"), await self.process.wait()
-
-    async def _told(self) -> None:
-        assert self.process is not None and self.process.stderr is not None
         async for raw in self.process.stderr:
             line = raw.decode("utf-8", "replace").rstrip()
             told = _progress(line)
@@ -105,6 +93,7 @@ class Command:
                 self.progress = told
                 self.losses.append((told["run"], told["iteration"], told["loss"]))
             self.changed()
+        return await self.process.wait()
 
     def stop(self) -> None:
         """Interrupt it: it keeps or removes what is partial, and ends."""
@@ -125,16 +114,12 @@ class Command:
             try:
                 await asyncio.wait_for(self.process.wait(), _GRACE)
             except TimeoutError:
-                with suppress(ProcessLookupError):
-                    self.process.kill()
+                _kill(self.process)
 
 
 def _progress(line: str) -> dict[str, Any] | None:
-    if not line.startswith('{"run"'):
-        return None
     with suppress(ValueError):
-        told = json.loads(line)
-        return told if isinstance(told, dict) else None
+        return json.loads(line) if line.startswith('{"run"') else None
     return None
 
 
@@ -187,7 +172,6 @@ class Desk:
         return await (_started() if coming is None else asyncio.shield(coming))
 
     async def close(self) -> None:
-        """End all of them."""
         coming = [] if self._coming is None else [await self._coming]
         for process in (*self._busy, *self._idle, *coming):
             _kill(process)
@@ -209,17 +193,12 @@ async def _started() -> asyncio.subprocess.Process:
 async def _answered(process: asyncio.subprocess.Process, question: dict[str, Any]) -> dict[str, Any]:
     assert process.stdin is not None and process.stdout is not None
     try:
-        process.stdin.write(json.dumps(question, default=_path).encode() + b"\n")
+        process.stdin.write(json.dumps(question, default=str).encode() + b"\n")
         await process.stdin.drain()
         line = await process.stdout.readline()
         return json.loads(line)
     except (OSError, ValueError):
         raise InputError("the data could not be looked at: the process ended early. Is there enough memory?") from None
-
-
-def _path(value: Any) -> str:
-    assert isinstance(value, Path)
-    return str(value)
 
 
 def _kill(process: asyncio.subprocess.Process) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
+from html import escape
 from pathlib import Path
 
 from fastapi import FastAPI, Request
@@ -13,14 +14,9 @@ from nicegui import ui
 from starlette.requests import ClientDisconnect
 
 from orthaug._base.errors import InputError
-from orthaug.commands.app.page import Page
-from orthaug.commands.app.sessions import Sessions
-
-_ICON = (
-    "<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'><rect width='32' height='32' rx='7' fill='#0550ae'/>"
-    "<path d='M9 7v16h16' stroke='#fff' stroke-width='3.4' fill='none' stroke-linecap='round'/>"
-    "<path d='M9 17h6v6' stroke='#9cc8ff' stroke-width='2.2' fill='none'/></svg>"
-)
+from orthaug.commands.app.gate import PLAIN
+from orthaug.commands.app.page import MARK, Page
+from orthaug.commands.app.session import Sessions
 
 
 def application(sessions: Sessions, spec: Path | None) -> FastAPI:
@@ -53,15 +49,17 @@ def application(sessions: Sessions, spec: Path | None) -> FastAPI:
         return FileResponse(file, filename=what, headers={"cache-control": "no-store"})
 
     @ui.page("/session/{key}", title="orthaug", response_timeout=20)
-    def work(key: str) -> None:
+    def work(key: str) -> Response | None:
         session = sessions.find(key)
-        Page(session).draw() if session is not None else Page.gone()
+        if session is None:
+            return _told("This work is not open any more. Its spec is offered where something new begins.", 404)
+        Page(session).draw()
 
     pages.on_exception(lambda error: None)  # each page tells of its own
     ui.run_with(
         app,
         title="orthaug",
-        favicon=_ICON,
+        favicon=MARK,
         dark=None,
         language="en-US",
         tailwind=False,
@@ -104,7 +102,4 @@ def _refused(text: str, code: int) -> Response:
 
 
 def _told(text: str, code: int) -> Response:
-    from html import escape
-
-    body = "<!doctype html><html lang='en'><title>orthaug</title><body style='font:1rem system-ui;margin:3rem'><p>"
-    return HTMLResponse(f"{body}{escape(text)}</p><p><a href='/'>Begin anew</a></p></body></html>", code)
+    return HTMLResponse(f"{PLAIN}<p>{escape(text)}</p><p><a href='/'>Begin anew</a></p></body></html>", code)

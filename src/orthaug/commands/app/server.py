@@ -17,7 +17,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import PARTIALS
 from orthaug.commands import streams
 from orthaug.commands.app.gate import Gate
-from orthaug.commands.app.sessions import Sessions
+from orthaug.commands.app.session import Sessions
 from orthaug.commands.signals import WATCH
 
 _HOST = "127.0.0.1"
@@ -74,26 +74,14 @@ def serve(spec: Path | None, *, port: int | None = None, browser: bool = True) -
     with listening, private_folder() as folder:
         os.environ["NICEGUI_STORAGE_PATH"] = str(folder / "storage")  # else it would keep one in the working folder
         check_installed()
+        from orthaug.commands.app.spec_text import in_file
+
         sessions = Sessions(folder)
         if spec is not None:
-            _check_spec(spec)
+            in_file(spec)
         with _asked_to_end() as asked:
             asyncio.run(_serve(sessions, listening, spec, asked, browser))
     streams.say("ended")
-
-
-def _check_spec(spec: Path) -> None:
-    """Raise InputError for a spec that no page could show."""
-    from orthaug.commands.app.spec_text import opened
-    from orthaug.data.tables import check_readable
-
-    check_readable(spec)
-    try:
-        opened(spec.read_text(encoding="utf-8-sig"))
-    except UnicodeDecodeError:
-        raise InputError(f"{spec}: not a text file; expected TOML in UTF-8.") from None
-    except InputError as error:
-        raise InputError(f"{spec}: {error}") from None
 
 
 @contextlib.contextmanager

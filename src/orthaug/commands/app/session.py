@@ -1,23 +1,25 @@
-"""One person's work on the page: file, spec, check, training, results. It lives on the server; a page only shows it."""
+"""Work on the page: file, spec, check, training, results. It lives on the server; a page only shows it."""
 
 from __future__ import annotations
 
 import asyncio
 import json
 import re
+import secrets
 import shutil
 import zipfile
 from collections import Counter
-from collections.abc import Awaitable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from orthaug._base.errors import InputError
 from orthaug.commands.app.processes import Command, Desk
-from orthaug.commands.app.spec_text import absolute, plain, with_value
+from orthaug.commands.app.spec_text import absolute, in_file, keep, kept_title, plain, with_value
 from orthaug.data.tables import KNOWN
 
+_SESSIONS = 50  # that are kept at once
 _PAUSE = 0.6  # s without a change until a spec is checked
 KINDS = ("fit", "compare")
 
@@ -34,17 +36,19 @@ class Session:
         self.found: dict[str, Any] | None = None
         self.looking = ""
         self.trouble = ""
-        """What is wrong with the data, in words."""
+        """What is wrong with the data."""
         self.unfit = ""
-        """Why the chosen channels make no spec, in words."""
+        """Why the chosen channels make no spec."""
         self.kept = False
         """Whether a file was looked at that the spec, which a person has worked on, was not begun anew for."""
         self.spec = ""
+        self.kept_as = ""
+        """The title under which its spec is kept when the server ends; empty until there is something to keep."""
         self.authors: list[str] = []
         """Who made each change of the spec: a part of a page, which need not be told of its own."""
         self.checked: dict[str, Any] | None = None
         self.refused = ""
-        """Why the spec cannot be trained, in words."""
+        """Why the spec cannot be trained."""
         self.stale = False
         """Whether `checked` is of an earlier spec: this one could not be opened."""
         self.checking = False
@@ -70,7 +74,7 @@ class Session:
         self.versions[what] += 1
 
     def start(self, work: Awaitable[Any]) -> asyncio.Task[Any]:
-        """Let something run; it is not lost, and not awaited."""
+        """Let something run without waiting for it."""
         task = asyncio.ensure_future(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
@@ -89,7 +93,7 @@ class Session:
         Raises:
             InputError: an ending of no data file.
         """
-        plain_name = re.sub(r"[^\w. -]", "_", re.split(r"[/\\]", name)[-1]).strip(" .")[-60:]
+        plain_name = _as_name(re.split(r"[/\\]", name)[-1])
         ending = Path(plain_name).suffix.lower()
         if ending not in KNOWN or not Path(plain_name).stem:
             raise InputError(f"'{plain_name}': no data file that is known; known are {', '.join(KNOWN)}.")
@@ -99,6 +103,8 @@ class Session:
         """Look at a data file, and begin a spec for it where its columns tell what they are."""
         self.data, self.found, self.title = path, None, path.name
         self._look_again(None, None, None)
+        if self.edited:  # it may name this file
+            self._check_soon()
 
     def choose(self, inputs: Sequence[str], outputs: Sequence[str], step: float | None) -> None:
         """Begin the spec anew with these columns."""
@@ -113,9 +119,9 @@ class Session:
         assert self.data is not None
         self.looking, self.trouble, self.unfit = f"Looking at {self.data.name} …", "", ""
         self.changed("data")
-        given: dict[str, Any] = {"path": self.data, "out": self.folder / "spec.toml"}
+        place = self.folder / "spec.toml"
         try:
-            found = await self.desk.ask("look", **given, inputs=inputs, outputs=outputs, step=step)
+            found = await self.desk.ask("look", path=self.data, out=place, inputs=inputs, outputs=outputs, step=step)
             if self.found is not None and found["spec"] is None:
                 self.unfit = found["open"]
             else:
@@ -143,27 +149,20 @@ class Session:
         assert self.data is not None
         file = self.data.name if self.data.parent == self.folder else self.data.as_posix()
         name = re.sub(r"\W", "_", self.data.stem)
-        self.write(with_value(self.spec, ("data", "tests", name), {"files": [file]}), "test")
+        self.edit("test", with_value, ("data", "tests", name), {"files": [file]})
         self.kept = False
         self.changed("data")
 
-    def open_spec(self, path: Path) -> None:
-        """Take a spec that stands somewhere; it is read, and never written.
+    def open_spec(self, path: Path, *, kept: bool = False) -> None:
+        """Take a spec that stands somewhere, or one of earlier work that was kept; it is read, and never written.
 
         Raises:
             InputError: a file that cannot be read, or broken TOML.
         """
-        try:
-            text = path.read_text(encoding="utf-8-sig")
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
-        except UnicodeDecodeError:
-            raise InputError(f"{path}: not a text file; expected TOML in UTF-8.") from None
-        try:
-            self.write(absolute(text, path.absolute().parent), "file")
-            self.title = path.name
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
+        text = path.read_text(encoding="utf-8") if kept else absolute(in_file(path), path.absolute().parent)
+        self.title = kept_title(path) if kept else path.name
+        self.write(text, "file")
+        self.changed("data")
 
     # Spec
 
@@ -174,9 +173,19 @@ class Session:
         self.spec = text
         self.authors.append(author)
         self.changed("spec")
+        if author != "file" and text.strip():
+            self.kept_as = self.kept_as or _as_name(self.title) or "spec"
+            keep(self.kept_as, self.key, text)
+        self._check_soon()
+
+    def edit(self, author: str, change: Callable[..., str], *given: Any) -> None:
+        """Take the spec after a change of `spec_text`, which is given the rest."""
+        self.write(change(self.spec, *given), author)
+
+    def _check_soon(self) -> None:
         if self._check is not None:
             self._check.cancel()
-        self.checking = bool(text.strip())
+        self.checking = bool(self.spec.strip())
         self.changed("check")
         self._check = self.start(self._checked())
 
@@ -307,11 +316,50 @@ class Session:
         raise InputError("there is nothing of that name yet.")
 
     async def close(self) -> None:
-        """End all that runs."""
         for task in list(self._tasks):
             if task is self._check or task is self._look:
                 task.cancel()
         await asyncio.gather(*(command.end() for command in self.commands.values()))
+
+
+class Sessions:
+    """All work that goes on, by keys that cannot be guessed."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.desk = folder, Desk()
+        self._open: dict[str, Session] = {}
+        self._made = 0
+
+    def new(self, spec: Path | None = None) -> Session:
+        """A session in a folder of its own, which nobody else may read.
+
+        Raises:
+            InputError: too many sessions, or a spec that cannot be read.
+        """
+        untouched = [session for session in self._open.values() if session.untouched]
+        if len(self._open) >= _SESSIONS and untouched:
+            del self._open[untouched[0].key]
+        if len(self._open) >= _SESSIONS:
+            raise InputError(f"{_SESSIONS} pieces of work are open; end orthaug app, and start it again.")
+        key = secrets.token_urlsafe(12)
+        self._made += 1
+        folder = self.folder / f"work-{self._made}"
+        folder.mkdir(mode=0o700)
+        session = self._open[key] = Session(key, folder, self.desk)
+        if spec is not None:
+            session.open_spec(spec)
+        return session
+
+    def find(self, key: str) -> Session | None:
+        return self._open.get(key)
+
+    async def close(self) -> None:
+        await asyncio.gather(self.desk.close(), *(session.close() for session in self._open.values()))
+
+
+def _as_name(text: str) -> str:
+    """What any system takes as the name of a file."""
+    return re.sub(r"[^\w. -]", "_", text).strip(" .")[-60:]
 
 
 def _zipped(folder: Path, place: Path) -> Path:

@@ -1,19 +1,24 @@
-"""A spec as text that forms change: one key or table at a time, comments and order kept."""
+"""A spec as text that forms change, one key or table at a time, comments and order kept; and where it stands."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import platformdirs
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT
 
 from orthaug._base.errors import InputError
+from orthaug.data.tables import check_readable
 
 _WORDS = ("parameter", "regressor", "output", "unit", "channel")  # keys whose values are text, digits or not
+_KEPT = 20  # specs of earlier work
+_MARK = 7  # letters behind the title in the name of one
 
 
 def opened(text: str) -> tomlkit.TOMLDocument:
@@ -26,6 +31,53 @@ def opened(text: str) -> tomlkit.TOMLDocument:
         return tomlkit.parse(text)
     except (TOMLKitError, RecursionError) as error:
         raise InputError(f"broken TOML: {' '.join(str(error).split())}.") from None
+
+
+def in_file(path: Path) -> str:
+    """The text of a spec that stands somewhere.
+
+    Raises:
+        InputError: a file that cannot be read, or broken TOML.
+    """
+    check_readable(path)
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        opened(text)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file; expected TOML in UTF-8.") from None
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return text
+
+
+def keep(title: str, key: str, spec: str) -> None:
+    """Write the spec of a piece of work anew, whole or not at all; nothing where the folder cannot be written."""
+    place = _folder() / f"{title}-{key[: _MARK - 1]}.toml"
+    with suppress(OSError):
+        place.parent.mkdir(parents=True, exist_ok=True)
+        partial = place.with_suffix(".partial")
+        partial.write_text(spec, encoding="utf-8")
+        os.replace(partial, place)
+        for old in earlier()[_KEPT:]:
+            old.unlink(missing_ok=True)
+
+
+def earlier() -> list[Path]:
+    """The specs that are kept, the latest first."""
+    with suppress(OSError):
+        return sorted(_folder().glob("*.toml"), key=lambda place: place.stat().st_mtime, reverse=True)
+    return []
+
+
+def kept_title(place: Path) -> str:
+    """What it was called."""
+    return place.stem[:-_MARK]
+
+
+def _folder() -> Path:
+    return platformdirs.user_state_path("orthaug") / "app"
 
 
 def absolute(text: str, folder: Path) -> str:
@@ -73,8 +125,8 @@ def read(key: str, value: str) -> Any:
     value = value.strip()
     if not value:
         return None
-    if key == "channels":
-        return [name.strip() for name in value.split(",") if name.strip()]
+    if key in ("channels", "inputs"):
+        return [name.strip() for name in value.split(",") if name.strip()] or None
     for kind in (int, float) if key not in _WORDS else ():
         try:
             return kind(value)
@@ -83,10 +135,13 @@ def read(key: str, value: str) -> Any:
     return value
 
 
-def _made(document: Any, key: str) -> Any:
-    if not isinstance(document.get(key), Mapping):
-        document[key] = tomlkit.table()
-    return document[key]
+def _made(document: Any, path: Sequence[str]) -> Any:
+    """The table at the end of the path, made where there is none."""
+    for key in path:
+        if not isinstance(document.get(key), Mapping):
+            document[key] = tomlkit.table()
+        document = document[key]
+    return document
 
 
 def plain(text: str) -> dict[str, Any]:
@@ -116,9 +171,7 @@ def with_value(text: str, path: Sequence[str], value: Any) -> str:
     """With a key of a table set, or without it where the value is None; tables on the way are made."""
 
     def change(document: Any) -> None:
-        table = document
-        for key in path[:-1]:
-            table = _made(table, key)
+        table = _made(document, path[:-1])
         if value is None:
             table.pop(path[-1], None)
         elif isinstance(value, Mapping):  # inline: a table of its own would land elsewhere beside dotted keys
@@ -140,9 +193,7 @@ def with_row(text: str, path: Sequence[str], row: Mapping[str, Any]) -> str:
     """With a table more at the end of a list of tables."""
 
     def change(document: Any) -> None:
-        table = document
-        for key in path[:-1]:
-            table = _made(table, key)
+        table = _made(document, path[:-1])
         rows = table.get(path[-1])
         if not isinstance(rows, list) or (not rows and not isinstance(rows, AoT)):
             table[path[-1]] = tomlkit.aot()
@@ -156,11 +207,11 @@ def with_row(text: str, path: Sequence[str], row: Mapping[str, Any]) -> str:
     return changed(text, change)
 
 
-def with_cell(text: str, path: Sequence[str], index: int, key: str, value: Any) -> str:
-    """With a key of one table of a list set, or without it where the value is None."""
+def with_told(text: str, path: Sequence[str], index: int, key: str, told: str) -> str:
+    """With a key of one table of a list as a field says it, or without it where that says nothing."""
 
     def change(document: Any) -> None:
-        row = _list(document, path)[index]
+        row, value = _at(document, path)[index], read(key, told)
         if value is None:
             row.pop(key, None)
         else:
@@ -173,18 +224,15 @@ def without_row(text: str, path: Sequence[str], index: int) -> str:
     """Without one table of a list."""
 
     def change(document: Any) -> None:
-        rows = _list(document, path)
+        rows = _at(document, path)
         del rows[index]
         if not rows:
-            table = document
-            for key in path[:-1]:
-                table = table[key]
-            del table[path[-1]]
+            del _at(document, path[:-1])[path[-1]]
 
     return changed(text, change)
 
 
-def _list(document: Any, path: Sequence[str]) -> Any:
+def _at(document: Any, path: Sequence[str]) -> Any:
     for key in path:
         document = document[key]
     return document
@@ -221,7 +269,7 @@ def as_motion(text: str) -> str:
         for key in ("baseline", "lags", "physics", "motion", "suspects"):
             document.pop(key, None)
         document["motion"] = tomlkit.parse(MOTION.format(output=outputs[0], force=inputs[0], **given))["motion"]
-        _made(document, "learner")["inputs"] = ["v"]
+        _made(document, ["learner"])["inputs"] = ["v"]
 
     return changed(_without_comments(text, _OF_TERMS), change)
 

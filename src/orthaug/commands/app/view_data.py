@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import MISSING, fields
+from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +34,7 @@ from orthaug.data.record import check_step
 
 _STEPS = ("data", "prepare")
 _LISTED = 40  # columns
+_OFFERED = 5  # specs of earlier work
 _USES = {"": "leave out", "input": "input", "output": "output"}
 _SUMMARIES = {
     "detrend": "take out mean or trend",
@@ -64,11 +67,11 @@ class DataView:
         self.session = session
         self.uses: dict[str, str] = {}
         self.step = ""
+        self.kind = next(iter(STEPS))
         self._curves: Any = None
         self._drawn: tuple[Any, Any, bool] = (None, None, False)
 
     def draw(self) -> None:
-        """The places; their content follows."""
         from orthaug.data.tables import KNOWN
 
         with ui.element("div").classes("columns wide-right"):
@@ -94,7 +97,6 @@ class DataView:
         self.follow_spec("")
 
     def name_file(self) -> None:
-        """Open a file that stands on this machine."""
         given = (self.path.value or "").strip().strip("\"'")
         if given:
             self.session.open_file(Path(given).expanduser().absolute())
@@ -104,8 +106,7 @@ class DataView:
         session, found = self.session, self.session.found
         with redrawn(self.status):
             if session.looking:
-                with ui.element("p").classes("note busy").props("role=status"):
-                    text(session.looking, "span")
+                note(session.looking, "busy")
             elif session.trouble:
                 note(session.trouble, "bad")
             elif found is not None and session.data is not None:
@@ -117,6 +118,13 @@ class DataView:
                 if session.kept:
                     note("The spec is kept as it is. Take this file as a test of it, or begin anew below.", "care")
                     button("Take it as a test", session.add_test)
+            elif not session.spec and (kept := spec_text.earlier()[:_OFFERED]):
+                text("Or go on with the spec of earlier work:", "p", "hint")
+                with ui.element("div").classes("fields"):
+                    for place in kept:
+                        when = datetime.fromtimestamp(place.stat().st_mtime)
+                        label = f"{spec_text.kept_title(place)}, {when:%Y-%m-%d %H:%M}"
+                        button(label, partial(session.open_spec, place, kept=True))
         self.columns.set_visibility(found is not None)
         state = (session.data, found, bool(session.spec))
         if found is not None and any(a is not b for a, b in zip(state, self._drawn, strict=True)):
@@ -148,7 +156,8 @@ class DataView:
                     with ui.element("div").classes("grow"):
                         text(column["header"], "p", "strong")
                         text(column["told"], "p", "hint")
-                    self._choose_use(column["header"])
+                    head = column["header"]
+                    choice(f"use of {head}", _USES, self.uses[head], partial(self.uses.__setitem__, head), "bare")
             if found["timed"]:
                 text(found["timed"], "p", "hint")
             left = [c for c in found["columns"] if not c["usable"] and not c["timed"]]
@@ -163,25 +172,15 @@ class DataView:
             with ui.element("div").classes("fields"):
                 step = "" if found["step"] is None else f"{found['step']:g}"
                 label = "sampling time in s"
-                self.step_field = field(label, self.step, self._set_step, classes="medium", hint=step or "1")
-                label = (
-                    "Begin with these channels"
-                    if found["spec"] is None and not self.session.spec
-                    else "Begin anew with these channels"
+                self.step_field = field(
+                    label, self.step, partial(setattr, self, "step"), classes="medium", hint=step or "1"
                 )
-                button(label, self.choose, main=found["spec"] is None)
-
-    def _choose_use(self, header: str) -> None:
-        def use(value: str) -> None:
-            self.uses[header] = value
-
-        choice(f"use of {header}", _USES, self.uses[header], use, "bare")
-
-    def _set_step(self, value: str) -> None:
-        self.step = value
+                anew = "" if found["spec"] is None and not self.session.spec else "anew "
+                button(f"Begin {anew}with these channels", self.choose, main=found["spec"] is None).props(
+                    "data-place=begin"
+                )
 
     def choose(self) -> None:
-        """Begin the spec with the columns as they are chosen."""
         chosen = {kind: [h for h, use in self.uses.items() if use == kind] for kind in ("input", "output")}
         try:
             step = _seconds(self.step)
@@ -208,12 +207,14 @@ class DataView:
                 self._draw_step(i, step)
             if not steps:
                 text("None yet.", "p", "hint")
-            options = {"": "add a step …"} | {kind: f"{kind}: {_SUMMARIES.get(kind, kind)}" for kind in STEPS}
-            choice("add a step", options, "", self._add, "bare")
+            options = {kind: f"{kind}: {_SUMMARIES.get(kind, kind)}" for kind in STEPS}
+            with ui.element("div").classes("fields"):
+                choice("step to add", options, self.kind, partial(setattr, self, "kind"), "bare")
+                button("Add", self._add)
 
     def _draw_step(self, index: int, step: Mapping[str, Any]) -> None:
         kind = str(step.get("step"))
-        with ui.element("div").classes("entry step"):
+        with named(ui.element("div").classes("entry step").props("role=group"), f"step {index + 1}"):
             with ui.element("div").classes("grow"):
                 text(f"{index + 1}. {_SUMMARIES.get(kind, kind)}", "p", "strong")
                 with ui.element("div").classes("fields"):
@@ -222,21 +223,15 @@ class DataView:
                         field(
                             _LABELS.get(own.name, own.name),
                             spec_text.shown(step.get(own.name)),
-                            self._setting(index, own.name),
+                            partial(self.session.edit, "steps", spec_text.with_told, _STEPS, index, own.name),
                             classes="short",
                             hint="" if own.default is MISSING else usual,
                         )
-            named(button("Remove", lambda: self._remove(index)), f"Remove step {index + 1}")
+            remove = partial(self.session.edit, "more steps", spec_text.without_row, _STEPS, index)
+            named(button("Remove", remove), f"Remove step {index + 1}")
 
-    def _setting(self, index: int, key: str) -> Any:
-        def change(value: str) -> None:
-            self._write(spec_text.with_cell(self.session.spec, _STEPS, index, key, spec_text.read(key, value)), "steps")
-
-        return change
-
-    def _add(self, kind: str) -> None:
-        if kind not in STEPS:
-            return
+    def _add(self) -> None:
+        kind = self.kind
         needed = [own.name for own in fields(STEPS[kind]) if own.default is MISSING]
         first: dict[str, Any] = {name: _FIRST[name] for name in needed if name in _FIRST}
         if "cutoff" in needed:
@@ -245,20 +240,14 @@ class DataView:
         if "channel" in needed:
             data = spec_text.section(self.session.content(), "data")
             first["channel"] = next(iter(spec_text.names(data, "inputs")), "")
-        self._write(spec_text.with_row(self.session.spec, _STEPS, {"step": kind, **first}), "more steps")
-
-    def _remove(self, index: int) -> None:
-        self._write(spec_text.without_row(self.session.spec, _STEPS, index), "more steps")
-
-    def _write(self, spec: str, author: str) -> None:
-        self.session.write(spec, author)
+        self.session.edit("more steps", spec_text.with_row, _STEPS, {"step": kind, **first})
 
     def follow_check(self) -> None:
         """Curves of the file, and of the training data after preparation; why they cannot be drawn."""
+        session, found, checked = self.session, self.session.found, self.session.checked
         with redrawn(self.refusal):
-            if self.session.stale:
-                note(sentence(self.session.refused), "bad")
-        found, checked, session = self.session.found, self.session.checked, self.session
+            if session.stale:
+                note(sentence(session.refused), "bad")
         prepared = {} if checked is None else checked["curves"]
         raw = {} if found is None else found["curves"]
         cleaned = bool(checked and checked["prepared"])
@@ -283,18 +272,15 @@ class DataView:
                 text("The curves of a file are drawn here, once there is one.", "p", "hint")
                 return
             plot(curves_figure(rows), f"Curves of {', '.join(label for label, _ in rows)} over time.")
-            told = [
-                "In colour the training data",
-                ", after preparation" * cleaned,
-                ", in grey the whole file" * bool(raw),
-            ]
-            text(f"{''.join(told) if prepared else 'The whole file'}. Drag to zoom, double-click for all.", "p", "hint")
+            told = "The whole file"
+            if prepared:
+                grey = ", in grey the whole file" * bool(raw)
+                told = f"In colour the training data{', after preparation' * cleaned}{grey}"
+            text(f"{told}. Drag to zoom, double-click for all.", "p", "hint")
             for done in (checked or {}).get("prepared", ()):
                 text(f"Done: {done}", "p", "hint")
             if checked and session.spec:
-                table(
-                    ("part", "rows"), [(part, count) for part, count in checked["rows"].items()], "Rows that are used"
-                )
+                table(("part", "rows"), list(checked["rows"].items()), "Rows that are used")
 
 
 def _seconds(told: str) -> float | None:
@@ -307,8 +293,7 @@ def _seconds(told: str) -> float | None:
     if not told:
         return None
     try:
-        return check_step(float(told))
-    except InputError:
-        raise
+        step = float(told)
     except ValueError:
         raise InputError(f"it must be a number of seconds, such as 0.01; got {told}.") from None
+    return check_step(step)

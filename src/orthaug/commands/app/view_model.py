@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from nicegui import ui
@@ -44,8 +45,7 @@ class ModelView:
         self.session = session
 
     def draw(self) -> None:
-        """The places; their content follows."""
-        with ui.element("div").classes("columns"):
+        with ui.element("div").classes("columns wide-left"):
             with ui.element("div").classes("stack"):
                 with card("Physics"):
                     self.physics = ui.element("div")
@@ -76,9 +76,6 @@ class ModelView:
         if not self.session.spec.strip():
             self._draw_physics({})
 
-    def _write(self, spec: str, author: str = "form") -> None:
-        self.session.write(spec, author)
-
     def _draw_physics(self, content: Mapping[str, Any]) -> None:
         with redrawn(self.physics):
             if not content:
@@ -102,14 +99,10 @@ class ModelView:
             with ui.element("div").classes("fields grow"):
                 for key in keys:
                     wide = "" if key in ("parameter", "regressor") else "short"
-                    field(key, term.get(key), self._cell(index, key), classes=f"{wide} {key}")
-            named(button("Remove", lambda: self._remove(index)), f"Remove term {index + 1}")
-
-    def _cell(self, index: int, key: str) -> Callable[[str], None]:
-        def change(value: str) -> None:
-            self._write(spec_text.with_cell(self.session.spec, _TERMS, index, key, spec_text.read(key, value)))
-
-        return change
+                    change = partial(self.session.edit, "form", spec_text.with_told, _TERMS, index, key)
+                    field(key, term.get(key), change, classes=f"{wide} {key}")
+            remove = partial(self.session.edit, "more terms", spec_text.without_row, _TERMS, index)
+            named(button("Remove", remove), f"Remove term {index + 1}")
 
     def _add(self) -> None:
         taken = {str(term.get("parameter")) for term in spec_text.rows_of(self.session.spec, _TERMS)}
@@ -118,13 +111,10 @@ class ModelView:
         inputs, outputs = spec_text.names(data, "inputs"), spec_text.names(data, "outputs")
         row = {"parameter": name, "regressor": f"{[*inputs, *outputs, 'u'][0]}[k-1]**2"}
         row |= {"output": outputs[0]} if len(outputs) > 1 else {}
-        self._write(spec_text.with_row(self.session.spec, _TERMS, row), "more terms")
-
-    def _remove(self, index: int) -> None:
-        self._write(spec_text.without_row(self.session.spec, _TERMS, index), "more terms")
+        self.session.edit("more terms", spec_text.with_row, _TERMS, row)
 
     def _to_motion(self) -> None:
-        self._write(spec_text.as_motion(self.session.spec), "motion")
+        self.session.edit("motion", spec_text.as_motion)
         ui.notify("A mass, a spring and a damper: change the equations in the spec below.")
 
     def _draw_motion(self, content: Mapping[str, Any]) -> None:
@@ -140,13 +130,11 @@ class ModelView:
                     text(name, "p", "strong name")
                     with ui.element("div").classes("fields grow"):
                         for key in ("initial", "unit", "min", "max"):
-                            field(key, row.get(key), self._value(("motion", "parameters", name, key)), classes="short")
+                            field(key, row.get(key), self._value("motion", "parameters", name, key), classes="short")
 
-    def _value(self, path: tuple[str, ...]) -> Callable[[str], None]:
-        def change(value: str) -> None:
-            self._write(spec_text.with_value(self.session.spec, path, spec_text.read(path[-1], value)))
-
-        return change
+    def _value(self, *path: str) -> Callable[[str], None]:
+        """Takes what a field says as the value of a key."""
+        return lambda told: self.session.edit("form", spec_text.with_value, path, spec_text.read(path[-1], told))
 
     def _draw_learner(self, content: Mapping[str, Any]) -> None:
         learner, training = spec_text.section(content, "learner"), spec_text.section(content, "training")
@@ -162,30 +150,24 @@ class ModelView:
                     hidden = learner.get("hidden", [16])
                     field("neurons", spec_text.shown(hidden), self._set_hidden, classes="short")
                 if kind == "terms":
-                    field("highest degree", learner.get("degree"), self._value(("learner", "degree")), classes="short")
+                    field("highest degree", learner.get("degree"), self._value("learner", "degree"), classes="short")
                 seen = learner.get("inputs")
-                field("what it sees", spec_text.shown(seen), self._set_inputs, hint="all that the physics reads")
+                change = self._value("learner", "inputs")
+                field("what it sees", spec_text.shown(seen), change, hint="all that the physics reads")
             with ui.element("div").classes("fields"):
                 structure = str(spec_text.section(content, "structure").get("kind", "orthogonal"))
-                choice("structure", _STRUCTURES, structure, self._chosen(("structure", "kind")))
+                choice("structure", _STRUCTURES, structure, self._value("structure", "kind"))
                 focus = str(training.get("focus", "simulation" if moves else "prediction"))
-                choice("trained on", _FOCUS, focus, self._chosen(("training", "focus")))
-                field(
-                    "starts", training.get("restarts"), self._value(("training", "restarts")), classes="short", hint="1"
-                )
-                field(
-                    "iterations", training.get("iterations"), self._value(("training", "iterations")), classes="short"
-                )
-
-    def _chosen(self, path: tuple[str, ...]) -> Callable[[str], None]:
-        return lambda value: self._write(spec_text.with_value(self.session.spec, path, value))
+                choice("trained on", _FOCUS, focus, self._value("training", "focus"))
+                for label, key, hint in (("starts", "restarts", "1"), ("iterations", "iterations", "")):
+                    field(label, training.get(key), self._value("training", key), classes="short", hint=hint)
 
     def _set_kind(self, kind: str) -> None:
         spec = spec_text.with_value(self.session.spec, ("learner", "kind"), kind)
         learner = spec_text.section(self.session.content(), "learner")
         if kind == "terms" and not {"terms", "degree"} & set(learner):
             spec = spec_text.with_value(spec, ("learner", "degree"), 2)
-        self._write(spec, "learner")
+        self.session.write(spec, "learner")
 
     def _set_hidden(self, value: str) -> None:
         try:
@@ -193,11 +175,7 @@ class ModelView:
         except ValueError:
             ui.notify("Neurons are whole numbers, such as 16, or 8, 8 for two layers.", type="warning")
             return
-        self._write(spec_text.with_value(self.session.spec, ("learner", "hidden"), hidden or None))
-
-    def _set_inputs(self, value: str) -> None:
-        names = [name.strip() for name in value.split(",") if name.strip()]
-        self._write(spec_text.with_value(self.session.spec, ("learner", "inputs"), names or None))
+        self.session.edit("form", spec_text.with_value, ("learner", "hidden"), hidden or None)
 
     def follow_check(self) -> None:
         """What checking says of the spec as it is."""

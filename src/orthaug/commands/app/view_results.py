@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from functools import partial
 
 from nicegui import ui
 
@@ -11,6 +11,14 @@ from orthaug.commands.app.session import Session
 from orthaug.commands.app.widgets import button, card, choice, field, link, named, note, redrawn, text
 
 _REPORTS = {"report.html": "of the fit", "comparison.html": "of the comparison"}
+_FILES = (
+    ("spec", "spec.toml", "Spec", "the command line runs it to the same numbers"),
+    ("fit", "model.zip", "Model", "for orthaug simulate, predict, linearize, track"),
+    ("fit", "report.html", "Report", "one file, needs no network"),
+    ("fit", "result.json", "Numbers", "result.json"),
+    ("fit", "result.zip", "All of the fit", "result folder"),
+    ("compare", "comparison.zip", "All of the comparison", "result folder"),
+)
 _TARGETS = {
     "c": "C99 without libraries",
     "casadi": "CasADi, for optimisation and MPC",
@@ -23,27 +31,25 @@ _TARGETS = {
 
 
 class ReportView:
-    """Shows report.html as it is."""
+    """Shows report.html."""
 
     def __init__(self, session: Session) -> None:
         self.session, self.shown = session, "report.html"
         self._state: object = None
 
     def draw(self) -> None:
-        """The place; its content follows."""
         self.place = ui.element("div")
         self.follow_work()
 
     def follow_work(self) -> None:
         """The report of the last result."""
         session = self.session
-        there = [
-            name for kind, name in (("fit", "report.html"), ("compare", "comparison.html")) if kind in session.results
-        ]
-        marks = [session.commands[kind].began for kind in ("fit", "compare") if kind in session.results]
-        if (there, marks) == self._state:
+        kinds = {"fit": "report.html", "compare": "comparison.html"}
+        marks = {name: session.commands[kind].began for kind, name in kinds.items() if kind in session.results}
+        there = list(marks)
+        if marks == self._state:
             return
-        self._state = (there, marks)
+        self._state = marks
         with redrawn(self.place):
             if not there:
                 with card("Report"):
@@ -53,7 +59,7 @@ class ReportView:
             with ui.element("div").classes("fields report-line"):
                 if len(there) > 1:
                     choice("report", {name: _REPORTS[name] for name in there}, self.shown, self._show, "bare")
-                link("Download the report", f"/session/{session.key}/get/{self.shown}")
+                link("Download", f"/session/{session.key}/get/{self.shown}")
             frame = ui.element("iframe").classes("report").props('sandbox="allow-scripts" title="report"')
             place = f"/session/{session.key}/get/{self.shown}?show=true&n={session.versions['work']}"
             frame.props(f'data-src="{place}"')  # page.js loads it once the frame has its width
@@ -71,8 +77,7 @@ class ExportView:
         self._state: object = None
 
     def draw(self) -> None:
-        """The places; their content follows."""
-        with ui.element("div").classes("columns even"):
+        with ui.element("div").classes("columns"):
             with card("Files"):
                 self.files = ui.element("div")
             with card("Model as code", "Needs no orthaug; each folder has a README and test vectors."):
@@ -80,7 +85,6 @@ class ExportView:
         self.follow_work()
 
     def follow_work(self) -> None:
-        """What there is to take."""
         session = self.session
         state = (bool(session.spec), tuple(session.results), tuple(session.exports.items()))
         if state == self._state:
@@ -93,16 +97,8 @@ class ExportView:
 
     def _draw_files(self) -> None:
         session = self.session
-        files = [("spec.toml", "Spec", "the command line runs it to the same numbers")] if session.spec else []
-        if "fit" in session.results:
-            files += [("model.zip", "Model", "for orthaug simulate, predict, linearize, track")]
-            files += [
-                ("report.html", "Report", "one file, needs no network"),
-                ("result.json", "Numbers", "result.json"),
-            ]
-            files += [("result.zip", "All of the fit", "result folder")]
-        if "compare" in session.results:
-            files += [("comparison.zip", "All of the comparison", "result folder")]
+        there = {"spec" if session.spec else "", *session.results}
+        files = [own for of, *own in _FILES if of in there]
         for name, label, hint in files:
             with ui.element("div").classes("entry"):
                 with ui.element("div").classes("grow"):
@@ -129,18 +125,14 @@ class ExportView:
             with ui.element("div").classes("entry"):
                 with ui.element("div").classes("grow"):
                     text(summary, "p", "strong")
-                    if why and why != "…":
-                        note(why, "bad")
+                    if why:
+                        note("Writing …" if why == "…" else why, "busy" if why == "…" else "bad")
                 if why == "":
-                    link(f"{target}.zip", f"/session/{session.key}/get/{target}.zip")
-                elif why == "…":
-                    text("writing …", "p", "note busy").props("role=status")
+                    made = link(f"{target}.zip", f"/session/{session.key}/get/{target}.zip")
                 else:
-                    made = button("Write", self._exporting(target))
-                    named(made, f"Write {target}")
-
-    def _exporting(self, target: str) -> Callable[[], None]:
-        return lambda: self.session.export(target, self.name)
+                    made = named(button("Write", partial(session.export, target, self.name)), f"Write {target}")
+                    made.props("loading" if why == "…" else "")
+                made.props(f"data-place={target}")
 
     def _rename(self, value: str) -> None:
         if re.fullmatch(r"[A-Za-z]\w{0,39}", value.strip(), re.ASCII):

@@ -27,7 +27,6 @@ class TrainingView:
         self._state: Any = None
 
     def draw(self) -> None:
-        """The places; their content follows."""
         with card("Train", "Runs orthaug fit on the spec, or orthaug compare: physics alone and every structure."):
             with ui.element("div").classes("fields"):
                 self.begin = button("Train", lambda: self.session.train("fit"), main=True)
@@ -37,12 +36,10 @@ class TrainingView:
             self.state = ui.element("div")
             self.bar = ui.element("progress").props('max=1 value=0 aria-label="progress of training"')
             self.losses = ui.element("div")
-        self.fit = ui.element("div")
-        self.comparison = ui.element("div")
+        self.results = ui.element("div")
         self.follow_work()
 
     def follow_check(self) -> None:
-        """Whether there is something to train."""
         able = bool(self.session.spec.strip()) and self.session.running is None and not self.session.refused
         for made in (self.begin, self.compare):
             made.set_enabled(able)
@@ -55,7 +52,9 @@ class TrainingView:
         self.end.set_enabled(running is not None and not running.stopping)
         able = running is not None and running.arguments[0] == "fit"  # half a comparison compares nothing
         self.finish.set_visibility(able)
-        self.finish.set_enabled(running is not None and bool(running.progress) and not running.asked)
+        self.finish.set_enabled(
+            running is not None and bool(running.progress) and not (running.stopping or running.ending)
+        )
         shown = running or max(session.commands.values(), key=lambda c: c.began, default=None)
         with redrawn(self.state):
             if shown is None:
@@ -85,22 +84,20 @@ class TrainingView:
 
     def _tell(self, command: Command) -> None:
         told, what = command.progress, _TITLES.get(command.arguments[0], "")
+        took = f"{command.seconds:.0f} s"
         if command.running:
-            done = (
-                f"run {told['run']} of {told['runs']}, iteration {told['iteration']}"
-                if told
-                else "reading and compiling"
-            )
-            loss = f", loss {number(told['loss'], 4)}" if told else ""
-            ending = f"{done}{loss}"
+            now = "reading and compiling"
+            if told:
+                now = f"run {told['run']} of {told['runs']}, iteration {told['iteration']}"
+                now += f", loss {number(told['loss'], 4)}"
             if command.stopping or command.ending:
-                ending = "stopping …" if command.stopping else "ending with the best so far …"
-            text(f"{what}: {ending} · {command.seconds:.0f} s", "p", "note busy").props("role=status")
-            self.bar.props(f"value={told.get('done', 0) if told else 0}")
+                now = "stopping …" if command.stopping else "ending with the best so far …"
+            note(f"{what}: {now} · {took}", "busy")
+            self.bar.props(f"value={told.get('done', 0)}")
         elif command.stopping and command.code != 0:
-            note(f"{what} was stopped after {command.seconds:.0f} s; nothing was kept of it.", "care")
+            note(f"{what} was stopped after {took}; nothing was kept of it.", "care")
         elif command.code == 0 and command.ending:
-            note(f"{what} was stopped after {command.seconds:.0f} s; the best so far is kept.", "care")
+            note(f"{what} was stopped after {took}; the best so far is kept.", "care")
         elif command.code == 0:
             note(f"{what} is done, in {command.seconds:.1f} s.", "good")
         else:
@@ -108,26 +105,18 @@ class TrainingView:
 
     def _draw_results(self) -> None:
         session = self.session
-        with redrawn(self.fit):
-            if (result := session.results.get("fit")) is not None:
-                with card("Result"):
-                    if session.trained["fit"] != session.spec:
-                        note("The spec has changed since this was trained.", "care")
-                    _sentences(session.verdicts.get("fit"))
-                    _fit(result, session.units if session.trained["fit"] == session.spec else {})
-        with redrawn(self.comparison):
-            if (result := session.results.get("compare")) is not None:
-                with card("Comparison"):
-                    if session.trained["compare"] != session.spec:
-                        note("The spec has changed since this was compared.", "care")
-                    _sentences(session.verdicts.get("compare"))
-                    _compare(result, session.units if session.trained["compare"] == session.spec else {})
-
-
-def _sentences(verdict: Mapping[str, Any] | None) -> None:
-    """The verdict that the report begins with."""
-    if verdict is not None:
-        note(" ".join(verdict["sentences"]), verdict["level"])
+        with redrawn(self.results):
+            kinds = (("fit", "Result", "trained", _fit), ("compare", "Comparison", "compared", _compare))
+            for kind, title, done, draw in kinds:
+                if (result := session.results.get(kind)) is None:
+                    continue
+                with card(title):
+                    same = session.trained[kind] == session.spec
+                    if not same:
+                        note(f"The spec has changed since this was {done}.", "care")
+                    if (verdict := session.verdicts.get(kind)) is not None:  # that the report begins with
+                        note(" ".join(verdict["sentences"]), verdict["level"])
+                    draw(result, session.units if same else {})
 
 
 def _fit(result: Mapping[str, Any], units: Mapping[str, str]) -> None:

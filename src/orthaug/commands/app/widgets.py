@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import contextmanager
 from html import escape
@@ -22,7 +23,12 @@ def named(element: Drawn, label: str) -> Drawn:
 
 def text(what: Any, tag: str = "p", classes: str = "") -> ui.html:
     """Text in an element; never read as HTML."""
-    return ui.html(escape(str(what)), sanitize=False, tag=tag).classes(classes)
+    return ui.html(_whole(what), sanitize=False, tag=tag).classes(classes)
+
+
+def _whole(what: Any) -> str:
+    """Escaped, with lags that no line breaks at their minus."""
+    return re.sub(r"\[k-\d+\]", r"<span class='n'>\g<0></span>", escape(str(what)))
 
 
 def sentence(told: str) -> str:
@@ -89,21 +95,21 @@ def choice(
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "") -> None:
-    """A table; on a phone each row is a block with the heads beside its cells."""
+    """A table; on a phone each row of more than two cells is a block with the heads beside them."""
+    kinds = ["w" if any(str(row[i])[:1].isalpha() for row in rows) else "" for i in range(len(head))]  # words, numbers
     lines = ["<table>", f"<caption>{escape(caption)}</caption>" if caption else "", "<thead><tr>"]
-    lines += [f"<th scope='col'>{escape(name)}</th>" for name in head]
+    lines += [f"<th scope='col' class='{kind}'>{escape(name)}</th>" for name, kind in zip(head, kinds, strict=True)]
     lines.append("</tr></thead><tbody>")
     for row in rows:
-        cells = [_cell(name, str(value)) for name, value in zip(head[1:], row[1:], strict=True)]
-        lines.append(f"<tr><th scope='row'>{escape(str(row[0]))}</th>{''.join(cells)}</tr>")
+        lines.append(f"<tr><th scope='row'>{_whole(row[0])}</th>")
+        for name, value, kind in zip(head[1:], map(str, row[1:]), kinds[1:], strict=True):
+            kind += " n" if len(value) <= _SHORT else ""
+            lines.append(f"<td class='{kind}' data-label='{escape(name, True)}'>{_whole(value)}</td>")
+        lines.append("</tr>")
     made = ui.html("".join([*lines, "</tbody></table>"]), sanitize=False).classes("table")
+    made.classes("cards" if len(head) > 2 else "")
     if len(head) >= _WIDE:  # it may scroll, by keys too
         named(made.props("tabindex=0 role=region"), caption or head[0])
-
-
-def _cell(head: str, value: str) -> str:
-    short = " class='n'" if len(value) <= _SHORT else ""
-    return f"<td{short} data-label='{escape(head, True)}'>{escape(value)}</td>"
 
 
 def number(value: Any, digits: int = 5) -> str:
@@ -117,11 +123,11 @@ def button(label: str, clicked: Callable[[], Any], *, main: bool = False, classe
     return made.classes(("main " if main else "plain ") + classes)
 
 
-def link(label: str, place: str, *, download: bool = True) -> ui.element:
-    """A link that looks like a button."""
-    made = text(label, "a", "download")
+def link(label: str, place: str) -> ui.element:
+    """A file to take, as a link that looks like a button."""
+    made = text(label, "a", "download").props("download")
     made.props["href"] = place
-    return made.props("download") if download else made
+    return made
 
 
 def note(what: str, kind: str = "") -> ui.html:
@@ -136,17 +142,13 @@ def curves_figure(rows: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], unit:
     """Curves below one another on one axis of time: of each row a label, and traces `x`, `y`, `name`, `raw`."""
     traces: list[dict[str, Any]] = []
     layout = _layout(70 + 130 * len(rows))
-    layout["xaxis"] |= {
-        "title": {"text": unit, "font": {"size": 12}},
-        "anchor": f"y{len(rows)}" if len(rows) > 1 else "y",
-    }
+    layout["xaxis"] |= {"title": _small(unit), "anchor": f"y{len(rows)}" if len(rows) > 1 else "y"}
     gap = 0.12 / max(len(rows), 1)
     for i, (label, drawn) in enumerate(rows):
         axis, top = (f"y{i + 1}" if i else "y"), 1 - i / len(rows)
-        title = {"text": label, "font": {"size": 12}}
         layout[f"yaxis{i + 1 if i else ''}"] = {
             **{"domain": [max(0.0, top - 1 / len(rows) + gap), top - gap / 2], "zeroline": False, "automargin": True},
-            **{"title": title, "nticks": 5, "anchor": "x"},
+            **{"title": _small(label), "nticks": 5, "anchor": "x"},
         }
         for curve in drawn:
             raw = curve.get("raw", False)
@@ -164,9 +166,8 @@ def loss_figure(losses: Sequence[tuple[int, int, float | None]]) -> dict[str, An
         x.append(iteration)
         y.append(loss)
     layout = _layout(260)
-    layout["xaxis"] |= {"title": {"text": "iteration", "font": {"size": 12}}}
-    title = {"text": "loss", "font": {"size": 12}}
-    layout["yaxis"] = {"type": "log", "title": title, "automargin": True, "exponentformat": "e", "nticks": 5}
+    layout["xaxis"] |= {"title": _small("iteration")}
+    layout["yaxis"] = {"type": "log", "title": _small("loss"), "automargin": True, "exponentformat": "e", "nticks": 5}
     own = {"type": "scatter", "mode": "lines+markers", "marker": {"size": 4}, "showlegend": 1 < len(runs) <= 6}
     traces = [
         {**own, "name": f"run {run}", "x": x, "y": y, "line": {"width": 1.5, "color": _COLORS[i % len(_COLORS)]}}
@@ -176,6 +177,10 @@ def loss_figure(losses: Sequence[tuple[int, int, float | None]]) -> dict[str, An
 
 
 _CONFIG = {"displayModeBar": False, "responsive": False, "displaylogo": False}
+
+
+def _small(title: str) -> dict[str, Any]:
+    return {"text": title, "font": {"size": 12}}
 
 
 def _layout(height: int) -> dict[str, Any]:

@@ -25,7 +25,6 @@ from orthaug.commands.kinds import kind_of, open_job
 from orthaug.data.record import Channel, check_step
 from orthaug.data.survey import Column, Survey
 from orthaug.physics.baseline import derived_units
-from orthaug.reports.text import check_text
 
 MOST = 3000
 """Points of a curve that are drawn."""
@@ -120,11 +119,10 @@ def _timed(found: Survey) -> str:
 
 def _column(found: Survey, column: Column) -> dict[str, Any]:
     usable = column in found.signals
-    timed = column is found.clock.column
     told = starting.as_seen(column, spikes=column.kind != "input") if usable else column.unusable or "constant"
-    own = {"header": column.header, "name": column.name, "unit": column.unit, "kind": column.kind}
-    head = f"{column.name}" + (f" = column '{column.header}'" if column.header != column.name else "")
-    return own | {"usable": usable, "timed": timed, "told": told.removeprefix(f"{head}: ")}
+    head = column.name + (f" = column '{column.header}'" if column.header != column.name else "")
+    own = {"header": column.header, "kind": column.kind, "usable": usable, "timed": column is found.clock.column}
+    return own | {"told": told.removeprefix(f"{head}: ")}
 
 
 def _curves(found: Survey) -> dict[str, Any]:
@@ -147,7 +145,7 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
     """
     job = open_job(Path(path), require_full_rank=False)
     moves = job.spec.motion is not None
-    told: dict[str, Any] = {"check": None, "text": "", "refusal": None, "bias": []}
+    told: dict[str, Any] = {"check": None, "refusal": None, "bias": []}
     if whole or not moves:
         if moves:
             from orthaug._base.jax import use_compilation_cache
@@ -155,11 +153,9 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
             use_compilation_cache()
         result = kind_of(job).checked(job)
         refused = kind_of(job).refused(job, result)
-        told = {"check": json.loads(result.to_json()), "text": check_text(result)}
-        told |= {"refusal": None if refused is None else str(refused)}
-        told["bias"] = [
-            {"name": one.name, "removed_by": one.removed_by, "percent": one.percent} for one in result.bias or ()
-        ]
+        bias = [{"name": one.name, "removed_by": one.removed_by, "percent": one.percent} for one in result.bias or ()]
+        told = {"check": json.loads(result.to_json()), "bias": bias}
+        told["refusal"] = None if refused is None else str(refused)
     return told | {
         "rows": {part.name: len(part.record) for part in job.parts},
         "step": job.train.record.sampling_time,
