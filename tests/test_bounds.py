@@ -11,12 +11,15 @@ from test_cli import run
 
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jnp
+from orthaug.analysis.imitation import imitation
 from orthaug.commands.spec import load_spec
 from orthaug.data.record import Record
+from orthaug.fitting.criteria import Prediction, Simulation
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
+from orthaug.inference.covariance import prediction_std
 from orthaug.models.learners import MLP, Function
 from orthaug.physics.baseline import Baseline, Term
 
@@ -217,6 +220,162 @@ def test_bounds_that_are_not_reached_change_nothing(structure):
     assert not found.at_bound and not any("bound" in str(text) for text in found.warnings)
     if free.std is not None:
         np.testing.assert_allclose(found.std, free.std, rtol=1e-12)
+
+
+# --- beside a learner that sees only some features: what stands at a bound is a known term
+
+
+def powers(ny, inputs):
+    """A learner that is linear in its weights, so that training ends where it should: powers up to the fourth."""
+    return Function(
+        lambda w, z: w @ jnp.concatenate([jnp.ones(1), z, z**2, z**3, z**4]),
+        lambda key: 0.1 * jnp.ones((ny, 1 + 4 * len(inputs))),
+        inputs,
+    )
+
+
+def heated(ny=1, fixed=None):
+    """Cooling along a curve of the temperature, of which the physics has the line and the learner sees the rest."""
+    rng = np.random.default_rng(7)
+    u = np.repeat(rng.uniform(0.0, 1.0, 40), 10)
+    y = np.zeros((len(u), ny))
+    gains = np.array([0.5, -0.3])[:ny]
+    for k in range(1, len(u)):
+        y[k] = 0.9 * y[k - 1] - 0.15 * y[k - 1] ** 3 + gains * u[k - 1] + 0.003 * rng.normal(size=ny)
+    terms, names = [], ["y1", "y2"][:ny]
+    for i, name in enumerate(names, 1):
+        side = {"min": -0.06, "max": 0.0} if fixed is None else {"fixed": True}
+        start = -0.02 if fixed is None else fixed
+        terms += [Term(f"one{i}", f"{name}[k-1]", 1.0, output=name, fixed=True),
+                  Term(f"loss{i}", f"{name}[k-1]", start, output=name, **side),
+                  Term(f"gain{i}", "u[k-1]", output=name)]  # fmt: skip
+    inputs = tuple(f"{name}[k-1]" for name in names)
+    record = Record.from_arrays(u[:, None], y, inputs=["u"], outputs=names)
+    return record, Baseline.from_terms(terms), powers(ny, inputs)
+
+
+OPTIONS = {"regularization": "none", "solver": LevenbergMarquardt(60, tolerance=1e-12)}
+
+
+def of(names, fit):
+    order = [fit.problem.baseline.names.index(name) for name in names]
+    return fit.theta[order], fit.std[order]
+
+
+@pytest.mark.parametrize("criterion", [Prediction(), Simulation(40, 5)], ids=["one step", "free run"])
+@pytest.mark.parametrize("ny", [1, 2])
+def test_a_bound_leaves_the_others_as_a_fixed_term_does(ny, criterion):
+    """The loss is steeper than the bound allows: the learner has to express the rest, for nothing else can."""
+    fits = []
+    for fixed in (None, -0.06):
+        given, baseline, learner = heated(ny, fixed)
+        fits.append(estimate(given, baseline, learner=learner, criterion=criterion, blocks=0, **OPTIONS))
+    found, known = fits
+    gains = [f"gain{i}" for i in range(1, ny + 1)]
+    assert dict(found.at_bound) == {f"loss{i}": -0.06 for i in range(1, ny + 1)}
+    (value, std), (expected, error) = of(gains, found), of(gains, known)
+    np.testing.assert_allclose(value, expected, rtol=1e-4)
+    np.testing.assert_allclose(std, error, rtol=1e-3)
+    assert np.all(np.abs(value - np.array([0.5, -0.3])[:ny]) < 4 * std)
+    assert found.status.loss == pytest.approx(known.status.loss, rel=1e-4) and found.defect < 1e-12
+    assert found.status.iterations <= 60 and found.status.loss <= found.status.start_loss
+    assert not any(warning.code == "no_standard_errors" for warning in found.warnings)
+
+
+def test_what_the_learner_could_imitate_is_told_of_the_others():
+    given, baseline, learner = heated()
+    fit = estimate(given, baseline, learner=learner, **OPTIONS)
+    told = imitation(fit.problem, others=False, held=tuple(fit.at_bound))
+    assert told.determined == ("gain1",) and told.directions == () and not fit.model.shared.size
+    assert told.text.startswith("loss1 stands at a bound: θ is not split off along it.")
+    assert "imitate nothing of the other physics" in told.text
+    (warning,) = (str(text) for text in fit.warnings if text.code == "at_a_bound")
+    assert "is a known term" in warning and "the learner is not made orthogonal to it" in warning
+
+
+def test_an_ensemble_keeps_its_bounds():
+    given, baseline, learner = heated()
+    fit = estimate(given, baseline, learner=learner, restarts=3, ensemble=True, **OPTIONS)
+    single = estimate(given, baseline, learner=learner, **OPTIONS)
+    assert fit.at_bound == single.at_bound
+    np.testing.assert_allclose(fit.theta, single.theta, rtol=1e-8)
+    assert fit.status.loss == pytest.approx(single.status.loss, rel=1e-8)
+
+
+def test_predictions_have_the_errors_of_a_fit_with_that_term_fixed():
+    stds = []
+    for fixed in (None, -0.06):
+        given, baseline, learner = heated(fixed=fixed)
+        stds.append(prediction_std(estimate(given, baseline, learner=learner, **OPTIONS).model, given)[0][2:])
+    np.testing.assert_allclose(stds[0], stds[1], rtol=1e-6)
+
+
+def seen_in_part(truth=1.0):
+    """Two inputs that go together; the second acts along a curve, which the learner sees."""
+    rng = np.random.default_rng(3)
+    second = rng.uniform(0.0, 1.0, 400)
+    first = second**3 + 0.2 * rng.normal(size=400)
+    y = truth * first + 0.5 * second + 0.8 * second**4 + 0.01 * rng.normal(size=400)
+    return Record.from_arrays(np.column_stack([first, second]), y, outputs=["y"])
+
+
+def two_inputs(box, fixed=None):
+    terms = []
+    for name, regressor in (("a", "u1[k]"), ("b", "u2[k]")):
+        (low, high), known = box.get(name, (None, None)), name in (fixed or {})
+        start = fixed[name] if known else high if low is None else low
+        terms.append(Term(name, regressor, start or 0.0, fixed=known, min=low, max=high))
+    return Baseline.from_terms(terms)
+
+
+CURVED = powers(1, ("u2[k]",))
+ALIKE = {True: 1e-4, False: 1 / 300}  # the free run counts what has bounds among its 400 degrees of freedom
+CRITERIA = pytest.mark.parametrize("criterion", [Prediction(), Simulation(40, 0)], ids=["one step", "free run"])
+ALONE = {
+    "found by the fit": {"a": (None, 1.2)},
+    "shared": {"b": (0.8, None)},
+}  # (1.31, 0.70) alone, (1.00, 0.88) beside
+BESIDE = {"found by the fit": {"a": (1.2, None)}, "shared": {"b": (None, 0.75)}}
+
+
+def partly(box, criterion, learner=CURVED, fixed=None):
+    return estimate(seen_in_part(), two_inputs(box, fixed), learner=learner, criterion=criterion, blocks=0, **OPTIONS)
+
+
+@CRITERIA
+@pytest.mark.parametrize("box", ALONE.values(), ids=ALONE.keys())
+def test_a_bound_of_physics_alone_is_left_with_the_learner(box, criterion):
+    alone, found, free = partly(box, criterion, None), partly(box, criterion), partly({}, criterion)
+    assert set(alone.at_bound) == set(box) and not found.at_bound
+    assert abs(found.theta[0] - 1.0) < 4 * found.std[0]
+    np.testing.assert_allclose(found.theta, free.theta, rtol=1e-6)
+    np.testing.assert_allclose(found.std, free.std, rtol=ALIKE[criterion.one_step])
+    assert found.status.iterations <= 60 and found.status.loss <= found.status.start_loss
+
+
+@CRITERIA
+@pytest.mark.parametrize("box", BESIDE.values(), ids=BESIDE.keys())
+def test_a_bound_that_only_the_learner_reaches(box, criterion):
+    alone, found = partly(box, criterion, None), partly(box, criterion)
+    ((name, at),) = found.at_bound.items()
+    known = partly({}, criterion, fixed=found.at_bound)
+    assert not alone.at_bound and at in box[name]
+    other = 1 - ("a", "b").index(name)
+    np.testing.assert_allclose(found.theta[other], known.theta[0], rtol=1e-6)
+    np.testing.assert_allclose(found.std[other], known.std[0], rtol=ALIKE[criterion.one_step])
+    assert found.status.iterations <= 60 and found.status.loss <= found.status.start_loss
+
+
+@pytest.mark.parametrize("iterations", [1, 3])
+@pytest.mark.parametrize("box", [*ALONE.values(), *BESIDE.values()], ids=str)
+def test_no_run_ends_above_physics_alone_with_bounds(box, iterations):
+    options = {**OPTIONS, "solver": LevenbergMarquardt(iterations), "restarts": 3}
+    learner = MLP(hidden=(4,), inputs=("u2[k]",))
+    found = estimate(seen_in_part(), two_inputs(box), learner=learner, **options)
+    assert all(run.loss <= found.status.start_loss * (1 + 1e-12) for run in found.restarts)
+    assert all(run.iterations <= iterations for run in found.restarts)
+    low, high = found.problem.baseline.bounds
+    assert np.all((low <= found.theta) & (found.theta <= high))
 
 
 # --- what is told

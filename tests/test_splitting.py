@@ -301,7 +301,7 @@ def test_bounds_hold_under_the_training_measure_only():
         estimate(example.train, bounded, learner=NET, structure=Orthogonal(measure=WIDE))
     fit = estimate(example.train, bounded, learner=NET, solver=QUICK)
     assert fit.at_bound
-    with pytest.raises(InputError, match="theta1 stand at a bound, which a split under the uniform measure would leav"):
+    with pytest.raises(InputError, match="theta1 stand at a bound, and a split under the uniform measure knows none"):
         fit.split(WIDE)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -54,6 +54,8 @@ class Imitation:
     alternatives: tuple[Alternative, ...] = ()
     terms: bool = False
     """Whether the learner can be linear combinations of its inputs only."""
+    held: tuple[str, ...] = ()
+    """Parameters at a bound: known terms, along which nothing is split off."""
 
     @classmethod
     def of(cls, inputs: Sequence[str], shared: Shared, *others: Any) -> Self:
@@ -68,8 +70,13 @@ class Imitation:
             sees = f"The learner is a sum of {len(self.inputs)} terms"
         if self.everything:
             return f"{sees} and could imitate all of the physics: θ is split off along every direction."
+        if self.held:
+            stand, them = ("stands", "it") if len(self.held) == 1 else ("stand", "them")
+            sees = f"{_listed(self.held)} {stand} at a bound: θ is not split off along {them}. {sees}"
         if not self.directions:
-            return f"{sees} and could imitate nothing of the physics: the fit determines every parameter beside it."
+            rest = " other" if self.held else ""
+            told = f"{sees} and could imitate nothing of the{rest} physics"
+            return f"{told}: the fit determines every{rest} parameter beside it."
         could = _listed([_combination(direction) for direction in self.directions])
         told = [f"{sees} and could imitate {could}: there, and only there, θ is split off."]
         if self.determined:
@@ -97,10 +104,16 @@ class MotionImitation(Imitation):
         return told
 
 
-def imitation(problem: Problem, physics: PhysicsMap | None = None, *, others: bool = True) -> Imitation:
-    """What the problem's learner could imitate, and what `others`, other inputs, would make of it."""
+def imitation(
+    problem: Problem, physics: PhysicsMap | None = None, *, others: bool = True, held: Collection[str] = ()
+) -> Imitation:
+    """What the problem's learner could imitate, and what `others`, other inputs, would make of it.
+
+    Args:
+        held: parameters at a bound.
+    """
     slopes = _slopes(problem, physics)
-    own = problem.shared
+    own = problem.shared.leaving([problem.baseline.names.index(name) for name in held])
     inputs = tuple(str(entry) for entry in problem.features.entries)
     alternatives = []
     for other in other_inputs(problem) if others and not problem.features.linear else ():
@@ -109,7 +122,8 @@ def imitation(problem: Problem, physics: PhysicsMap | None = None, *, others: bo
         if not shared.all and set(other) != set(inputs):
             alternatives.append(Alternative.of(other, shared, _untouched(shared, slopes)))
     shown, terms = tuple(alternatives[:_ALTERNATIVES]), problem.features.linear
-    return Imitation.of(inputs, own, _untouched(own, slopes), shown, terms)
+    found = Imitation.of(inputs, own, _untouched(own, slopes), shown, terms, tuple(held))
+    return replace(found, determined=tuple(name for name in found.determined if name not in held))
 
 
 def _slopes(problem: Problem, physics: PhysicsMap | None) -> dict[str, np.ndarray] | None:

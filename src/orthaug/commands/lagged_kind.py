@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,6 @@ from orthaug.fitting.elimination import directions
 from orthaug.inference.measures import weigh_problem
 from orthaug.physics.baseline import derived_units
 from orthaug.physics.excitation import identifiability, require_rank
-from orthaug.physics.problem import Problem
 from orthaug.reports.result import CheckResult, FitResult, ParameterResult, parameter_rows, physical_rows
 
 if TYPE_CHECKING:
@@ -77,7 +76,7 @@ def content(
         told |= _physical_content(job, fit, warnings)
         told["bias"] = attempt("the bias by suspects", partial(_bias_of, job, fit), warnings, None)
         told |= _analysed(fit, one_step, free_run, warnings)
-    shared = _shared_of(job, fit.problem, others=False)
+    shared = _shared_of(job, fit, others=False)
     rows = parameter_rows(
         fit.problem.baseline.parameters,
         fit.theta if fit.status.ok else np.full(len(fit.theta), np.nan),
@@ -100,7 +99,7 @@ def content(
     warnings += budget.warnings if budget else ()
     if fit.model.structure != "orthogonal" or fit.model.form.bound is None:  # a variant of what the spec declares
         shared = None
-    told["parameters"] = _with_biases(rows, shared.determined if shared else None, budget)
+    told["parameters"] = _with_biases(rows, shared.determined if shared else None, budget, fit.at_bound)
     if told["physical_parameters"] is not None:
         physical = shared.physical if shared else None
         told["physical_parameters"] = _with_biases(told["physical_parameters"], physical, budget)
@@ -207,11 +206,14 @@ def _budget_of(job: LaggedJob, fit: Estimate) -> Budget | None:
 
 
 def _with_biases(
-    rows: Sequence[ParameterResult], determined: Sequence[str] | None, budget: Budget | None
+    rows: Sequence[ParameterResult],
+    determined: Sequence[str] | None,
+    budget: Budget | None,
+    held: Collection[str] = (),
 ) -> list[ParameterResult]:
-    """Parameters with whether the learner could imitate them, and what biases them."""
-    shared = [None if determined is None else row.name not in determined for row in rows]
-    biases = [budget.of(row.name) if budget else None for row in rows]
+    """Parameters with whether the learner could imitate them, and what biases them; not of those `held` at a bound."""
+    shared = [None if determined is None or row.name in held else row.name not in determined for row in rows]
+    biases = [budget.of(row.name) if budget and row.name not in held else None for row in rows]
     return [row.told(imitated, bias) for row, imitated, bias in zip(rows, shared, biases, strict=True)]
 
 
@@ -227,17 +229,17 @@ def _ground(job: LaggedJob, fit: Estimate | None) -> Ground:
     return Ground(weighed, problem, fit.theta, job.physics, learned, fit.model.shared)
 
 
-def _shared_of(job: LaggedJob, problem: Problem | None = None, *, others: bool = True) -> Imitation | None:
+def _shared_of(job: LaggedJob, fit: Estimate | None = None, *, others: bool = True) -> Imitation | None:
     """Before training already; None without a learner, or where the structure splits nothing along chosen directions.
 
     Args:
-        problem: the job's, as it was fitted; None for as it was posed.
+        fit: of the job's problem; None for the problem as it was posed.
         others: tell what other learner inputs would make of it.
     """
     structure = job.spec.declared_structure()
     if job.spec.declared_learner() is None or not structure.projects or structure.shared == "all":
         return None
-    problem = problem or job.problem
+    problem = fit.problem if fit else job.problem
     if not problem.baseline.names or not problem.features.entries:
         return None
-    return imitation(problem, job.physics, others=others)
+    return imitation(problem, job.physics, others=others, held=tuple(fit.at_bound) if fit else ())

@@ -115,7 +115,10 @@ def _split_lagged(model: Model, record: Record, measure: Measure, told: Sequence
     parameters = model.form.baseline.parameters
     stands = [p.name for p, value in zip(parameters, model.theta, strict=True) if value in (p.min, p.max)]
     if stands:
-        raise InputError(f"{', '.join(stands)} stands at a bound, which a split would leave; fit without the bound.")
+        raise InputError(
+            f"{', '.join(stands)} stands at a bound, and a split knows none; fit without the bound, or with "
+            "`fixed = true` there."
+        )
     support = Support(model.fitting(record, need_outputs=True), model.form.layout, model.form.used)
     under = split_under(measure, model, support, model.statistics.joint(len(model.theta)))
     std = None if under.covariance is None else np.sqrt(np.diag(under.covariance))

@@ -48,7 +48,7 @@ def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estim
         theta, theta_aux, fixed = ThetaSplit(aux, aux, {})
     else:
         there = share.coordinates if ending.usable else 0.0 * problem.target_coordinates
-        held = learned.errors.fixed if learned.errors else None
+        held = learned.errors.fixed if learned.errors else learned.fixed if ending.usable else None
         theta, theta_aux, fixed = split_theta(structure, problem, there, learned.coefficients, held)
     errors = learned.errors or _one_step_errors(task, structure, learned, theta - theta_aux, fixed)
     noise = errors.noise if ending.usable else None
@@ -56,7 +56,7 @@ def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estim
     known = noise is not None and identified and not learned.elsewhere
     told = _warnings(problem, structure, learned, identified, noise, fixed)
     if known and errors.covariance is None and learned.errors is None:
-        text = "no standard errors: beside a learner that sees only some features, an ensemble or a bound leaves none."
+        text = "no standard errors: beside a learner that sees only some features, an ensemble leaves none."
         told.append(Warning("no_standard_errors", text))
     reason = ALONE.get(ending, "") if learned.bound is None else ""
     return Estimate(
@@ -67,7 +67,7 @@ def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estim
         covariance=errors.covariance if known else None,
         freedom=errors.freedom,
         effective_weights=learned.effective,
-        defect=_defect(task, structure, learned, share, theta_aux),
+        defect=_defect(task, structure, share, ThetaSplit(theta, theta_aux, fixed), learned),
         problem=problem,
         criterion=task.criterion,
         at_bound={problem.baseline.names[i]: value for i, value in fixed.items()},
@@ -87,6 +87,8 @@ def _model(
     record, scaling = problem.record, learned.scaling
     numbers = (parameters.theta, parameters.theta_aux, learned.weights, scaling.centre, scaling.halfwidth, learned.unit)
     middle = _middle(problem, learned, noise)
+    decoupled = structure.projects and directions(structure, problem) is None
+    held = {} if decoupled else parameters.fixed
     return Model(
         form=Lagged(problem.baseline, problem.features, problem.layout, problem.outputs, learned.bound),
         numbers=Numbers(*numbers, learned.tilt),
@@ -99,8 +101,15 @@ def _model(
         largest_output=problem.largest_output,
         deviation=problem.deviation,
         weight=problem.weight.matrix,
-        shared=directions(structure, problem),
-        statistics=Statistics(learned.gram, middle, noise, learned.ridge, errors.freedom, learned.errors is not None),
+        shared=directions(structure, problem, parameters.fixed),
+        statistics=Statistics(
+            None if learned.gram is None else _beside(held, learned.gram),
+            None if middle is None else _beside(held, middle),
+            noise,
+            learned.ridge,
+            errors.freedom,
+            learned.errors is not None,
+        ),
     )
 
 
@@ -116,26 +125,41 @@ def _one_step_errors(
     noise = covariance = None
     if mixed is not None:
         noise = problem.weight.covariance(mixed)
-        taken = eliminate(structure, problem).taken
-        if learned.bound is None or np.array_equal(taken, np.eye(len(c))):
+        if learned.bound is None or (structure.projects and directions(structure, problem) is None):
             middle = task.physics_middle(mixed) if ny > 1 else mixed[0, 0] * np.eye(len(c))
             covariance = theta_covariance(problem.projection, middle, fixed)
-        elif not fixed:
-            covariance = _beside_the_learner(problem, learned, mixed, taken)
+        elif structure.projects:
+            covariance = _beside_the_learner(problem, structure, learned, mixed, fixed)
     mean_square = float(np.trace(whitened)) / problem.samples
     return ErrorStatistics(noise, covariance, float(freedom.min()), mean_square, fixed)
 
 
-def _beside_the_learner(problem: Problem, learned: Learned, whitened: Matrix, taken: Matrix) -> Matrix | None:
-    """Cov θ̂ where only some directions are split off: `K Cov(c, w) Kᵀ` with `K = [I, ∂θ_aux/∂w]` (F8)."""
+def _beside_the_learner(
+    problem: Problem, structure: Structure, learned: Learned, whitened: Matrix, fixed: Fixed
+) -> Matrix | None:
+    """Cov θ̂ where only some directions are split off: `K Cov(c, w) Kᵀ` with `K = [I, ∂θ_aux/∂w]` (F8).
+
+    Entries at a bound are no unknowns: they have NaN.
+    """
     gram = learned.gram
     middle = _middle(problem, learned, problem.weight.covariance(whitened))
     if gram is None or middle is None:
         return None
-    factor, nt = problem.projection, len(taken)
+    factor, taken = problem.projection, eliminate(structure, problem).taken_beside(fixed)
+    nt = len(taken)
     overlap = np.linalg.solve(factor.to_coordinates.T, gram[:nt, nt:])  # QᵀJ
     k = np.column_stack([np.eye(nt), factor.from_coordinates(taken @ overlap)])
-    return JointCovariance(gram, learned.ridge, middle, nt).of(k)
+    covariance = JointCovariance(_beside(fixed, gram), learned.ridge, _beside(fixed, middle), nt).of(k)
+    held = list(fixed)
+    covariance[held] = covariance[:, held] = np.nan
+    return covariance
+
+
+def _beside(fixed: Fixed, gram: Matrix) -> Matrix:
+    """A Gram matrix of (c, w) in which what stands at a bound is no unknown."""
+    unknown = np.ones(len(gram))
+    unknown[list(fixed)] = 0.0
+    return gram * np.outer(unknown, unknown)
 
 
 def _middle(problem: Problem, learned: Learned, noise: Matrix | None) -> Matrix | None:
@@ -148,13 +172,15 @@ def _middle(problem: Problem, learned: Learned, noise: Matrix | None) -> Matrix 
     return None if learned.middle is None else learned.middle(whitened)
 
 
-def _defect(task: OneStepTask, structure: Structure, learned: Learned, share: Share, theta_aux: Vector) -> float | None:
+def _defect(
+    task: OneStepTask, structure: Structure, share: Share, parameters: ThetaSplit, learned: Learned
+) -> float | None:
     """‖QᵀF̃‖ / ‖F‖ with F̃ = F − Φ θ_aux (eq:orth_property), along the shared directions; None for F = 0."""
     size = np.sqrt(share.square)
     if not 0 < size < np.inf:
         return None
-    along = task.problem.projection.along(directions(structure, task.problem))
-    return float(np.linalg.norm(along @ task.left_share(learned, theta_aux)) / size)
+    along = task.problem.projection.along(directions(structure, task.problem, parameters.fixed))
+    return float(np.linalg.norm(along @ task.left_share(learned, parameters.theta_aux)) / size)
 
 
 def without_loss(mean_square: float) -> list[Warning]:
@@ -205,9 +231,12 @@ def _warnings(
     if fixed:
         names = ", ".join(f"{problem.baseline.names[i]} = {value:g}" for i, value in fixed.items())
         text = (
-            f"at a bound: {names}. What stands at a bound has no standard error, and those of the others hold "
-            "with it fixed there; data that contradict a bound contradict the physics or the bound."
+            f"at a bound: {names}. What stands at a bound is a known term, as with `fixed = true`: it has no standard "
+            "error, and the others and theirs hold with it there; "
         )
+        if structure.projects and learned.bound is not None and directions(structure, problem) is not None:
+            text += "the learner is not made orthogonal to it; "
+        text += "data that contradict a bound contradict the physics or the bound."
         told.append(Warning("at_a_bound", text))
     return told
 

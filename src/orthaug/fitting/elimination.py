@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug.fitting.structures import PenaltyRows, Structure
 from orthaug.physics.problem import Problem
+from orthaug.physics.shared import Shared
 
 Fixed = dict[int, float]
 """Entries of θ that stand at a bound, with its value."""
@@ -21,7 +23,8 @@ class Elimination:
 
     P, `taken`, is the projector onto what a split moves from the learner to θ: all in the paper's structure, nothing in
     the additive one. `(A, B, e)` are the structure's rows. An active set meets the bounds: some entries of θ stand at a
-    bound, and the others minimise the rest.
+    bound, and the others minimise the rest. Where the learner can imitate part of the physics only, they are known
+    terms then, which a split moves nothing to: P is that of the `shared` directions that leave them alone.
     """
 
     to_coordinates: Matrix
@@ -30,6 +33,8 @@ class Elimination:
     rows: PenaltyRows
     lower: Vector
     upper: Vector
+    shared: Shared | None = None
+    """The directions that P projects onto; None where P is the same whatever stands at a bound."""
 
     @property
     def bounded(self) -> bool:
@@ -43,16 +48,22 @@ class Elimination:
 
     @property
     def decoupled(self) -> bool:
-        """Whether θ does not depend on the learner (F1)."""
-        return not self._learner.any()
+        """Whether θ does not depend on the learner, nor the learner on bounds (F1)."""
+        return not self._learner({}).any()
+
+    def taken_beside(self, fixed: Fixed) -> Matrix:
+        """P (nθ, nθ) where some entries of θ stand at a bound."""
+        if not fixed or self.shared is None:
+            return self.taken
+        basis = np.linalg.qr(self.to_coordinates @ self.shared.leaving(fixed).basis)[0]
+        return basis @ basis.T
 
     @property
     def _theta(self) -> Matrix:
         return np.concatenate([self.to_coordinates, self.rows.theta])
 
-    @property
-    def _learner(self) -> Matrix:
-        return np.concatenate([np.eye(len(self.outputs)) - self.taken, self.rows.learner])
+    def _learner(self, fixed: Fixed) -> Matrix:
+        return np.concatenate([np.eye(len(self.outputs)) - self.taken_beside(fixed), self.rows.learner])
 
     @property
     def _target(self) -> Vector:
@@ -68,7 +79,7 @@ class Elimination:
             return np.zeros((nt, nt)), np.zeros(nt)
         free, offset = self._split(fixed)
         basis = np.linalg.qr(free)[0]
-        stacked = np.column_stack([self._learner, self._target - offset])
+        stacked = np.column_stack([self._learner(fixed), self._target - offset])
         stacked = stacked - basis @ (basis.T @ stacked)
         small = np.linalg.qr(stacked, mode="r")[:nt]
         small = np.concatenate([small, np.zeros((nt - len(small), nt + 1))])
@@ -78,7 +89,7 @@ class Elimination:
         """The minimising θ (nθ,) for the learner's coordinates f (nθ,)."""
         free, offset = self._split(fixed)
         scale = np.linalg.norm(free, axis=0)
-        right = self._target - self._learner @ f - offset
+        right = self._target - self._learner(fixed) @ f - offset
         theta = np.empty(len(f))
         theta[[i for i in range(len(f)) if i not in fixed]] = (
             np.linalg.lstsq(free / scale, right, rcond=None)[0] / scale
@@ -88,21 +99,57 @@ class Elimination:
         return theta
 
     def active(self, f: Vector) -> Fixed:
-        """Which entries of θ stand at which bound, for the learner's coordinates f."""
+        """Which entries of θ stand at which bound, for the learner's coordinates f.
+
+        Those of the nearest θ in the bounds where nothing is held; what a held entry leaves to the learner may move
+        others past theirs, and these are added (`past`).
+        """
         if not self.bounded:
             return {}
         from scipy.optimize import lsq_linear  # slow to import
 
-        matrix, right = self._theta, self._target - self._learner @ f
+        matrix, right = self._theta, self._target - self._learner({}) @ f
         scale = np.linalg.norm(matrix, axis=0)
         solution = lsq_linear(
             matrix / scale, right, bounds=(self.lower * scale, self.upper * scale), method="bvls", tol=1e-14
         )
-        return {
-            i: float(self.lower[i] if side < 0 else self.upper[i])
-            for i, side in enumerate(solution.active_mask)
-            if side
-        }
+        return self.past(
+            f,
+            {
+                i: float(self.lower[i] if side < 0 else self.upper[i])
+                for i, side in enumerate(solution.active_mask)
+                if side
+            },
+        )
+
+    def settled(self, run: Callable[[Fixed], Vector | None]) -> Fixed:
+        """What stands at a bound where training with the same entries held ended.
+
+        Those of physics alone are held first. What was held once before is not released again, so that this ends.
+
+        Args:
+            run: trains with some entries held, and gives the learner's coordinates f; None to leave it at that.
+        """
+        fixed = {} if self.decoupled else self.active(np.zeros_like(self.outputs))
+        tried = [fixed]
+        while (f := run(fixed)) is not None:
+            active = self.active(f)
+            if active != fixed and active in tried:
+                active = self.past(f, fixed)
+            if active == fixed:
+                break
+            fixed = active
+            tried.append(fixed)
+        return fixed
+
+    def past(self, f: Vector, fixed: Fixed) -> Fixed:
+        """The `fixed`, and at their bounds all entries that would else leave them, for the learner's coordinates f."""
+        while True:
+            theta = self.theta(f, fixed)
+            beyond = {i: float(v) for i, v in enumerate(np.clip(theta, self.lower, self.upper)) if v != theta[i]}
+            if not beyond or not np.isfinite(theta).all():
+                return fixed
+            fixed = fixed | beyond
 
     def _split(self, fixed: Fixed) -> tuple[Matrix, Vector]:
         """The columns of the free entries, and what the fixed ones contribute."""
@@ -115,6 +162,8 @@ def eliminate(structure: Structure, problem: Problem) -> Elimination:
     """The elimination of θ from a problem's criterion with a structure's rows and the baseline's bounds."""
     baseline, projection = problem.baseline, problem.projection
     nt = len(baseline.names)
+    shared = _shared(structure, problem)
+    partly = structure.projects and np.isfinite(baseline.bounds).any() and not shared.all
     return Elimination(
         to_coordinates=projection.to_coordinates,
         outputs=problem.target_coordinates,
@@ -122,12 +171,23 @@ def eliminate(structure: Structure, problem: Problem) -> Elimination:
         rows=structure.penalty(baseline.names, baseline.initial, problem.weight.unit),
         lower=baseline.bounds[0],
         upper=baseline.bounds[1],
+        shared=shared if partly else None,
     )
 
 
-def directions(structure: Structure, problem: Problem) -> Matrix | None:
-    """The directions of θ (nθ, s) along which a split makes the learner orthogonal; None for all."""
-    return None if structure.shared == "all" or problem.shared.all else problem.shared.basis
+def _shared(structure: Structure, problem: Problem) -> Shared:
+    names = problem.baseline.names
+    return Shared(names, np.eye(len(names))) if structure.shared == "all" else problem.shared
+
+
+def directions(structure: Structure, problem: Problem, fixed: Iterable[int] = ()) -> Matrix | None:
+    """The directions of θ (nθ, s) along which a split makes the learner orthogonal; None for all.
+
+    Args:
+        fixed: entries of θ that stand at a bound, which no direction moves.
+    """
+    shared = _shared(structure, problem)
+    return None if shared.all else shared.leaving(fixed).basis
 
 
 class ThetaSplit(NamedTuple):
@@ -153,15 +213,20 @@ def split_theta(
     """
     baseline, factor = problem.baseline, problem.projection
     elimination = eliminate(structure, problem)
-    aux = factor.from_coordinates(elimination.taken @ share)
+    if coefficients is not None and fixed is None:  # an iterate need not satisfy what only its end satisfies
+        apart = elimination.shared is not None  # nothing is moved to what stands at a bound
+        reached = coefficients + (0.0 if apart else factor.from_coordinates(elimination.taken @ share))
+        inside = np.clip(reached, *baseline.bounds)
+        fixed = elimination.active(share) | {i: value for i, value in enumerate(inside) if value != reached[i]}
+    fixed = elimination.active(share) if fixed is None else fixed
+    taken = elimination.taken_beside(fixed) @ share
+    aux = factor.from_coordinates(taken)
+    if elimination.shared is not None:
+        aux[list(fixed)] = 0.0  # but for rounding it is
     if coefficients is not None:
-        theta = coefficients + aux
-        if fixed is None:  # an iterate need not satisfy what only its end satisfies
-            inside = np.clip(theta, *baseline.bounds)
-            fixed = elimination.active(share) | {i: value for i, value in enumerate(inside) if value != theta[i]}
-        theta = np.array([fixed.get(i, value) for i, value in enumerate(theta)])
-    elif (fixed := elimination.active(share)) or len(elimination.rows.target):
+        theta = np.array([fixed.get(i, value) for i, value in enumerate(coefficients + aux)])
+    elif fixed or len(elimination.rows.target):
         theta = elimination.theta(share, fixed)
     else:  # refined least squares, as exact as double precision allows
-        theta = problem.least_squares - factor.from_coordinates(share - elimination.taken @ share)
+        theta = problem.least_squares - factor.from_coordinates(share - taken)
     return ThetaSplit(theta, aux, fixed)

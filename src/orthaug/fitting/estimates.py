@@ -166,8 +166,8 @@ class Estimate(AnyFit):
         check_type(measure, Measure, "measure", "a measure such as Uniform()")
         if self.at_bound:
             raise InputError(
-                f"{', '.join(self.at_bound)} stand at a bound, which a split under the {measure.name} measure would "
-                "leave; drop the bounds, or keep the training measure."
+                f"{', '.join(self.at_bound)} stand at a bound, and a split under the {measure.name} measure knows "
+                "none: drop the bounds, keep the training measure, or give them `fixed = true` there."
             )
         support = Support(self.problem.record, self.problem.layout, self.model.form.used, self.problem.rows.x)
         joint = self.model.statistics.joint(len(self.theta))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -12,12 +12,13 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug.data.regressors import Features
 from orthaug.fitting.course import Course, Layout
 from orthaug.fitting.criteria import Criterion
-from orthaug.fitting.elimination import Elimination, eliminate
+from orthaug.fitting.elimination import Elimination, Fixed, eliminate
 from orthaug.fitting.initial_states import InitialStates, Start
 from orthaug.fitting.objective import Flown, FreeRunObjective, LinearisedFreeRun
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.segment_sums import SegmentSums
 from orthaug.fitting.segments import lay_segments
+from orthaug.fitting.solvers.descent import Descent
 from orthaug.fitting.structures import Structure
 from orthaug.models.lagged import Lagged
 from orthaug.models.learners import Bound
@@ -52,6 +53,8 @@ class FlightPlan(Course):
 
     dynamics: Lagged
     task: OneStepTask
+    fixed: Fixed = field(default_factory=dict)
+    """Entries of an orthogonal θ that are known to stand at a bound beside the learner."""
 
     @classmethod
     def of(cls, task: OneStepTask, criterion: Criterion) -> FlightPlan:
@@ -76,7 +79,7 @@ class FlightPlan(Course):
     def alone(self) -> FlightPlan:
         """The same rows and segments without a learner."""
         alone, task = replace(self.dynamics, features=Features(()), bound=None), self.task.alone
-        return replace(self, task=task, dynamics=alone, scaling=task.scaling, unit=task.unit)
+        return replace(self, task=task, dynamics=alone, scaling=task.scaling, unit=task.unit, fixed={})
 
     @property
     def lengthens(self) -> bool:
@@ -96,6 +99,9 @@ class FlightPlan(Course):
         """The criterion as a function of θ and the weights."""
         start, elimination = np.asarray(self.segments.start), eliminate(structure, self.problem)
         free = elimination.projects and not elimination.bounded and self.bound is not None  # the unknown is c
+        bounds = elimination.lower.copy(), elimination.upper.copy()
+        for i, value in self.fixed.items():
+            bounds[0][i] = bounds[1][i] = value
         return StructuredObjective(
             dynamics=self.dynamics,
             numbers=self.numbers,
@@ -105,11 +111,12 @@ class FlightPlan(Course):
             rms=self.rms,
             deviation=self.problem.deviation,
             physics=len(self.problem.baseline.names),
-            bounds=None if free else (elimination.lower, elimination.upper),
+            bounds=None if free else bounds,
             colour=self.colour,
             sums=self.sums,
             task=self.task,
             elimination=elimination,
+            fixed=self.fixed,
         )
 
 
@@ -118,21 +125,28 @@ class StructuredObjective(FreeRunObjective):
     """`‖r‖²` of the free run and of the structure's rows.
 
     Without bounds or penalties the unknown θ is `c = θ − θ_aux`, split at the end (F2). Where an orthogonal θ has
-    bounds, it is the unknown itself and `c = θ − θ_aux(w)` follows, so that the split cannot leave them.
+    bounds, it is the unknown itself and `c = θ − θ_aux(w)` follows, so that the split cannot leave them. The entries
+    that are `fixed` at a bound are known terms, to which nothing is split.
     """
 
     task: OneStepTask
     elimination: Elimination
+    fixed: Fixed
 
     @property
     def follows(self) -> bool:
         """Whether c follows θ, `c = θ − θ_aux(w)`."""
         return self.elimination.projects and self.elimination.bounded and self.task.bound is not None
 
+    @property
+    def apart(self) -> bool:
+        """Whether what stands at a bound becomes a known term beside the learner."""
+        return self.follows and self.elimination.shared is not None
+
     def begin(self, w: Vector) -> Vector:
         """p of the one-step θ for the weights w."""
         f = self.task.share_of(w)
-        theta = self.elimination.theta(f, self.elimination.active(f))
+        theta = self.elimination.theta(f, self.fixed or self.elimination.active(f))
         return np.concatenate([theta if self.follows else theta - self._taken(f), w])
 
     def place(self, p: Vector) -> tuple[Vector, Vector, Vector]:
@@ -179,4 +193,28 @@ class StructuredObjective(FreeRunObjective):
 
     def _taken(self, share: Any) -> Any:
         """θ_aux of the learner's share QᵀF, or of its slope."""
-        return self.task.problem.projection.from_coordinates(self.elimination.taken @ share)
+        return self.task.problem.projection.from_coordinates(self._projector @ share)
+
+    @cached_property
+    def _projector(self) -> Matrix:
+        return self.elimination.taken_beside(self.fixed)
+
+    def held(self, end: Descent) -> Fixed:
+        """What stands at a bound at the end of a run: entries that got there, and the fixed ones that would stay.
+
+        Those that the learner could imitate stay where the nearest θ in the bounds does, the others where descent
+        would leave the bounds.
+        """
+        flown, elimination = end.flown, self.elimination
+        ends = enumerate(zip(flown.theta, elimination.lower, elimination.upper, strict=True))
+        at = {i: float(value) for i, (value, *sides) in ends if value in sides}
+        if not self.fixed or end.linear is None or elimination.shared is None:
+            return at
+        f = self.task.share_of(flown.w)
+        nearest = replace(elimination, outputs=elimination.to_coordinates @ flown.c + f).active(f)
+        downhill = np.where(flown.theta == elimination.upper, end.linear.gradient[: self.physics], 0.0)
+        downhill = np.where(flown.theta == elimination.lower, -end.linear.gradient[: self.physics], downhill)
+        imitated = [bool(row.any()) for row in elimination.shared.basis]
+        return {
+            i: v for i, v in at.items() if i not in self.fixed or (i in nearest if imitated[i] else downhill[i] > 0)
+        }

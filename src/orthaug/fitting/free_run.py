@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Vector
-from orthaug._base.progress import RunTell
+from orthaug._base.progress import RunTell, quiet
 from orthaug.data.record import Record
 from orthaug.fitting.course import Flight
 from orthaug.fitting.criteria import Criterion
+from orthaug.fitting.elimination import Fixed
 from orthaug.fitting.flight_plan import FlightPlan, StructuredObjective
 from orthaug.fitting.flights import FlightTask, Place
 from orthaug.fitting.initial_states import Start
@@ -65,6 +66,46 @@ class FreeRunTask(FlightTask):
         self, solver: LevenbergMarquardt, structure: Structure, tell: RunTell
     ) -> tuple[FlightPlan, Flight | None]:
         return self.plan, fly_alone(self.plan, solver, structure, tell)
+
+    def run(
+        self,
+        solver: LevenbergMarquardt,
+        w: Any,
+        structure: Structure,
+        regularization: str | float = "none",
+        progress: RunTell = quiet,
+    ) -> Flight:
+        """As any run on the free run, with an orthogonal θ at a bound a known term beside the learner.
+
+        What stands at a bound where physics alone ends is held there from the start. The run is made again, from there
+        too, where other entries stand at one at its end; what was held once before is not released again.
+        """
+        fixed: Fixed = {}
+        alone: Any = self.physics
+        if alone is not None and self.plan.objective(structure).apart:
+            fixed = alone.objective.held(alone.end)
+        seconds, tried = 0.0, [fixed]
+        while True:
+            own = replace(self, plan=replace(self.plan, fixed=fixed))
+            flight = super(FreeRunTask, own).run(solver, w, structure, regularization, progress)
+            seconds += flight.seconds
+            objective: Any = flight.objective
+            if not (flight.end.ending.usable and objective.apart):
+                break
+            held = objective.held(flight.end)
+            held = held | fixed if held in tried else held
+            if held == fixed:
+                break
+            fixed = held
+            tried.append(fixed)
+        if (
+            alone
+            and fixed != tried[0]
+            and alone.mean_square < self.plan.mean_square(flight.end.flown.c, flight.end.flown.w)
+        ):
+            own = replace(self, plan=replace(self.plan, fixed=tried[0]))  # other bounds than those of its start
+            flight = super(FreeRunTask, own).run(solver.at_most(0), w, structure, regularization, progress)
+        return flight._replace(seconds=seconds)
 
     def places(
         self,

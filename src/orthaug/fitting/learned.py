@@ -51,6 +51,8 @@ class Learned:
     """ΣψᵀΣ_eψ in the units of `gram`, for the noise covariance (ny, ny) of whitened outputs."""
     coefficients: Vector | None = None
     """c = θ − θ_aux (nθ,), if it was an unknown of training; None where θ is solved."""
+    fixed: Fixed | None = None
+    """What stood at a bound, where θ is solved; None where that is not known."""
     errors: ErrorStatistics | None = None
     """Of a free run; None where they are those of the one-step residual."""
     scores: FreeRunScores | None = None

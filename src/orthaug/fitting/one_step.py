@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.errors import InputError
 from orthaug._base.jax import jnp
 from orthaug._base.progress import RunTell, quiet
 from orthaug._base.warning import Warning
@@ -17,14 +16,14 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import Features
 from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.criteria import Criterion, Prediction
-from orthaug.fitting.elimination import Elimination, Fixed, eliminate
+from orthaug.fitting.elimination import Elimination, Fixed, eliminate, split_theta
 from orthaug.fitting.learned import Learned
 from orthaug.fitting.normal_equations import Blocks, Hold, OneStep, Summed, linearise
 from orthaug.fitting.paper_criterion import JointOneStep, PaperCriterion, Physics
-from orthaug.fitting.rules import ridge_of
+from orthaug.fitting.rules import check_joint, ridge_of
 from orthaug.fitting.solvers import compiled
 from orthaug.fitting.solvers.adam_lbfgs import GradientRun
-from orthaug.fitting.structures import Orthogonal, Structure
+from orthaug.fitting.structures import Additive, Orthogonal, Structure
 from orthaug.inference.covariance import mixing
 from orthaug.models.learners import Bound, Learner, Scaling
 from orthaug.models.rows import Engine, InMemory, LearnerSums, MixedGram, Overlap, ResidualGram, from_chunks, row_values
@@ -34,7 +33,6 @@ from orthaug.physics.streamed import StreamedProblem
 
 OUTPUT_UNIT = 10.0
 """The learner's output unit in standard deviations of the baseline's residual: the table is in docs/design.md."""
-_ACTIVE_SETS = 10  # tries to find which bounds are active; each changes at least one entry
 
 
 class Share(NamedTuple):
@@ -146,13 +144,19 @@ class OneStepTask:
         structure = Orthogonal() if structure is None else structure
         elimination = eliminate(structure, self.problem)
         run = self._run_inside(solver, w, structure, elimination, regularization, progress)
-        plain = not (structure.from_initial or elimination.bounded or len(elimination.rows.target))
-        above = run.ending.usable and self.bound is not None and self.loss(run) > self.start_loss
-        if not (above and plain and solver.gauss_newton and solver.iterations):
+        plain = not (structure.from_initial or len(elimination.rows.target))
+        if not (plain and solver.gauss_newton and solver.iterations and self._above(run)):
             return run
         silent = self.bound.silent(np.asarray(w)) if self.bound else None  # its runs end below physics alone
         w = w if silent is None else jnp.asarray(silent)
-        return self._run_inside(solver, w, structure, elimination, regularization, progress)
+        run = self._run_inside(solver, w, structure, elimination, regularization, progress)
+        if elimination.bounded and silent is not None and self._above(run):  # the bounds of another active set
+            return self._run_inside(solver.at_most(0), w, structure, elimination, regularization, progress)
+        return run
+
+    def _above(self, run: compiled.TrainingRun) -> bool:
+        """Whether a run ended above physics alone."""
+        return run.ending.usable and self.loss(run) > self.start_loss
 
     def _run_inside(
         self,
@@ -165,23 +169,25 @@ class OneStepTask:
     ) -> compiled.TrainingRun:
         """One run with θ inside its bounds, which an active set meets (they reach into training, F1).
 
-        Entries at a bound are held there, and training goes on until the same entries stand there.
+        Entries at a bound are known terms: they are held there from the first step on, as if they were `fixed`. Where
+        others stand there at the end, the run is made again.
         """
 
         def tell(iteration: int, loss: float) -> None:
             progress(iteration, self.mean_square(loss))
 
-        fixed: Fixed = {}
-        seconds = iterations = 0
-        for _ in range(_ACTIVE_SETS):
-            run = self._run_held(solver, w, structure, elimination, fixed, regularization, tell)
-            seconds, iterations = seconds + run.seconds, iterations + run.iterations
-            at_bounds = {} if elimination.decoupled else elimination.active(self.coordinates(run))
-            if at_bounds == fixed or not run.ending.usable:
-                break
-            w, fixed = run.w, at_bounds
+        runs: list[compiled.TrainingRun] = []
+
+        def share(fixed: Fixed) -> Vector | None:
+            """QᵀF at the end of a run with these held; None where nothing follows from it."""
+            runs.append(self._run_held(solver, w, structure, elimination, fixed, regularization, tell))
+            reach = elimination.bounded and not elimination.decoupled
+            return self.coordinates(runs[-1]) if reach and runs[-1].ending.usable else None
+
+        fixed = elimination.settled(share)
         held = bool(elimination.hold(fixed)[0].any())
-        return run._replace(seconds=seconds, iterations=iterations, held=held)
+        known = None if elimination.decoupled else fixed
+        return runs[-1]._replace(seconds=sum(run.seconds for run in runs), held=held, fixed=known)
 
     def coordinates(self, run: compiled.TrainingRun) -> Vector:
         """QᵀF (nθ,) in whitened outputs, at the end of a run."""
@@ -208,7 +214,7 @@ class OneStepTask:
             if self.checkpoints is not None:
                 options["kept"] = self.checkpoints.of_run(np.asarray(w), regularization, structure.name, *hold)
             return self._least_squares(solver, w, hold, options)
-        self._check_joint(solver, ridge, evidence)
+        check_joint(solver, ridge, evidence, resident=self.engine.resident)
         physics = Physics.of(self.problem, elimination, fixed, ridge, self.rms, solved=structure.projects)
         if solver.gauss_newton:
             end = self._joint_least_squares(solver, w, physics, progress)
@@ -222,15 +228,6 @@ class OneStepTask:
         return compiled.TrainingRun(
             end.w, normal, ridge, effective, end.iterations, end.ending, end.seconds, coefficients
         )
-
-    def _check_joint(self, solver: Any, ridge: float, evidence: bool) -> None:
-        """Raise InputError for what needs θ to be solved, or the solver to see normal equations."""
-        if solver.gauss_newton and (ridge or not self.engine.resident):  # evidence starts with a ridge
-            what = "regularization" if ridge else "training on rows that are not in memory"
-            raise InputError(f"{what} needs a solved θ; leave out `from_initial`, which trains θ from θ⁰.")
-        if evidence or not self.engine.resident:
-            what = "evidence regularization" if evidence else "training on rows that are not in memory"
-            raise InputError(f"{what} needs the Gauss-Newton matrix of the levenberg-marquardt solver.")
 
     def _joint_least_squares(self, solver: Any, w: Any, physics: Physics, progress: RunTell) -> GradientRun:
         """Levenberg-Marquardt over θ, from θ⁰, and the weights together."""
@@ -281,6 +278,7 @@ class OneStepTask:
             ridge=run.ridge * self.rms**2,
             middle=lambda noise: self.middle(run.w, noise),
             coefficients=run.coefficients,
+            fixed=None if run.coefficients is not None else run.fixed,
         )
 
     def physics_learned(self) -> Learned:
@@ -302,11 +300,12 @@ class OneStepTask:
         The median is one function of the regressor again, and split like any other. It lacks some statistics: those
         are taken from the `best` member.
         """
-        factor, least_squares = self.problem.projection, self.problem.least_squares
-        coefficients = []
-        for member in members:
-            share = factor.from_coordinates(self.share(member).coordinates) if member.coefficients is None else None
-            coefficients.append(member.coefficients if share is None else least_squares - share)
+        coefficients = [
+            split_theta(Additive(), self.problem, self.share(member).coordinates, fixed=member.fixed or {}).theta
+            if member.coefficients is None
+            else member.coefficients
+            for member in members
+        ]
         centre = np.mean(coefficients, axis=0)
         return replace(
             members[best],
@@ -314,6 +313,7 @@ class OneStepTask:
             tilt=np.array(coefficients) - centre,
             effective=float(np.mean([member.effective for member in members])),
             gram=None,
+            fixed=None,
             coefficients=centre if members[best].coefficients is not None else None,
         )
 

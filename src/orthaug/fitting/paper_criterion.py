@@ -47,13 +47,14 @@ class Physics(NamedTuple):
             return np.concatenate([matrix, np.zeros((nt - len(matrix), *matrix.shape[1:]))])
 
         penalty = elimination.rows
+        held = elimination.hold(fixed) if solved else None
         pieces = (
             elimination.outputs / rms if solved else to_rows @ initial,
             to_rows * (0.0 if solved else scale),
             elimination.outputs / rms,
             padded(penalty.theta * scale) / rms,
-            padded(penalty.learner),
-            padded(penalty.target - penalty.theta @ initial) / rms,
+            padded(penalty.learner) if held is None else held[0],
+            (padded(penalty.target - penalty.theta @ initial) if held is None else held[1]) / rms,
             problem.samples,
             ridge,
         )
@@ -76,12 +77,9 @@ class PaperCriterion:
         v, w = unknowns
         miss = physics.outputs - physics.start - physics.basis @ v  # QᵀY − Rθ
         square, share = row_sum(lambda chunk: self._sums(w, chunk), chunks)
-        if self.orthogonal:
-            total = square - share @ share + miss @ miss
-        else:
-            total = square - share @ share + jnp.sum((miss - share) ** 2)
-            rows = physics.rows_target - physics.rows_v @ v - physics.rows_f @ share
-            total = total + rows @ rows
+        rows = physics.rows_target - physics.rows_v @ v - physics.rows_f @ share
+        total = square - share @ share + rows @ rows
+        total = total + (miss @ miss if self.orthogonal else jnp.sum((miss - share) ** 2))
         return (total + physics.ridge * (w @ w)) / physics.samples
 
     def _sums(self, w: Float[Array, "nw"], chunk: Chunk) -> tuple[Float[Array, ""], Float[Array, "nt"]]:

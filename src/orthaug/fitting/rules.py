@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from orthaug._base.checks import check_count
-from orthaug._base.errors import KeyedError, shown
+from orthaug._base.errors import InputError, KeyedError, shown
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.kinds import SOLVERS
 from orthaug.fitting.solvers.solver import Solver
@@ -147,3 +147,13 @@ def check_motion_choices(
             "solver",
             f" = {SOLVERS.kind_of(solver)}; expected levenberg-marquardt for a motion",
         )
+
+
+def check_joint(solver: Any, ridge: float, evidence: bool, *, resident: bool) -> None:
+    """Raise InputError for what needs θ to be solved, or the solver to see normal equations, one step ahead."""
+    if solver.gauss_newton and (ridge or not resident):  # evidence starts with a ridge
+        what = "regularization" if ridge else "training on rows that are not in memory"
+        raise InputError(f"{what} needs a solved θ; leave out `from_initial`, which trains θ from θ⁰.")
+    if evidence or not resident:
+        what = "evidence regularization" if evidence else "training on rows that are not in memory"
+        raise InputError(f"{what} needs the Gauss-Newton matrix of the levenberg-marquardt solver.")

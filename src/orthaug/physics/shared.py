@@ -60,6 +60,19 @@ class Shared:
             told.append({name: float(f"{a / first:.12g}") for name, a in zip(self.names, column, strict=True) if a})
         return tuple(told)
 
+    def leaving(self, held: Iterable[int]) -> Shared:
+        """The shared directions that leave some entries of θ where they are; in reduced form too."""
+        basis = self.basis
+        for i in held:
+            if not basis[i].any():
+                continue
+            j = int(np.argmax(np.abs(basis[i])))
+            moved = np.outer(basis[:, j], basis[i] / basis[i, j])
+            left = basis - moved
+            left[np.abs(left) <= _ROUNDING * np.maximum(np.abs(basis), np.abs(moved))] = 0.0
+            basis = np.delete(left, j, axis=1)
+        return Shared(self.names, basis)
+
 
 def shared_directions(
     baseline: Baseline, features: Features, layout: Layout, outputs: Sequence[str], x: Float[np.ndarray, "N nx"]

@@ -80,6 +80,8 @@ class TrainingRun(NamedTuple):
     """θ (nθ,) where the solver iterated on it too; None where it is eliminated."""
     held: bool = False
     """Whether a penalty or a bound held the learner, so that `normal` has its rows too."""
+    fixed: dict[int, float] | None = None
+    """Entries of θ that stood at a bound, with its value."""
 
 
 @dataclass(frozen=True, eq=False)
