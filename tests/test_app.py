@@ -44,7 +44,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # a process in the bac
 from orthaug.commands.entry import main
 main()
 """
-LATE = 30_000  # ms
+LATE = 90_000  # ms
 SPEC = """# kept
 [data]
 inputs = ["u"]
