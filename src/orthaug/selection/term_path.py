@@ -267,7 +267,7 @@ def _grown(runs: TermRuns, point: Point, count: int) -> Point:
 
 
 def _most(folds: Blocks, size: int) -> float:
-    """0 where physics alone is as good as up to `size` terms on blocks without which they were picked; else infinite."""
+    """0 where physics alone is as good as up to `size` terms on blocks without which they were picked; or infinite."""
     points: Sequence[Point | None] = [None] * len(folds.folds)
     rungs: list[Rung] = []
     while size and (not rungs or rungs[-1].size < size):
