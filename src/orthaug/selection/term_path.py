@@ -3,7 +3,7 @@
 Forward the terms come by what they lower the error by; from the best model on backward they go, the least missed first.
 The choice is the smallest model that is within one standard error of the best (Breiman et al. 1984), block by block in
 pairs, or worse by less than is worth a term. Blocks that had a say in the terms judge them too well: so the path is
-gone anew without each block, and a choice has no more terms than lower the errors there.
+gone anew without each block, and no term is chosen where physics alone is as good there.
 """
 
 from __future__ import annotations
@@ -267,10 +267,7 @@ def _grown(runs: TermRuns, point: Point, count: int) -> Point:
 
 
 def _most(folds: Blocks, size: int) -> float:
-    """How many terms lower the error on blocks without which they were picked; infinite where it falls up to `size`.
-
-    0 where physics alone is as good.
-    """
+    """0 where physics alone is as good as up to `size` terms on blocks without which they were picked; or infinite."""
     points: Sequence[Point | None] = [None] * len(folds.folds)
     rungs: list[Rung] = []
     while size and (not rungs or rungs[-1].size < size):
@@ -278,10 +275,7 @@ def _most(folds: Blocks, size: int) -> float:
         count = min(_added_to(before), size - before) if rungs else 0
         points, held = folds.along(points, count)
         rungs.append(Rung(Point((), held, held), (), held, 0.0, before + count))
-    if not size or judge_all(rungs)[0].chosen:
-        return 0
-    best = min(rungs, key=lambda rung: rung.score).size
-    return best if best < size else np.inf
+    return np.inf if size and not judge_all(rungs)[0].within else 0
 
 
 def _backward(path: TermPath, judged: Any) -> None:
