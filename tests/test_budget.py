@@ -162,7 +162,7 @@ def test_what_is_missing_of_a_speed_is_named_or_told_with_what_explains_as_much(
     rng = np.random.default_rng(0)
     u, y = np.repeat(rng.uniform(-1, 1, 188), 8)[:1500], np.zeros(1500)
     for k in range(1, 1500):
-        y[k] = 0.9 * y[k - 1] + 0.3 * u[k - 1] - form(y[k - 1]) + 0.003 * rng.normal()
+        y[k] = 0.9 * y[k - 1] + 0.3 * u[k - 1] - form[missing](y[k - 1]) + 0.003 * rng.normal()
     physics = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "u[k-1]")])
     solver, learner = LevenbergMarquardt(100), MLP((8,), inputs=("y[k-1]",))
     found = bias_budget(estimate(Record.from_arrays(u, y), physics, learner=learner, solver=solver))
