@@ -59,6 +59,13 @@ def test_correlations_are_those_of_two_loops():
     np.testing.assert_allclose(autocorrelation(e, 10), naive_correlation(e, e, 10)[10:], atol=1e-14)
 
 
+def test_many_lags_are_those_of_two_loops():
+    rng = np.random.default_rng(3)
+    e, u = ([rng.normal(3.0, 1e3, n) for n in (300, 7, 1, 260)] for _ in range(2))
+    np.testing.assert_allclose(cross_correlation(e, u, 280), naive_correlation(e, u, 280), atol=1e-14)
+    np.testing.assert_allclose(autocorrelation([*e, np.zeros(0)], 280), naive_correlation(e, e, 280)[280:], atol=1e-14)
+
+
 def test_no_product_crosses_a_boundary():
     first, second = np.zeros(50), np.zeros(50)
     first[-1], second[0] = 1.0, -1.0  # neighbours in a record that is stacked; the mean is zero

@@ -168,25 +168,36 @@ def dead_times(task: MotionTask, solver: Any) -> tuple[DeadTime, ...]:
     Args:
         task: with physics alone trained; what it leaves is set against.
     """
-    motion, record = task.problem.motion, task.problem.record
-    first = task.physics
-    if first is None:
+    if task.physics is None:
         return ()
-    found = []
-    for number, name in enumerate(motion.inputs):
-        tried = {0: (residual_of(task.plan, first), first)}
-
-        def leaves(samples: int, number: int = number, tried: dict = tried) -> float:
-            if samples not in tried:
-                nearest = tried[min(tried, key=lambda known: (abs(known - samples), tried[known][0]))][1]
-                course, flight = refitted(task, nearest, motion, _delayed(record, number, samples), solver)
-                tried[samples] = (residual_of(course, flight), flight or first)
-            return tried[samples][0]
-
-        best = _least(leaves, len(record) // _LONGEST)
-        if leaves(best) < (1 - _LATE) * leaves(0):
-            found.append(DeadTime(name, best, leaves(best), leaves(0)))
+    found, most = [], len(task.problem.record) // _LONGEST
+    for number, name in enumerate(task.problem.motion.inputs):
+        delays = _Delays(task, solver, number, {0: (residual_of(task.plan, task.physics), task.physics)})
+        best = _least(delays.leaves, most)
+        if delays.leaves(best) < (1 - _LATE) * delays.leaves(0):
+            found.append(DeadTime(name, best, delays.leaves(best), delays.leaves(0)))
     return tuple(found)
+
+
+@dataclass(frozen=True, eq=False)
+class _Delays:
+    """Physics alone with one input delayed, refitted from the nearest delay that was tried."""
+
+    task: MotionTask
+    solver: Any
+    number: int
+    tried: dict[int, tuple[float, Flight]]
+    """What each delay leaves, and where it ended; none is there from the start."""
+
+    def leaves(self, samples: int) -> float:
+        """What physics alone leaves with the input so many samples later."""
+        if samples not in self.tried:
+            near = self.tried[min(self.tried, key=lambda known: (abs(known - samples), self.tried[known][0]))][1]
+            problem = self.task.problem
+            late = _delayed(problem.record, self.number, samples)
+            course, flight = refitted(self.task, near, problem.motion, late, self.solver)
+            self.tried[samples] = residual_of(course, flight), flight or self.tried[0][1]
+        return self.tried[samples][0]
 
 
 def _least(leaves: Callable[[int], float], most: int) -> int:

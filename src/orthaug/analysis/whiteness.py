@@ -18,6 +18,7 @@ Pieces = Sequence[Vector] | Vector  # a signal in one piece per experiment; a pl
 
 CONSTANT = 64 * np.finfo(float).eps  # rounding of the mean: a smaller deviation, against the largest value, is none
 LARGEST = 1e150  # squares of larger values overflow: a model that left all bounds has no statistics
+_FEW_LAGS = 100  # their products take half as long as the transforms at 10⁶ rows, twice as long at 10⁴
 ROWS_PER_LAG = 20  # with fewer, Ljung-Box rejects too often (3 % instead of 1 % at 4) and AIC overfits
 
 
@@ -39,10 +40,19 @@ def cross_correlation(residual: Pieces, inputs: Pieces, lags: int = 25) -> Vecto
     if e is None or u is None:
         return None
     reach = min(lags, max(map(len, e)) - 1)
-    pairs = list(zip(e, u, strict=True))
-    leads = [sum(y[lag:] @ x[: len(x) - lag] for x, y in pairs if len(x) > lag) for lag in range(reach, 0, -1)]
-    follows = [sum(x[lag:] @ y[: len(y) - lag] for x, y in pairs if len(x) > lag) for lag in range(reach + 1)]
-    return np.array(leads + follows)
+    return np.sum([_products(x, y, reach) for x, y in zip(e, u, strict=True)], axis=0)
+
+
+def _products(x: Vector, y: Vector, reach: int) -> Vector:
+    """Σ x_k y_{k−τ} for τ = −reach…reach: a product each, or all of them by two transforms."""
+    if reach <= _FEW_LAGS or not len(x):
+        own = max(min(reach, len(x) - 1), 0)
+        lags = range(-own, own + 1)
+        found = [x[max(t, 0) : len(x) + min(t, 0)] @ y[max(-t, 0) : len(y) - max(t, 0)] for t in lags]
+        return np.pad(found, reach - own)
+    size = 1 << (len(x) + reach).bit_length()  # zeros behind the record, so that it does not meet its start
+    products = np.fft.irfft(np.fft.rfft(x, size) * np.fft.rfft(y, size).conj(), size)
+    return np.concatenate([products[size - reach :], products[: reach + 1]])
 
 
 def pieces_of(signal: Pieces) -> list[Vector]:
