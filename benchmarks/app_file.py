@@ -1,4 +1,4 @@
-"""A data file of 200 MB dropped on the page of `orthaug app`: time, and memory of the server and of its helpers.
+"""A data file of 200 MB on the page of `orthaug app`, from the drop to the export: time, and memory of its processes.
 
 Run: python benchmarks/app_file.py (needs Linux, Playwright and Chromium)
 """
@@ -90,6 +90,16 @@ def main() -> None:
                 ):
                     tab.wait_for_selector(seen)
                     told[what] = time.perf_counter() - began
+                for part, press, what, seen in (
+                    ("Training", "Train", "trained", "text=Training is done"),
+                    ("Report", None, "its report open", "iframe"),
+                    ("Export", "Write c", "written in C", "text=c.zip"),
+                ):
+                    tab.get_by_role("tab", name=part).click()
+                    if press:
+                        tab.get_by_role("button", name=press, exact=True).click()
+                    tab.wait_for_selector(seen)
+                    told[what] = time.perf_counter() - began
         finally:
             watched.ending = True
             server.send_signal(signal.SIGINT)
@@ -99,7 +109,7 @@ def main() -> None:
             f"{file.stat().st_size / 1e6:.0f} MB, {ROWS} rows: " + ", ".join(f"{w} {t:.1f} s" for w, t in told.items())
         )
         print(f"server {before / 1e6:.0f} MB before, at most {watched.most[server.pid] / 1e6:.0f} MB; ", end="")
-        print(f"largest process that looks at data {helpers / 1e6:.0f} MB")
+        print(f"largest process that looks at data or trains {helpers / 1e6:.0f} MB")
 
 
 if __name__ == "__main__":

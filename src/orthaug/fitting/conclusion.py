@@ -17,8 +17,9 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
 from orthaug.fitting.elimination import Fixed, ThetaSplit, directions, eliminate, split_theta
 from orthaug.fitting.estimates import NOT_UNIQUE, Estimate
+from orthaug.fitting.laid_rows import Share
 from orthaug.fitting.learned import ErrorStatistics, Learned
-from orthaug.fitting.one_step import OneStepTask, Share
+from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.status import ALONE, Ending, Status
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.inference.covariance import degrees_of_freedom, noise_covariance, theta_covariance

@@ -17,6 +17,25 @@ Fixed = dict[int, float]
 """Entries of θ that stand at a bound, with its value."""
 
 
+def settle(fixed: Fixed, run: Callable[[Fixed], Fixed | None]) -> Fixed:
+    """What stands at a bound where a run with the same entries held ended.
+
+    What was held together once before is not released again, so that this ends.
+
+    Args:
+        fixed: what is held first.
+        run: runs with some entries held, and gives those that stand at one then; None to leave it at that.
+    """
+    tried = [fixed]
+    while (active := run(fixed)) is not None:
+        active = active | fixed if active in tried else active
+        if active == fixed:
+            break
+        fixed = active
+        tried.append(fixed)
+    return fixed
+
+
 @dataclass(frozen=True, eq=False)
 class Elimination:
     """θ eliminated from `‖p − (I − P) f − Tθ‖² + ‖e − A θ − B f‖²`, f = QᵀF, p = QᵀY, `T` = coordinates of θ.
@@ -123,24 +142,13 @@ class Elimination:
         )
 
     def settled(self, run: Callable[[Fixed], Vector | None]) -> Fixed:
-        """What stands at a bound where training with the same entries held ended.
-
-        Those of physics alone are held first. What was held once before is not released again, so that this ends.
+        """What stands at a bound where training with the same entries held ended; those of physics alone at first.
 
         Args:
             run: trains with some entries held, and gives the learner's coordinates f; None to leave it at that.
         """
-        fixed = {} if self.decoupled else self.active(np.zeros_like(self.outputs))
-        tried = [fixed]
-        while (f := run(fixed)) is not None:
-            active = self.active(f)
-            if active != fixed and active in tried:
-                active = self.past(f, fixed)
-            if active == fixed:
-                break
-            fixed = active
-            tried.append(fixed)
-        return fixed
+        first = {} if self.decoupled else self.active(np.zeros_like(self.outputs))
+        return settle(first, lambda fixed: None if (f := run(fixed)) is None else self.active(f))
 
     def past(self, f: Vector, fixed: Fixed) -> Fixed:
         """The `fixed`, and at their bounds all entries that would else leave them, for the learner's coordinates f."""

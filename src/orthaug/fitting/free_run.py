@@ -16,7 +16,7 @@ from orthaug._base.progress import RunTell, quiet
 from orthaug.data.record import Record
 from orthaug.fitting.course import Flight
 from orthaug.fitting.criteria import Criterion
-from orthaug.fitting.elimination import Fixed
+from orthaug.fitting.elimination import Fixed, settle
 from orthaug.fitting.flight_plan import FlightPlan, StructuredObjective
 from orthaug.fitting.flights import FlightTask, Place
 from orthaug.fitting.initial_states import Start
@@ -80,32 +80,24 @@ class FreeRunTask(FlightTask):
         What stands at a bound where physics alone ends is held there from the start. The run is made again, from there
         too, where other entries stand at one at its end; what was held once before is not released again.
         """
-        fixed: Fixed = {}
         alone: Any = self.physics
+        first: Fixed = {}
         if alone is not None and self.plan.objective(structure).apart:
-            fixed = alone.objective.held(alone.end)
-        seconds, tried = 0.0, [fixed]
-        while True:
+            first = alone.objective.held(alone.end)
+        flights: list[Flight] = []
+
+        def fly(fixed: Fixed, solver: LevenbergMarquardt = solver) -> Fixed | None:
             own = replace(self, plan=replace(self.plan, fixed=fixed))
-            flight = super(FreeRunTask, own).run(solver, w, structure, regularization, progress)
-            seconds += flight.seconds
-            objective: Any = flight.objective
-            if not (flight.end.ending.usable and objective.apart):
-                break
-            held = objective.held(flight.end)
-            held = held | fixed if held in tried else held
-            if held == fixed:
-                break
-            fixed = held
-            tried.append(fixed)
-        if (
-            alone
-            and fixed != tried[0]
-            and alone.mean_square < self.plan.mean_square(flight.end.flown.c, flight.end.flown.w)
-        ):
-            own = replace(self, plan=replace(self.plan, fixed=tried[0]))  # other bounds than those of its start
-            flight = super(FreeRunTask, own).run(solver.at_most(0), w, structure, regularization, progress)
-        return flight._replace(seconds=seconds)
+            flights.append(super(FreeRunTask, own).run(solver, w, structure, regularization, progress))
+            end, objective = flights[-1].end, flights[-1].objective
+            assert isinstance(objective, StructuredObjective)
+            return objective.held(end) if end.ending.usable and objective.apart else None
+
+        if settle(first, fly) != first and alone is not None:  # other bounds than those of its start
+            flown = flights[-1].end.flown
+            if alone.mean_square < self.plan.mean_square(flown.c, flown.w):
+                fly(first, solver.at_most(0))
+        return flights[-1]._replace(seconds=sum(flight.seconds for flight in flights))
 
     def places(
         self,

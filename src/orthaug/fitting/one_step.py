@@ -2,64 +2,52 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.errors import InputError
 from orthaug._base.jax import jnp
 from orthaug._base.progress import RunTell, quiet
 from orthaug._base.warning import Warning
 from orthaug.data.record import Record
 from orthaug.data.regressors import Features
+from orthaug.data.sources import RecordSource, witness
 from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.elimination import Elimination, Fixed, eliminate, split_theta
+from orthaug.fitting.laid_rows import LaidRows
 from orthaug.fitting.learned import Learned
-from orthaug.fitting.normal_equations import Blocks, Hold, OneStep, Summed, linearise
+from orthaug.fitting.normal_equations import Hold, OneStep, Summed, linearise
 from orthaug.fitting.paper_criterion import JointOneStep, PaperCriterion, Physics
 from orthaug.fitting.rules import check_joint, ridge_of
 from orthaug.fitting.solvers import compiled
 from orthaug.fitting.solvers.adam_lbfgs import GradientRun
 from orthaug.fitting.structures import Additive, Orthogonal, Structure
-from orthaug.inference.covariance import mixing
 from orthaug.models.learners import Bound, Learner, Scaling
-from orthaug.models.rows import Engine, InMemory, LearnerSums, MixedGram, Overlap, ResidualGram, from_chunks, row_values
+from orthaug.models.rows import Engine, InMemory, Overlap
 from orthaug.models.terms import scaling_of
 from orthaug.physics.problem import Problem
 from orthaug.physics.streamed import StreamedProblem
 
+MANY_ROWS, FEW_ROWS = 1_000_000, 200_000
+"""From how many rows on runs begin where runs over few of them ended; the table is in docs/design.md."""
 OUTPUT_UNIT = 10.0
 """The learner's output unit in standard deviations of the baseline's residual: the table is in docs/design.md."""
 
 
-class Share(NamedTuple):
-    """The learner's values F over the rows, in whitened outputs: QᵀF (nθ,), its part in the physics, and ‖F‖²."""
-
-    coordinates: Vector
-    square: float
-
-
 @dataclass(frozen=True, eq=False)
-class OneStepTask:
-    """A problem with its learner (None for physics alone), scaled for training.
+class OneStepTask(LaidRows):
+    """Training on rows that are laid out: what physics alone does on them, and where states of runs are kept."""
 
-    `unit` (ny,) is the learner's output unit in the outputs' units. `rms` is the RMS of the baseline's whitened
-    residual, the unit of the criterion's rows. The engine keeps these rows.
-    """
-
-    problem: Problem
-    bound: Bound | None
-    scaling: Scaling
-    unit: Vector
-    rms: float
-    engine: Engine
-    rows: Any
     criterion: Criterion = Prediction()  # noqa: RUF009  (frozen)
     physics_loss: float | None = None
     checkpoints: Checkpoints | None = None
+    few: OneStepTask | None = None
+    """The same on some of very many rows, in memory: a run begins where one over them ended."""
 
     @classmethod
     def of(
@@ -130,7 +118,18 @@ class OneStepTask:
         theta = elimination.theta(nothing, elimination.active(nothing))
         missed = problem.target_coordinates - problem.projection.to_coordinates @ theta
         loss = float(problem.unexplained_moments.square + missed @ missed) / problem.samples
-        return replace(self, physics_loss=loss)
+        begins = self.bound is not None and solver.gauss_newton and not structure.from_initial
+        few = self._few() if begins and problem.count >= MANY_ROWS else None
+        return replace(self, physics_loss=loss, few=few and few.prepared(solver, structure))
+
+    def _few(self) -> OneStepTask | None:
+        """On a witness of the rows, the weights in the same units; None where it lacks what the physics needs."""
+        assert self.bound is not None
+        problem = self.problem
+        source = problem.source if isinstance(problem, StreamedProblem) else RecordSource(problem.record, 0)
+        with suppress(InputError):
+            return OneStepTask.of(problem.on(witness(source, FEW_ROWS)), self.bound.learner, self.scaling, self.unit)
+        return None
 
     def run(
         self,
@@ -140,8 +139,16 @@ class OneStepTask:
         regularization: str | float = "none",
         progress: RunTell = quiet,
     ) -> compiled.TrainingRun:
-        """One run from the weights `w`; the arguments as in `estimate`, `structure` None for no penalty."""
+        """One run from the weights `w`; the arguments as in `estimate`, `structure` None for no penalty.
+
+        Over very many rows its iterations are those over all of them, its seconds those over the few as well.
+        """
         structure = Orthogonal() if structure is None else structure
+        if self.few is not None:
+            first = self.few.run(solver, w, structure, regularization, lambda iteration, loss: progress(0, loss))
+            w = first.w if first.ending.usable else w
+            own = replace(self, few=None).run(solver, w, structure, regularization, progress)
+            return own._replace(seconds=first.seconds + own.seconds)
         elimination = eliminate(structure, self.problem)
         run = self._run_inside(solver, w, structure, elimination, regularization, progress)
         plain = not (structure.from_initial or len(elimination.rows.target))
@@ -249,19 +256,9 @@ class OneStepTask:
         summed = Summed(self.engine, self.bound, self.rows, hold)
         return solver.drive(summed, jnp.asarray(w), self._nothing, samples=samples, **options)
 
-    @property
-    def _nothing(self) -> Overlap:
-        """No overlap known yet."""
-        nt, size = len(self.problem.baseline.names), self.bound.size if self.bound else 0
-        return Overlap(np.zeros((nt, size)), np.zeros(nt))
-
     def loss(self, run: compiled.TrainingRun) -> float:
         """Mean of squared errors of a run, with each output in its standard deviation."""
         return self.mean_square(run.normal.loss)
-
-    def mean_square(self, loss: Any) -> float:
-        """The criterion's `‖r‖²` as the mean of squared errors with each output in its standard deviation."""
-        return float(loss) * self.rms**2 / self.problem.samples
 
     def learned(self, run: compiled.TrainingRun) -> Learned:
         """What a run left."""
@@ -317,59 +314,6 @@ class OneStepTask:
             coefficients=centre if members[best].coefficients is not None else None,
         )
 
-    def share(self, learned: Learned) -> Share:
-        """QᵀF, refined once, and ‖F‖²; not finite where the learner is not."""
-        f = np.zeros(len(self.problem.baseline.names))
-        if learned.bound is None:
-            return Share(f, 0.0)
-        for _ in range(2):
-            rest, square = self._sums(learned, f)
-            f = f + rest
-        return Share(f, square)
-
-    def left_share(self, learned: Learned, theta: Vector) -> Vector:
-        """Qᵀ(F − Φθ) (nθ,), in whitened outputs."""
-        return self._sums(learned, self.problem.projection.to_coordinates @ theta)[0]
-
-    def residual_gram(self, learned: Learned, c: Vector) -> Matrix:
-        """Σ r rᵀ (ny, ny) of the residual r = Y − F − Φc, in whitened outputs."""
-        problem = self.problem
-        physics = problem.target_coordinates - problem.projection.to_coordinates @ c
-        total = self.engine.sum(ResidualGram(learned.bound), self.rows, *self._weights(learned), physics / self.rms)
-        return np.asarray(total) * self.rms**2
-
-    def _sums(self, learned: Learned, shift: Vector) -> tuple[Vector, float]:
-        summed = LearnerSums(learned.bound)
-        rest, square = self.engine.sum(summed, self.rows, *self._weights(learned), shift / self.rms)
-        return np.asarray(rest) * self.rms, float(square) * self.rms**2
-
-    def values(self, w: Any) -> Float[np.ndarray, "N ny"]:
-        """f at the training rows, in the outputs' units; the rows are in memory."""
-        if self.bound is None:
-            return np.zeros_like(self.problem.target)
-        return from_chunks(row_values(self.bound, w, self.rows.z), len(self.problem.rows)) * self.unit
-
-    def share_of(self, w: Vector) -> Vector:
-        """QᵀF (nθ,) of the learner with the weights w, in whitened outputs."""
-        if not self.engine.resident or isinstance(self.problem, StreamedProblem):
-            sums = self.engine.sum(LearnerSums(self.bound), self.rows, w, None, self._nothing.values)
-            return np.asarray(sums[0]) * self.rms
-        return self.problem.projection.coordinates(self.problem.weight.rows(self.values(w)))
-
-    def share_slope(self, w: Vector) -> Matrix:
-        """QᵀJ (nθ, nw) of the learner with the weights w, in whitened outputs."""
-        nt = len(self.problem.baseline.names)
-        if self.bound is None:
-            return np.zeros((nt, 0))
-        total = self.engine.sum(Blocks(self.bound), self.rows, w, self._nothing)
-        return np.asarray(total[:nt, nt + 1 :]) * self.rms
-
-    def _weights(self, learned: Learned) -> tuple[Any, Any]:
-        """Weights and tilt of a learned function, the tilt in the coordinates of the rows."""
-        if learned.tilt is None:
-            return learned.weights, None
-        return learned.weights, learned.tilt @ self.problem.projection.to_coordinates.T / self.rms
-
     def gram(self, run: compiled.TrainingRun) -> Matrix:
         """Gram matrix of `[Φ J]` in whitened outputs, from the run's last pass; of a held run without the hold."""
         normal = run.normal
@@ -383,17 +327,3 @@ class OneStepTask:
         inner = np.asarray(normal.hessian) * self.rms**2 + overlap.T @ overlap
         cross = to_phi.T @ overlap
         return np.block([[to_phi.T @ to_phi, cross], [cross.T, inner]])
-
-    def middle(self, w: Any, noise: Matrix) -> Matrix:
-        """ΣψᵀΣ_eψ of `[Φ J]` for the noise covariance of whitened outputs; one pass over the rows."""
-        mix = mixing(noise)
-        total = np.asarray(self.engine.sum(MixedGram(self.bound), self.rows, w, mix))
-        to_phi = self.problem.projection.to_coordinates
-        nt = len(to_phi)
-        change = np.eye(len(total)) * self.rms
-        change[:nt, :nt] = to_phi
-        return change.T @ total @ change
-
-    def physics_middle(self, noise: Matrix) -> Matrix:
-        """ΣqᵀΣ_eq (nθ, nθ) of the rows q of Q, for the noise covariance of whitened outputs."""
-        return np.asarray(self.engine.sum(MixedGram(None), self.rows, np.zeros(0), mixing(noise)))
