@@ -67,12 +67,16 @@ class Judged:
     chosen: bool
 
 
-def judge_all(rungs: Sequence[Rung], most: float = np.inf) -> tuple[Judged, ...]:
-    """Every model up to a size beside the best, block by block in pairs; the choice is the smallest that is as good."""
-    best, found = min((rung for rung in rungs if rung.size <= most), key=lambda rung: rung.score), []
+def judge_all(rungs: Sequence[Rung], terms: bool = True) -> tuple[Judged, ...]:
+    """Every model beside the best, block by block in pairs; the choice is the smallest that is as good.
+
+    Args:
+        terms: whether a model that has any may be chosen.
+    """
+    best, found = min((rung for rung in rungs if terms or not rung.size), key=lambda rung: rung.score), []
     for rung in rungs:
         count = len(rung.held)
-        finite = bool(np.isfinite(rung.held).all()) and rung.size <= most
+        finite = bool(np.isfinite(rung.held).all()) and (terms or not rung.size)
         worse = rung.held - best.held if finite else np.full(count, np.inf)
         tolerated = worse.std(ddof=1) / np.sqrt(count) if finite else 0.0
         within = finite and (float(worse.mean()) <= tolerated or rung.score <= (1 + WORTH) * best.score)
@@ -166,13 +170,13 @@ def _along(given: _Given, item: tuple[int, Point | None, int], tell: Callable[..
 
 @dataclass(frozen=True, eq=False)
 class TermPath(Search):
-    """Models of terms, of which those up to `most` may be chosen."""
+    """Models of terms, which are chosen where `confirmed` on blocks that had no say in them."""
 
     runs: TermRuns
-    most: float = np.inf
+    confirmed: bool = True
 
     def judged(self) -> tuple[Judged, ...]:
-        return judge_all(self.rungs, self.most)
+        return judge_all(self.rungs, self.confirmed)
 
     @property
     def chosen(self) -> Rung:
@@ -210,7 +214,7 @@ def climb(
         InputError: too few rows for so many blocks.
     """
     with one_blas_thread():
-        folds, rungs, held_out = Blocks(runs, blocks, runner), [], np.inf
+        folds, rungs, confirmed = Blocks(runs, blocks, runner), [], True
 
         def judged(point: Point, change: Sequence[str], began: float) -> Rung:
             held, _ = next(folds.judge([point]))
@@ -221,12 +225,12 @@ def climb(
 
         try:
             _forward(runs, most, judged)
-            held_out = _most(folds, TermPath(tuple(rungs), runs).chosen.size)
-            _backward(TermPath(tuple(rungs), runs, held_out), judged)
+            confirmed = _confirmed(folds, TermPath(tuple(rungs), runs).chosen.size)
+            _backward(TermPath(tuple(rungs), runs, confirmed), judged)
         except KeyboardInterrupt:
             if not rungs:
                 raise
-    return TermPath(tuple(rungs), runs, held_out)
+    return TermPath(tuple(rungs), runs, confirmed)
 
 
 def steps(most: int) -> int:
@@ -266,8 +270,8 @@ def _grown(runs: TermRuns, point: Point, count: int) -> Point:
     return runs.fit(point, (*point.chosen, *new)) if new else point
 
 
-def _most(folds: Blocks, size: int) -> float:
-    """0 where physics alone is as good as up to `size` terms on blocks without which they were picked; or infinite."""
+def _confirmed(folds: Blocks, size: int) -> bool:
+    """Whether up to `size` terms beat physics alone on blocks without which they were picked."""
     points: Sequence[Point | None] = [None] * len(folds.folds)
     rungs: list[Rung] = []
     while size and (not rungs or rungs[-1].size < size):
@@ -275,7 +279,7 @@ def _most(folds: Blocks, size: int) -> float:
         count = min(_added_to(before), size - before) if rungs else 0
         points, held = folds.along(points, count)
         rungs.append(Rung(Point((), held, held), (), held, 0.0, before + count))
-    return np.inf if size and not judge_all(rungs)[0].within else 0
+    return bool(size) and not judge_all(rungs)[0].within
 
 
 def _backward(path: TermPath, judged: Any) -> None:
