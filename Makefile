@@ -19,7 +19,7 @@ demo: $(STAMP)  ## fit the built-in mass-spring-damper example
 	@$(BIN)/orthaug demo
 
 test: $(STAMP)  ## run the whole test suite, a file at a time on every core
-	@$(BIN)/python -m pytest -q -n auto --dist loadfile
+	@$(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder
 
 check: $(STAMP) docs  ## ruff, pyright, the architecture test and the site of the documents
 	@$(BIN)/ruff check .

@@ -47,6 +47,18 @@ def pytest_xdist_auto_num_workers() -> int:
     return (os.cpu_count() or 1) + 1
 
 
+# Half a minute or more each: a worker that took one of these files last would be waited for.
+_LONGEST = """
+app documents engines motion_fit report_browser cli export reproduction motion_cli free_run scikit_learn published
+"""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files first, the others as they come."""
+    place = {f"test_{name}": i for i, name in enumerate(_LONGEST.split())}
+    items.sort(key=lambda item: place.get(item.path.stem, len(place)))
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _programs_are_let_go() -> Iterator[None]:
     """A worker compiles thousands of programs; where it could map no more memory, XLA would crash."""

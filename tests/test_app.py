@@ -14,7 +14,7 @@ import tomllib
 import urllib.error
 import urllib.request
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -250,6 +250,22 @@ def server(tmp_path_factory) -> Iterator[Server]:
         started.end()
 
 
+@pytest.fixture
+def serve() -> Iterator[Callable[..., Server]]:
+    """Starts servers that do not outlive the test."""
+    started: list[Server] = []
+
+    def begin(*arguments: Any) -> Server:
+        started.append(Server(*arguments))
+        return started[-1]
+
+    yield begin
+    for server in started:
+        if server.process.poll() is None:
+            server.process.kill()
+            server.process.communicate()
+
+
 @pytest.fixture(scope="module")
 def browser():
     from playwright.sync_api import sync_playwright
@@ -285,6 +301,7 @@ class Tab:
 
     def go(self, name: str) -> None:
         self.page.get_by_role("tab", name=name).click()
+        self.page.wait_for_selector(f"[role=tab][aria-selected=true]:has-text('{name}')")
 
     def drop(self, file: Path) -> None:
         self.page.set_input_files("#dropped", file)
@@ -293,6 +310,7 @@ class Tab:
     def write(self, change) -> str:
         """Change the spec in the editor, and wait until it was checked."""
         editor = self.page.get_by_label("spec in TOML")
+        self.page.wait_for_function("document.querySelector('.editor textarea')?.value")
         spec = change(editor.input_value())
         self.page.evaluate("document.querySelectorAll('.note').forEach(note => note.dataset.old = '1')")
         editor.fill(spec)  # "Checking …" may be gone before it is seen
@@ -675,11 +693,12 @@ def test_the_latest_specs_are_kept_whole(tmp_path, monkeypatch):
 
 
 @browsed
-def test_the_spec_of_a_server_that_was_killed_is_offered_by_the_next(browser, csv, tmp_path):
-    killed = Server(tmp_path)
+def test_the_spec_of_a_server_that_was_killed_is_offered_by_the_next(serve, browser, csv, tmp_path):
+    killed = serve(tmp_path)
     tab = Tab(browser, killed)
     assert "earlier work" not in tab.page.inner_text("body")
     tab.drop(csv)
+    tab.page.wait_for_selector(".account")
     tab.go("Model")
     spec = tab.write(lambda text: text.replace("restarts = 3", "restarts = 7").replace("[learner]", "[learner"))
     assert '"plant.csv"' in spec and "Broken TOML" in tab.page.inner_text(".note.bad")
@@ -688,9 +707,10 @@ def test_the_spec_of_a_server_that_was_killed_is_offered_by_the_next(browser, cs
     tab.context.close()
     assert [p.stat().st_mode & 0o77 for p in (tmp_path / "state").rglob("*")] == [0, 0, 0]
 
-    server = Server(tmp_path)
+    server = serve(tmp_path)
     tab = Tab(browser, server)
     tab.page.get_by_role("button", name="plant.csv, 20").click()
+    tab.page.wait_for_selector(".head .hint:has-text('plant.csv')")
     tab.go("Model")
     tab.page.wait_for_selector("text=Broken TOML")
     assert tab.page.get_by_label("spec in TOML").input_value() == spec
@@ -706,13 +726,13 @@ def test_the_spec_of_a_server_that_was_killed_is_offered_by_the_next(browser, cs
 
 @browsed
 @pytest.mark.skipif(not os.path.exists("/proc/self/task"), reason="children are read from /proc")
-def test_ctrl_c_leaves_nothing(browser, csv, tmp_path):
+def test_ctrl_c_leaves_nothing(serve, browser, csv, tmp_path):
     (tmp_path / "plant.toml").write_text(
         f'[data]\ninputs = ["u"]\noutputs = ["y"]\ntrain = {{ files = ["{csv.as_posix()}"] }}\n'
         '[[baseline.terms]]\nparameter = "a"\nregressor = "y[k-1]"\n[learner]\nhidden = [8]\n'
         "[training]\nrestarts = 200\niterations = 4000\nregularization = 0.0\n"
     )
-    server = Server(tmp_path, tmp_path / "plant.toml")
+    server = serve(tmp_path, tmp_path / "plant.toml")
     tab = Tab(browser, server)
     tab.go("Model")
     tab.page.wait_for_selector(".note.good")
