@@ -16,7 +16,7 @@ import urllib.request
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -287,6 +287,8 @@ def csv(tmp_path_factory) -> Path:
 class Tab:
     """A tab of a browser of its own, with what it complained of and asked for."""
 
+    open: ClassVar[list[Tab]] = []
+
     def __init__(self, browser, server: Server, width: int = 1280, scheme: str = "light") -> None:
         self.context = browser.new_context(viewport={"width": width, "height": 844}, color_scheme=scheme)
         self.page, self.told, self.server = self.context.new_page(), [], server
@@ -296,6 +298,7 @@ class Tab:
         self.page.on("pageerror", lambda error: self.told.append(str(error)))
         self.page.on("request", lambda r: self.asked.add(r.url))
         self.page.on("websocket", lambda w: self.asked.add(w.url.replace("ws://", "http://")))
+        self.open.append(self)
         self.page.goto(server.url)
         self.page.wait_for_selector("#drop")
 
@@ -336,10 +339,23 @@ class Tab:
             width = self.page.viewport_size["width"]
             assert self.page.evaluate("document.documentElement.scrollWidth") <= width, name
 
-    def close(self) -> None:
+    def leave(self) -> None:
+        self.open.remove(self)
         self.context.close()
+
+    def close(self) -> None:
+        self.leave()
         assert self.told == []
         assert {url for url in self.asked if not url.startswith((self.server.base, "data:", "blob:"))} == set()
+
+
+@pytest.fixture(autouse=True)
+def _tell_of_tabs_left_open() -> Iterator[None]:
+    """What a tab shows where its test has failed."""
+    yield
+    for tab in list(Tab.open):
+        print(tab.page.url, tab.told, tab.page.inner_text("body"), sep="\n")
+        tab.leave()
 
 
 @served
@@ -657,7 +673,7 @@ def test_a_wrong_sampling_time_is_told_under_it_and_takes_nothing_away(server, b
     for wrong, told in (("-1", "must be a positive number of seconds"), ("ten", "a number of seconds, such as 0.01")):
         page.get_by_label("sampling time").fill(wrong)
         page.get_by_role("button", name="Begin with these").click()
-        assert told in page.locator(".q-field__messages").inner_text()
+        page.wait_for_selector(f".q-field__messages:has-text('{told}')")
     page.get_by_label("sampling time").fill("0.5")
     page.get_by_role("button", name="Begin with these").click()
     page.wait_for_selector("text=first physics")
@@ -704,7 +720,7 @@ def test_the_spec_of_a_server_that_was_killed_is_offered_by_the_next(serve, brow
     assert '"plant.csv"' in spec and "Broken TOML" in tab.page.inner_text(".note.bad")
     killed.process.kill()
     killed.process.communicate()
-    tab.context.close()
+    tab.leave()
     assert [p.stat().st_mode & 0o77 for p in (tmp_path / "state").rglob("*")] == [0, 0, 0]
 
     server = serve(tmp_path)
@@ -745,4 +761,4 @@ def test_ctrl_c_leaves_nothing(serve, browser, csv, tmp_path):
     assert (server.process.returncode, told) == (0, "ended\n")
     assert [number for number in children if Path(f"/proc/{number}").exists()] == []
     assert sorted(path.name for path in tmp_path.iterdir()) == ["plant.toml"]
-    tab.context.close()
+    tab.leave()

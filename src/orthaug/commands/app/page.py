@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from functools import partial
 from html import escape
 from importlib.resources import files
 from typing import Any
@@ -65,9 +67,14 @@ class Page:
             if event.args in _PARTS:
                 tabs.set_value(event.args)
 
+        def reopen(event: Any) -> None:
+            if tabs.value == start:  # else somebody was faster
+                go(event)
+
         ui.on("part", go)
+        ui.on("reopened", reopen)
         tabs.on_value_change(lambda event: ui.run_javascript(f"shown({json.dumps(str(event.value))}, false)"))
-        opened = "location.hash ? emitEvent('part', location.hash.slice(1)) : shown({}, true)"
+        opened = "location.hash ? emitEvent('reopened', location.hash.slice(1)) : shown({}, true)"
         ui.timer(_OFTEN, lambda: ui.run_javascript(opened.format(json.dumps(start))), once=True)
 
     def follow(self) -> None:
@@ -78,26 +85,28 @@ class Page:
         def moved(what: str) -> bool:
             return now.get(what, 0) != seen.get(what, 0)
 
+        looks: list[Callable[[], None]] = []
         if moved("data"):
-            self.data.follow_data()
-            self.model.follow_data()
+            looks += [self.data.follow_data, self.model.follow_data]
         if moved("spec"):
             authors = set(self.session.authors[seen.get("spec", 0) :])
             author = authors.pop() if len(authors) == 1 else ""
-            self.data.follow_spec(author)
-            self.model.follow_spec(author)
+            looks += [partial(self.data.follow_spec, author), partial(self.model.follow_spec, author)]
         if moved("check"):
-            self.data.follow_check()
-            self.model.follow_check()
+            looks += [self.data.follow_check, self.model.follow_check]
         if moved("work") or moved("spec") or moved("data") or self.session.running is not None:
-            self.training.follow_work()
+            looks.append(self.training.follow_work)
         elif moved("check"):
-            self.training.follow_check()
+            looks.append(self.training.follow_check)
         if moved("work") or moved("spec"):
-            self.report.follow_work()
-            self.export.follow_work()
+            looks += [self.report.follow_work, self.export.follow_work]
         if now != seen:
-            self._name()
+            looks.append(self._name)
+        for look in looks:
+            try:
+                look()
+            except Exception as error:  # a part that fails keeps no other from what is new
+                self._complain(error)
 
     def _name(self) -> None:
         self.title.set_content(escape(self.session.title or "from data to a model"))
