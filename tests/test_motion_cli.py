@@ -25,6 +25,8 @@ from orthaug.commands import cli
 from orthaug.commands.kinds import open_job
 from orthaug.data.readers import read_record
 from orthaug.models.motion_field import parts_at
+from orthaug.reports.result import FitResult
+from orthaug.reports.text import _bias_lines
 
 SPEC = """
 [data]
@@ -153,11 +155,20 @@ def test_a_fit_finds_mass_and_stiffness_beside_the_friction(result):
 
 
 def test_what_a_learner_that_helps_may_hold_of_a_parameter_is_told_where_no_suspect_is_declared(printed, result):
-    assert result["validation"]["verdict"] == "helps" and [p["name"] for p in result["parameters"] if p["shared"]] == [
-        "c"
-    ]
-    told = " ".join(printed.split())
-    assert "No suspect explains half of what the learner found: a part of that may belong to c, and" in told
+    rows = {row["name"]: row for row in result["parameters"]}
+    assert result["validation"]["verdict"] == "helps" and [name for name in rows if rows[name]["shared"]] == ["c"]
+    assert result["bias"] is None and rows["c"]["bias"]["cause"].startswith("coulomb of v")
+    assert rows["c"]["ci95_with_bias"][0] < C < rows["c"]["ci95_with_bias"][1]
+    assert "% of what the learner found is coulomb of v" in " ".join(printed.split())
+
+
+def test_a_learner_that_no_term_explains_is_told(folder, printed):
+    """The result without the bias that was found."""
+    content = strict((folder / "out" / "result.json").read_text())
+    for row in content["parameters"]:
+        row["bias"] = None
+    (told,) = _bias_lines(FitResult.model_validate(content))
+    assert told.startswith("No suspect explains half of what the learner found: a part of that may belong to c, and")
 
 
 def test_a_result_has_what_a_motion_has_and_null_for_the_rest(result):

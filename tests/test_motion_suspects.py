@@ -11,10 +11,11 @@ from test_motion_fit import WHOLE, data, positive, spring
 import orthaug as oa
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jnp
-from orthaug.analysis.budget import AS_MUCH, motion_budget, rivals_of
-from orthaug.analysis.motion_bias import softened_bias
+from orthaug.analysis.budget import AS_MUCH
+from orthaug.analysis.motion_bias import ground_after, softened_bias, usual_biases
+from orthaug.analysis.motion_budget import motion_budget, rivals_of
 from orthaug.analysis.motion_suspects import check_motion_suspects, usual_motion_suspects
-from orthaug.physics.motion_problem import pose_motion
+from orthaug.physics.motion_problem import MotionProblem, pose_motion
 
 FRICTION = oa.MotionSuspect.of("expression", "tanh(v/0.1)", factor="-1/m", unit="N", name="friction")
 HARDENING = oa.MotionSuspect.of("cubic", "x", factor="-1/m", equation="v", coefficient=0.2, name="hardening")
@@ -49,6 +50,12 @@ def test_physics_alone_is_biased_as_the_term_says_and_the_residual_tells_its_siz
     assert told.coefficient == pytest.approx(0.1, abs=3 * told.std) and told.coefficient == pytest.approx(0.1, rel=0.05)
     assert told.t > 5 and told.share > 5 * hardening.residual.share
     assert 0.9 < friction.cosine < 1.0
+
+
+def usual_of(problem: MotionProblem) -> list[str]:
+    """Names of the usual terms over the guessed states."""
+    x, u = problem.looked_at
+    return [suspect.name for suspect in usual_motion_suspects(problem.motion, x.T, u.T)]
 
 
 def refitted(fit: oa.MotionEstimate, friction: float, size: float) -> np.ndarray:
@@ -158,7 +165,7 @@ def test_suspects_that_the_motion_cannot_have_are_refused() -> None:
     )
     with pytest.raises(InputError, match="`equation` is missing; one of a, b, y"):
         oa.MotionSuspect.of("offset").place(two)
-    assert [s.name for s in usual_motion_suspects(problem)] == [
+    assert usual_of(problem) == [
         *(f"{kind} of {name}" for name in "xv" for kind in ("coulomb", "quadratic_drag", "cubic")),
         *(f"{kind} of u" for kind in ("cubic", "dead_zone", "saturation")),
         "offset",
@@ -184,12 +191,12 @@ def test_what_keeps_its_sign_has_no_jump_at_zero() -> None:
     assert best.shape == "constant" and best.coefficient == pytest.approx(-0.48, rel=0.2)
     assert "jump" not in found.text and "the equation of h lacks something constant" in found.text
     assert not {"jump", "absolute"} & {term.shape for term in found.missing.terms}
-    assert [s.name for s in usual_motion_suspects(fit.problem) if "of h" in s.name] == [
+    assert [name for name in usual_of(fit.problem) if "of h" in name] == [
         "quadratic_drag of h",
         "cubic of h",
     ]
     assert "curved in h" in replace(best, variable="h", shape="square", one_sided=True).meaning
-    assert "coulomb of v" in [s.name for s in usual_motion_suspects(pose_motion(data(60), spring()))]
+    assert "coulomb of v" in usual_of(pose_motion(data(60), spring()))
 
 
 def test_friction_that_turns_round_smoothly_is_no_drag() -> None:
@@ -200,7 +207,7 @@ def test_friction_that_turns_round_smoothly_is_no_drag() -> None:
     suspects = [oa.MotionSuspect.of(kind, "v", factor="-1/m", name=kind) for kind in kinds]
     table, smooth = oa.suspected_bias(fit, suspects), softened_bias(fit, suspects)
     alone, beside = motion_budget(fit, table), motion_budget(fit, table, smooth)
-    assert alone.cause.suspect.name == "quadratic_drag" and alone.coefficient < 0 and alone.of("c").ci95[0] > TRUTH[1]
+    assert alone.cause.suspect.name == "quadratic_drag" and alone.coefficient < 0 and alone.of("c").value < 0
     assert beside.cause.suspect.name.startswith("coulomb as tanh(v/0.") and beside.share > 0.97
     assert beside.coefficient == pytest.approx(6.0, rel=0.3)
     low, high = beside.of("c").ci95
@@ -212,11 +219,47 @@ def test_friction_that_turns_round_smoothly_is_no_drag() -> None:
     assert "(quadratic_drag explains as much and would move them elsewhere)" in twice.warnings[0].text
 
 
+def test_usual_terms_that_the_learner_sees_are_weighed_too(
+    learned: oa.MotionEstimate, alone: oa.MotionEstimate
+) -> None:
+    """With widths by the states that the fit has found: guessed ones may stand still."""
+    table, smooth = usual_biases(learned)
+    kinds = ("coulomb", "quadratic_drag", "cubic")
+    assert [entry.suspect.name for entry in table] == [*(f"{kind} of v" for kind in kinds), "offset"]
+    assert len(smooth) == 6
+    found = motion_budget(learned, table, smooth)
+    assert found.cause.suspect.name.startswith("coulomb of v") and found.share > 0.9
+    low, high = found.of("c").ci95
+    assert low < TRUTH[1] < high < learned.values[1]
+    assert usual_biases(alone) == ([], [])
+
+
+def test_a_rival_leaves_about_as_little_of_the_learner(learned: oa.MotionEstimate) -> None:
+    (cause,) = oa.suspected_bias(learned, [oa.MotionSuspect.of("quadratic_drag", "v", factor="-1/m", name="drag")])
+    for share, least in ((0.9999, 0.995), (0.95, 0.9), (0.6, 0.5)):
+        table = [replace(cause, explained=least + step) for step in (0.001, -0.001)]
+        assert rivals_of(replace(cause, explained=share), table) == table[:1]
+
+
+def test_what_a_cause_leaves_of_the_learner_may_be_another_s(learned: oa.MotionEstimate) -> None:
+    """A cause that explains all but a drag of half its size: the interval counts what that would do."""
+    ground = ground_after(learned)
+    kinds = ("coulomb", "quadratic_drag")
+    dry, drag = (oa.MotionSuspect.of(kind, "v", factor="-1/m", name=kind) for kind in kinds)
+    rows = [suspect.values(ground.motion, learned.values, ground.field.x, ground.field.u) for suspect in (dry, drag)]
+    both = replace(ground, learned=(rows[0] + 0.5 * rows[1])[:, None])
+    first, second = both.table([dry, drag])
+    (after,) = both.after(replace(first, coefficient_found=1.0), [first, second])
+    assert after.suspect is drag and after.explained == pytest.approx(1.0)
+    assert after.coefficient_found == pytest.approx(0.5)
+    assert both.after(replace(first, seen=False), [second]) == []
+
+
 def test_a_jump_that_is_there_stays_one(learned: oa.MotionEstimate) -> None:
     assert softened_bias(learned, SUSPECTS) == []  # none of the kind coulomb
     jump = oa.MotionSuspect.of("coulomb", "v - 0.1", factor="-1/m", name="dry", coefficient=0.5)
     smooth = [entry.suspect for entry in softened_bias(learned, [jump])]
-    assert len(smooth) == 5 and all(s.expression.startswith("(-1/m)*(tanh((v - 0.1)/") for s in smooth)
+    assert len(smooth) == 6 and all(s.expression.startswith("(-1/m)*(tanh((v - 0.1)/") for s in smooth)
     assert {(s.equation, s.coefficient, s.jump) for s in smooth} == {(None, 0.5, None)}
     drag = oa.MotionSuspect.of("quadratic_drag", "v", factor="-1/m", name="drag")
     (entry,) = oa.suspected_bias(learned, [drag])

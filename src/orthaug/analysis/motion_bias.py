@@ -10,7 +10,7 @@ learner sees.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -20,7 +20,13 @@ from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug.analysis.absorbed import completing
 from orthaug.analysis.bias import IN_SPAN, Certificate, SuspectedBias, find_certificate
 from orthaug.analysis.motion_response import Place, TermsResponse, respond_to
-from orthaug.analysis.motion_suspects import MotionSuspect, check_motion_suspects, equations_of, softened
+from orthaug.analysis.motion_suspects import (
+    MotionSuspect,
+    check_motion_suspects,
+    equations_of,
+    softened,
+    usual_motion_suspects,
+)
 from orthaug.analysis.robustness import block_of
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_measures import field_under
@@ -141,6 +147,10 @@ class MotionGround:
     def _weighed(self, rows: np.ndarray) -> np.ndarray:
         return rows * np.sqrt(self.field.weight)[:, None] / self.field.size
 
+    def usual(self) -> tuple[MotionSuspect, ...]:
+        """What is often missing, with widths by its points."""
+        return usual_motion_suspects(self.motion, self.field.x, self.field.u)
+
     def table(
         self, suspects: Sequence[MotionSuspect], used: float | None = None, steps: int | None = None
     ) -> list[TermBias]:
@@ -154,7 +164,7 @@ class MotionGround:
         response = respond_to(self.place, added)
         if not np.isfinite(response.information).all() or not np.isfinite(response.gradient).all():
             return []
-        seen = [self._seen(suspect) if self.learns else None for suspect in suspects]
+        seen = [self.sees(suspect) if self.learns else None for suspect in suspects]
         residuals: list[Told | None] = [None] * len(added)
         if used is not None and not all(seen):  # what the learner sees it has taken from the residual
             residuals = told_by_residual(response, used, steps)
@@ -193,6 +203,19 @@ class MotionGround:
         told = (response.cosine(k), response.size(k), seen, explained, found, certificate)
         return TermBias(*own, *told, None if seen else residual)
 
+    def after(self, cause: TermBias, table: Sequence[TermBias]) -> list[TermBias]:
+        """What terms that the learner sees explain of it without a cause that it sees; nothing of another cause."""
+        if self.learned is None or not cause.seen:
+            return []
+        own = self._rows(cause.suspect, cause.suspect.place(self.motion))
+        rest, found = replace(self, learned=self.learned - (cause.coefficient_found or 0.0) * own), []
+        for entry in table:
+            if entry.seen and entry.suspect != cause.suspect:
+                rows = self._rows(entry.suspect, entry.suspect.place(self.motion))
+                explained, coefficient = rest._explained(self._weighed(rows))
+                found.append(replace(entry, explained=explained, coefficient_found=coefficient))
+        return found
+
     def _rows(self, suspect: MotionSuspect, place: int) -> Matrix:
         """The term (M, nl) in the learned equations, 0 where it acts elsewhere."""
         learned = learned_places(self.motion)
@@ -218,7 +241,7 @@ class MotionGround:
         product = float(np.vdot(rest, tilde)) / norm
         return float(min((product / np.linalg.norm(tilde)) ** 2, 1.0)), float(product / norm)
 
-    def _seen(self, suspect: MotionSuspect) -> bool:
+    def sees(self, suspect: MotionSuspect) -> bool:
         """Whether the learner is added where the term acts, and the term is a function of what the learner sees."""
         if suspect.place(self.motion) not in learned_places(self.motion):
             return False
@@ -288,6 +311,19 @@ def softened_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> lis
     field = fit.split_by.field
     smooth = softened(suspects, fit.problem.motion, fit.values, field.x, field.u)
     return suspected_bias(fit, smooth) if smooth else []
+
+
+def usual_biases(fit: MotionEstimate) -> tuple[list[TermBias], list[TermBias]]:
+    """What usual terms do that nobody declared, and their smooth forms.
+
+    Of these only what the learner sees counts: the rest is no likely cause of what it found. Nothing where it could
+    imitate no change of a parameter.
+    """
+    ground = ground_after(fit)
+    if ground is None or not ground.learns or not fit.shared.basis.shape[1]:
+        return [], []
+    seen = [suspect for suspect in ground.usual() if ground.sees(suspect)]
+    return suspected_bias(fit, seen), softened_bias(fit, seen)
 
 
 def ground_after(fit: MotionEstimate) -> MotionGround | None:

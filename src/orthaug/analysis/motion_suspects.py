@@ -20,7 +20,7 @@ from orthaug.physics.motion_problem import MotionProblem
 from orthaug.physics.suspected_motion import AddedTerm
 
 _OF_STATES = ("coulomb", "quadratic_drag", "cubic")
-_WIDTHS = (0.25, 0.5, 1.0, 2.0, 4.0)  # of friction that turns round smoothly, in median sizes of what it acts on
+_WIDTHS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # of friction that turns round smoothly, in median sizes of what it acts on
 _OF_INPUTS = ("cubic", "dead_zone", "saturation")
 
 
@@ -145,16 +145,15 @@ def check_motion_suspects(suspects: Sequence[MotionSuspect], problem: MotionProb
             raise InputError(f"suspect '{suspect.name}' = {suspect.expression} is not finite at {where}.")
 
 
-def motion_width(on: str, problem: MotionProblem) -> float:
-    """A width from the data: the median of |on| where it is not zero, to six digits, over guessed states and inputs.
+def motion_width(on: str, motion: Motion, x: Matrix, u: Matrix) -> float:
+    """A width from states x (M, nx) and inputs u (M, nu): the median of |on| where it is not zero, to six digits.
 
     Raises:
         InputError: an expression that cannot be read, that is not finite, or zero everywhere.
     """
-    motion, (x, u) = problem.motion, problem.looked_at
-    size = np.abs(MotionSuspect(on, on).values(motion, motion.initial, x.T, u.T))
+    size = np.abs(MotionSuspect(on, on).values(motion, motion.initial, x, u))
     if not np.isfinite(size).all() or not np.any(size > 0):
-        raise InputError(f"'{on}' is zero or not finite over the guessed states; the data give no `width`. State one.")
+        raise InputError(f"'{on}' is zero or not finite over the states; the data give no `width`. State one.")
     return float(f"{np.median(size[size > 0]):.6g}")
 
 
@@ -192,11 +191,14 @@ def softened(
     return tuple(found)
 
 
-def usual_motion_suspects(problem: MotionProblem) -> tuple[MotionSuspect, ...]:
-    """What is often missing: friction, drag and hardening of every state, what bends an input, an offset."""
-    motion, (x, u) = problem.motion, problem.looked_at
-    moving = [(name, True, row) for name, row in zip(motion.names_of_states, x, strict=True) if np.ptp(row) > 0]
-    moving += [(name, False, row) for name, row in zip(motion.inputs, u, strict=True) if np.ptp(row) > 0]
+def usual_motion_suspects(motion: Motion, x: Matrix, u: Matrix) -> tuple[MotionSuspect, ...]:
+    """What is often missing: friction, drag and hardening of every state, what bends an input, an offset.
+
+    Args:
+        x: states (M, nx) that it is about; with inputs u (M, nu) they tell the widths.
+    """
+    moving = [(name, True, row) for name, row in zip(motion.names_of_states, x.T, strict=True) if np.ptp(row) > 0]
+    moving += [(name, False, row) for name, row in zip(motion.inputs, u.T, strict=True) if np.ptp(row) > 0]
     places = usual_places(motion)
     found = []
     for place in places:
@@ -206,7 +208,7 @@ def usual_motion_suspects(problem: MotionProblem) -> tuple[MotionSuspect, ...]:
             for kind in _OF_STATES if is_state else _OF_INPUTS:
                 if kind in ODD_JUMPS and not changes_sign(row):
                     continue
-                width = motion_width(name, problem) if kind in WIDTHS else None
+                width = motion_width(name, motion, x, u) if kind in WIDTHS else None
                 label = f"{kind} of {name}{where}"
                 found.append(MotionSuspect.of(kind, name, width=width, equation=equation, name=label))
         found.append(MotionSuspect.of("offset", equation=equation, name=f"offset{where}"))

@@ -10,14 +10,13 @@ import numpy as np
 from orthaug._base.errors import InputError, RankError
 from orthaug._base.warning import Warning
 from orthaug.analysis.closed_loop import closed_loop
-from orthaug.analysis.motion_suspects import usual_motion_suspects
 from orthaug.commands.attempt import attempt, attempt_warned
 from orthaug.commands.motion_job import MotionJob
 from orthaug.reports.result import CheckResult, FitResult, MeasureResult, ParameterResult, parameter_rows
 
 if TYPE_CHECKING:
-    from orthaug.analysis.budget import MotionBudget
     from orthaug.analysis.input_timing import Trial
+    from orthaug.analysis.motion_budget import MotionBudget
     from orthaug.fitting.motion_estimates import MotionEstimate
     from orthaug.models.response import Response
     from orthaug.reports.drawing import Figure
@@ -95,7 +94,7 @@ def _biases(job: MotionJob, trial: Trial) -> list[dict[str, Any]] | None:
     ground = ground_before(trial.task, job.structure)
     if ground is None:
         return None
-    table = ground.table(job.suspects or usual_motion_suspects(job.problem))
+    table = ground.table(job.suspects or ground.usual())
     return [entry.as_dict() for entry in table if job.suspects or entry.size]
 
 
@@ -161,16 +160,16 @@ def content(
 
 def _analysed(job: MotionJob, fit: MotionEstimate, free_run: Response, warnings: list[Any]) -> dict[str, Any]:
     """What is asked of a fit behind its training; None for an analysis that fails. Warnings are added."""
-    from orthaug.analysis.budget import motion_budget
     from orthaug.analysis.learned_part import equation_parts
-    from orthaug.analysis.motion_bias import softened_bias, suspected_bias
+    from orthaug.analysis.motion_bias import softened_bias, suspected_bias, usual_biases
+    from orthaug.analysis.motion_budget import motion_budget
     from orthaug.analysis.motion_diagnosis import diagnose_motion
     from orthaug.analysis.motion_modes import motion_stability
     from orthaug.analysis.motion_response import substep_bias
 
     def biases() -> Any:
         table = suspected_bias(fit, job.suspects) if job.suspects else []
-        budget = motion_budget(fit, table, softened_bias(fit, job.suspects))
+        budget = motion_budget(fit, table, softened_bias(fit, job.suspects)) or motion_budget(fit, *usual_biases(fit))
         warnings.extend(budget.warnings if budget else ())
         return [entry.as_dict() for entry in table] or None, budget
 

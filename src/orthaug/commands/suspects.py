@@ -40,11 +40,11 @@ def declared_terms(sections: Sequence[SuspectSection], problem: MotionProblem) -
     Raises:
         InputError: an unknown kind, equation or name, an expression that cannot be read or has no value.
     """
-    suspects = []
+    suspects, (x, u) = [], problem.looked_at
     for section in sections:
         kept = ("factor", "equation", "coefficient", "unit", "name")
         options = {key: getattr(section, key) for key in kept}
-        width = _width(section, lambda on: motion_width(on, problem))
+        width = _width(section, lambda on: motion_width(on, problem.motion, x.T, u.T))
         suspects.append(MotionSuspect.of(section.kind, section.on, width=width, **options))
     check_motion_suspects(suspects, problem)
     return tuple(suspects)
