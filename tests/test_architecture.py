@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from sources import parsed
 
 import orthaug
 
@@ -49,7 +50,6 @@ def module_name(path: Path) -> str:
 
 
 FILES = {module_name(path): path for path in sorted(SOURCE.rglob("*.py")) if path.name != "__main__.py"}
-TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in FILES.items()}
 
 
 def imports_of(name: str, tree: ast.AST, is_package: bool) -> Iterator[tuple[int, str]]:
@@ -99,7 +99,7 @@ def room_of(name: str) -> str:
 
 
 def all_imports(name: str) -> list[tuple[int, str]]:
-    return list(imports_of(name, TREES[name], FILES[name].name == "__init__.py"))
+    return list(imports_of(name, parsed(FILES[name]), FILES[name].name == "__init__.py"))
 
 
 def breaches(name: str, tree: ast.AST, is_package: bool = False) -> list[str]:
@@ -151,7 +151,7 @@ def test_the_rooms_are_those_of_the_list() -> None:
 
 @pytest.mark.parametrize("name", FILES)
 def test_imports_point_to_the_left(name: str) -> None:
-    assert breaches(name, TREES[name], FILES[name].name == "__init__.py") == []
+    assert breaches(name, parsed(FILES[name]), FILES[name].name == "__init__.py") == []
 
 
 def test_no_files_import_each_other() -> None:
@@ -215,7 +215,7 @@ def test_nothing_prints_or_runs_text_as_code(name: str) -> None:
     found = [
         f"line {line}: {what}" for line, what in all_imports(name) if any(within(what, one) for one in UNSAFE_MODULES)
     ]
-    for node in ast.walk(TREES[name]):
+    for node in ast.walk(parsed(FILES[name])):
         if isinstance(node, ast.Call):
             verb = called(node)
             if verb in UNSAFE_CALLS or (verb == "print" and isinstance(node.func, ast.Name)):
@@ -245,7 +245,7 @@ def lines_of(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
 def test_files_and_functions_are_short(name: str) -> None:
     lines = len(FILES[name].read_text(encoding="utf-8").splitlines())
     assert lines <= MOST_LINES, f"{FILES[name]} has {lines} lines: there are two concepts in it."
-    for node in ast.walk(TREES[name]):
+    for node in ast.walk(parsed(FILES[name])):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             length = lines_of(node)
             assert length <= MOST_FUNCTION_LINES, f"{node.name} has {length} lines: there are two functions in it."

@@ -20,6 +20,8 @@ from test_cli import MLP as NETWORK
 
 from orthaug.models.storage import load, save
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 
 @pytest.fixture
 def project(tmp_path, monkeypatch) -> Path:

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from test_cli import MLP, SPEC, listing, make_project, one_line, run, signals, write_csv
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 NETWORK = SPEC.replace('kind = "none"\n', MLP)
 STARTED = NETWORK.replace('"b"', '"b"\ninitial = -0.1').replace('"c"', '"c"\ninitial = 0.4')
 

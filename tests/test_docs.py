@@ -7,10 +7,13 @@ import importlib
 import inspect
 import re
 import textwrap
+from collections.abc import Iterable
 from dataclasses import fields, is_dataclass
+from functools import cache
 from pathlib import Path
 
 import pytest
+from sources import parsed
 from test_architecture import ROOMS
 from test_cli import make_project
 
@@ -44,8 +47,8 @@ def found(path: str, page: str) -> list[Path]:
     return [file for place in places for file in ([place / path] if "*" not in path else place.glob(path))]
 
 
-def parsed(files: list[Path]) -> list[ast.stmt]:
-    return [node for file in files for node in ast.parse(file.read_text(encoding="utf-8")).body]
+def statements(files: Iterable[Path]) -> list[ast.stmt]:
+    return [node for file in files for node in parsed(file).body]
 
 
 def members(name: str, nodes: list[ast.stmt]) -> set[str]:
@@ -70,8 +73,16 @@ def commands_in(text: str) -> set[str]:
 
 
 COMMANDS = {command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands}
-EVERYTHING = parsed(sorted(SOURCE.rglob("*.py")))
-WORDS = set(re.findall(r"\w+", "".join(f.read_text() for d in (SOURCE, ROOT / "tests") for f in d.rglob("*.py"))))
+
+
+@cache
+def everything() -> list[ast.stmt]:
+    return statements(sorted(SOURCE.rglob("*.py")))
+
+
+@cache
+def words() -> set[str]:
+    return set(re.findall(r"\w+", "".join(f.read_text() for d in (SOURCE, ROOT / "tests") for f in d.rglob("*.py"))))
 
 
 @pytest.mark.parametrize("page", TEXTS)
@@ -96,7 +107,7 @@ def test_every_dotted_name_exists(page):
                 thing = getattr(thing, part, None)
         missing |= {name} if thing is None else set()
     for owner, attribute in re.findall(r"\b([A-Z]\w+)\.(?!md|csv)([a-z_]\w*)", "\n".join(backticked(TEXTS[page]))):
-        missing |= {f"{owner}.{attribute}"} - {f"{owner}.{one}" for one in members(owner, EVERYTHING)}
+        missing |= {f"{owner}.{attribute}"} - {f"{owner}.{one}" for one in members(owner, everything())}
     assert missing == set()
 
 
@@ -122,7 +133,7 @@ def test_commands_are_found_in_texts():
 def test_every_name_of_the_code_is_a_word_of_the_code(page):
     named = [text.partition("(")[0].removeprefix("@") for text in backticked(TEXTS[page])]
     named = [text for text in named if re.fullmatch(r"[A-Za-z]\w*_\w*|[A-Z]\w*[a-z]\w*|[A-Z]{3,}", text)]
-    assert {name for name in named if name not in WORDS} == set()
+    assert {name for name in named if name not in words()} == set()
 
 
 def test_every_numbered_fact_is_told():

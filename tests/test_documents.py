@@ -12,6 +12,7 @@ import given
 import matplotlib
 import pytest
 from documents import ROOT, Page, blocks, differences, pages
+from sources import parsed
 
 import orthaug
 from orthaug.export.kinds import TARGETS
@@ -84,7 +85,7 @@ def test_what_functions_return_is_in_the_reference():
     public = set(orthaug.__all__)
     annotations = [str(getattr(getattr(orthaug, name), "__annotations__", {}).get("return")) for name in public]
     for file in sorted(SOURCE.rglob("*.py")):
-        for node in ast.parse(file.read_text(encoding="utf-8")).body:
+        for node in parsed(file).body:
             if isinstance(node, ast.ClassDef):
                 classes.setdefault(node.name, []).append((file.relative_to(SOURCE).parts[0], node))
     returned = set(classes).intersection(re.findall(r"\b[A-Z]\w+", " ".join(annotations)))
@@ -116,7 +117,7 @@ def test_every_warning_has_a_row_with_a_remedy():
     calls = [
         node
         for file in SOURCE.rglob("*.py")
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        for node in ast.walk(parsed(file))
         if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("Warning", "WarningResult")
     ]
     first = [call.args[0] if call.args else call.keywords[0].value for call in calls]

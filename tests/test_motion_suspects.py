@@ -234,6 +234,16 @@ def test_usual_terms_that_the_learner_sees_are_weighed_too(
     assert usual_biases(alone) == ([], [])
 
 
+def test_states_that_nobody_guessed_have_suspects_where_the_run_goes() -> None:
+    still = oa.Motion.from_equations(
+        [oa.State("x", "v"), oa.State("v", "(u - c*v - k*x)/m")], [oa.Output("y", "x")], positive(m=1.2, c=1.2, k=30.0),
+        inputs=["u"],
+    )  # fmt: skip
+    fit = oa.estimate(data(), still, learner=None, criterion=WHOLE)
+    assert "coulomb of v" not in usual_of(fit.problem)
+    assert "coulomb of v" in [suspect.name for suspect in ground_after(fit).usual()]
+
+
 def test_a_rival_leaves_about_as_little_of_the_learner(learned: oa.MotionEstimate) -> None:
     (cause,) = oa.suspected_bias(learned, [oa.MotionSuspect.of("quadratic_drag", "v", factor="-1/m", name="drag")])
     for share, least in ((0.9999, 0.995), (0.95, 0.9), (0.6, 0.5)):

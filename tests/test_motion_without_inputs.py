@@ -13,6 +13,8 @@ from test_motion_cli import orthaug
 import orthaug as oa
 from orthaug.data.readers import read_record
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 STIFFNESS, DAMPING, TS = 12.0, 0.15, 0.04
 SPEC = f"""
 [data]

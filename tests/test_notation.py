@@ -9,7 +9,7 @@ import ast
 import re
 
 import pytest
-from test_docs import ROOT, backticked, members, parsed
+from test_docs import ROOT, backticked, members, statements
 from test_theory import FUNCTIONS, PAPER
 from test_theory import SOURCE as LATEX
 
@@ -67,7 +67,7 @@ def missing(row: Row) -> list[str]:
     absent = [str(file.relative_to(CODE)) for file in files if not file.is_file()]
     if absent:
         return absent
-    nodes = parsed(files)
+    nodes = statements(files)
     known, found = defined(nodes), []
     for name in backticked(row["in the code"]):
         owner, _, attribute = name.partition(".")
@@ -89,7 +89,7 @@ def test_what_a_row_names_exists(row):
         assert backticked(row["in the code"]) and missing(row) == []
         files = [CODE / name for name in backticked(row["file"])]
         named = {part for name in backticked(row["in the code"]) for part in name.split(".")}
-        assert all(named & defined(parsed([file])) for file in files), "a file of the row defines none of its names"
+        assert all(named & defined(statements([file])) for file in files), "a file of the row defines none of its names"
         assert row["test"] != "–", "code without a test"
     for test in backticked(row["test"]):
         file, _, name = test.partition(".")

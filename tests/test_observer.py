@@ -17,6 +17,8 @@ import orthaug as oa
 from orthaug._base.lines import percent
 from orthaug.analysis.observer_noise import by_verdict, to_keep
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 PHYSICS = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "y[k-2]"), oa.Term("g", "u[k-1]")])
 TWO = [
     oa.Term("a", "y[k-1]", output="y"),

@@ -6,7 +6,8 @@ import ast
 from collections.abc import Iterator
 
 import pytest
-from test_architecture import TREES
+from sources import parsed
+from test_architecture import FILES
 
 ONLY_POSIX = {
     **dict.fromkeys(("fcntl", "grp", "pwd", "pty", "termios", "tty", "syslog", "resource"), ()),
@@ -56,10 +57,10 @@ def is_text(node: ast.Call) -> bool:
     return not any(isinstance(mode, ast.Constant) and "b" in str(mode.value) for mode in modes)
 
 
-@pytest.mark.parametrize("name", TREES)
+@pytest.mark.parametrize("name", FILES)
 def test_every_system_has_what_is_used(name):
-    assert set(foreign(TREES[name])) - ASKED_FIRST.get(name, set()) == set()
-    assert list(without_encoding(TREES[name])) == []
+    assert set(foreign(parsed(FILES[name]))) - ASKED_FIRST.get(name, set()) == set()
+    assert list(without_encoding(parsed(FILES[name]))) == []
 
 
 @pytest.mark.parametrize(

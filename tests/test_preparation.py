@@ -15,6 +15,8 @@ from orthaug._base.errors import InputError
 from orthaug.data.preparation import steps_again, warnings_of
 from orthaug.data.record import Prepared
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 T = 0.01
 TIME = T * np.arange(1000)
 SLOW, FAST = np.sin(2 * np.pi * 2 * TIME), np.sin(2 * np.pi * 40 * TIME)

@@ -18,6 +18,8 @@ from orthaug.reports.fields import Content, Flag, Number, Numbers, WarningResult
 from orthaug.reports.result import DataResult, FitResult, ParameterResult, ScoreResult
 from orthaug.reports.schemas import RESULTS, schema_of
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "result.md"
 
 

@@ -16,6 +16,8 @@ from orthaug._base.lines import WIDTH, fit_screen, fold, table
 from orthaug._base.log import LOG, show_log
 from orthaug.commands import bars, streams
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 COMMAND = [sys.executable, "-m", "orthaug"]
 LEARNER = """kind = "mlp"
 hidden = [3]

@@ -7,6 +7,8 @@ import pandas as pd
 import pytest
 from test_cli import finite_json, listing, make_project, one_line, run, signals, write_csv
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 
 @pytest.fixture(scope="module")
 def project(tmp_path_factory):

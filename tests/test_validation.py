@@ -20,6 +20,8 @@ from orthaug.fitting.structures import Additive, Orthogonal
 from orthaug.models.learners import MLP
 from orthaug.models.storage import load
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 TRAIN, VALIDATION = record_of(0, rows=60), record_of(1, rows=90)
 OPTIONS = {"learner": MLP(hidden=(8,)), "solver": LevenbergMarquardt(iterations=60)}
 CHOICES = ("none", "evidence", 1.0)

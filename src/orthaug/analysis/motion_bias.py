@@ -148,8 +148,12 @@ class MotionGround:
         return rows * np.sqrt(self.field.weight)[:, None] / self.field.size
 
     def usual(self) -> tuple[MotionSuspect, ...]:
-        """What is often missing, with widths by its points."""
-        return usual_motion_suspects(self.motion, self.field.x, self.field.u)
+        """What is often missing, with widths by where its run goes."""
+        place = self.place
+        course = place.course if len(place.w) else place.course.alone
+        x, u = course.trajectory(place.c, place.w, place.states)
+        there = np.isfinite(x).all(axis=1)
+        return usual_motion_suspects(self.motion, x[there], u[there])
 
     def table(
         self, suspects: Sequence[MotionSuspect], used: float | None = None, steps: int | None = None
