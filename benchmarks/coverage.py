@@ -80,7 +80,7 @@ def mass_spring_damper() -> Callable[[int], list[np.ndarray]]:
 
     def draw(seed: int) -> list[np.ndarray]:
         noise = np.random.default_rng([seed, 2]).normal(0.0, 0.00018, len(force))
-        record = oa.Record.from_arrays(force, clean + lfilter([1.0], poles, noise))
+        record = oa.Record.from_arrays(force, clean + lfilter([1.0], poles, noise), sampling_time=TS)
         return [inside(np.array(oa.estimate(record, baseline, learner=None).physical(physics).ci95), TRUE)]
 
     return draw

@@ -61,10 +61,16 @@ def mr_damper() -> list[float | None]:
     return [None if one is None else one[0] for one in found]
 
 
-def cascaded_tanks() -> list[float | None]:
-    """FIT of the free run on the official test: with the learner, and by physics alone."""
-    found = [scores("cascaded_tanks", "fit", variant) for variant in (AS_DECLARED, Variant(ALONE))]
-    return [None if one is None else one[0] for one in found]
+def cascaded_tanks() -> float | None:
+    """FIT of the free run on the official test: 78.4, 79.2 or 83.5 by the kernels that BLAS takes on a machine."""
+    found = scores("cascaded_tanks", "fit", AS_DECLARED)
+    return None if found is None else found[0]
+
+
+def cascaded_tanks_alone() -> float | None:
+    """The same of physics alone."""
+    found = scores("cascaded_tanks", "fit", Variant(ALONE))
+    return None if found is None else found[0]
 
 
 @contextmanager
@@ -101,7 +107,7 @@ def main() -> None:
     for what, found in (
         ("Silverbox, mV", silverbox()),
         ("MR damper, FIT", mr_damper()),
-        ("Tanks, FIT", cascaded_tanks()),
+        ("Tanks, FIT", [cascaded_tanks(), cascaded_tanks_alone()]),
         ("its colour", colour()),
     ):
         print(what, " / ".join("absent" if one is None else f"{one:.4g}" for one in found))
