@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import importlib.util
 import json
 import os
@@ -185,6 +186,58 @@ def test_a_command_that_cannot_start_has_failed(monkeypatch):
     command = Command(["fit"], lambda: None)
     asyncio.run(command.run())
     assert (command.running, command.complaint) == (False, "the command cannot start (No such file or directory).")
+
+
+def test_a_process_that_cannot_start_is_told(tmp_path, monkeypatch):
+    async def refused():
+        raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
+
+    async def looked() -> str:
+        session = Session("key", tmp_path, Desk())
+        session.desk.prepare()
+        session.open_file(tmp_path / "run.csv")
+        await session._look
+        await session.desk.close()
+        return session.trouble
+
+    monkeypatch.setattr("orthaug.commands.app.processes._started", refused)
+    assert asyncio.run(looked()) == "no process can be started for that (Resource temporarily unavailable)."
+    monkeypatch.setattr("orthaug.commands.app.session.Session.worded", lambda *_: 1 / 0)
+    assert asyncio.run(failed(tmp_path)) == "this did not work (ZeroDivisionError)."
+
+
+async def failed(tmp_path) -> str:
+    """What is told of a task that fails with what nobody expected."""
+    session = Session("key", tmp_path, Desk())
+    session.open_file(tmp_path / "run.csv")
+    with pytest.raises(ZeroDivisionError):
+        await session._look
+    await asyncio.sleep(0)
+    return session.trouble
+
+
+def test_a_question_that_is_taken_back_leaves_its_process_to_the_next(tmp_path, monkeypatch):
+    started = []
+
+    async def counted():
+        started.append(1)
+        await asyncio.sleep(0.05)
+        raise OSError(errno.EAGAIN, "later")
+
+    async def twice() -> None:
+        desk = Desk()
+        desk.prepare()
+        first = asyncio.ensure_future(desk.ask("look"))
+        await asyncio.sleep(0.01)
+        first.cancel()
+        await asyncio.sleep(0)
+        assert desk._coming is not None and started == [1]
+        with pytest.raises(InputError, match="no process can be started"):
+            await desk.ask("look")
+        assert started == [1, 1]  # one more try
+
+    monkeypatch.setattr("orthaug.commands.app.processes._started", counted)
+    asyncio.run(twice())
 
 
 def test_sessions_that_nobody_used_make_room(tmp_path):

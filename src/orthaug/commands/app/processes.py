@@ -169,10 +169,24 @@ class Desk:
             if process.returncode is None:
                 return process
         coming, self._coming = self._coming, None
-        return await (_started() if coming is None else asyncio.shield(coming))
+        try:
+            if coming is not None:
+                try:
+                    return await asyncio.shield(coming)
+                except asyncio.CancelledError:
+                    self._coming = self._coming or coming  # for the next one
+                    raise
+                except OSError:  # it could not start then
+                    pass
+            return await _started()
+        except OSError as error:
+            raise InputError(f"no process can be started for that ({error.strerror}).") from None
 
     async def close(self) -> None:
-        coming = [] if self._coming is None else [await self._coming]
+        coming: list[asyncio.subprocess.Process] = []
+        if self._coming is not None:
+            with suppress(OSError):
+                coming = [await self._coming]
         for process in (*self._busy, *self._idle, *coming):
             _kill(process)
             with suppress(asyncio.TimeoutError):

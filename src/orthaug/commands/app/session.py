@@ -77,8 +77,15 @@ class Session:
         """Let something run without waiting for it."""
         task = asyncio.ensure_future(work)
         self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        task.add_done_callback(self._ended)
         return task
+
+    def _ended(self, task: asyncio.Task[Any]) -> None:
+        """Let no task fail without a word."""
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            self.trouble = f"this did not work ({type(error).__name__})."
+            self.changed("data")
 
     @property
     def first_step(self) -> str:
