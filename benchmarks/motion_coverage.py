@@ -17,6 +17,8 @@ from machine import describe
 
 import orthaug as oa
 from orthaug.analysis.learned_part import learned_reach
+from orthaug.analysis.motion_bias import usual_biases
+from orthaug.analysis.motion_budget import motion_budget
 from orthaug.models.motion_field import parts_at
 
 M, C, K, COULOMB = 1.0, 2.0, 100.0, 1.5
@@ -83,6 +85,8 @@ class Draws(NamedTuple):
     inside: np.ndarray
     curve: np.ndarray
     """Whether the band of the learned curve holds the true one (n, speeds)."""
+    named: np.ndarray
+    """Of each draw whether dry friction is named, and the interval of the damper itself that counts it (n, 3)."""
     without: int
     """Draws without intervals."""
 
@@ -111,6 +115,15 @@ def curve_inside(fit: oa.MotionEstimate) -> np.ndarray:
     return np.abs(parts_at(fit.model.form, fit.model.numbers, x, u)[1][:, 0] - true) <= half[:, 0]
 
 
+def damper_alone(fit: oa.MotionEstimate) -> tuple[float, float, float]:
+    """Whether the usual terms tell of dry friction, where none was declared, and the interval that counts it."""
+    budget = motion_budget(fit, *usual_biases(fit))
+    found = None if budget is None else budget.of("c")
+    if budget is None or found is None or found.ci95 is None:
+        return 0.0, np.nan, np.nan
+    return float(budget.cause.suspect.name.startswith("coulomb of v")), *found.ci95
+
+
 @cache
 def drawn(draws: int) -> Draws:
     found, without = [], 0
@@ -120,9 +133,9 @@ def drawn(draws: int) -> Draws:
             without += 1
             continue
         low, high = fit.interval.T
-        found.append((fit.values, fit.std, (low <= plant().true) & (plant().true <= high), curve_inside(fit)))
-    values, std, inside, curve = (np.array(part) for part in zip(*found, strict=True))
-    return Draws(values, std, inside, curve, without)
+        inside = (low <= plant().true) & (plant().true <= high)
+        found.append((fit.values, fit.std, inside, curve_inside(fit), damper_alone(fit)))
+    return Draws(*(np.array(part) for part in zip(*found, strict=True)), without)
 
 
 def table() -> list[list[float]]:
@@ -135,6 +148,13 @@ def band() -> list[float]:
     """Coverage of the learned curve's band in percent: where friction is smooth, and within 0.5 m/s of its turn."""
     curve, near = drawn(DRAWS).curve, np.abs(SPEEDS) <= 0.5
     return [float(100 * curve[:, part].mean()) for part in (~near, near)]
+
+
+def damper() -> list[float]:
+    """Percent of the draws that name dry friction, coverage of the damper itself, median width of its interval."""
+    named, low, high = drawn(DRAWS).named.T
+    inside = (low <= C) & (high >= C)
+    return [float(100 * named.mean()), float(100 * inside.mean()), float(np.nanmedian(high - low))]
 
 
 def main(draws: int) -> None:
@@ -157,6 +177,10 @@ def main(draws: int) -> None:
         end="",
     )
     print(f"{turn:.0f} % of those within.")
+    named, low, high = found.named.T
+    inside = 100 * ((low <= C) & (high >= C)).mean()
+    print(f"Dry friction is named in {100 * named.mean():.0f} % of the draws; the interval of the damper itself that ")
+    print(f"counts it holds {C} in {inside:.0f} %, median width {np.nanmedian(high - low):.2g}.")
 
 
 if __name__ == "__main__":
