@@ -206,7 +206,7 @@ def covered(systems: int, declared: bool) -> list[float]:
         hull = np.stack([np.minimum(plain, moved)[:, 0], np.maximum(plain, moved)[:, 1]], axis=-1)
         rest = with_bias(one.error, one.std, one.freedom, bias, left)
         hits.append([(limits[:, 0] <= 0) & (limits[:, 1] >= 0) for limits in (plain, hull, moved, rest)])
-    return [100 * float(share) for share in np.mean(hits, axis=(0, 2))]
+    return [100 * float(share) for share in np.concatenate(hits, axis=1).mean(axis=1)]
 
 
 SHARES = (0.3, 0.5, 0.7)

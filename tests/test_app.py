@@ -188,6 +188,24 @@ def test_a_command_that_cannot_start_has_failed(monkeypatch):
     assert (command.running, command.complaint) == (False, "the command cannot start (No such file or directory).")
 
 
+@served
+def test_a_part_of_the_page_that_fails_keeps_no_other_from_what_is_new(tmp_path, monkeypatch):
+    from orthaug.commands.app.page import Page
+
+    session = Session("key", tmp_path, Desk())
+    page, told, seen = Page(session), [], []
+    monkeypatch.setattr(page, "_complain", told.append)
+    monkeypatch.setattr(page, "_name", lambda: None)
+    monkeypatch.setattr(page.data, "follow_data", lambda: 1 / 0)
+    monkeypatch.setattr(page.model, "follow_data", lambda: seen.append("model"))
+    monkeypatch.setattr(page.training, "follow_work", lambda: seen.append("training"))
+    session.changed("data")
+    page.follow()
+    assert [type(error) for error in told] == [ZeroDivisionError] and seen == ["model", "training"]
+    page.follow()
+    assert len(told) == 1
+
+
 def test_a_process_that_cannot_start_is_told(tmp_path, monkeypatch):
     async def refused():
         raise OSError(errno.EAGAIN, "Resource temporarily unavailable")

@@ -13,7 +13,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import jnp
 from orthaug.analysis.budget import AS_MUCH
 from orthaug.analysis.motion_bias import ground_after, softened_bias, usual_biases
-from orthaug.analysis.motion_budget import motion_budget, rivals_of
+from orthaug.analysis.motion_budget import motion_budget, rivals_of, told_budget
 from orthaug.analysis.motion_suspects import check_motion_suspects, usual_motion_suspects
 from orthaug.physics.motion_problem import MotionProblem, pose_motion
 
@@ -216,7 +216,7 @@ def test_friction_that_turns_round_smoothly_is_no_drag() -> None:
     assert [rival.suspect.name[:15] for rival in rivals] == ["coulomb as tanh"] and rivals[0] is not beside.cause
     twice = motion_budget(fit, [beside.cause, replace(table[1], explained=beside.share)])  # a rival that is elsewhere
     assert twice.of("c").ci95[1] > alone.of("c").ci95[0]
-    assert "(quadratic_drag explains as much and would move them elsewhere)" in twice.warnings[0].text
+    assert "(near it: quadratic_drag, " in twice.warnings[0].text
 
 
 def test_usual_terms_that_the_learner_sees_are_weighed_too(
@@ -232,6 +232,35 @@ def test_usual_terms_that_the_learner_sees_are_weighed_too(
     low, high = found.of("c").ci95
     assert low < TRUTH[1] < high < learned.values[1]
     assert usual_biases(alone) == ([], [])
+
+
+def test_a_learner_that_found_nothing_is_no_term() -> None:
+    for seed in (0, 1):
+        options = {"learner": oa.MLP((4,), inputs=("v",)), "criterion": WHOLE, "blocks": 0, "seed": seed}
+        fit = oa.estimate(data(friction=0.0), spring(learned=True), **options)
+        table, smooth = usual_biases(fit)
+        assert max(entry.explained or 0.0 for entry in table) > 0.5  # of next to nothing
+        assert motion_budget(fit, table, smooth) is None and told_budget(fit, (), []) is None
+
+
+def test_a_declared_term_that_explains_half_hides_no_usual_one(learned: oa.MotionEstimate) -> None:
+    drag = oa.MotionSuspect.of("quadratic_drag", "v", factor="-1/m", name="drag")
+    table = oa.suspected_bias(learned, [drag])
+    half = motion_budget(learned, table)
+    assert half.cause.suspect is drag and half.share < 0.9 and half.of("c").value < 0
+    assert "what the learner found looks most like drag of size" in half.warnings[0].text
+    found = told_budget(learned, [drag], table)
+    assert found.cause.suspect.name.startswith("coulomb of v") and found.share > 0.9 and found.of("c").value > 0
+    sure = [replace(table[0], explained=0.95)]
+    assert told_budget(learned, [drag], sure).cause is sure[0]
+
+
+def test_the_interval_counts_what_the_next_term_makes_of_the_rest(learned: oa.MotionEstimate) -> None:
+    kinds = ("coulomb", "quadratic_drag")
+    both = oa.suspected_bias(learned, [oa.MotionSuspect.of(kind, "v", factor="-1/m", name=kind) for kind in kinds])
+    assert rivals_of(both[0], both) == []
+    one, two = (motion_budget(learned, table).of("c").ci95 for table in (both[:1], both))
+    assert two[0] < one[0] and two[1] > one[1]
 
 
 def test_states_that_nobody_guessed_have_suspects_where_the_run_goes() -> None:

@@ -353,7 +353,8 @@ def test_the_verdict_is_built_from_the_findings(lagged, motion):
         assert not doubted.then.startswith("Nothing further")
     residuals = residuals.model_copy(update={"verdict": "unmodelled", "steps": {"x": 0.1}})
     ended = motion.result.status.model_copy(update={"code": "converged"})
-    changed = {"residuals": residuals, "status": ended, "validation": None}
+    unbiased = [row.model_copy(update={"bias": None}) for row in motion.result.parameters]
+    changed = {"residuals": residuals, "status": ended, "validation": None, "parameters": unbiased}
     coarse = fit_verdict(motion.result.model_copy(update=changed))
     assert (
         "its one-step residual has the size of the steps of x" in coarse.trust and "x has steps as large" in coarse.then

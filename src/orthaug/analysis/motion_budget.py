@@ -23,13 +23,16 @@ from orthaug.analysis.budget import (
     told_biases,
     with_bias,
 )
-from orthaug.analysis.motion_bias import TermBias, ground_after
+from orthaug.analysis.motion_bias import TermBias, ground_after, softened_bias, usual_biases
+from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.fitting.motion_estimates import MotionEstimate
 
 _AS_CLOSE = 2.0  # times what a cause leaves of the learner: a rival that leaves no more cannot be told from it
 _CLOSE = 0.005  # of the learner: what leaves no more is as good as any
 _SURE = 3.3  # standard errors of a coefficient that the residual tells: one in a thousand is so large by chance
 _ELSEWHERE = 0.5  # of a bias, from which that of a rival is another one
+_NOTHING = 0.01  # of the learned equations: a learner that is smaller, and biases nothing, found nothing
+_UNMOVED = 0.1  # standard errors of every parameter
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +48,22 @@ class MotionBudget:
     def of(self, name: str) -> ParameterBias | None:
         """The bias of a parameter."""
         return next((entry for entry in self.parameters if entry.name == name), None)
+
+
+def told_budget(
+    fit: MotionEstimate, declared: Sequence[MotionSuspect], table: Sequence[TermBias]
+) -> MotionBudget | None:
+    """By the declared suspects; where these are not sure to be it, by the usual ones too that the learner sees.
+
+    Args:
+        table: what every declared suspect does to the fit.
+    """
+    smooth = softened_bias(fit, declared)
+    budget = motion_budget(fit, table, smooth)
+    if budget is not None and budget.share >= SURE_SHARE:
+        return budget
+    usual, softer = usual_biases(fit)
+    return motion_budget(fit, (*table, *usual), (*smooth, *softer)) if usual else budget
 
 
 def motion_budget(
@@ -65,6 +84,8 @@ def motion_budget(
     rivals = rivals_of(cause, (*table, *smooth)) if learns else []
     bias, value = coefficient * cause.per_unit, fit.values
     std, none = np.full(len(value), np.nan) if fit.std is None else fit.std, np.zeros(len(value))
+    if learns and (fit.split_by.share or 0.0) < _NOTHING and not np.any(np.abs(bias) > _UNMOVED * std):
+        return None
     apart = [np.abs(_moved(rival) - bias) for rival in rivals]
     after = _next_after(fit, cause, (*table, *smooth)) if learns else None
     beside = none if after is None else _moved(after)
@@ -133,18 +154,19 @@ def _motion_warning(budget: MotionBudget, rivals: Sequence[TermBias], *, learns:
     large = [entry for entry in budget.parameters if (entry.errors or 0.0) > 1]
     if not large:
         return None
-    cause, named = budget.cause, ", ".join(r.suspect.name for r in sorted(rivals, key=_explains, reverse=True)[:2])
-    explain = "explain" if len(rivals) > 1 else "explains"
-    other = f" ({named} {explain} as much and would move them elsewhere)" if rivals else ""
+    cause, first = budget.cause, sorted(rivals, key=_explains, reverse=True)[:2]
+    named = " and ".join(f"{rival.suspect.name}, {percent(_explains(rival))}" for rival in first)
+    other = f" (near it: {named}, and would move them elsewhere)" if rivals else ""
     cure = f"add it to the equation of {cause.equation}, with its size as a parameter"
+    what = "the learner" if learns else "the squares that the free run leaves"
+    size = f"{budget.coefficient:.3g} {cause.suspect.unit}".rstrip()
     if learns and budget.share < SURE_SHARE:
         return Warning(
             "biased",
-            f"what the learner found looks most like {cause.suspect.name} ({percent(budget.share)} of it), which would "
-            f"move {told_biases(large)}, and the standard errors do not cover that{other}: if it is that term, {cure}.",
+            f"what the learner found looks most like {cause.suspect.name} of size {size} ({percent(budget.share)} of "
+            f"it), which would move {told_biases(large)}, and the standard errors do not cover that{other}: if it is "
+            f"that term, {cure}.",
         )
-    what = "the learner" if learns else "the squares that the free run leaves"
-    size = f"{budget.coefficient:.3g} {cause.suspect.unit}".rstrip()
     return Warning(
         "biased",
         f"{cause.suspect.name} of size {size} explains {100 * budget.share:.0f} % of {what} and moves "

@@ -153,7 +153,9 @@ def motion_width(on: str, motion: Motion, x: Matrix, u: Matrix) -> float:
     """
     size = np.abs(MotionSuspect(on, on).values(motion, motion.initial, x, u))
     if not np.isfinite(size).all() or not np.any(size > 0):
-        raise InputError(f"'{on}' is zero or not finite over the states; the data give no `width`. State one.")
+        raise InputError(
+            f"'{on}' is zero or not finite over the guessed states; give a `width`, or its state a `start`."
+        )
     return float(f"{np.median(size[size > 0]):.6g}")
 
 

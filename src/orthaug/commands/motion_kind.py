@@ -161,15 +161,15 @@ def content(
 def _analysed(job: MotionJob, fit: MotionEstimate, free_run: Response, warnings: list[Any]) -> dict[str, Any]:
     """What is asked of a fit behind its training; None for an analysis that fails. Warnings are added."""
     from orthaug.analysis.learned_part import equation_parts
-    from orthaug.analysis.motion_bias import softened_bias, suspected_bias, usual_biases
-    from orthaug.analysis.motion_budget import motion_budget
+    from orthaug.analysis.motion_bias import suspected_bias
+    from orthaug.analysis.motion_budget import told_budget
     from orthaug.analysis.motion_diagnosis import diagnose_motion
     from orthaug.analysis.motion_modes import motion_stability
     from orthaug.analysis.motion_response import substep_bias
 
     def biases() -> Any:
         table = suspected_bias(fit, job.suspects) if job.suspects else []
-        budget = motion_budget(fit, table, softened_bias(fit, job.suspects)) or motion_budget(fit, *usual_biases(fit))
+        budget = told_budget(fit, job.suspects, table)
         warnings.extend(budget.warnings if budget else ())
         return [entry.as_dict() for entry in table] or None, budget
 

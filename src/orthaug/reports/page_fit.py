@@ -126,6 +126,9 @@ def _parameters(result: FitResult) -> list[Any]:
             Text(
                 f"The bias budget: {percent(cause.share)} of what the learner found is {cause.cause}, once what the "
                 "physics can imitate is taken out of both; what is drawn over one input alone may tell less."
+                if result.learns
+                else f"The bias budget: {cause.cause} explains {percent(cause.share)} of the squares that the free run "
+                "leaves."
             )
         )
     if result.physical_consistency:

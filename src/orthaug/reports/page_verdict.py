@@ -274,13 +274,13 @@ def _then(result: FitResult) -> str:
     if missing and significant:
         return f"Add {missing[0].expression} to the equation of {missing[0].equation}."
     if cause is not None and (cause.share or 0.0) > _NAMED:
-        return _advised(cause, result.motion is not None)
+        return _advised(cause, result.learns)
     tried = result.validation is not None and _code(result) != "helps"
     changes = [c for c in result.residuals.changes if c.kind != "learner" or not tried] if result.residuals else []
     if changes:
         return f"{_change(changes[0])}."
     if cause is not None:
-        return _advised(cause, result.motion is not None)
+        return _advised(cause, result.learns)
     if _warned(result, _RAN_AWAY):
         return 'Train on the free run (`focus = "simulation"`), or record data over the range that it leaves.'
     if not result.data.tests and not result.data.validation:
@@ -307,10 +307,12 @@ def _then(result: FitResult) -> str:
     return "Nothing further is predicted to help; export it (`orthaug export`) or design the next experiment."
 
 
-def _advised(cause: BiasResult, moves: bool) -> str:
-    """What to do about a cause of what was learned."""
+def _advised(cause: BiasResult, learned: bool) -> str:
+    """What to do about a cause of what was learned, or of what the free run leaves."""
     share = percent(cause.share)
-    if (cause.share or 0.0) < SURE_SHARE and not moves:
+    if not learned:
+        return f"Add “{cause.cause}” to the physics, for it explains {share} of what the free run leaves."
+    if (cause.share or 0.0) < SURE_SHARE:
         return f"Try “{cause.cause}” in the physics: what was learned looks most like it ({share} of it)."
     return f"Add “{cause.cause}” to the physics, for it explains {share} of what was learned."
 

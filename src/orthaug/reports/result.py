@@ -270,6 +270,11 @@ class FitResult(Headed):
     equation: EquationResult | None = None
     warnings: list[WarningResult]
 
+    @property
+    def learns(self) -> bool:
+        """Whether biases are of what a learner found; of a motion without one they are of what the free run leaves."""
+        return self.motion is None or self.shared is not None
+
 
 class CheckResult(Headed):
     """What `orthaug check` tells."""

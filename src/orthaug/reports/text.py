@@ -187,9 +187,9 @@ def _bias_lines(result: FitResult) -> list[str]:
     if not rows or rows[0].bias is None:
         return _unexplained(result)
     cause, share, width = rows[0].bias.cause, rows[0].bias.share or 0.0, _width(rows)
-    what = "learner found" if result.motion is None or result.shared is not None else "free run leaves"
+    what = "learner found" if result.learns else "free run leaves"
     lines = [f"{100 * share:.0f} % of what the {what} is {cause}. The bias that implies:"]
-    if (result.motion is None or result.shared is not None) and share < SURE_SHARE:
+    if result.learns and share < SURE_SHARE:
         lines = [f"What the learner found looks most like {cause}: {percent(share)} of it. The bias if it is that:"]
     lines.append(f"{'parameter':<{width}}  {'bias':>11}  {'of std':>7}  {'of value':>9}  {'95 % interval with it':^29}")
     for row in rows:

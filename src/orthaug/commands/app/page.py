@@ -12,6 +12,7 @@ from typing import Any
 from nicegui import ui
 
 from orthaug._base.errors import InputError
+from orthaug._base.log import LOG
 from orthaug.commands.app.session import Session
 from orthaug.commands.app.view_data import DataView
 from orthaug.commands.app.view_model import ModelView
@@ -106,6 +107,7 @@ class Page:
             try:
                 look()
             except Exception as error:  # a part that fails keeps no other from what is new
+                LOG.exception("a part of the page failed")
                 self._complain(error)
 
     def _name(self) -> None:
