@@ -204,7 +204,7 @@ def covered(systems: int, declared: bool) -> list[float]:
         plain = with_bias(one.error, one.std, one.freedom, 0 * bias, 0 * bias)
         moved = with_bias(one.error, one.std, one.freedom, bias, 0 * bias)
         hull = np.stack([np.minimum(plain, moved)[:, 0], np.maximum(plain, moved)[:, 1]], axis=-1)
-        rest = with_bias(one.error, one.std, one.freedom, bias, left)
+        rest = with_bias(one.error, one.std, one.freedom, bias, np.linalg.norm(left, axis=0))
         hits.append([(limits[:, 0] <= 0) & (limits[:, 1] >= 0) for limits in (plain, hull, moved, rest)])
     return [100 * float(share) for share in np.concatenate(hits, axis=1).mean(axis=1)]
 

@@ -327,7 +327,9 @@ def usual_biases(fit: MotionEstimate) -> tuple[list[TermBias], list[TermBias]]:
     if ground is None or not ground.learns or not fit.shared.basis.shape[1]:
         return [], []
     seen = [suspect for suspect in ground.usual() if ground.sees(suspect)]
-    return suspected_bias(fit, seen), softened_bias(fit, seen)
+    smooth = softened(seen, fit.problem.motion, fit.values, ground.field.x, ground.field.u)
+    table = suspected_bias(fit, (*seen, *smooth))  # one program for all
+    return table[: len(seen)], table[len(seen) :]
 
 
 def ground_after(fit: MotionEstimate) -> MotionGround | None:
