@@ -250,9 +250,10 @@ def test_a_question_that_is_taken_back_leaves_its_process_to_the_next(tmp_path, 
         first.cancel()
         await asyncio.sleep(0)
         assert desk._coming is not None and started == [1]
-        with pytest.raises(InputError, match="no process can be started"):
-            await desk.ask("look")
-        assert started == [1, 1]  # one more try
+        for starts in ([1], [1, 1]):  # the one that is on its way, then another
+            with pytest.raises(InputError, match="no process can be started"):
+                await desk.ask("look")
+            assert started == starts
 
     monkeypatch.setattr("orthaug.commands.app.processes._started", counted)
     asyncio.run(twice())

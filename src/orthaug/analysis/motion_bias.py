@@ -328,7 +328,7 @@ def usual_biases(fit: MotionEstimate) -> tuple[list[TermBias], list[TermBias]]:
         return [], []
     seen = [suspect for suspect in ground.usual() if ground.sees(suspect)]
     smooth = softened(seen, fit.problem.motion, fit.values, ground.field.x, ground.field.u)
-    table = suspected_bias(fit, (*seen, *smooth))  # one program for all
+    table = ground.table((*seen, *smooth))  # one program for all
     return table[: len(seen)], table[len(seen) :]
 
 

@@ -169,16 +169,13 @@ class Desk:
             if process.returncode is None:
                 return process
         coming, self._coming = self._coming, None
+        if coming is None or (coming.done() and coming.exception()):  # or it could not start then
+            coming = asyncio.ensure_future(_started())
         try:
-            if coming is not None:
-                try:
-                    return await asyncio.shield(coming)
-                except asyncio.CancelledError:
-                    self._coming = self._coming or coming  # for the next one
-                    raise
-                except OSError:  # it could not start then
-                    pass
-            return await _started()
+            return await asyncio.shield(coming)
+        except asyncio.CancelledError:
+            self._coming = self._coming or coming  # for the next one
+            raise
         except OSError as error:
             raise InputError(f"no process can be started for that ({error.strerror}).") from None
 

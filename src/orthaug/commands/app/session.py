@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from orthaug._base.errors import InputError
+from orthaug._base.log import LOG
 from orthaug.commands.app.processes import Command, Desk
 from orthaug.commands.app.spec_text import absolute, in_file, keep, kept_title, plain, with_value
 from orthaug.data.tables import KNOWN
@@ -84,6 +85,7 @@ class Session:
         """Let no task fail without a word."""
         self._tasks.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None:
+            LOG.error("a task of the page failed", exc_info=error)
             self.trouble = f"this did not work ({type(error).__name__})."
             self.changed("data")
 
