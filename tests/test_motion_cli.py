@@ -510,7 +510,7 @@ def test_parameters_of_equations_without_a_learner_are_not_moved_by_what_it_sees
     assert stiction["bias"]["b"] < 0 and wear["bias"]["R"] != 0
 
 
-def test_an_analysis_that_fails_numerically_loses_no_training(motor, monkeypatch):
+def test_an_analysis_that_fails_numerically_loses_no_training(folder, result, monkeypatch):
     from orthaug.analysis import motion_bias, motion_modes
 
     def fails(*_, **__):
@@ -518,9 +518,11 @@ def test_an_analysis_that_fails_numerically_loses_no_training(motor, monkeypatch
 
     monkeypatch.setattr(motion_modes, "motion_stability", fails)
     monkeypatch.setattr(motion_bias, "suspected_bias", fails)
-    code, out, err = orthaug("fit", motor, "--out", motor.parent / "out")
+    spec = put(folder).with_name("fails.toml")
+    spec.write_text(SPEC.replace("[training]", SUSPECTS))
+    code, out, err = orthaug("fit", spec, "--out", folder / "fails")
     assert code == 0, err
-    told = strict((motor.parent / "out" / "result.json").read_text())
+    told = strict((folder / "fails" / "result.json").read_text())
     texts = [w["text"] for w in told["warnings"] if w["code"] == "analysis_failed"]
     assert texts == [
         "the analysis of the modes failed numerically (Singular matrix): the result stands without it.",
@@ -528,7 +530,7 @@ def test_an_analysis_that_fails_numerically_loses_no_training(motor, monkeypatch
     ]
     assert told["stability"] is None and told["bias"] is None and told["residuals"] is not None
     assert all(unfolded(text) in unfolded(out + err) for text in texts)
-    assert (motor.parent / "out" / "model").is_dir() and (motor.parent / "out" / "report.html").exists()
+    assert (folder / "fails" / "model").is_dir() and (folder / "fails" / "report.html").exists()
 
 
 BAD = {

@@ -130,8 +130,11 @@ def training_clock() -> float:
 
 
 def padded_length(rows: int) -> int:
-    """What to pad a number of rows to: lengths grow by powers of two, so that few programs are compiled."""
-    return max(256, 1 << (rows - 1).bit_length())
+    """What to pad a number of rows to: lengths grow by powers of two, so that few programs are compiled.
+
+    To compile one takes longer than a thousand rows.
+    """
+    return max(1024, 1 << (rows - 1).bit_length())
 
 
 if not TYPE_CHECKING:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Vector, check_choice
-from orthaug._base.jax import Array, jax, jnp, padded_length
+from orthaug._base.jax import Array, jax, jnp
 from orthaug.analysis.visited import MOST_STEPS, Place, Visited, measured_by, positive, visited_by
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Dynamics, Numbers
@@ -40,11 +40,11 @@ def transitions(
     model: Model, states: Float[np.ndarray, "m n0"], inputs: Float[np.ndarray, "m nu"]
 ) -> Float[np.ndarray, "m n0 n0"]:
     """A_k at m points; not finite where there is no derivative."""
-    n0, size = states.shape[1], min(_BATCH, padded_length(len(states)))
+    n0 = states.shape[1]
     width = difference_width(states) if len(states) else np.ones(n0)
     batches = [np.zeros((0, n0, n0))]
-    for begin in range(0, len(states), size):
-        rows = np.minimum(np.arange(begin, begin + size), len(states) - 1)  # the last one again: one shape
+    for begin in range(0, len(states), _BATCH):
+        rows = np.minimum(np.arange(begin, begin + _BATCH), len(states) - 1)  # the last one again: one shape
         found = _transitions(model.form, model.numbers, states[rows], inputs[rows], width)
         batches.append(np.asarray(found)[: len(states) - begin])
     return np.concatenate(batches)

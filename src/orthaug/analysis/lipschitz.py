@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
-from orthaug._base.jax import Array, jax, jnp, padded_length
+from orthaug._base.jax import Array, jax, jnp
 from orthaug.analysis.feedback import by_differences, difference_width
 from orthaug.analysis.visited import MOST_STEPS, Place, Where, evenly, positive, usable
 from orthaug.data.record import Record
@@ -139,7 +139,7 @@ def _weight_sizes(
     if not form.differentiable or not cells * len(directions):
         return np.arange(0), np.zeros(0), np.zeros(0)
     some = evenly(len(x), max(_FEWEST, _MOST_CELLS // (cells * len(directions))))
-    size = min(_BATCH, padded_length(len(some)), max(1, _BATCH_CELLS // cells))
+    size = min(_BATCH, max(1, _BATCH_CELLS // cells))
     squares = []
     for begin in range(0, len(some), size):
         rows = some[np.minimum(np.arange(begin, begin + size), len(some) - 1)]  # the last one again: one shape

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from orthaug._base.checks import Matrix, as_signal, check_type
 from orthaug._base.errors import InputError
-from orthaug._base.jax import Array, jax, jnp, padded_length
+from orthaug._base.jax import Array, jax, jnp
 from orthaug.data.record import Record
 from orthaug.data.regressors import stack_rows
 from orthaug.fitting.colour import correlation_length
@@ -26,7 +26,7 @@ from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 from orthaug.physics.output_weights import times
 
-_BATCH = 1024
+_BATCH = 256
 _RIM = 1e-9  # the largest of training is no extrapolation
 
 
@@ -68,7 +68,7 @@ def whitened_rows(model: Model, x: Matrix, y: Matrix, numbers: Numbers | None = 
         InputError: physics or learner that is not finite on a row.
     """
     pieces, numbers = [], model.numbers if numbers is None else numbers
-    size = 1 if len(x) == 1 else min(_BATCH, padded_length(len(x)))
+    size = 1 if len(x) == 1 else _BATCH
     for begin in range(0, len(x), size):
         rows = x[begin : begin + size]
         padded = np.concatenate([rows, np.repeat(rows[-1:], size - len(rows), axis=0)]) if len(rows) < size else rows

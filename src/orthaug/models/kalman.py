@@ -17,7 +17,7 @@ from orthaug._base.jax import jax, jnp, padded_length
 from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import Numbers, Parts
 
-_SIDE_BY_SIDE = 2048  # starts of predictions
+_SIDE_BY_SIDE = 1024  # starts of predictions
 
 
 class Noise(NamedTuple):
@@ -200,7 +200,7 @@ def ahead(
     for begin in range(0, len(windows), _SIDE_BY_SIDE):
         rows = slice(begin, min(begin + _SIDE_BY_SIDE, len(windows)))
         count = len(windows[rows])
-        more = min(_SIDE_BY_SIDE, padded_length(len(windows))) - count
+        more = _SIDE_BY_SIDE - count
         chosen = [np.concatenate([a[rows], np.repeat(a[rows][-1:], more, axis=0)]) for a in (*beliefs, windows)]
         parts, spread = _ahead(form, numbers, noise, Belief(*chosen[:2]), chosen[2], horizon)
         pieces.append([np.asarray(part)[:count] for part in parts])

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector, as_signal, check_count
 from orthaug._base.errors import InputError
-from orthaug._base.jax import Array, jax, jnp, padded_length
+from orthaug._base.jax import Array, jax, jnp
 from orthaug._base.views import Shown
 from orthaug.data.record import Channel, Experiment, Prepared, Record
 from orthaug.models.dynamics import Dynamics, Numbers, Parts
@@ -233,10 +233,10 @@ class Model(OnRecords, Shown):
         """The free run from a state along lagged inputs (T, nu), in parts."""
         if not self.form.states:
             return self.parts_at(inputs)
-        size, pieces = min(_BATCH, padded_length(len(inputs))), []
-        for begin in range(0, len(inputs), size):
-            steps = min(size, len(inputs) - begin)
-            padded = np.zeros((size, inputs.shape[1]))
+        pieces = []
+        for begin in range(0, len(inputs), _BATCH):
+            steps = min(_BATCH, len(inputs) - begin)
+            padded = np.zeros((_BATCH, inputs.shape[1]))
             padded[:steps] = inputs[begin : begin + steps]
             state, parts = _free_run(self.form, self.numbers, state, padded)
             pieces.append([np.asarray(part)[:steps] for part in parts])
@@ -282,8 +282,7 @@ class Model(OnRecords, Shown):
 def _in_batches(function: Callable[..., Parts], rows: tuple[np.ndarray, ...], largest: int = _BATCH) -> Parts:
     """`function` over batches of rows, padded to one shape, its results concatenated."""
     count = len(rows[0])
-    size = min(_BATCH, largest, padded_length(count))
-    pieces = []
+    size, pieces = min(_BATCH, largest), []
     for begin in range(0, count, size):
         batch = [array[begin : begin + size] for array in rows]
         padding = size - len(batch[0])

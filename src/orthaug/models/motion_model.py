@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 FIRST_ROWS = 64  # that tell where a free run starts
-_SIDE_BY_SIDE = 2048  # windows of predictions
+_SIDE_BY_SIDE = 256  # windows of predictions
+_SHORTEST = 32  # steps of these that a program is made for at least
 _GUESS_ITERATIONS, _WINDOW_ITERATIONS = 30, 6
 
 
@@ -55,17 +56,13 @@ def _run(
 
 @partial(jax.jit, static_argnames="form")
 def _last(
-    form: Moving, numbers: Numbers, states: Float[Array, "n0 m"], inputs: Float[Array, "T nu m"]
+    form: Moving, numbers: Numbers, states: Float[Array, "n0 m"], inputs: Float[Array, "T nu m"], steps: Any
 ) -> Float[Array, "ny m"]:
-    """The last output of runs side by side."""
+    """The last output of `steps` of runs side by side."""
     numbers = form.prepared(numbers)
     side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row), -1, -1)
-
-    def step(state: Any, row: Any) -> tuple[Any, None]:
-        return side_by_side(state, row)[0], None
-
-    states = jax.lax.scan(step, states, inputs[:-1])[0]
-    return side_by_side(states, inputs[-1])[1].total
+    states = jax.lax.fori_loop(0, steps - 1, lambda i, states: side_by_side(states, inputs[i])[0], states)
+    return side_by_side(states, inputs[steps - 1])[1].total
 
 
 class Trained(NamedTuple):
@@ -345,25 +342,20 @@ class MotionModel(OnRecords, Shown):
         with np.errstate(all="ignore"):
             known = np.isfinite(run[begins]).all(axis=1, keepdims=True)
         states[:, hidden] = np.where(known, run[begins], states)[:, hidden]
-        scored = (np.arange(steps) < window)[:, None]
-        pieces = []
+        length, pieces = max(_SHORTEST, 1 << (steps - 1).bit_length()), []  # few horizons have programs of their own
         for begin in range(0, len(begins), _SIDE_BY_SIDE):
             chosen = begins[begin : begin + _SIDE_BY_SIDE]
-            padded = np.concatenate(
-                [chosen, np.repeat(chosen[-1:], min(_SIDE_BY_SIDE, padded_length(len(begins))) - len(chosen))]
-            )
-            rows = padded[None, :] + np.arange(steps)[:, None]
-            windows = Windows(
-                np.moveaxis(inputs[rows], -1, 1),
-                np.moveaxis(experiment.outputs[rows], -1, 1),
-                np.broadcast_to(scored, rows.shape),
-            )
+            padded = np.concatenate([chosen, np.repeat(chosen[-1:], _SIDE_BY_SIDE - len(chosen))])
+            rows = np.minimum(padded[None, :] + np.arange(length)[:, None], len(inputs) - 1)
+            following = np.moveaxis(inputs[rows], -1, 1)
+            target = np.moveaxis(experiment.outputs[rows[:window]], -1, 1)
+            windows = Windows(following[:window], target, np.ones((window, len(padded)), dtype=bool))
             settled = settle(
                 self.form, self.numbers, states[padded].T, windows, self.weight, self.loose, _WINDOW_ITERATIONS
             )[0]
             ends = [(self.form, self.numbers)]
             ends += [(self.alone.form, self.alone.numbers)] if self.form.bound is not None else []
-            pieces.append([np.asarray(_last(*end, settled, windows.inputs)).T[: len(chosen)] for end in ends])
+            pieces.append([np.asarray(_last(*end, settled, following, steps)).T[: len(chosen)] for end in ends])
         outputs, physics = (np.concatenate([piece[i] for piece in pieces]) for i in (0, -1))
         return outputs, physics
 
