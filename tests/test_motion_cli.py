@@ -157,7 +157,10 @@ def test_a_fit_finds_mass_and_stiffness_beside_the_friction(result):
 def test_what_a_learner_that_helps_may_hold_of_a_parameter_is_told_where_no_suspect_is_declared(printed, result):
     rows = {row["name"]: row for row in result["parameters"]}
     assert result["validation"]["verdict"] == "helps" and [name for name in rows if rows[name]["shared"]] == ["c"]
-    assert result["bias"] is None and rows["c"]["bias"]["cause"].startswith("coulomb of v")
+    (cause,) = result["bias"]  # a usual one that nobody declared
+    assert rows["c"]["bias"]["cause"] == cause["name"] and cause["name"].startswith("coulomb of v")
+    assert cause["equation"] == "v" and cause["expression"].startswith("tanh(v/")
+    assert cause["coefficient_found"] * cause["bias"]["c"] == pytest.approx(rows["c"]["bias"]["value"])
     assert rows["c"]["ci95_with_bias"][0] < C < rows["c"]["ci95_with_bias"][1]
     assert "% of what the learner found is coulomb of v" in " ".join(printed.split())
 
