@@ -53,7 +53,14 @@ def test_code_that_is_typed_stays(text):
 def test_prose():
     made = formulas.typeset("<article><td>ŷ_k = φ(x_k)θ_b, the physics</td></article>")
     assert made.count("<math>") == 1 and made.endswith("</math>, the physics</td></article>")
-    for text in ("X (n_samples, n_features) and noise_std_", "a file train_k.csv", "10 %, then", "y_k outside"):
+    for text in (
+        "at_most",
+        "no_help of it",
+        "X (n_samples, n_features) and noise_std_",
+        "a file train_k.csv",
+        "10 %, then",
+        "y_k outside",
+    ):
         page = f"<article>{text}</article>" if text != "y_k outside" else f"<nav>{text}</nav><article></article>"
         assert formulas.typeset(page) == page
 

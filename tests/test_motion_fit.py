@@ -375,6 +375,22 @@ def test_what_is_called_coloured_is_told_with_its_correlation(own: float, words:
     assert told.startswith("y has autocorrelations of up to 0.2") and words in told and "z" not in told
 
 
+def test_traces_that_tests_see_beside_the_noise_are_told() -> None:
+    from orthaug.analysis.motion_diagnosis import _traces
+    from orthaug.analysis.predictability import Predictable
+    from orthaug.analysis.residuals import analyse
+
+    random = np.random.default_rng(3)
+    e, u, x = random.normal(size=(4000, 2)), random.normal(size=(4000, 1)), random.normal(size=(4000, 1))
+    shares = tuple(Predictable(name, 1.0, 0.5, 0.0, 0.02) for name in "yz")
+    names = (["y", "z"], ["u"], ["v"])
+    assert _traces(analyse([e], [u], [x], *names), shares) == ""
+    e[:, 0] += 0.1 * u[:, 0]
+    e[:, 1] += 0.1 * (x[:, 0] ** 2 - 1)
+    told = _traces(analyse([e], [u], [x], *names), shares)
+    assert told == " Tests still see traces (y follows u; z is not flat over v): 2 % of its square at most."
+
+
 def test_a_term_that_is_there_already_moves_the_run_as_its_parameter_does() -> None:
     """Linear in x, added to the equation of v: the spring's own column, −k/m of it by the logarithm of k."""
     from orthaug.analysis.missing_terms import doubted

@@ -19,6 +19,8 @@ import orthaug as oa
 from orthaug._base.views import MAKERS
 from orthaug.commands import bars
 from orthaug.models.learners import MLP
+from orthaug.reports.html import card_of_result, html_of
+from orthaug.reports.result import BiasResult, FitResult, ParameterResult, WarningResult
 
 VOID = {"br", "meta", "hr", "link", "img", "input"}
 KINDS = ("free_run", "one_step", "residuals", "learned", "parameters", "bode")
@@ -101,6 +103,28 @@ def test_fits_and_models_are_shown(fit):
     value = f"{fit.theta[0]:.6g}"
     for shown in (fit, fit.model):
         assert {"a", "b", "m/N", value} <= set(Checked(shown._repr_html_()).cells)
+
+
+def test_the_fit_of_a_spec_shows_what_its_result_tells(fit):
+    row = ParameterResult(
+        **{
+            "name": "m",
+            "unit": "",
+            "derived_unit": "kg",
+            "initial": 1.0,
+            "value": 2.5,
+            "std": 0.25,
+            "ci95": [2.0, 3.0],
+        },
+        bias=BiasResult(value=0.125, cause="friction", share=0.95),
+        ci95_with_bias=[1.9, 2.9],
+    )
+    result = FitResult.model_construct(
+        parameters=[row], physical_parameters=None, warnings=[WarningResult(code="biased", text="friction moves m")]
+    )
+    shown = html_of(card_of_result(fit, result))
+    assert {"m", "2.5", "(kg)", "[2, 3]", "0.125", "[1.9, 2.9]"} <= set(Checked(shown).cells)
+    assert "friction moves m" in shown
 
 
 @pytest.mark.parametrize("kind", KINDS)

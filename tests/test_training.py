@@ -46,6 +46,14 @@ def test_the_lowest_error_on_held_out_blocks_is_chosen():
     assert found.model.form.bound is not None
 
 
+def test_the_lowest_generalised_cross_validation_is_chosen_one_step_ahead_and_told():
+    found = estimate(record(), PHYSICS, learner=NETWORK, solver=LM, regularization="auto", restarts=3)
+    scores = [run.score for run in found.restarts]
+    assert [run.chosen for run in found.restarts] == [score == min(scores) for score in scores]
+    assert all(run.score > run.loss and run.validation is None for run in found.restarts)
+    assert all(run.score is None for run in chosen().restarts)
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_where_no_learner_is_better_the_result_is_physics_alone(seed):
     found = estimate(linear(seed), PHYSICS, **OPTIONS)

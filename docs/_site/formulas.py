@@ -24,6 +24,7 @@ _INDEX = rf"[_^](?:\{{[^{{}}]*\}}|[{_GREEK}]?[A-Za-z0-9*]{{0,4}}(?![A-Za-z0-9_])
 _INDEXED = re.compile(rf"(?<![A-Za-z0-9_/.])[{_LETTERS}][{''.join(_ACCENTS)}]?{_INDEX}[{''.join(_RAISED)}*]*")
 _RUN = rf"(?:[{_LETTERS}0-9()\[\]|‖*'/·√∂∫⊥{''.join(_RAISED)}{''.join(_LOWERED)}{''.join(_ACCENTS)}]|{_INDEX})+"
 _SUM = re.compile(rf"(?<![\w/.]){_RUN}(?:\s[=+−·≤≥≈→]\s{_RUN})*(?![\w.]\w)")
+_NAME = re.compile(r"[a-z]{2,}(?:_[a-z]{2,})+")  # of code, as in a heading
 _TOKEN = re.compile(
     rf"(?P<space>\s+)|(?P<number>\d+(?:\.\d+)?)|(?P<raised>[{''.join(_RAISED)}]+)|(?P<lowered>[{''.join(_LOWERED)}]+)"
     rf"|(?P<index>[_^](?:\{{[^{{}}]*\}}|\([^()]*\)|[{_GREEK}][a-z]*|[A-Z]+|[a-z0-9]+))"
@@ -138,7 +139,7 @@ def _prose(text: str) -> str:
 
 def _run(match: re.Match[str]) -> str:
     run = match[0]
-    if not re.search(rf"{_INDEX}|[{_GREEK}].*[{''.join(_RAISED)}{''.join(_ACCENTS)}]", run):
+    if _NAME.fullmatch(run) or not re.search(rf"{_INDEX}|[{_GREEK}].*[{''.join(_RAISED)}{''.join(_ACCENTS)}]", run):
         return run
     bare = re.sub(_INDEX, "", run)
     if re.search(r"[A-Za-z]{3,}|[*]{2}", bare) or any(run.count(a) != run.count(b) for a, b in ("()", "[]")):

@@ -107,7 +107,8 @@ def _words(
     units = {c.name: c.unit for c in fit.problem.record.outputs}
     sizes = ", ".join(f"{s.rms:.3g} {units[s.name]}".strip() + f" of {s.name}" for s in shares)
     if verdict == "white":
-        return f"What the free run leaves ({sizes}) is white: noise on the outputs, which is what it is trained for."
+        noise = "is white: noise on the outputs, which is what it is trained for."
+        return f"What the free run leaves ({sizes}) {noise}{_traces(tests, shares)}"
     if verdict == "equation_noise":
         learner = "that the learner does not see" if fit.model.form.bound is not None else "(a learner would tell)"
         no_input = "no input, " if fit.problem.motion.inputs else ""
@@ -130,6 +131,16 @@ def _words(
     holds = ', try another hold of the inputs, or delay one (step = "shift" of data.prepare)'
     remedy = f"{learner}{holds if fit.problem.motion.inputs else ''}"
     return f"What the free run leaves ({sizes}) holds more than noise: {'; '.join(what)}. Physics is missing; {remedy}."
+
+
+def _traces(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) -> str:
+    """What tests surely see beside the noise, too little to conclude otherwise."""
+    told = [f"{test.name} follows {', '.join(test.correlated_inputs)}" for test in tests if test.correlated_inputs]
+    told += [f"{test.name} is not flat over {', '.join(over)}" for test in tests if (over := test.curved_over(0.0))]
+    if not told:
+        return ""
+    most = max(share.largest(own_past=False) for share in shares)
+    return f" Tests still see traces ({'; '.join(told)}): {percent(most)} of its square at most."
 
 
 def _colour(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) -> str:

@@ -60,7 +60,9 @@ class Fitted:
         return self.fit.plot
 
     def _repr_html_(self) -> str:
-        return self.fit._repr_html_()
+        from orthaug.reports.html import card_of_result, html_of
+
+        return html_of(card_of_result(self.fit, self.result))
 
 
 @one_blas_thread()

@@ -54,6 +54,8 @@ class Restart:
     regularization: str | float = "none"
     validation: float | None = None
     """Mean squared error where nothing was fitted: on the validation record, or on held-out blocks."""
+    score: float | None = None
+    """Generalised cross-validation, where that chose among the runs."""
 
 
 class AnyFit(ShownFit):

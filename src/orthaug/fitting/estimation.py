@@ -115,7 +115,8 @@ def estimate(
             `validation` chooses on the free run. For a motion it is evidence.
         restarts: runs from initial weights of seeds `seed … seed + restarts - 1`, spread over the cores. Kept is the
             one of the lowest error of the criterion on `validation`; without that, of free runs and of several
-            regularizations, on `blocks` that are held out; else of the lowest training loss.
+            regularizations, on `blocks` that are held out; else of the lowest generalised cross-validation under
+            "auto", and of the lowest training loss otherwise.
         seed: of the initial weights.
         ensemble: the median of all restarts as one model, instead of the best one.
         blocks: parts into which the training data are cut for that, each held out once; 0 for none.

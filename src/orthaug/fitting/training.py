@@ -136,7 +136,10 @@ def train(
         estimate = _concluded(conclude, task, structure, _median(task, runs, members, best))
     else:
         estimate = concluded(best)
-    restarts = tuple(_restart(starts[i], runs[i], losses[i], errors[i], chosen=i in members) for i in shown)
+    scored = choice.scored and held_out is None
+    scores = [_cross_validation(task, run) if scored else math.nan for run in runs]
+    told_of = list(zip(starts, runs, losses, errors, scores, strict=True))
+    restarts = tuple(_restart(*told_of[i], chosen=i in members) for i in shown)
     status = replace(
         estimate.status, seconds=task.seconds + sum(run.seconds for run in runs), start_loss=task.start_loss
     )
@@ -150,7 +153,7 @@ def train(
     return replace(estimate, restarts=restarts, status=status, held_out=held_out, warnings=warnings)
 
 
-def _restart(start: PlannedRun, run: Any, loss: float, error: float, *, chosen: bool) -> Restart:
+def _restart(start: PlannedRun, run: Any, loss: float, error: float, score: float, *, chosen: bool) -> Restart:
     return Restart(
         seed=start.seed,
         loss=finite_or_none(loss),
@@ -159,6 +162,7 @@ def _restart(start: PlannedRun, run: Any, loss: float, error: float, *, chosen: 
         chosen=chosen,
         regularization=start.regularization,
         validation=finite_or_none(error),
+        score=finite_or_none(score),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import singledispatch
 from typing import Any
 
@@ -17,6 +17,7 @@ from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.motion import Motion
+from orthaug.reports.result import FitResult
 
 # Colours are the notebook's own, so that a card is read on light and on dark.
 _TEMPLATE = """<div class="orthaug" style="max-width:60em;overflow-x:auto">
@@ -61,9 +62,9 @@ class Card:
 
 
 def html_of(shown: Any) -> str:
-    """The object as HTML, escaped."""
+    """The object, or a card, as HTML, escaped."""
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-    card = card_of(shown)
+    card = shown if isinstance(shown, Card) else card_of(shown)
     tables = [Table(t.columns, _shortened(t)) for t in card.tables]
     return environment.from_string(_TEMPLATE).render(card=Card(card.title, card.facts, tables, card.notes))
 
@@ -154,6 +155,19 @@ def _fit(fit: Estimate | MotionEstimate) -> Card:
     return Card(type(fit).__name__, _told(facts), [parameters], [warning.text for warning in fit.warnings])
 
 
+def card_of_result(fit: Estimate | MotionEstimate, result: FitResult) -> Card:
+    """A fit with what its result tells of every parameter, and all of the result's warnings."""
+    parameters = [*result.parameters, *(result.physical_parameters or ())]
+    columns = ["parameter", "value", "std", "95 % interval", "unit"]
+    rows = [[row.name, _number(row.value), _number(row.std, 3), _ends(row.ci95), row.shown_unit] for row in parameters]
+    if any(row.bias for row in parameters):
+        columns += ["bias", "95 % interval with it"]
+        for cells, row in zip(rows, parameters, strict=True):
+            cells += [_number(row.bias.value if row.bias else None, 3), _ends(row.ci95_with_bias)]
+    notes = [warning.text for warning in result.warnings]
+    return replace(card_of(fit), tables=[Table(columns, rows)], notes=notes)
+
+
 @card_of.register(Model)
 @card_of.register(MotionModel)
 def _model(model: Model | MotionModel) -> Card:
@@ -198,6 +212,10 @@ def _bounds(low: float, high: float) -> str:
     if np.isfinite(low) and np.isfinite(high):
         return _interval(low, high)
     return f"≥ {low:g}" if np.isfinite(low) else f"≤ {high:g}" if np.isfinite(high) else "–"
+
+
+def _ends(interval: Sequence[Any] | None) -> str:
+    return "–" if interval is None else _interval(*interval)
 
 
 def _interval(low: Any, high: Any) -> str:

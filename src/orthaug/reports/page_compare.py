@@ -9,7 +9,7 @@ from typing import Any
 from orthaug.models.response import Response
 from orthaug.reports.page_blocks import Grid, Section, Table, Text, digits_for, interval, number
 from orthaug.reports.page_figures import parameter_comparison
-from orthaug.reports.page_fit import Origin, origin_blocks, score_blocks, unit_cell, units_of_result
+from orthaug.reports.page_fit import Origin, origin_blocks, score_blocks, units_of_result
 from orthaug.reports.page_runs import compared_plots
 from orthaug.reports.result import CompareResult
 
@@ -96,7 +96,7 @@ def _parameters(result: CompareResult) -> list[Any]:
             row.name,
             p.name,
             number(p.value, digits_for(p.value, p.std, 6)),
-            unit_cell(p),
+            p.shown_unit,
             number(p.std, 2, p.value),
             interval(p.ci95),
         ]

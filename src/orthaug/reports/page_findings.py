@@ -112,12 +112,16 @@ def excitation_blocks(result: FitResult) -> list[Any]:
             )
         )
     if result.bias:
-        head = ["suspect", "expression", "explains of the learner", "cosine with the physics", "removed by"]
-        rows = [
-            [s.name, s.expression, percent(s.explained), number(s.cosine, 3, 1.0), s.removed_by or "–"]
-            for s in result.bias
-        ]
-        blocks.append(Table("Terms that may be missing from the physics, and what becomes of them.", head, rows))
+        head = ["suspect", "expression", "explains of the learner", "cosine with the physics"]
+        rows = [[s.name, s.expression, percent(s.explained), number(s.cosine, 3, 1.0)] for s in result.bias]
+        caption = "Terms that may be missing from the physics."
+        if any(s.removed_by for s in result.bias):
+            caption = "Terms that may be missing from the physics, and what takes their bias from the parameters."
+            head = [*head, "removed by"]
+            rows = [[*row, s.removed_by or "–"] for row, s in zip(rows, result.bias, strict=True)]
+        else:
+            caption += " Whether a measure takes their bias from the parameters is told by `orthaug check`."
+        blocks.append(Table(caption, head, rows))
         if result.bias[0].percent:
             blocks.append(bias_plot(result.bias))
     return blocks
@@ -125,6 +129,12 @@ def excitation_blocks(result: FitResult) -> list[Any]:
 
 def _sentence(text: str) -> str:
     return f"{text[0].upper()}{text[1:].rstrip('.')}." if text else ""
+
+
+_CHOOSES = {
+    "score": "score, generalised cross-validation: the loss, raised by how many weights a run uses for it",
+    "validation": "error on data that were not fitted",
+}
 
 
 def restarts_blocks(result: FitResult) -> list[Any]:
@@ -135,20 +145,17 @@ def restarts_blocks(result: FitResult) -> list[Any]:
         f"{number(status.seconds, 3)} s. {_sentence(status.message)}"
     )
     fall = f" The loss is {number(status.loss, 4)}; that of physics alone was {number(status.start_loss, 4)}."
-    head = ["seed", "regularization", "loss", "validation", "iterations", "ended", "chosen"]
+    runs, caption = result.restarts, "Every run from its own initial weights."
+    by = [name for name in _CHOOSES if any(getattr(r, name) is not None for r in runs)]
+    if by and sum(r.chosen for r in runs) == 1 < len(runs):
+        caption += f" The chosen one has the lowest {_CHOOSES[by[0]]}."
+    head = ["seed", "regularization", "loss", *by, "iterations", "ended", "chosen"]
     rows = [
-        [
-            str(r.seed),
-            str(r.regularization),
-            number(r.loss),
-            number(r.validation),
-            str(r.iterations),
-            r.code.replace("_", " "),
-            "yes" if r.chosen else "no",
-        ]
-        for r in result.restarts
+        [str(r.seed), str(r.regularization), number(r.loss), *(number(getattr(r, name)) for name in by)]
+        + [str(r.iterations), r.code.replace("_", " "), "yes" if r.chosen else "no"]
+        for r in runs
     ]
     blocks: list[Any] = [Text(told + fall)]
     plot = restart_plot(result.restarts)
     blocks += [plot] if plot else []
-    return blocks + ([Table("Every run from its own initial weights.", head, rows)] if rows else [])
+    return blocks + ([Table(caption, head, rows)] if rows else [])

@@ -138,17 +138,12 @@ def _parameters(result: FitResult) -> list[Any]:
     return blocks + _equations(result)
 
 
-def unit_cell(row: ParameterResult) -> str:
-    """The unit of the spec, or in brackets the one that follows from those of the channels."""
-    return row.unit or (f"({row.derived_unit})" if row.derived_unit else "–")
-
-
 def _parameter_cells(row: ParameterResult, biased: bool, shared: bool) -> list[str]:
     scale = row.value
     cells = [
         row.name,
         number(row.value, digits_for(row.value, row.std, 6)),
-        unit_cell(row),
+        row.shown_unit,
         number(row.std, 2, scale),
         interval(row.ci95),
         number(row.initial),

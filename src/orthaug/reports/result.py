@@ -88,6 +88,8 @@ class StatusResult(Content):
 class RestartResult(Content):
     """One run from its own initial weights."""
 
+    absent: ClassVar = frozenset({"score"})
+
     seed: Whole
     loss: Number
     iterations: Whole
@@ -95,6 +97,7 @@ class RestartResult(Content):
     chosen: Flag
     regularization: str | float
     validation: Number
+    score: Number = None
 
 
 class BiasResult(Content):
@@ -124,6 +127,11 @@ class ParameterResult(Content):
     shared: Flag | None = None
     bias: BiasResult | None = None
     ci95_with_bias: Numbers | None = None
+
+    @property
+    def shown_unit(self) -> str:
+        """The unit of the spec, or in brackets the one that follows from those of the channels."""
+        return self.unit or (f"({self.derived_unit})" if self.derived_unit else "–")
 
     def told(self, shared: bool | None, bias: ParameterBias | None) -> ParameterResult:
         """The same with whether the learner could imitate it, and its bias."""
