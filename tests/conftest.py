@@ -75,6 +75,16 @@ def _programs_are_let_go() -> Iterator[None]:
         sys.modules["jax"].clear_caches()
 
 
+@pytest.fixture(autouse=True, scope="session")
+def _defects_are_seen() -> Iterator[None]:
+    """A user keeps a training behind which an analysis fails; a test fails."""
+    from orthaug.commands import attempt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(attempt, "DEFECTS", ())
+        yield
+
+
 @pytest.fixture(scope="session")
 def data_folder() -> Path:
     """The measured data sets; the test is skipped where they are absent."""

@@ -240,6 +240,20 @@ def test_an_unmodelled_residual_is_told_with_its_size_and_advice():
     assert "coloured" in dict(found.warnings)["coloured_residual"]
 
 
+def test_a_coloured_disturbance_biases_the_one_step_parameters_and_is_told():
+    """The physics is complete; y_{k−1} holds what the disturbance e_{k−1} tells of e_k."""
+    rng = np.random.default_rng(5)
+    u, e, y = np.repeat(rng.normal(size=500), 4), np.zeros(2000), np.zeros(2000)
+    for k in range(2, 2000):
+        e[k] = 0.9 * e[k - 1] + 0.02 * rng.normal()
+        y[k] = 1.5 * y[k - 1] - 0.7 * y[k - 2] + u[k - 1] + e[k]
+    one, two = (of(Record.from_arrays(u, y), criterion=c) for c in (Prediction(), Simulation()))
+    told = dict(one.warnings)["coloured_residual"]
+    assert "biases the one-step θ" in told and 'focus = "simulation"' in told
+    assert not any("one-step θ" in warning.text for warning in two.warnings)
+    assert of(second_order(0, equation=0.1)).warnings == ()
+
+
 # --- the criterion that sensor noise asks for
 
 

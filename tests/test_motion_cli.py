@@ -536,6 +536,22 @@ def test_an_analysis_that_fails_numerically_loses_no_training(folder, result, mo
     assert (folder / "fails" / "model").is_dir() and (folder / "fails" / "report.html").exists()
 
 
+def test_a_defect_of_an_analysis_loses_no_training_either(monkeypatch):
+    from orthaug.commands import attempt
+
+    monkeypatch.setattr(attempt, "DEFECTS", (IndexError, ValueError))
+    warnings = []
+
+    def fails(error):
+        raise error
+
+    assert attempt.attempt("the analysis", lambda: fails(IndexError("out of bounds")), warnings, 3) == 3
+    (warning,) = warnings
+    assert warning.code == "analysis_failed" and "a defect of orthaug (IndexError: out of bounds)" in warning.text
+    with pytest.raises(InputError, match="bad"):
+        attempt.attempt("the analysis", lambda: fails(InputError("bad")), warnings, 3)
+
+
 BAD = {
     "undefined": ("c*v", "cc*v", "the equation of 'v' = (force - cc*v - k*x)/m: unknown name 'cc', did you mean 'c'?"),
     "lag": ("(force -", "(force[k] -", "a signal such as y[k-1] is no part of it"),

@@ -375,6 +375,19 @@ def test_what_is_called_coloured_is_told_with_its_correlation(own: float, words:
     assert told.startswith("y has autocorrelations of up to 0.2") and words in told and "z" not in told
 
 
+def test_several_experiments_are_diagnosed_as_one_is() -> None:
+    from orthaug.analysis.motion_diagnosis import diagnose_motion
+
+    record = oa.Record.join([data(200, friction=0.0), data(120, friction=0.0, seed=1)])
+    fit = oa.estimate(record, spring(), learner=None, criterion=WHOLE)
+    found = diagnose_motion(fit, fit.model.simulate(record))
+    assert found is not None and found.verdict == "white" and found.predictable[0].inputs == 0
+    friction = oa.Record.join([data(200), data(120, seed=1)])
+    fit = oa.estimate(friction, spring(), learner=None, criterion=WHOLE)
+    found = diagnose_motion(fit, fit.model.simulate(friction))
+    assert found is not None and found.verdict == "unmodelled"
+
+
 def test_traces_that_tests_see_beside_the_noise_are_told() -> None:
     from orthaug.analysis.motion_diagnosis import _traces
     from orthaug.analysis.predictability import Predictable

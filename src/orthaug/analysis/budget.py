@@ -28,6 +28,7 @@ from orthaug.physics.parameters import PhysicsMap
 
 LEAST_SHARE = 0.5  # of the learner's energy that a cause must explain to be named
 _NOTHING = 0.01  # of the noise: a learner that is smaller found nothing that could be explained
+_FEWEST_LEFT = 5  # rows beyond what was fitted: where fewer are left any term explains the learner
 AS_MUCH = 0.98  # of what the cause explains: a rival cannot be told from it
 SURE_SHARE = 0.9  # from which on a cause is told without a doubt
 _NEAR = 0.5  # of what the cause explains: a rival that is named beside it
@@ -117,6 +118,8 @@ def bias_budget(
 def budget_on(ground: Ground, fit: Estimate, suspects: Sequence[Suspect]) -> Budget | None:
     """The same on a ground that is there already."""
     if not ground.problem.baseline.names or ground.learned is None or not np.all(np.isfinite(ground.learned)):
+        return None
+    if fit.freedom < _FEWEST_LEFT:
         return None
     noise = fit.model.statistics.noise
     if noise is not None and np.all(np.mean(ground.learned**2, axis=0) < _NOTHING**2 * np.diag(noise)):

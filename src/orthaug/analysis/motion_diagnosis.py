@@ -67,7 +67,7 @@ def diagnose_motion(fit: MotionEstimate, free_run: Response) -> Diagnosis | None
     verdict = "unmodelled" if told or late else "white" if white else "equation_noise"
     text = _words(verdict, fit, tests, shares, followed, curved, lacks, late)
     warnings = [one.warning for one in late]
-    warnings += [] if white else [Warning("coloured_residual", _COLOURED + (_UNCOUNTED if told else ""))]
+    warnings += [] if white else [Warning("coloured_residual", _coloured(fit) + (_UNCOUNTED if told else ""))]
     return Diagnosis(verdict, text, (), tests, None, None, tuple(warnings), shares, (), missing)
 
 
@@ -77,10 +77,14 @@ def _late(fit: MotionEstimate) -> tuple[DeadTime, ...]:
     return dead_times(on_longest(without_learner(fit.problem), fit.criterion, solver, Orthogonal()), solver)
 
 
-_COLOURED = (
-    "the errors of the free run are coloured: held-out errors say how good the model is, and standard errors are "
-    "robust only where there are rows enough."
-)
+def _coloured(fit: MotionEstimate) -> str:
+    """That errors are coloured, and what its standard errors are worth."""
+    told = "the errors of the free run are coloured: held-out errors say how good the model is"
+    if fit.std is None or fit.plain_covariance is not None:
+        return f"{told}."
+    return f"{told}, and standard errors are those of white ones, as rows are too few: take them for a rough guide."
+
+
 _UNCOUNTED = " Intervals count noise alone: what is missing may have moved the parameters by more than that."
 
 
@@ -89,7 +93,8 @@ def _predictable(i: int, test: ResidualTest, errors: list, inputs: list, every: 
     signal = [piece[:, i] for piece in errors]
     longest = min(_LAGS, min(map(len, signal)) // _ROWS_PER_LAG)
     own = from_own_past(signal, max(longest, 1))
-    tells = [from_lags(signal, [u[:, j] for u in inputs], range(longest + 1)) for j in range(inputs[0].shape[1])]
+    driven = [[u[:, j] for u in inputs] for j in range(inputs[0].shape[1])]  # of each input its experiments
+    tells = [from_lags(signal, [one], range(longest + 1)) for one in driven]
     best = max((share.sure for share in tells), default=0.0)
     return Predictable(test.name, float(test.rms or 0.0), own.sure, best, float(test.largest_share or 0.0))
 

@@ -26,6 +26,12 @@ _BIASED = Warning(
     "noise on the measured output biases the one-step θ, and its intervals do not cover that bias: "
     'train with focus = "simulation".',
 )
+_INCONSISTENT = Warning(
+    "coloured_residual",
+    "the one-step residual is coloured: what disturbs one row is in the lagged outputs of the next, which biases the "
+    'one-step θ, and its intervals do not cover that bias. Train with focus = "simulation" for the parameters.',
+)
+_COLOUR = 0.1  # of the residual's variance that its own past tells: from there on that bias may matter
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,10 +118,19 @@ def words(verdict: str, seen: Finding) -> tuple[str, tuple[Warning, ...]]:
         "sensor_noise": _sensor_noise,
         "unmodelled": _unmodelled,
     }[verdict](seen)
+    if verdict == "unmodelled" and _inconsistent(seen):
+        warnings = (*warnings, _INCONSISTENT)
     plain = seen.fit.std is not None and seen.fit.plain_covariance is None
     if plain and not warnings and not (seen.free_white if seen.simulated else seen.white):
         warnings = (_coloured("errors of the free run are" if seen.simulated else "one-step residual is"),)
     return text, warnings
+
+
+def _inconsistent(seen: Finding) -> bool:
+    """Whether a coloured disturbance enters one-step θ through lagged outputs."""
+    if seen.simulated or seen.white or seen.steps or not seen.fit.model.form.states or seen.fit.std is None:
+        return False
+    return any(one.own_past > _COLOUR for one in seen.predictable)
 
 
 def _white(seen: Finding) -> tuple[str, tuple[Warning, ...]]:

@@ -1,4 +1,4 @@
-"""Analyses behind a finished training: where one fails numerically the result stands, and a warning says which."""
+"""Analyses behind a finished training: where one fails the result stands, and a warning says which."""
 
 from __future__ import annotations
 
@@ -7,14 +7,19 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from orthaug._base.errors import InputError
+from orthaug._base.log import LOG
 from orthaug._base.warning import Warning
 
 T = TypeVar("T")
 _NUMERICAL = (ArithmeticError, np.linalg.LinAlgError)
+DEFECTS: tuple[type[BaseException], ...] = (AttributeError, IndexError, KeyError, TypeError, ValueError)
 
 
 def attempt(what: str, analysis: Callable[[], T], warnings: list[Any], otherwise: T) -> T:
-    """What an analysis finds, or `otherwise` with one more warning where its numerics fail.
+    """What an analysis finds, or `otherwise` with one more warning where it fails.
+
+    A training may have taken hours: a defect of an analysis does not take it away, and is logged.
 
     Args:
         what: the analysis in words, to begin a sentence with.
@@ -24,8 +29,13 @@ def attempt(what: str, analysis: Callable[[], T], warnings: list[Any], otherwise
         return analysis()
     except _NUMERICAL as error:
         told = f"{what} failed numerically ({str(error).rstrip('.')}): the result stands without it."
-        warnings.append(Warning("analysis_failed", told))
-        return otherwise
+    except InputError:
+        raise
+    except DEFECTS as error:
+        LOG.info("%s failed", what, exc_info=True)
+        told = f"{what} failed by a defect of orthaug ({type(error).__name__}: {error}): the result stands without it."
+    warnings.append(Warning("analysis_failed", told))
+    return otherwise
 
 
 def attempt_warned(

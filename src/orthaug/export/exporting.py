@@ -5,7 +5,7 @@ from __future__ import annotations
 import keyword
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -166,7 +166,7 @@ def _listed(head: str, signals: Sequence[Signal]) -> str:
 def _vectors_of(model: Any, program: Program) -> Vectors:
     """A free run under random levels of the inputs, in the range that the model was trained on where that is known.
 
-    It starts from zero, or from one where zero has no output.
+    Of the starts it takes the one from which the outputs stay finite for longest.
     """
     rng = np.random.default_rng(_SEED)
     middle, reach = _range(model, program)
@@ -180,14 +180,24 @@ def _vectors_of(model: Any, program: Program) -> Vectors:
 
         return jax.lax.scan(one, state, rows)[1]
 
-    run, count, states, outputs = jax.jit(run), 0, np.zeros(0), np.zeros(0)
-    for start in (np.zeros(len(program.states)), np.ones(len(program.states))):
+    run, found = jax.jit(run), []
+    for start in _starts(model, program):
         states, outputs = map(np.asarray, run(start, inputs))
         finite = np.asarray(np.isfinite(np.concatenate([states, outputs], axis=1)).all(axis=1))
         count = finite.size if finite.all() else int(np.argmin(finite))
-        if count:
-            break
-    return Vectors(inputs[:count], states[:count], outputs[:count])
+        found.append(Vectors(inputs[:count], states[:count], outputs[:count]))
+    return max(found, key=lambda vectors: len(vectors.outputs))  # the first of equal ones
+
+
+def _starts(model: Any, program: Program) -> Iterator[np.ndarray]:
+    """States to start from: in the middle of what the learner saw of their channels, zero, one."""
+    zero = np.zeros(len(program.states))
+    if model.form.bound is not None:
+        entries = model.form.features.entries if isinstance(model, Model) else model.form.features
+        centres = {entry.text.partition("[")[0]: c for entry, c in zip(entries, model.numbers.centre, strict=True)}
+        yield np.array([float(centres.get(signal.name.partition("[")[0], 0.0)) for signal in program.states])
+    yield zero
+    yield zero + 1
 
 
 def _range(model: Any, program: Program) -> tuple[Any, Any]:

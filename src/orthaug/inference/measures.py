@@ -326,7 +326,12 @@ def weigh(measure: Measure, support: Support, baseline: Baseline, outputs: tuple
     with np.errstate(all="ignore"):
         phi = np.asarray(baseline.phi(points.x, support.layout, outputs, np))
     if not np.isfinite(phi).all():
-        raise InputError(f"the physics is not finite on all points of the {measure.name} measure; narrow it.")
+        point, _, column = np.argwhere(~np.isfinite(phi))[0]
+        at = ", ".join(f"{lag} = {value:.4g}" for lag, value in zip(support.layout, points.x[point], strict=True))
+        raise InputError(
+            f"the physics is not finite on all points of the {measure.name} measure: what {baseline.names[column]} "
+            f"multiplies is not at {at}. Take the training measure, or a uniform one over a box where it is."
+        )
     unit = np.sqrt(points.weight)[:, None, None] * weight
     projection = Projection.factor(times(unit, phi))
     return Weighed(measure, points, unit, projection, excitation(projection.r, baseline.names))
