@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from orthaug.data.record import Channel
 from orthaug.models.response import Response, Trajectory
-from orthaug.reports import plots
+from orthaug.reports import finding_plots, plots
 from orthaug.reports.findings import SuspectResult
 from orthaug.reports.result import ParameterResult, RowResult
 
@@ -89,7 +89,7 @@ def test_text_that_looks_like_a_formula_is_drawn_as_it_is(tmp_path, text):
         [
             *(make(odd, text) for make, _ in FIGURES.values()),
             plots.comparison_figure([row]),
-            plots.bias_figure([suspect]),
+            finding_plots.bias_figure([suspect]),
         ]
     ):
         with warnings.catch_warnings():
@@ -127,18 +127,6 @@ def test_a_long_residual_is_drawn_by_its_outline():
     assert (np.nanmin(values), np.nanmax(values)) == (np.nanmin(residual), np.nanmax(residual))
     begin, end = np.searchsorted(0.1 * np.arange(20_000), time[[1000, 1002]] - 0.05)
     assert values[1000:1002].tolist() == [residual[begin:end].min(), residual[begin:end].max()]
-
-
-def test_a_large_heat_map_has_no_numbers(tmp_path):
-    def suspect(count: int) -> SuspectResult:
-        unknown = dict.fromkeys(("relative_physical_bias", "expected_physical_bias"))
-        shares = {f"c{i}": 0.01 * i for i in range(count)}
-        return SuspectResult.model_construct(name="drag", relative_bias=shares, coefficient=1.0, size=1.0, **unknown)
-
-    for count, numbers in ((5, 5), (300, 0)):
-        figure = plots.bias_figure([suspect(count)])
-        assert len(figure.axes[0].texts) == numbers and len(figure.axes[0].get_xticks()) == count
-    assert drawn(figure, tmp_path / "figure.png")
 
 
 def drawn(figure: Figure, path) -> bool:

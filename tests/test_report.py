@@ -26,9 +26,11 @@ from orthaug.models.response import Response, Trajectory
 from orthaug.reports.learned_part import Curve, curve_limits
 from orthaug.reports.page import fit_page
 from orthaug.reports.page_blocks import interval, number, percent
-from orthaug.reports.page_fit import FitPage
+from orthaug.reports.page_compare import ComparePage, compare_sections
+from orthaug.reports.page_fit import FitPage, fit_sections
 from orthaug.reports.page_runs import Run, compared_plots, error_band, packed, run_plots
 from orthaug.reports.page_verdict import compare_verdict, fit_verdict
+from orthaug.reports.result import BiasResult
 
 SUSPECT = '[[suspects]]\nname = "square"\non = "u[k-1]**2"\n'
 FIT = ["Verdict", "Parameters", "Free run", "Physics and learner", "What was learned", "Residual tests", "Stability",
@@ -292,7 +294,7 @@ def test_a_curve_that_stays_has_no_mark_and_the_model_without_its_learner_has_it
         "model",
         "measured − model",
     ]
-    assert plot.layout["yaxis2"]["title"] == {"text": "residual [m]"}
+    assert plot.layout["yaxis2"]["title"] == {"text": "residual<br>[m]"}
     (away,) = run_plots([Run("tests.slow", wave(300), wave(300, wild=200))], {})
     assert "s y of the model without its learner leaves the panel" in away.caption
 
@@ -422,3 +424,27 @@ def test_a_learned_curve_fills_its_panel_where_data_are():
     curve = Curve(along, inside, np.where(inside, along, 30 * along)[:, None], None)
     low, high = curve_limits(curve, 0, np.array([-1.1, 0.9]))
     assert -1.6 < low < -1.1 and 1.0 < high < 1.5
+
+
+def test_the_bar_of_the_learner_is_the_share_that_the_table_tells(motion):
+    page = FitPage(origin_of(motion.job, "fit"), motion.result, motion.responses)
+    table, bar = next(section.blocks for section in fit_sections(page) if section.key == "share")
+    part = motion.result.motion.parts[0]
+    assert bar.traces[0]["x"][0] == pytest.approx(100 * part.share)
+    assert table.rows[0][-1] == percent(part.share) and "over that of their sum" in table.caption
+
+
+def test_a_comparison_tells_the_biases(compared):
+    def heads(result):
+        sections = compare_sections(ComparePage(origin_of(compared.job, "compare"), result, {}))
+        table = next(section for section in sections if section.key == "parameters").blocks[-1]
+        return table.head, table.rows[0][-1]
+
+    def with_bias(bias):
+        first = compared.result.comparison[0]
+        parameters = [row.model_copy(update={"bias": bias}) for row in first.parameters]
+        return compared.result.model_copy(update={"comparison": [first.model_copy(update={"parameters": parameters})]})
+
+    assert "bias" not in heads(with_bias(None))[0]
+    head, cell = heads(with_bias(BiasResult(value=-0.25, cause="drag", share=0.9)))
+    assert head[-1] == "bias" and cell == "−0.25"

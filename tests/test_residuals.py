@@ -146,7 +146,7 @@ def test_against_a_white_residual_bins_are_an_analysis_of_variance():
     assert found.p == pytest.approx(scipy.stats.f_oneway(*groups).pvalue, rel=1e-8)
     np.testing.assert_allclose(found.means + e.mean(), [group.mean() for group in groups])
     within = sum(np.sum((group - group.mean()) ** 2) for group in groups)
-    np.testing.assert_allclose(found.errors, np.sqrt(within / 980 / 50))
+    np.testing.assert_allclose(found.errors, np.sqrt(within / 980 * (1 / 50 - 1 / 1000)))  # of the distance to the mean
     assert found.share == pytest.approx(1 - within / np.sum((e - e.mean()) ** 2))
     mean_square = 50 * sum(group.mean() ** 2 for group in groups) / 20
     against_zero = against_regressor(e, x, a=np.ones(1))

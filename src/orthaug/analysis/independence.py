@@ -40,8 +40,10 @@ class CrossTest:
 class RegressorTest:
     """Residual against a regressor, by bins: p-value of no relation, share of the residual's variance explained.
 
-    Per bin: `centres` (mean of the regressor, in its unit), `means` of the residual and their standard `errors` from
-    the deviation within the bins (in the residual's unit; the errors take it as white), and `counts` of rows.
+    Per bin: `centres` (mean of the regressor, in its unit), `means` of the residual and their standard `errors` (in the
+    residual's unit), and `counts` of rows. The means are those that the test looks at: of a coloured residual by
+    generalised least squares, less the mean of all rows where the test is centred. Where the rows do not tell them
+    apart they are plain means, with errors that take the residual as white.
     """
 
     p: float | None
@@ -75,9 +77,9 @@ def against_input(
     if values is None or e is None or u is None or a is None:
         return None
     band = float(-scipy.special.ndtri(level / 2) * np.sqrt(_spectral_product(a, u) / sum(map(len, e))))
-    p = _no_relation(_lag_blocks(e, u, a, len(values) // 2), intercept=True)
+    found = _relation(_lag_blocks(e, u, a, len(values) // 2), intercept=True)
     causal = np.abs(values[len(values) // 2 :])
-    return CrossTest(values, band, p, int(causal.argmax()), float(causal.max()))
+    return CrossTest(values, band, None if found is None else found.p, int(causal.argmax()), float(causal.max()))
 
 
 def against_regressor(
@@ -107,8 +109,13 @@ def against_regressor(
     means = np.bincount(placed, whole) / counts
     total, explained = float(whole @ whole), float(counts @ means**2)
     within = np.sqrt(max(total - explained, 0.0) / (len(whole) - len(counts)))
-    p = _no_relation(_bin_blocks(cut(whole, e), cut(placed, e), a, len(counts)), intercept=centred)
-    centres, errors = np.bincount(placed, x) / counts, within / np.sqrt(counts)
+    found = _relation(_bin_blocks(cut(whole, e), cut(placed, e), a, len(counts)), intercept=centred)
+    errors = within / np.sqrt(counts)
+    if found is not None and found.rank == len(counts) - centred:
+        contrast = np.eye(len(counts)) - centred * counts / len(whole)  # to the mean of all rows
+        means = contrast @ found.coefficients
+        errors = np.sqrt(np.maximum(np.diag(contrast @ found.covariance @ contrast.T), 0.0))
+    centres, p = np.bincount(placed, x) / counts, None if found is None else found.p
     return RegressorTest(p, min(explained / total, 1.0), centres, size * means, size * errors, counts)
 
 
@@ -160,8 +167,18 @@ def _bins(x: Vector, bins: int) -> Int[np.ndarray, "_"] | None:
     return number[place] if number[-1] > 0 else None
 
 
-def _no_relation(blocks: Iterable[Matrix], intercept: bool) -> float | None:
-    """p-value of `β = 0` in `target = Z β + ε`, or `+ constant`, from blocks of rows (1, Z, target); F(rank, rest).
+@dataclass(frozen=True, eq=False)
+class _Relation:
+    """Least squares `target = Z β + ε`: p-value of `β = 0`, and β with its covariance in the directions of Z's rank."""
+
+    p: float
+    rank: int
+    coefficients: Vector
+    covariance: Matrix
+
+
+def _relation(blocks: Iterable[Matrix], intercept: bool) -> _Relation | None:
+    """β of `target = Z β + ε`, or `+ constant`, from blocks of rows (1, Z, target); p by F(rank, rest).
 
     A Gram matrix suffices: only the part of the target that Z explains is needed, and directions that
     it cannot resolve are dropped. They depend on Z alone, so the level stays.
@@ -175,9 +192,11 @@ def _no_relation(blocks: Iterable[Matrix], intercept: bool) -> float | None:
     unit = 1 / np.sqrt(np.where(np.diag(inner) > 0, np.diag(inner), np.inf))
     values, vectors = np.linalg.eigh(inner * np.outer(unit, unit))
     kept = values > _RANK * max(values[-1], 1.0)
-    rank, freedom = kept.sum(), rows - kept.sum() - intercept
+    rank, freedom = int(kept.sum()), rows - kept.sum() - intercept
     if rank == 0 or freedom < 1 or total <= 0:
         return None
-    explained = np.sum((vectors[:, kept].T @ (unit * moment)) ** 2 / values[kept])
-    left = max(total - explained, np.finfo(float).eps * total)
-    return float(scipy.special.fdtrc(rank, freedom, explained / rank / (left / freedom)))
+    root = unit[:, None] * vectors[:, kept] / np.sqrt(values[kept])  # of the inverse of the inner products
+    explained = np.sum((root.T @ moment) ** 2)
+    left = max(total - explained, np.finfo(float).eps * total) / freedom
+    p = float(scipy.special.fdtrc(rank, freedom, explained / rank / left))
+    return _Relation(p, rank, root @ (root.T @ moment), left * root @ root.T)

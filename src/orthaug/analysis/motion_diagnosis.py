@@ -155,7 +155,7 @@ def _colour(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) ->
         if not test.practically_white():
             past = f", and {percent(share.own_past)} of it follows from its own past"
             past = past if share.own_past > _LITTLE else ", too little to predict it from its own past"
-            told.append(f"{test.name} has autocorrelations of up to {test.largest_acf:.2f}{past}")
+            told.append(f"{test.name} has autocorrelations of up to {test.largest_acf:.2f} in size{past}")
     return "; ".join(told)
 
 

@@ -153,7 +153,7 @@ def _sensor_noise(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     colour = max((t.largest_acf or 0.0) for t in seen.tests)
     closer = "as close" if seen.ratio is None or seen.ratio > 0.95 else f"{1 / seen.ratio:.1f} times closer"
     own = "the free run is" if seen.simulated else "the physics trained on the free run comes"
-    how = f"its largest autocorrelation is {colour:.2f}, and {own} {closer} without measured lags"
+    how = f"its largest autocorrelation is {colour:.2f} in size, and {own} {closer} without measured lags"
     text = f"The one-step residual is coloured: {how}. That is noise on the measured output"
     if seen.simulated:
         more = f" {_sentence(seen.changes[0])}" if seen.changes else ""
@@ -176,7 +176,7 @@ def _sensor_noise(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
 
 
 def _unmodelled(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
-    told = [f"its largest autocorrelation is {max((t.largest_acf or 0.0) for t in seen.own):.2f}"]
+    told = [f"its largest autocorrelation is {max((t.largest_acf or 0.0) for t in seen.own):.2f} in size"]
     for test in seen.own:
         told += [f"the residual of {test.name} still follows {name}" for name in test.follows()]
         told += [f"the residual of {test.name} is curved over {name}" for name in test.curved_over(SHARE)]

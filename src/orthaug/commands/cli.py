@@ -68,7 +68,7 @@ def check(
     result = kind_of(job).checked(job)
     tell(result, check_text(result), as_json)
     if figure is not None and result.bias:
-        from orthaug.reports.plots import bias_figure
+        from orthaug.reports.finding_plots import bias_figure
 
         save_figure(bias_figure(result.bias), figure, force=force)
     refused = kind_of(job).refused(job, result)

@@ -110,7 +110,7 @@ def figures(
     job: LaggedJob, fit: Estimate, result: FitResult, responses: Mapping[str, tuple[Response, Response]]
 ) -> dict[str, Figure]:
     """The figures of a result by their names."""
-    from orthaug.reports import plots
+    from orthaug.reports import finding_plots, plots
 
     last, structure = job.parts[-1].name, fit.model.structure
     one_step, free = responses[last]
@@ -121,12 +121,14 @@ def figures(
         "residual": plots.residual_figure(one_step, f"one-step residual, {where}"),
     }
     if result.residuals is not None:
+        units = {channel.name: channel.unit for channel in (*fit.model.inputs, *fit.model.outputs)}
         for kind, tests in (("one-step", result.residuals.one_step), ("free-run", result.residuals.free_run)):
             if tests is not None:
                 title = f"{kind} residual on the training data, {structure}"
-                drawn[f"residuals_{kind.replace('-', '_')}"] = plots.residual_analysis_figure(tests, title)
+                figure = finding_plots.residual_analysis_figure(tests, title, units)
+                drawn[f"residuals_{kind.replace('-', '_')}"] = figure
     if result.bias:
-        drawn["bias"] = plots.bias_figure(result.bias)
+        drawn["bias"] = finding_plots.bias_figure(result.bias)
     if fit.model.form.bound is not None:
         drawn["components"] = plots.components_figure(one_step, f"parts of the one-step prediction, {where}")
     return drawn

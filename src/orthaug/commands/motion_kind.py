@@ -196,7 +196,7 @@ def figures(
     job: MotionJob, fit: MotionEstimate, result: FitResult, responses: Mapping[str, tuple[Response, Response]]
 ) -> dict[str, Figure]:
     """The figures of a result by their names."""
-    from orthaug.reports import plots
+    from orthaug.reports import finding_plots, plots
     from orthaug.reports.learned_part import learned_of
 
     part = job.parts[-1]
@@ -208,7 +208,7 @@ def figures(
         "states": plots.states_figure(fit.model, part.record, f"states of the free run, {part.name}"),
     }
     if result.bias:
-        drawn["bias"] = plots.bias_figure(result.bias)
+        drawn["bias"] = finding_plots.bias_figure(result.bias)
     drawn["prediction"] = plots.output_figure(one_step, f"one-step prediction, {part.name}")
     if learns:
         drawn["components"] = plots.parts_figure(fit.model, part.record, f"physics and learner, {part.name}")

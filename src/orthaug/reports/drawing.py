@@ -26,6 +26,7 @@ except UnicodeDecodeError:
 
 # Okabe-Ito: told apart by every reader
 BLACK, GREY, BLUE, ORANGE, GREEN = "#000000", "#B8B8B8", "#0072B2", "#E69F00", "#009E73"
+CYCLE = (BLUE, ORANGE, GREEN, BLACK)
 SIZE = (7.0, 2.4)  # inches per panel
 TOP, BOTTOM, RIGHT = 0.6, 0.5, 0.15  # inches around panels
 _LEFT, _GAP = 0.95, 0.32

@@ -72,7 +72,7 @@ def plot(
 
 
 def _drawn(what: Any, kind: str, title: str | None) -> Figure:
-    from orthaug.reports import linear_plots, plots
+    from orthaug.reports import finding_plots, linear_plots, plots
 
     if isinstance(what, Linearization):
         if kind == "bode" and not what[0].inputs:
@@ -86,7 +86,7 @@ def _drawn(what: Any, kind: str, title: str | None) -> Figure:
     if not isinstance(what, Response):
         if not what.bias:
             raise InputError("this result has no suspects, so that there is no figure of their biases.")
-        return plots.bias_figure(what.bias)
+        return finding_plots.bias_figure(what.bias)
     if kind == "residual" and any(trajectory.measured is None for trajectory in what.trajectories):
         raise InputError("the outputs of this response were not measured; it has no residual.")
     horizon = "free run" if what.horizon is None else f"{what.horizon}-step prediction"

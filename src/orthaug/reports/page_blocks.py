@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base import lines
+from orthaug.reports.result import ParameterResult
 
 _LARGE = 7  # digits before the point from which a power of ten is written
 _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
@@ -72,6 +73,11 @@ def percent(share: float | None, digits: int = 2, *, signed: bool = False) -> st
     return told.replace("-", "−")
 
 
+def chance(p: float | None) -> str:
+    """A p-value; a small one is as good as a smaller one."""
+    return "< 10⁻⁶" if p is not None and p < 1e-6 else number(p, 2)
+
+
 def prose(text: str) -> str:
     """A sentence with the minus signs that tables have.
 
@@ -85,6 +91,16 @@ def prose(text: str) -> str:
 def with_unit(name: str, unit: str | None) -> str:
     """A name with its unit in brackets."""
     return f"{name} [{unit}]" if unit else name
+
+
+def regressor_label(name: str, units: Mapping[str, str]) -> str:
+    """A channel, or a lag of one, with its unit; units by channel."""
+    return with_unit(name, units.get(name.partition("[")[0]))
+
+
+def parameter_label(row: ParameterResult) -> str:
+    """A parameter with its unit, or with the one that the channels ask for where the spec gives none."""
+    return with_unit(row.name, row.unit or ("" if row.derived_unit == "1" else row.derived_unit))
 
 
 CATEGORIES = {"autorange": "reversed", "automargin": True, "type": "category"}

@@ -9,7 +9,14 @@ from typing import Any
 from orthaug.models.response import Response
 from orthaug.reports.page_blocks import Grid, Section, Table, Text, digits_for, interval, number
 from orthaug.reports.page_figures import parameter_comparison
-from orthaug.reports.page_fit import Origin, origin_blocks, score_blocks, units_of_result
+from orthaug.reports.page_fit import (
+    BIAS_TOLD,
+    Origin,
+    bias_cell,
+    origin_blocks,
+    score_blocks,
+    units_of_result,
+)
 from orthaug.reports.page_runs import compared_plots
 from orthaug.reports.result import CompareResult
 
@@ -91,17 +98,20 @@ def _models(result: CompareResult) -> list[Any]:
 def _parameters(result: CompareResult) -> list[Any]:
     if not result.comparison or not result.comparison[0].parameters:
         return []
+    told = [(row.name, parameter) for row in result.comparison for parameter in row.parameters]
+    biased = any(parameter.bias for _, parameter in told)
     rows = [
         [
-            row.name,
+            name,
             p.name,
             number(p.value, digits_for(p.value, p.std, 6)),
             p.shown_unit,
             number(p.std, 2, p.value),
             interval(p.ci95),
+            *([bias_cell(p)] if biased else []),
         ]
-        for row in result.comparison
-        for p in row.parameters
+        for name, p in told
     ]
-    head = ["model", "parameter", "value", "unit", "standard error", "95 % interval"]
-    return [Grid(parameter_comparison(result.comparison)), Table("What each model estimates.", head, rows)]
+    head = ["model", "parameter", "value", "unit", "standard error", "95 % interval", *(["bias"] if biased else [])]
+    caption = f"What each model estimates.{BIAS_TOLD if biased else ''}"
+    return [Grid(parameter_comparison(result.comparison)), Table(caption, head, rows)]

@@ -6,14 +6,26 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
+from orthaug.reports.biases import bias_map
 from orthaug.reports.findings import SuspectResult
-from orthaug.reports.page_blocks import CATEGORIES, Plot, area, percent, rounded, titled, with_unit
+from orthaug.reports.page_blocks import (
+    CATEGORIES,
+    Plot,
+    area,
+    chance,
+    number,
+    parameter_label,
+    percent,
+    regressor_label,
+    rounded,
+    titled,
+    with_unit,
+)
 from orthaug.reports.residual_tests import RegressorResult, ResidualTestResult
 from orthaug.reports.result import ParameterResult, PartScores, RestartResult, RowResult
 
 _ROW = 62  # pixels of a parameter
+_NAMED = 0.8  # height of its name on an axis from -1 to 1: above the numbers of its axis, and below those of the last
 _FAR = 6.0  # widths of an interval from which the initial value is not drawn: the interval would be a point
 _DECADES = 20.0  # ratio of scores from which their axis is logarithmic
 _BAD = 1.0  # NRMSE of the mean, from which it is too
@@ -40,7 +52,7 @@ def interval_plot(rows: Sequence[ParameterResult]) -> Plot | None:
             "domain": [top - 0.42 / len(drawn), top - 0.08 / len(drawn)],
             "anchor": f"x{number}",
             "range": [-1, 1],
-            "tickvals": [0],
+            "tickvals": [_NAMED],
             "ticktext": [_tick(row)],
             "fixedrange": True,
             "showgrid": False,
@@ -86,14 +98,7 @@ def _tick(row: ParameterResult) -> str:
     """The name of a parameter, and half its interval in per cent of it."""
     low, high = row.ci95 or (None, None)
     half = None if low is None or high is None or not row.value else abs((high - low) / (2 * row.value))
-    return f"<b>{with_unit(row.name, row.unit or _other_than_1(row))}</b>" + (
-        "" if half is None else f"<br>± {percent(half)}"
-    )
-
-
-def _other_than_1(row: ParameterResult) -> str:
-    """The unit that the channels ask for, where a label has to name it."""
-    return "" if row.derived_unit in (None, "1") else row.derived_unit
+    return f"<b>{parameter_label(row)}</b>" + ("" if half is None else f"<br>± {percent(half)}")
 
 
 def _reach(row: ParameterResult) -> list[float]:
@@ -186,7 +191,7 @@ def residual_plots(test: ResidualTestResult, what: str, units: Mapping[str, str]
         bars = {"type": "bar", "x": lags, "y": test.acf[1:], "name": "autocorrelation", "marker": {"color": "@model"}}
         told = (
             f"Autocorrelation of the {what} of {test.name}; the band holds 99 % of the values that noise gives."
-            f" The largest is {_digits(test.largest_acf)}."
+            f" The largest in size is {number(test.strongest_acf, 2)}."
         )
         layout = titled("lag [samples]", "autocorrelation") | {"shapes": [_band(test.acf_band)], "showlegend": True}
         plots.append(Plot(f"Autocorrelation of the {what} of {test.name}.", told, [bars], layout, 280, small=True))
@@ -227,46 +232,46 @@ def _means_plot(
         "error_y": {"array": errors, "color": "@learner", "thickness": 1},
         "marker": {"color": "@learner"},
     }
+    surely = chance(curve.p)
     told = (
-        f"Mean of the {what} of {test.name} over {name} with 99 % intervals: it explains "
-        f"{percent(curve.share)} of its variance."
+        f"Mean of the {what} of {test.name}, less that of all rows, over {name} with 99 % intervals, both with its "
+        f"autocorrelation taken into account as in the test: that it is flat has p "
+        f"{'' if surely.startswith('<') else '= '}{surely}. Plain means explain {percent(curve.share)} of its variance."
     )
     label = f"Mean of the {what} of {test.name} over {name}."
-    layout = titled(_lagged(name, units), _lagged(f"residual of {test.name}", units, test.name))
+    layout = titled(regressor_label(name, units), with_unit(f"residual of {test.name}", units.get(test.name)))
     return Plot(label, told, [dots], layout, 280, small=True)
 
 
 def bias_plot(suspects: Sequence[SuspectResult]) -> Plot:
-    """Heat map of the bias of each parameter by each suspect, in per cent."""
-    names, labels = list(suspects[0].percent), [suspect.name for suspect in suspects]
-    shares = np.array([[suspect.percent[name] for name in names] for suspect in suspects], dtype=float)
-    shares = np.where(np.abs(shares) < 1e-7, 0.0 * shares, shares)
-    signed = np.sign(shares) * np.log10(1 + np.abs(shares))  # biases of 0.1 % and of 100 % both show
-    reach = max(float(np.nanmax(np.abs(signed), initial=0.0)), 1e-12)
-    told = [[percent(v / 100, signed=True) if np.isfinite(v) else "–" for v in row] for row in shares]
+    """Heat map of the bias of each parameter by each suspect, in per cent; of many the largest."""
+    shown = bias_map(suspects)
     heat = {
         "type": "heatmap",
-        "x": names,
-        "y": labels,
-        "z": rounded(signed, 5),
-        "zmin": -reach,
-        "zmax": reach,
-        "text": told,
-        "texttemplate": "%{text}" if shares.size <= 200 else "",
+        "x": list(shown.parameters),
+        "y": list(shown.suspects),
+        "z": rounded(shown.colours, 5),
+        "zmin": -shown.reach,
+        "zmax": shown.reach,
+        "text": shown.cells,
+        "texttemplate": "%{text}",
+        "textfont": {"size": 10},
         "showscale": False,
         "colorscale": "@diverging",
-        "hovertemplate": "%{y} on %{x}: %{text}<extra></extra>",
+        "hovertemplate": "%{y} on %{x}: %{text} %<extra></extra>",
     }
     layout = {
         "yaxis": CATEGORIES,
-        "xaxis": {"side": "top", "type": "category"},
+        "xaxis": {"side": "top", "type": "category", "tickvals": list(shown.parameters)},
         "showlegend": False,
     }
     caption = (
         "Bias of each parameter (columns) by each term that may be missing from the physics (rows), in per cent of "
-        "its value; a term without a guessed size counts as 1 % of the output."
+        "its value; a term without a guessed size counts as 1 % of the output. Colours are logarithmic."
     )
-    return Plot("Bias of each parameter by each suspected term.", caption, [heat], layout, 90 + 28 * len(labels))
+    caption += f" {shown.left_out}" if shown.left_out else ""
+    height = 90 + 28 * len(shown.suspects)
+    return Plot("Bias of each parameter by each suspected term.", caption, [heat], layout, height)
 
 
 def restart_plot(restarts: Sequence[RestartResult]) -> Plot | None:
@@ -325,10 +330,7 @@ def parameter_comparison(rows: Sequence[RowResult]) -> list[Plot]:
             },
         }
         layout = {
-            "xaxis": {
-                "title": {"text": with_unit(parameter.name, parameter.unit or _other_than_1(parameter))},
-                "nticks": 6,
-            },
+            "xaxis": {"title": {"text": parameter_label(parameter)}, "nticks": 6},
             "yaxis": CATEGORIES,
             "showlegend": False,
         }
@@ -340,12 +342,3 @@ def parameter_comparison(rows: Sequence[RowResult]) -> list[Plot]:
 def _band(half: float) -> dict[str, Any]:
     told = {"name": "99 % of what noise gives", "showlegend": True}
     return area("@reach", xref="paper", x0=0, x1=1, y0=-half, y1=half, **told)
-
-
-def _lagged(name: str, units: Mapping[str, str], channel: str | None = None) -> str:
-    """What stands at an axis, with the unit of its channel, or of the lag that it is."""
-    return with_unit(name, units.get(channel or name.partition("[")[0]))
-
-
-def _digits(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.2g}"

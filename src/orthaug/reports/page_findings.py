@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from orthaug.reports.page_blocks import Grid, Table, Text, number, percent, with_unit
+from orthaug.reports.page_blocks import Grid, Table, Text, chance, number, percent, with_unit
 from orthaug.reports.page_figures import bias_plot, residual_plots, restart_plot
 from orthaug.reports.residual_tests import ResidualTestResult
 from orthaug.reports.result import FitResult
@@ -45,16 +45,11 @@ def _test_cells(what: str, test: ResidualTestResult, units: Mapping[str, str]) -
         number(test.rms, 3),
         number(test.mean, 2, test.rms),
         white,
-        _chance(test.ljung_box.p) if test.ljung_box else "–",
-        number(test.largest_acf, 2, 1.0),
+        chance(test.ljung_box.p) if test.ljung_box else "–",
+        number(test.strongest_acf, 2, 1.0),
         ", ".join(test.correlated_inputs) or "no input",
         ", ".join(test.curved_regressors) or "nothing",
     ]
-
-
-def _chance(p: float | None) -> str:
-    """A p-value; a small one is as good as a smaller one."""
-    return "< 10⁻⁶" if p is not None and p < 1e-6 else number(p, 2)
 
 
 def stability_blocks(result: FitResult) -> list[Any]:

@@ -29,6 +29,8 @@ from orthaug.reports.page_learned import learned_blocks
 from orthaug.reports.page_runs import Run, error_band, run_plots
 from orthaug.reports.result import CompareResult, DataResult, FitResult, ParameterResult, PartScores
 
+BIAS_TOLD = " The bias is estimate less truth, as far as one suspected term explains what the learner found."
+
 
 @dataclass(frozen=True, eq=False)
 class Origin:
@@ -115,7 +117,7 @@ def _parameters(result: FitResult) -> list[Any]:
     if any(row.derived_unit for row in rows):
         caption += " A unit in brackets is not the spec's: the channels' units ask for it."
     if biased:
-        caption += " The bias is estimate less truth, as far as one suspected term explains what the learner found;"
+        caption += f"{BIAS_TOLD[:-1]};"
         caption += " the interval with it is that of the estimate less its bias."
     blocks: list[Any] = [Table(caption, columns, [_parameter_cells(row, biased, shared) for row in rows])]
     plot = interval_plot(rows)
@@ -138,6 +140,11 @@ def _parameters(result: FitResult) -> list[Any]:
     return blocks + _equations(result)
 
 
+def bias_cell(row: ParameterResult) -> str:
+    """The bias by what the learner found."""
+    return number(row.bias.value, 2, row.value) if row.bias else "–"
+
+
 def _parameter_cells(row: ParameterResult, biased: bool, shared: bool) -> list[str]:
     scale = row.value
     cells = [
@@ -149,7 +156,7 @@ def _parameter_cells(row: ParameterResult, biased: bool, shared: bool) -> list[s
         number(row.initial),
     ]
     if biased:
-        cells += [number(row.bias.value, 2, scale) if row.bias else "–", interval(row.ci95_with_bias)]
+        cells += [bias_cell(row), interval(row.ci95_with_bias)]
     return cells + ([{True: "yes", False: "no", None: "–"}[row.shared]] if shared else [])
 
 
@@ -232,35 +239,23 @@ def _shares(page: FitPage) -> list[Any]:
         for name, physics, learner, share, unit in rows
     ]
     head = ["part", "physics", "learner", "unit", "share of the learner"]
-    table = Table(f"RMS of what physics and learner add to {what}.", head, cells)
-    bars = [
-        {
-            "type": "bar",
-            "orientation": "h",
-            "y": [row[0] for row in rows],
-            "name": name,
-            "x": [_of_both(row, i) for row in rows],
-            "marker": {"color": color},
-        }
-        for i, (name, color) in enumerate((("physics", "@physics"), ("learner", "@learner")))
-    ]
-    layout = {
-        "barmode": "stack",
-        "xaxis": {"title": {"text": "share of the two RMS [%]"}, "range": [0, 100]},
-        "yaxis": CATEGORIES,
+    caption = f"RMS of what physics and learner add to {what}. The share is the learner's RMS over that of their sum; "
+    caption += "it need not fit to the two RMS, for the parts may cancel or follow each other."
+    bars = {
+        "type": "bar",
+        "orientation": "h",
+        "y": [row[0] for row in rows],
+        "x": [None if row[3] is None else 100 * row[3] for row in rows],
+        "marker": {"color": "@learner"},
     }
-    caption = "How the RMS of physics and learner divide."
+    largest = max((x for x in bars["x"] if x is not None), default=0.0)
+    axis = {"title": {"text": "share of the learner [%]"}, "range": [0, max(100.0, 1.05 * largest)]}
+    layout = {"xaxis": axis, "yaxis": CATEGORIES, "showlegend": False}
+    told = "The learner's RMS over that of physics and learner together."
     if result.structure == "orthogonal":
-        caption += " The learner holds only what the physics cannot: its overlap with the physics is split off."
-    plot = Plot(
-        "Shares of physics and learner; the table has the numbers.", caption, bars, layout, 110 + 34 * len(rows)
-    )
-    return [table, plot]
-
-
-def _of_both(row: tuple[Any, ...], which: int) -> float:
-    physics, learner = (abs(part or 0.0) for part in row[1:3])
-    return 100 * (physics, learner)[which] / max(physics + learner, 1e-300)
+        told += " The learner holds only what the physics cannot: its overlap with the physics is split off."
+    label = "Share of the learner; the table has the numbers."
+    return [Table(caption, head, cells), Plot(label, told, [bars], layout, 90 + 34 * len(rows))]
 
 
 def _part_shares(part: str, response: Response) -> list[tuple[str, float, float, float | None, str]]:

@@ -15,7 +15,7 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug.data.record import Channel
 from orthaug.models.response import Response
-from orthaug.reports.page_blocks import Plot, area, number, percent, with_unit
+from orthaug.reports.page_blocks import Plot, area, number, percent
 
 MOST_POINTS = 100_000  # of a curve
 _BUDGET = 560_000  # points of a page: three million letters
@@ -295,13 +295,18 @@ def _axes(i: int, panels: int, channel: Channel, limits: list[float] | None) -> 
     top = 1 - i * high
     middle = top - (high - _GAP) * _UPPER
     bottom = top - high + (_GAP if i + 1 < panels // 2 else 0)
-    title = with_unit(channel.name, channel.unit)
-    upper = {"title": {"text": title}, "domain": [middle, top]} | ({"range": limits} if limits else {})
+    title = {"text": _stacked(channel.name, channel.unit)}
+    upper = {"title": title, "domain": [middle, top]} | ({"range": limits} if limits else {})
     lower = {
-        "title": {"text": with_unit("residual", channel.unit)},
+        "title": {"text": _stacked("residual", channel.unit)},
         "domain": [max(bottom, 0), middle - _GAP / 2],
     }
     return {f"yaxis{2 * i + 1}" if i else "yaxis": upper, f"yaxis{2 * i + 2}": lower}
+
+
+def _stacked(name: str, unit: str) -> str:
+    """A title on two lines: the panels are too low on paper for name and unit behind each other."""
+    return f"{name}<br>[{unit}]" if unit else name
 
 
 def _mark(layout: dict[str, Any], run: Run, start: float, step: float) -> None:

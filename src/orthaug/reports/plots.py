@@ -8,18 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orthaug._base.lines import percent
 from orthaug.data.record import Record
 from orthaug.models.motion_field import parts_at
 from orthaug.models.response import Response
 from orthaug.reports.drawing import (
     BLACK,
     BLUE,
-    BOTTOM,
     GREEN,
     GREY,
     ORANGE,
-    RIGHT,
     SIZE,
     TOP,
     Figure,
@@ -35,10 +32,8 @@ from orthaug.reports.drawing import (
     save,
     window,
 )
-from orthaug.reports.findings import SuspectResult
 from orthaug.reports.learned_part import LearnedPart, curve_limits, labels_with_units, trajectory_of
-from orthaug.reports.page_blocks import with_unit
-from orthaug.reports.residual_tests import ResidualTestResult
+from orthaug.reports.page_blocks import parameter_label, with_unit
 from orthaug.reports.result import RowResult
 from orthaug.reports.selection import SelectResult
 
@@ -49,10 +44,8 @@ if TYPE_CHECKING:
 
 __all__ = ["save"]
 
-_CYCLE = (BLUE, ORANGE, GREEN, BLACK)
 _KINDS = ("prediction", "simulation")
 _BESIDE = 3  # panels beside each other
-_MOST_NUMBERS = 200  # in a heat map: of more the colours alone are shown
 _SIZES = {"orders": "linear lags", "terms": "terms beside the physics", "learner": "weights of the network"}
 _WIDE = 5.0  # ratio of scores from which their axis is logarithmic
 _OVER_TIME = "parameters over time with 95 % bands; vertical lines: the residual left its band"
@@ -194,61 +187,6 @@ def learner_figure(part: LearnedPart, title: str) -> Figure:
 
 
 @plain
-def residual_analysis_figure(tests: Sequence[ResidualTestResult], title: str) -> Figure:
-    """Of each residual: autocorrelation, correlation with the inputs, means over its most telling regressor."""
-    figure = Figure(figsize=(SIZE[0] * 1.3, TOP + 2.6 * len(tests)))
-    axes = grid(figure, len(tests), 3, gap=(BOTTOM + 0.3, 0.7))
-    headline(figure, f"{title}: 99 % bands")
-    for row, test in zip(axes, tests, strict=True):
-        if test.acf is not None and test.acf_band is not None:
-            row[0].bar(np.arange(1, len(test.acf)), _floats(test.acf[1:]), color=BLUE, width=0.6)
-            row[0].axhspan(-test.acf_band, test.acf_band, color=GREY, alpha=0.5)
-        label(row[0], x="lag", y=f"residual of {test.name}", title="autocorrelation")
-        for (name, cross), color in zip(test.crossed.items(), _CYCLE, strict=False):
-            reach = len(cross.values) // 2
-            row[1].plot(
-                np.arange(-reach, reach + 1), _floats(cross.values), ".-", color=color, linewidth=0.8, label=name
-            )
-        if test.crossed:
-            row[1].axhspan(-test.cross_band, test.cross_band, color=GREY, alpha=0.5)
-            row[1].legend(fontsize=8, frameon=False)
-        label(row[1], x="lag behind the input", title="correlation with the inputs")
-        for name, curve in test.most_telling.items():
-            centres, means, errors = (_floats(values) for values in (curve.centres, curve.means, curve.errors))
-            row[2].errorbar(centres, means, 2.576 * errors, fmt="o", color=GREEN, markersize=3)
-            row[2].axhline(0.0, color=BLACK, linewidth=0.6)
-            label(row[2], x=name, title=f"mean over {name}, {percent(curve.share or 0.0)} explained")
-    return figure
-
-
-@plain
-def bias_figure(suspects: Sequence[SuspectResult]) -> Figure:
-    """Heat map of the bias of each parameter by each suspect, in per cent."""
-    names, labels = list(suspects[0].percent), [suspect.name for suspect in suspects]
-    shares = np.array([_floats([suspect.percent[name] for name in names]) for suspect in suspects])
-    written = shares.size <= _MOST_NUMBERS
-    left, bottom = 0.3 + 0.075 * max(map(len, labels)), BOTTOM if written else 0.3 + 0.09 * max(map(len, names))
-    width, height = left + (0.8 if written else 0.18) * len(names), TOP + bottom + 0.28 * len(suspects)
-    figure = Figure(figsize=(max(width + RIGHT, SIZE[0]), height))
-    ((axis,),) = grid(figure, 1, 1, left=left, bottom=bottom)
-    signed = np.sign(shares) * np.log10(1 + np.abs(shares))  # biases of 0.1 % and of 100 % both show
-    reach = max(float(np.nanmax(np.abs(signed), initial=0.0)), 1e-12)
-    axis.imshow(signed, cmap="PuOr", vmin=-reach, vmax=reach, aspect="auto")
-    for i, j in np.ndindex(*shares.shape) if written else ():
-        if np.isfinite(shares[i, j]):
-            dark = abs(signed[i, j]) > 0.6 * reach
-            color = "white" if dark else BLACK
-            axis.text(j, i, f"{shares[i, j]:+.2g}", ha="center", va="center", fontsize=7, color=color)
-    axis.set_xticks(range(len(names)), names, rotation=0 if written else 90)
-    axis.set_yticks(range(len(suspects)), labels, fontsize=8)
-    axis.tick_params(length=0)
-    axis.grid(visible=False)
-    axis.spines[:].set_visible(False)
-    headline(figure, "bias of each parameter [%] by terms that may be missing (without a guess: of 1 % of the output)")
-    return figure
-
-
-@plain
 def comparison_figure(rows: Sequence[RowResult]) -> Figure:
     """Scores and parameters of several ways of modelling, from the rows of a comparison.
 
@@ -276,7 +214,7 @@ def comparison_figure(rows: Sequence[RowResult]) -> Figure:
             if interval:
                 axis.plot([i, i], interval, "_-", color=GREEN, markersize=14)
             axis.plot([i], [entry.value], "o", color=GREEN, markerfacecolor=GREEN if interval else "white")
-        axis.set_ylabel(with_unit(parameter.name, parameter.unit))
+        axis.set_ylabel(parameter_label(parameter))
     for axis in axes:
         ruled(axis).margins(y=0.15)
     axes[-1].set_xticks(place, names, rotation=15, ha="right")

@@ -77,10 +77,21 @@ class ResidualTestResult(Content):
 
     @property
     def most_telling(self) -> dict[str, RegressorResult]:
-        """The regressor that explains most of it, by its name; none where none was looked at."""
+        """The regressor over which it is most surely curved, or that explains most of it where it is flat over all.
+
+        By its name; none where none was looked at.
+        """
         curves = {name: curve for name, curve in self.regressors.items() if curve is not None}
-        best = max(curves, key=lambda name: curves[name].share or 0.0, default=None)
+        curved = [name for name in self.curved_regressors if name in curves]
+        shares = {name: curve.share or 0.0 for name, curve in curves.items()}
+        best = min(curved, key=lambda name: (curves[name].p or 0.0, -shares[name]), default=None)
+        best = max(curves, key=lambda name: shares[name], default=None) if best is None else best
         return {} if best is None else {best: curves[best]}
+
+    @property
+    def strongest_acf(self) -> float | None:
+        """The autocorrelation that is the largest in size, with its sign."""
+        return max((value for value in (self.acf or [])[1:] if value is not None), key=abs, default=None)
 
 
 class RunningTestResult(Content):

@@ -87,15 +87,30 @@
     });
   }
 
-  /* Every name of a category axis; on a narrow screen on several lines. */
-  function named(figure, narrow) {
-    const names = [...new Set(figure.data.flatMap((trace) => trace.y))];
-    const lines = (name) => name.replace(/(.{12,}?)[ ,](?=.{4})/g, "$1<br>");
-    return { tickvals: names, ticktext: narrow ? names.map(lines) : names, tickfont: { color: "@soft", size: narrow ? 9 : 12 } };
+  const isNarrow = (width) => width < 520;
+  const namesOf = (figure) => [...new Set(figure.data.flatMap((trace) => trace.y))];
+  const lettered = (figure) => figure.data.some((trace) => trace.texttemplate);
+
+  /* Letters after which a name goes on below: on a narrow screen, and on paper beside cells that hold numbers; else 0. */
+  const folds = (figure, width) => (isNarrow(width) ? 12 : onPaper && lettered(figure) ? 24 : 0);
+  const broken = (name, after) => (after ? name.replace(new RegExp(`(.{${after},}?)[ ,](?=.{4})`, "g"), "$1<br>") : name);
+
+  /* Every name of a category axis. */
+  function named(figure, width) {
+    const names = namesOf(figure), after = folds(figure, width);
+    return { tickvals: names, ticktext: names.map((name) => broken(name, after)), tickfont: { color: "@soft", size: after ? 9 : 12 } };
+  }
+
+  /* Pixels by which a figure is higher than planned, so that names on several lines leave each other room. */
+  function taller(figure, width) {
+    if (figure.layout.yaxis?.type !== "category" || !folds(figure, width)) return 0;
+    const names = namesOf(figure), after = folds(figure, width);
+    const most = Math.max(...names.map((name) => broken(name, after).split("<br>").length));
+    return names.length * Math.max(0, 12 * most - (onPaper ? 16 : 22));
   }
 
   function layout(figure, from, width) {
-    const narrow = width < 520;
+    const narrow = isNarrow(width);
     const axis = {
       gridcolor: "@grid", linecolor: "@grid", zerolinecolor: "@grid", automargin: true, tickfont: { color: "@soft" },
       exponentformat: "power",
@@ -106,7 +121,7 @@
         own[key] = { ...axis, ...own[key] };
         if (own[key].title) own[key].title = { standoff: 6, ...own[key].title };
         if (narrow) own[key].nticks = own[key].nticks ?? 5;
-        if (key === "yaxis" && own[key].type === "category") Object.assign(own[key], named(figure, narrow));
+        if (key === "yaxis" && own[key].type === "category") Object.assign(own[key], named(figure, width));
       }
     }
     return coloured({
@@ -115,13 +130,15 @@
       hoverlabel: { bgcolor: "@shade", font: { color: "@ink" } },
       legend: { orientation: "h", x: 0, y: 1, yanchor: "bottom", xanchor: "left", bgcolor: "rgba(0,0,0,0)" },
       modebar: { bgcolor: "rgba(0,0,0,0)", color: "@soft", activecolor: "@ink" },
-      height: heightOf(figure), width, ...own,
+      height: heightOf(figure, width), width, ...own,
     }, from);
   }
 
   /* On paper plots are lower, so that few pages end where the next plot does not fit. */
-  const heightOf = (figure) => (onPaper ? Math.round(PAPER * figure.height) : figure.height);
-  const widthOf = (place) => (onPaper ? (figures[place.dataset.figure].small ? 320 : 660) : place.clientWidth);
+  const heightOf = (figure, width) => Math.round((onPaper ? PAPER : 1) * figure.height) + taller(figure, width);
+  const widthOf = (place) => (onPaper ? (figures[place.dataset.figure].small ? 320 : 660) : Math.max(place.clientWidth, least(place)));
+  /* Cells that hold numbers keep their width; what does not fit a narrow screen is scrolled. */
+  const least = (place) => Math.max(0, ...figures[place.dataset.figure].data.map((t) => (t.texttemplate ? 130 + 28 * t.x.length : 0)));
   const home = (figure) => figure.layout.xaxis?.range ?? [0, 1];
   const flown = (figure) => figure.data.some((trace) => trace.series || trace.minus);
 
@@ -129,9 +146,11 @@
     const figure = figures[place.dataset.figure], from = style();
     const now = place.layout && flown(figure) ? place.layout.xaxis.range : home(figure);
     const shown = layout(figure, from, widthOf(place));
-    place.style.height = `${heightOf(figure)}px`;
+    place.style.height = `${heightOf(figure, widthOf(place))}px`;
     if (flown(figure)) shown.xaxis.range = [...now];
-    return Plotly.react(place, coloured(traces(figure, now), from), shown, CONFIG);
+    const drawn = traces(figure, now);
+    if (isNarrow(shown.width) && lettered(figure)) drawn.forEach((trace) => { trace.textfont = { size: 8 }; });
+    return Plotly.react(place, coloured(drawn, from), shown, CONFIG);
   }
 
   /* After a zoom the curves are drawn anew, as finely as they are now seen. */

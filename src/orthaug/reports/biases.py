@@ -1,0 +1,75 @@
+"""Which biases by suspected terms a heat map shows, and how they are written in its cells."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthaug._base.checks import Matrix
+from orthaug._base.lines import counted, plain_number
+from orthaug.reports.findings import SuspectResult
+
+_MOST_COLUMNS = 12  # more cells beside each other are too narrow for their numbers on paper
+_MOST_CELLS = 200
+_LEAST = 0.01  # per cent: of less only that it is less is told, for a cell is narrow
+_ZERO = 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class BiasMap:
+    """The part of a bias table that is drawn, with a number in every cell.
+
+    `shares` (suspects, parameters) are in per cent, NaN where there is none; `colours` are their signed logarithms,
+    so that biases of 0.1 % and of 100 % both show, and lie within ± `reach`.
+    """
+
+    parameters: tuple[str, ...]
+    suspects: tuple[str, ...]
+    shares: Matrix
+    left_out: str
+    """A sentence on what the map leaves out; empty where it has all."""
+
+    @property
+    def colours(self) -> Matrix:
+        """What the colours stand for."""
+        return np.sign(self.shares) * np.log10(1 + np.abs(self.shares))
+
+    @property
+    def reach(self) -> float:
+        """The largest colour."""
+        return max(float(np.nanmax(np.abs(self.colours), initial=0.0)), 1e-12)
+
+    @property
+    def cells(self) -> list[list[str]]:
+        """What is written in them."""
+        return [[_cell(value) for value in row] for row in self.shares]
+
+
+def bias_map(suspects: Sequence[SuspectResult]) -> BiasMap:
+    """All biases, or those of the suspects and parameters with the largest ones, in the order of the result."""
+    names = list(suspects[0].percent)
+    shares = np.array([[suspect.percent[name] for name in names] for suspect in suspects], dtype=float)
+    shares = np.where(np.abs(shares) < _ZERO, 0.0, shares)
+    size = np.nan_to_num(np.abs(shares))
+    columns = _largest(size.max(axis=0), _MOST_COLUMNS)
+    rows = _largest(size[:, columns].max(axis=1, initial=0.0), _MOST_CELLS // max(len(columns), 1))
+    shown = [suspects[i].name for i in rows]
+    parts = [(len(rows), counted(len(suspects), "suspect")), (len(columns), counted(len(names), "parameter"))]
+    fewer = " and ".join(f"{count} of {whole}" for count, whole in parts if count < int(whole.partition(" ")[0]))
+    told = f"Shown are those with the largest biases, {fewer}; result.json has all." if fewer else ""
+    return BiasMap(tuple(names[j] for j in columns), tuple(shown), shares[np.ix_(rows, columns)], told)
+
+
+def _largest(size: np.ndarray, most: int) -> list[int]:
+    """The places of the largest values, in their order."""
+    return sorted(np.argsort(-size, kind="stable")[:most].tolist())
+
+
+def _cell(share: float) -> str:
+    if not np.isfinite(share):
+        return "–"
+    if share and abs(share) < _LEAST:
+        return f"< {_LEAST}"
+    return plain_number(share, sign="+").replace("-", "−") if share else "0"
