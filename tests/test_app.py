@@ -26,9 +26,12 @@ from test_cli import run, signals, write_csv
 from orthaug._base.errors import InputError
 from orthaug.commands.app import spec_text
 from orthaug.commands.app.gate import Gate
-from orthaug.commands.app.processes import Command, Desk
+from orthaug.commands.app.processes import Command, Desk, Run
 from orthaug.commands.app.session import Session, Sessions
 from orthaug.commands.app.worker import thinned
+from orthaug.commands.bars import training_bar
+from orthaug.commands.job import ALONE, AS_DECLARED, Variant
+from orthaug.commands.kinds import open_job
 from orthaug.commands.parts import expanded
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
@@ -186,6 +189,60 @@ def test_a_command_that_cannot_start_has_failed(monkeypatch):
     command = Command(["fit"], lambda: None)
     asyncio.run(command.run())
     assert (command.running, command.complaint) == (False, "the command cannot start (No such file or directory).")
+
+
+def test_lines_of_progress_say_what_each_run_is(csv, tmp_path, monkeypatch, capsys):
+    (tmp_path / "spec.toml").write_text(
+        f'[data]\ninputs = ["u"]\noutputs = ["y"]\ntrain = {{ files = ["{csv.as_posix()}"] }}\n'
+        '[[baseline.terms]]\nparameter = "a"\nregressor = "y[k-1]"\ninitial = 0.5\n'
+        "[learner]\nhidden = [4]\n[training]\nrestarts = 2\n"
+    )
+    job = open_job(tmp_path / "spec.toml")
+    runs = job.planned(AS_DECLARED)
+    assert [tuple(run.values()) for run in runs] == [
+        *(("orthogonal", 1, "none"), ("orthogonal", 2, "none"), ("orthogonal", 1, "ard"), ("orthogonal", 2, "ard"))
+    ]
+    assert len(runs) == job.run_count and job.planned(Variant(ALONE)) == ({"structure": ALONE},)
+    penalised = job.planned(Variant("baseline-penalty"))
+    assert {run["structure"] for run in penalised} == {"baseline-penalty"} and len(penalised) == 4
+    monkeypatch.setenv("ORTHAUG_PROGRESS", "json")
+    monkeypatch.setattr("orthaug.commands.bars._OFTEN", 0.0)
+    with training_bar(8, 10) as progress:
+        for first, plan in ((0, runs), (4, penalised)):
+            own = progress.after(runs=first)
+            own.planned(plan)
+            own(1, 3, 0.5)
+        own(4, 3, 0.5)  # made again: nothing was planned of it
+    lines = [json.loads(line) for line in capsys.readouterr().err.splitlines() if line.startswith("{")]
+    told = [Run.told(line) for line in lines]
+    assert told == [Run(2, "orthogonal", 2, "none"), Run(6, "baseline-penalty", 2, "none"), Run(9)]
+
+
+@served
+def test_curves_of_the_loss_are_named_by_start_or_by_structure():
+    from orthaug.commands.app.view_training import _runs_told
+    from orthaug.commands.app.widgets import loss_figure
+
+    def drawn(runs: list[Run]) -> tuple[list[str], list[str], dict[str, Any]]:
+        figure = loss_figure([(run, i, 0.5**i) for i in range(3) for run in runs])
+        legend = [trace["name"] for trace in figure["data"] if trace["showlegend"]]
+        return legend, [trace["hovertemplate"].partition("<br>")[0] for trace in figure["data"]], figure["layout"]
+
+    plan = [(start, kind) for kind in ("none", "ard") for start in (1, 2, 3)]
+    fit = [Run(i, "orthogonal", *own) for i, own in enumerate(plan, 1)]
+    legend, names, layout = drawn(fit)
+    assert legend == names == [f"start {start}, {kind}" for start, kind in plan]
+    assert layout["legend"]["yanchor"] == "bottom" and layout["margin"]["b"] >= 40 + 6 * 19  # below the axis
+    assert drawn(fit[:3])[0] == ["start 1", "start 2", "start 3"]
+    kinds = ("orthogonal", "additive", "<i>own</i>")
+    compared = [Run(0, "physics alone")]
+    compared += [Run(6 * i + run.number, kind, *run[2:]) for i, kind in enumerate(kinds) for run in fit]
+    legend, names, _ = drawn(compared)
+    assert legend == ["physics alone", "orthogonal", "additive", "&lt;i&gt;own&lt;/i&gt;"]
+    assert names[0] == "physics alone" and names[1] == "orthogonal, start 1, none" and len(set(names)) == 19
+    assert drawn([Run(1), Run(2)])[0] == ["run 1", "run 2"] and drawn([Run(1, "orthogonal", 1, "ard")])[0] == []
+    assert "(ard, none)" in _runs_told(set(fit)) and "The colour tells" in _runs_told(set(compared))
+    assert _runs_told({Run(1)}) == "Each curve is a run: one training."
 
 
 @served
