@@ -370,6 +370,7 @@ def started(tmp_path, monkeypatch) -> Iterator[Callable[..., Session]]:
 
 async def look(session: Session, name: str) -> None:
     session.open_file(session.place_for(name))
+    assert session._look is not None
     await session._look
 
 

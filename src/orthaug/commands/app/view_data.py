@@ -281,8 +281,9 @@ class DataView:
         """A file and its curves: of the training data that were checked, the file looked at where there are none."""
         session, checked = self.session, self.session.checked
         if checked is None:
-            known = session.found is not None and session.data is not None
-            return (session.data.name, session.found["curves"]) if known else ("", {})
+            if session.found is None or session.data is None:
+                return "", {}
+            return session.data.name, session.found["curves"]
         trained = [Path(file) for file in checked["files"]]
         place = next((place for place in (session.data, *session.raw) if place in trained), None)
         return ("", {}) if place is None else (place.name, session.raw.get(place, {}))
