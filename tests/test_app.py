@@ -26,9 +26,12 @@ from test_cli import run, signals, write_csv
 from orthaug._base.errors import InputError
 from orthaug.commands.app import spec_text
 from orthaug.commands.app.gate import Gate
-from orthaug.commands.app.processes import Command, Desk
+from orthaug.commands.app.processes import Command, Desk, Run
 from orthaug.commands.app.session import Session, Sessions
 from orthaug.commands.app.worker import thinned
+from orthaug.commands.bars import training_bar
+from orthaug.commands.job import ALONE, AS_DECLARED, Variant
+from orthaug.commands.kinds import open_job
 from orthaug.commands.parts import expanded
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
@@ -188,6 +191,60 @@ def test_a_command_that_cannot_start_has_failed(monkeypatch):
     assert (command.running, command.complaint) == (False, "the command cannot start (No such file or directory).")
 
 
+def test_lines_of_progress_say_what_each_run_is(csv, tmp_path, monkeypatch, capsys):
+    (tmp_path / "spec.toml").write_text(
+        f'[data]\ninputs = ["u"]\noutputs = ["y"]\ntrain = {{ files = ["{csv.as_posix()}"] }}\n'
+        '[[baseline.terms]]\nparameter = "a"\nregressor = "y[k-1]"\ninitial = 0.5\n'
+        "[learner]\nhidden = [4]\n[training]\nrestarts = 2\n"
+    )
+    job = open_job(tmp_path / "spec.toml")
+    runs = job.planned(AS_DECLARED)
+    assert [tuple(run.values()) for run in runs] == [
+        *(("orthogonal", 1, "none"), ("orthogonal", 2, "none"), ("orthogonal", 1, "ard"), ("orthogonal", 2, "ard"))
+    ]
+    assert len(runs) == job.run_count and job.planned(Variant(ALONE)) == ({"structure": ALONE},)
+    penalised = job.planned(Variant("baseline-penalty"))
+    assert {run["structure"] for run in penalised} == {"baseline-penalty"} and len(penalised) == 4
+    monkeypatch.setenv("ORTHAUG_PROGRESS", "json")
+    monkeypatch.setattr("orthaug.commands.bars._OFTEN", 0.0)
+    with training_bar(8, 10) as progress:
+        for first, plan in ((0, runs), (4, penalised)):
+            own = progress.after(runs=first)
+            own.planned(plan)
+            own(1, 3, 0.5)
+        own(4, 3, 0.5)  # made again: nothing was planned of it
+    lines = [json.loads(line) for line in capsys.readouterr().err.splitlines() if line.startswith("{")]
+    told = [Run.told(line) for line in lines]
+    assert told == [Run(2, "orthogonal", 2, "none"), Run(6, "baseline-penalty", 2, "none"), Run(9)]
+
+
+@served
+def test_curves_of_the_loss_are_named_by_start_or_by_structure():
+    from orthaug.commands.app.view_training import _runs_told
+    from orthaug.commands.app.widgets import loss_figure
+
+    def drawn(runs: list[Run]) -> tuple[list[str], list[str], dict[str, Any]]:
+        figure = loss_figure([(run, i, 0.5**i) for i in range(3) for run in runs])
+        legend = [trace["name"] for trace in figure["data"] if trace["showlegend"]]
+        return legend, [trace["hovertemplate"].partition("<br>")[0] for trace in figure["data"]], figure["layout"]
+
+    plan = [(start, kind) for kind in ("none", "ard") for start in (1, 2, 3)]
+    fit = [Run(i, "orthogonal", *own) for i, own in enumerate(plan, 1)]
+    legend, names, layout = drawn(fit)
+    assert legend == names == [f"start {start}, {kind}" for start, kind in plan]
+    assert layout["legend"]["yanchor"] == "bottom" and layout["margin"]["b"] >= 40 + 6 * 19  # below the axis
+    assert drawn(fit[:3])[0] == ["start 1", "start 2", "start 3"]
+    kinds = ("orthogonal", "additive", "<i>own</i>")
+    compared = [Run(0, "physics alone")]
+    compared += [Run(6 * i + run.number, kind, *run[2:]) for i, kind in enumerate(kinds) for run in fit]
+    legend, names, _ = drawn(compared)
+    assert legend == ["physics alone", "orthogonal", "additive", "&lt;i&gt;own&lt;/i&gt;"]
+    assert names[0] == "physics alone" and names[1] == "orthogonal, start 1, none" and len(set(names)) == 19
+    assert drawn([Run(1), Run(2)])[0] == ["run 1", "run 2"] and drawn([Run(1, "orthogonal", 1, "ard")])[0] == []
+    assert "(ard, none)" in _runs_told(set(fit)) and "The colour tells" in _runs_told(set(compared))
+    assert _runs_told({Run(1)}) == "Each curve is a run: one training."
+
+
 @served
 def test_a_part_of_the_page_that_fails_keeps_no_other_from_what_is_new(tmp_path, monkeypatch):
     from orthaug.commands.app.page import Page
@@ -270,6 +327,143 @@ def test_sessions_that_nobody_used_make_room(tmp_path):
             session.data = first.data
     with pytest.raises(InputError, match="50 pieces of work are open"):
         sessions.new()
+
+
+def looked(**given: Any) -> dict[str, Any]:
+    """What a look at a file with the columns left and right gives."""
+    columns = [{"header": head, "kind": "", "usable": True, "timed": False, "told": ""} for head in ("left", "right")]
+    curves = {head: {"x": [0.0, 1.0], "y": [0.0, 1.0]} for head in ("left", "right")}
+    plain = {"columns": columns, "curves": curves, "rows": 2, "timed": "", "step": None, "account": "", "open": ""}
+    return plain | {"spec": None} | given
+
+
+class Answers:
+    """In place of a desk: a spec for what is chosen, or for every file where `tells`; nothing of specs."""
+
+    def __init__(self, tells: bool = False) -> None:
+        self.tells = tells
+
+    async def ask(self, question: str, **given: Any) -> dict[str, Any]:
+        if question == "examine":
+            raise InputError("nothing is checked here.")
+        chosen = given["inputs"] is not None
+        if not (chosen or self.tells):
+            return looked()
+        inputs, outputs = given["inputs"] or "left", given["outputs"] or "right"
+        file = given["path"].name
+        channels = f'inputs = ["{inputs}"]\noutputs = ["{outputs}"]'
+        spec = f'[data]\n{channels}\ntrain = {{ files = ["{file}"], rows = [0, 2] }}\n'
+        return looked(spec=spec, inputs=[inputs], outputs=[outputs])
+
+
+@pytest.fixture
+def started(tmp_path, monkeypatch) -> Iterator[Callable[..., Session]]:
+    """Sessions whose desk answers at once."""
+    monkeypatch.setattr("platformdirs.user_state_path", lambda name: tmp_path / "state" / name)
+    (tmp_path / "work").mkdir()
+
+    def begin(*, tells: bool = False) -> Session:
+        return Session("secret-key", tmp_path / "work", Answers(tells))  # type: ignore[arg-type]
+
+    yield begin
+
+
+async def look(session: Session, name: str) -> None:
+    session.open_file(session.place_for(name))
+    assert session._look is not None
+    await session._look
+
+
+@pytest.mark.parametrize("tells", [False, True])
+def test_a_further_file_leaves_the_spec_and_may_be_a_test_of_it(started, tells):
+    async def worked() -> None:
+        session = started(tells=tells)
+        await look(session, "motor_train.csv")
+        assert session.title == "motor_train.csv" and bool(session.spec) == tells and not session.apart
+        if not tells:
+            session.choose(["left"], ["right"], None)
+            await session._look
+        begun = session.spec
+        await look(session, "motor_test.csv")
+        assert (session.spec, session.title, session.apart) == (begun, "motor_train.csv", True)
+        assert {path.name for path in session.raw} == {"motor_train.csv", "motor_test.csv"}
+        session.add_test()
+        assert not session.apart
+        await look(session, "motor_test.csv")
+        await look(session, "motor_train.csv")  # the spec was worked on, and names both
+        assert not session.apart and tomllib.loads(session.spec)["data"]["tests"] == {
+            "motor_test": {"files": ["motor_test.csv"]}
+        }
+        await look(session, "other.csv")
+        session.choose(["right"], ["left"], None)
+        await session._look
+        assert tomllib.loads(session.spec)["data"]["train"]["files"] == ["other.csv"] and not session.apart
+        assert session.title == "other.csv" and {path.name for path in session.raw} >= {"other.csv"}
+        await session.close()
+
+    asyncio.run(worked())
+    assert sorted(map(spec_text.kept_title, spec_text.earlier())) == ["motor_train.csv", "other.csv"]
+
+
+def test_a_file_that_is_dropped_again_begins_a_spec_that_nobody_worked_on_anew(started):
+    async def worked() -> None:
+        session = started(tells=True)
+        await look(session, "a.csv")
+        session.authors.clear()
+        session.spec = session.spec.replace("rows", "every")
+        await look(session, "a.csv")
+        assert "rows" in session.spec
+        session.write(session.spec.replace("rows", "every"), "editor")
+        await look(session, "a.csv")
+        assert "every" in session.spec and not session.apart
+        session.add_test()
+        session.add_test()  # no test takes the place of another
+        assert list(session.content()["data"]["tests"]) == ["a", "a_"]
+        await session.close()
+
+    asyncio.run(worked())
+
+
+def test_a_spec_tells_its_files_and_columns():
+    content = tomllib.loads(SPEC + '[structure]\nmeasure = { kind = "file", files = ["m.csv"] }\n')
+    assert spec_text.files(content) == ["run.csv", "/there/b.csv", "../c.csv", "m.csv"]
+    content["data"]["channels"] = {"u": {"column": "Force (N)"}, "y": {"unit": "m"}}
+    assert spec_text.columns(content) == {"Force (N)": "input", "y": "output"}
+    assert spec_text.files({}) == [] and spec_text.columns({}) == {}
+
+
+@served
+def test_the_channels_and_the_grey_curves_are_those_of_the_spec(started):
+    from orthaug.commands.app.view_data import DataView
+    from orthaug.commands.app.view_results import ExportView
+
+    async def worked() -> Session:
+        session = started()
+        await look(session, "motor_train.csv")
+        session.choose(["left"], ["right"], None)
+        await session._look
+        await look(session, "motor_test.csv")
+        await session.close()
+        return session
+
+    session = asyncio.run(worked())
+    view, export = DataView(session), ExportView(session)
+    assert session.found is not None and session.data is not None
+    assert view._whole_file()[0] == "motor_test.csv"  # nothing was checked yet
+    view._take_uses(session.found)
+    assert view.uses == {"left": "input", "right": "output"} and view._lacking(session.found) == []
+    session.checked = {"files": [str(session.folder / "motor_train.csv")]}
+    assert view._whole_file() == ("motor_train.csv", session.raw[session.folder / "motor_train.csv"])
+    session.raw.clear()
+    assert view._whole_file() == ("", {})
+    assert export._beside() == ["motor_train.csv"]
+    session.spec = spec_text.with_value(session.spec, ("data", "tests", "a"), {"files": ["motor_test.csv", "/b.csv"]})
+    assert export._beside() == ["motor_train.csv", "motor_test.csv"]
+    session.spec = session.spec.replace('"left"', '"up"')
+    assert view._lacking(session.found) == ["up"]
+    view._drawn = (None, None, False)
+    view._take_uses(session.found)
+    assert view.uses == {"left": "", "right": ""}
 
 
 def test_what_cannot_be_served_is_said(tmp_path, monkeypatch):
@@ -719,9 +913,17 @@ def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
     page.get_by_label("cutoff").press("Enter")
     page.wait_for_selector("text=2 Hz is not below")
     page.get_by_role("button", name="Remove step 1").click()
+    own = page.inner_text(".head .hint")
     tab.drop(tmp_path / "own.csv")
+    page.wait_for_selector("text=own.csv is no part of them")
+    assert page.inner_text(".head .hint") == own and page.get_by_text("The names of the columns").count() == 0
+    assert [page.get_by_label(f"use of {name}").input_value() for name in ("force", "<i>way</i>")] == [
+        *("input", "output")
+    ]
     page.get_by_role("button", name="Take it as a test").click()
     page.wait_for_selector("text=tests.own")
+    tab.go("Export")
+    page.wait_for_selector("text=The spec names own.csv: let the two stand in one folder")
     added = tab.fetch("spec.toml").decode()
     assert tomllib.loads(added)["data"]["tests"].pop("own") == {"files": ["own.csv"]} and kept.splitlines()[0] in added
     assert tab.get("spec.toml?show=true").headers["content-disposition"][:10] == "attachment"

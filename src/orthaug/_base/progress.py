@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 Tell = Callable[[int, int, float], None]
 """Called now and then with the number of the run, its iteration and the loss; it may raise to stop the training.
 
 What it raises ends it without a result, but for `Enough`.
 """
+
+
+Plan = Sequence[Mapping[str, Any]]
+"""What is known of each run of a fit: `structure`, `start` from 1 on, `regularization`."""
 
 
 RunTell = Callable[[int, float], None]
@@ -22,6 +27,10 @@ class Enough(Exception):
 
 def quiet(iteration: int, loss: float) -> None:
     """Nobody listens to a run."""
+
+
+def _unplanned(first: int, plan: Plan) -> None:
+    """Nobody asks what the runs are."""
 
 
 def _nothing(run: int, iteration: int, loss: float) -> None:
@@ -43,6 +52,8 @@ class Progress:
     tell: Tell = _nothing
     runs: int = 0
     iterations: int = 0
+    plan: Callable[[int, Plan], None] = _unplanned
+    """Called with the number of the first run of a fit, and what is known of its runs."""
 
     def __call__(self, run: int, iteration: int, loss: float) -> None:
         self.tell(self.runs + run, self.iterations + iteration, loss)
@@ -50,6 +61,10 @@ class Progress:
     def after(self, *, runs: int = 0, iterations: int = 0) -> Progress:
         """The progress of what follows so many runs or iterations."""
         return replace(self, runs=self.runs + runs, iterations=self.iterations + iterations)
+
+    def planned(self, plan: Plan) -> None:
+        """Say what the runs that follow are."""
+        self.plan(self.runs, plan)
 
     def of(self, run: int) -> RunTell:
         """What one run tells: its iteration and the loss."""

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from orthaug._base.progress import SILENT, Enough, Progress, Tell
+from orthaug._base.progress import SILENT, Enough, Plan, Progress, Tell
 from orthaug.commands import streams
 from orthaug.commands.signals import WATCH
 from orthaug.commands.streams import say
@@ -69,7 +69,7 @@ def training_bar(runs: int, iterations: int, wanted: bool = True, rows: int = 0)
     ):
         task = bar.add_task("compiling", total=runs * iterations)
         done: dict[int, int] = {}
-        line = _lines(runs, iterations)
+        line = _Lines(runs, iterations)
 
         def tell(run: int, iteration: int, loss: float) -> None:
             nonlocal reached
@@ -86,28 +86,34 @@ def training_bar(runs: int, iterations: int, wanted: bool = True, rows: int = 0)
                 raise Enough
 
         try:
-            yield Progress(tell)
+            yield Progress(tell, plan=line.planned)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(reached) from None
         if interrupted.is_set():
             raise KeyboardInterrupt("the scoring of the model")
 
 
-def _lines(runs: int, iterations: int) -> Callable[[int, int, float, int], None]:
-    """What writes a line of JSON now and then, for a program that follows this one; nothing unless it is asked for."""
-    if os.environ.get(TOLD_AS) != "json":
-        return lambda run, iteration, loss, passes: None
-    last = -_OFTEN
+class _Lines:
+    """Writes a line of JSON now and then, for a program that follows this one; nothing unless it is asked for."""
 
-    def write(run: int, iteration: int, loss: float, passes: int) -> None:
-        nonlocal last
-        if time.monotonic() - last >= _OFTEN:
-            last = time.monotonic()
-            told = {"run": run + 1, "runs": runs, "iteration": iteration, "iterations": iterations}
-            share = min(1.0, passes / max(runs * iterations, 1))
-            streams.say(json.dumps({**told, "loss": loss if math.isfinite(loss) else None, "done": share}))
+    def __init__(self, runs: int, iterations: int) -> None:
+        self.runs, self.iterations = runs, iterations
+        self._wanted, self._last = os.environ.get(TOLD_AS) == "json", -_OFTEN
+        self._first, self._plan = 0, ()
 
-    return write
+    def planned(self, first: int, plan: Plan) -> None:
+        """The runs from this number on are these."""
+        self._first, self._plan = first, tuple(plan)
+
+    def __call__(self, run: int, iteration: int, loss: float, passes: int) -> None:
+        if not self._wanted or time.monotonic() - self._last < _OFTEN:
+            return
+        self._last = time.monotonic()
+        told = {"run": run + 1, "runs": self.runs, "iteration": iteration, "iterations": self.iterations}
+        share = min(1.0, passes / max(self.runs * self.iterations, 1))
+        own = run - self._first  # one that is made again has a number after those that are planned
+        known = self._plan[own] if 0 <= own < len(self._plan) else {}
+        streams.say(json.dumps({**told, "loss": loss if math.isfinite(loss) else None, "done": share, **known}))
 
 
 @contextmanager

@@ -112,6 +112,7 @@ def keeping(job: Job, folder: Path, *, resume: bool = False) -> Job:
 
 def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> Fitted:
     """Train a variant of a job and score every part; `judge_fit` asks whether the learner helps."""
+    progress.planned(job.planned(variant))
     return told_of(job, job.run(variant, progress))
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from orthaug import __version__
 from orthaug._base.errors import InputError
 from orthaug._base.parallel import Threads
-from orthaug._base.progress import SILENT, Progress
+from orthaug._base.progress import SILENT, Plan, Progress
 from orthaug._base.warning import Warning
 from orthaug.commands.parts import Part
 from orthaug.commands.spec import Spec, load_spec
@@ -126,7 +126,24 @@ class Job(ABC):
     @property
     def run_count(self) -> int:
         """How many runs a fit makes: restarts times regularizations."""
-        return self.spec.runs(linear=False)
+        return self.spec.runs(linear=self.linear)
+
+    @property
+    def linear(self) -> bool:
+        """Whether the physics is linear in θ."""
+        return False
+
+    def planned(self, variant: Variant) -> Plan:
+        """What is known of each run of a variant; nothing where fits to new weights of the outputs follow."""
+        spec = self.spec
+        if spec.training.output_weights == "covariance":
+            return ()
+        if variant.alone or spec.declared_learner() is None:
+            return ({"structure": ALONE},)
+        kind, validated = variant.kind or spec.structure.kind, spec.data.validation is not None
+        choices = spec.regularizations(linear=self.linear, validated=validated, kind=kind)
+        starts = range(1, spec.training.restarts + 1)
+        return tuple({"structure": kind, "start": i, "regularization": choice} for choice in choices for i in starts)
 
     @property
     def iterations(self) -> int:

@@ -63,8 +63,8 @@ class LaggedJob(Job):
         return self.problem.rows.start
 
     @property
-    def run_count(self) -> int:
-        return self.spec.runs(linear=self.problem.baseline.linear)
+    def linear(self) -> bool:
+        return self.problem.baseline.linear
 
     @property
     def compared(self) -> tuple[str, ...]:

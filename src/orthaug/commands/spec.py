@@ -323,10 +323,10 @@ class Spec(Section):
         flown = self.declared_criterion().flown
         return self.motion is not None or (flown is not None and not flown.segment)
 
-    def regularizations(self, *, linear: bool, validated: bool) -> tuple[str | float, ...]:
-        """Those that every start is run with."""
+    def regularizations(self, *, linear: bool, validated: bool, kind: str | None = None) -> tuple[str | float, ...]:
+        """Those that every start is run with, in the structure that is declared or another kind."""
         given = self.training.regularization
-        declared = (self.declared_solver(), self.declared_criterion(), self.declared_structure())
+        declared = (self.declared_solver(), self.declared_criterion(), self.declared_structure(kind))
         conditions: dict[str, Any] = {"linear": linear, "validated": validated}
         return tried(given, *declared, **conditions, motion=self.motion is not None, learner=self.declared_learner())
 

@@ -7,10 +7,10 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from orthaug._base.errors import InputError
 from orthaug.commands.bars import ENOUGH_LINE, TOLD_AS
@@ -21,6 +21,21 @@ _GRACE = 8.0  # s for a process to end by itself
 _AT_ONCE = 2  # questions
 
 
+class Run(NamedTuple):
+    """A run of training, as lines of progress tell of it: empty or 0 what they leave out."""
+
+    number: int
+    structure: str = ""
+    start: int = 0
+    regularization: str = ""
+
+    @classmethod
+    def told(cls, line: Mapping[str, Any]) -> Run:
+        """That of a line."""
+        kind = str(line.get("regularization", ""))
+        return cls(line["run"], line.get("structure", ""), line.get("start", 0), kind)
+
+
 @dataclass(eq=False)
 class Command:
     """A command of the program that runs in a child process."""
@@ -29,7 +44,7 @@ class Command:
     changed: Callable[[], None]
     progress: dict[str, Any] = field(default_factory=dict)
     """The last that was told: `run`, `runs`, `iteration`, `loss`, `done` (share)."""
-    losses: list[tuple[int, int, float]] = field(default_factory=list)
+    losses: list[tuple[Run, int, float | None]] = field(default_factory=list)
     """(run, iteration, loss) as told."""
     lines: list[str] = field(default_factory=list)
     began: float = 0.0
@@ -91,7 +106,7 @@ class Command:
                 self.lines = [*self.lines, line][-_LINES:]
             else:
                 self.progress = told
-                self.losses.append((told["run"], told["iteration"], told["loss"]))
+                self.losses.append((Run.told(told), told["iteration"], told["loss"]))
             self.changed()
         return await self.process.wait()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import re
 import secrets
 import shutil
@@ -11,13 +12,14 @@ import zipfile
 from collections import Counter
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 from orthaug._base.errors import InputError
 from orthaug._base.log import LOG
 from orthaug.commands.app.processes import Command, Desk
-from orthaug.commands.app.spec_text import absolute, in_file, keep, kept_title, plain, with_value
+from orthaug.commands.app.spec_text import absolute, files, in_file, keep, kept_title, plain, section, with_value
 from orthaug.data.tables import KNOWN
 
 _SESSIONS = 50  # that are kept at once
@@ -35,13 +37,13 @@ class Session:
         """What the work is called: the file that it began with."""
         self.data: Path | None = None
         self.found: dict[str, Any] | None = None
+        self.raw: dict[Path, dict[str, Any]] = {}
+        """By file that was looked at, the curves of its columns."""
         self.looking = ""
         self.trouble = ""
         """What is wrong with the data."""
         self.unfit = ""
         """Why the chosen channels make no spec."""
-        self.kept = False
-        """Whether a file was looked at that the spec, which a person has worked on, was not begun anew for."""
         self.spec = ""
         self.kept_as = ""
         """The title under which its spec is kept when the server ends; empty until there is something to keep."""
@@ -110,9 +112,10 @@ class Session:
 
     def open_file(self, path: Path) -> None:
         """Look at a data file, and begin a spec for it where its columns tell what they are."""
-        self.data, self.found, self.title = path, None, path.name
+        self.data, self.found = Path(os.path.abspath(path)), None
+        self.title = (self.spec.strip() and self.title) or path.name
         self._look_again(None, None, None)
-        if self.edited:  # it may name this file
+        if self.spec.strip():  # it may name this file
             self._check_soon()
 
     def choose(self, inputs: Sequence[str], outputs: Sequence[str], step: float | None) -> None:
@@ -135,10 +138,10 @@ class Session:
                 self.unfit = found["open"]
             else:
                 self.found = found
-            self.kept = inputs is None and self.edited
-            if found["spec"] is not None and not self.kept:
-                own = self.data.parent == self.folder  # a file that was dropped stands beside the spec
-                self.write(found["spec"] if own else absolute(found["spec"], self.folder), "look")
+            kept = {path: curves for path, curves in self.raw.items() if self.names(path)}
+            self.raw = kept | {self.data: found["curves"]}
+            if found["spec"] is not None and (inputs is not None or self._may_begin):
+                self._begin(found["spec"])
         except InputError as error:
             if self.found is None:
                 self.trouble = self.worded(error)
@@ -149,17 +152,36 @@ class Session:
             self.changed("data")
 
     @property
-    def edited(self) -> bool:
-        """Whether there is a spec that somebody has worked on."""
-        return bool(self.spec.strip()) and not set(self.authors) <= {"look"}
+    def _may_begin(self) -> bool:
+        """Whether looking at a file may begin the spec: there is none, or one that it began and nobody worked on."""
+        return not self.spec.strip() or (set(self.authors) <= {"look"} and not self.apart)
+
+    def _begin(self, spec: str) -> None:
+        assert self.data is not None
+        if self.title != self.data.name:  # the earlier work keeps its name
+            self.title, self.kept_as = self.data.name, ""
+        own = self.data.parent == self.folder  # a file that was dropped stands beside the spec
+        self.write(spec if own else absolute(spec, self.folder), "look")
+
+    @property
+    def apart(self) -> bool:
+        """Whether the file that was looked at is one that the spec does not name."""
+        return self.data is not None and bool(self.spec.strip()) and not self.names(self.data)
+
+    def names(self, file: Path) -> bool:
+        """Whether the spec names a file, or has a pattern for it."""
+        whole = os.path.abspath(file)
+        named = [os.path.abspath(self.folder / name) for name in files(self.content())]
+        return any(whole == name or fnmatch(whole, name) for name in named)
 
     def add_test(self) -> None:
         """Let the file that was looked at be a test of the spec."""
         assert self.data is not None
         file = self.data.name if self.data.parent == self.folder else self.data.as_posix()
-        name = re.sub(r"\W", "_", self.data.stem)
+        taken, name = section(self.content(), "data", "tests"), re.sub(r"\W", "_", self.data.stem)
+        while name in taken:
+            name += "_"
         self.edit("test", with_value, ("data", "tests", name), {"files": [file]})
-        self.kept = False
         self.changed("data")
 
     def open_spec(self, path: Path, *, kept: bool = False) -> None:
@@ -311,15 +333,12 @@ class Session:
             place = self.folder / "download.toml"
             place.write_text(self.spec, encoding="utf-8")
             return place
-        files = {
-            "report.html": "fit/report.html",
-            "result.json": "fit/result.json",
-            "comparison.html": "compare/report.html",
-        }
+        single = {"report.html": "fit/report.html", "result.json": "fit/result.json"}
+        single["comparison.html"] = "compare/report.html"
         folders = {"model.zip": "fit/model", "result.zip": "fit", "comparison.zip": "compare"}
         folders |= {f"{target}.zip": f"export/{target}" for target, why in self.exports.items() if not why}
-        if what in files and (self.folder / files[what]).is_file():
-            return self.folder / files[what]
+        if what in single and (self.folder / single[what]).is_file():
+            return self.folder / single[what]
         if what in folders and (self.folder / folders[what]).is_dir():
             return _zipped(self.folder / folders[what], self.folder / f"download-{what}")
         raise InputError("there is nothing of that name yet.")

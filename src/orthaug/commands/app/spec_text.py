@@ -101,6 +101,18 @@ def _with_files(document: Mapping[str, Any]) -> Iterator[Any]:
             yield entry
 
 
+def files(content: Mapping[str, Any]) -> list[str]:
+    """Every data file that a spec names, the training data first, each once."""
+    return list(dict.fromkeys(file for entry in _with_files(content) for file in names(entry, "files")))
+
+
+def columns(content: Mapping[str, Any]) -> dict[str, str]:
+    """Of the columns of a file that hold the channels: whether each is an `input` or an `output`."""
+    data = section(content, "data")
+    kinds = {name: kind for kind in ("input", "output") for name in names(data, f"{kind}s")}
+    return {str(section(data, "channels", name).get("column") or name): kind for name, kind in kinds.items()}
+
+
 def section(content: Mapping[str, Any], *path: str) -> Mapping[str, Any]:
     """The table at the end of the path; an empty one where there is none, or something else in its place."""
     for key in path:

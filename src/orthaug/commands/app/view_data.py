@@ -34,6 +34,8 @@ from orthaug.data.record import check_step
 
 _STEPS = ("data", "prepare")
 _LISTED = 40  # columns
+_COLUMNS = ("input ", "output ")  # begins of lines of an account that tell of columns, which stand by themselves
+_DRAFT = ("first physics", "test:")  # of lines that tell of a spec for the file
 _OFFERED = 5  # specs of earlier work
 _USES = {"": "leave out", "input": "input", "output": "output"}
 _SUMMARIES = {
@@ -69,6 +71,7 @@ class DataView:
         self.step = ""
         self.kind = next(iter(STEPS))
         self._curves: Any = None
+        self._apart = False
         self._drawn: tuple[Any, Any, bool] = (None, None, False)
 
     def draw(self) -> None:
@@ -104,27 +107,7 @@ class DataView:
     def follow_data(self) -> None:
         """What was seen in the file."""
         session, found = self.session, self.session.found
-        with redrawn(self.status):
-            if session.looking:
-                note(session.looking, "busy")
-            elif session.trouble:
-                note(session.trouble, "bad")
-            elif found is not None and session.data is not None:
-                lines = found["account"].splitlines() or [f"{session.data.name}: {found['rows']} rows"]
-                text(lines[0], "p", "strong")
-                with ui.element("ul").classes("account"):
-                    for line in [one for one in lines[1:] if not one.startswith(("input ", "output "))]:
-                        text(line, "li")
-                if session.kept:
-                    note("The spec is kept as it is. Take this file as a test of it, or begin anew below.", "care")
-                    button("Take it as a test", session.add_test)
-            elif not session.spec and (kept := spec_text.earlier()[:_OFFERED]):
-                text("Or go on with the spec of earlier work:", "p", "hint")
-                with ui.element("div").classes("fields"):
-                    for place in kept:
-                        when = datetime.fromtimestamp(place.stat().st_mtime)
-                        label = f"{spec_text.kept_title(place)}, {when:%Y-%m-%d %H:%M}"
-                        button(label, partial(session.open_spec, place, kept=True))
+        self._draw_status()
         self.columns.set_visibility(found is not None)
         state = (session.data, found, bool(session.spec))
         if found is not None and any(a is not b for a, b in zip(state, self._drawn, strict=True)):
@@ -136,8 +119,57 @@ class DataView:
                 note(sentence(session.unfit), "bad")
         self.follow_check()
 
+    def _draw_status(self) -> None:
+        session, found = self.session, self.session.found
+        self._apart = session.apart
+        with redrawn(self.status):
+            if session.looking:
+                note(session.looking, "busy")
+            elif session.trouble:
+                note(session.trouble, "bad")
+            elif found is not None and session.data is not None:
+                lines = found["account"].splitlines() or [f"{session.data.name}: {found['rows']} rows"]
+                text(lines[0], "p", "strong")
+                with ui.element("ul").classes("account"):
+                    untold = _COLUMNS if session.data in self._trained() or not session.spec else (*_COLUMNS, *_DRAFT)
+                    for line in [one for one in lines[1:] if not one.startswith(untold)]:
+                        text(line, "li")
+                if self._apart:
+                    self._offer_test(found)
+            elif not session.spec and (kept := spec_text.earlier()[:_OFFERED]):
+                text("Or go on with the spec of earlier work:", "p", "hint")
+                with ui.element("div").classes("fields"):
+                    for place in kept:
+                        when = datetime.fromtimestamp(place.stat().st_mtime)
+                        label = f"{spec_text.kept_title(place)}, {when:%Y-%m-%d %H:%M}"
+                        button(label, partial(session.open_spec, place, kept=True))
+
+    def _offer_test(self, found: Mapping[str, Any]) -> None:
+        """What may be done with a file that the spec does not name."""
+        told, lacking = "The spec is kept as it is", self._lacking(found)
+        if trained := self._trained():
+            told += f"; it trains on {', '.join(file.name for file in trained)}"
+        if lacking:
+            told += f". This file has no column {', '.join(lacking)}, which the spec reads"
+        note(f"{told}. Take this file as a test of it, or begin anew below.", "care")
+        button("Take it as a test", self.session.add_test, main=not lacking)
+
+    def _trained(self) -> list[Path]:
+        """The files that the spec trains on."""
+        train = spec_text.section(self.session.content(), "data", "train")
+        return [self.session.folder / file for file in spec_text.names(train, "files")]
+
+    def _lacking(self, found: Mapping[str, Any]) -> list[str]:
+        """The columns that the spec reads and the file does not have."""
+        heads = {column["header"] for column in found["columns"]}
+        return [column for column in spec_text.columns(self.session.content()) if column not in heads]
+
+    def _of_spec(self, found: Mapping[str, Any]) -> dict[str, str]:
+        """The use of each column in the spec; empty where there is none, or where the file lacks one of them."""
+        return {} if self._lacking(found) else spec_text.columns(self.session.content())
+
     def _take_uses(self, found: Mapping[str, Any]) -> None:
-        """The use of each column: of a further look at the same file what was chosen for it, otherwise what it says."""
+        """The use of each column: what the spec makes of it, otherwise what was chosen or what the file says."""
         data, before, _ = self._drawn
         if found is before:
             return
@@ -145,7 +177,9 @@ class DataView:
             self.step = ""
         inputs, outputs = found.get("inputs"), found.get("outputs")
         self.uses = {column["header"]: column["kind"] for column in found["columns"] if column["usable"]}
-        if inputs is not None and outputs is not None:
+        if of_spec := self._of_spec(found):
+            self.uses = {h: of_spec.get(h, "") for h in self.uses}
+        elif inputs is not None and outputs is not None:
             self.uses = {h: "input" if h in inputs else "output" if h in outputs else "" for h in self.uses}
 
     def _draw_columns(self, found: Mapping[str, Any]) -> None:
@@ -166,7 +200,7 @@ class DataView:
             if not usable:
                 note("No column of this file is a signal that changes: there is nothing to fit.", "bad")
                 return
-            if found["spec"] is None:
+            if found["spec"] is None and not self._of_spec(found):
                 names = "The names of the columns do not say which are inputs and outputs: choose them here."
                 note(found["open"] or names, "care")
             with ui.element("div").classes("fields"):
@@ -175,10 +209,9 @@ class DataView:
                 self.step_field = field(
                     label, self.step, partial(setattr, self, "step"), classes="medium", hint=step or "1"
                 )
-                anew = "" if found["spec"] is None and not self.session.spec else "anew "
-                button(f"Begin {anew}with these channels", self.choose, main=found["spec"] is None).props(
-                    "data-place=begin"
-                )
+                first = found["spec"] is None and not self.session.spec
+                begin = button(f"Begin {'' if first else 'anew '}with these channels", self.choose, main=first)
+                begin.props("data-place=begin")
 
     def choose(self) -> None:
         chosen = {kind: [h for h, use in self.uses.items() if use == kind] for kind in ("input", "output")}
@@ -194,7 +227,9 @@ class DataView:
         self.session.choose(chosen["input"], chosen["output"], step)
 
     def follow_spec(self, author: str) -> None:
-        """The steps of preparation, as the spec has them."""
+        """The steps of preparation, as the spec has them, and whether it names the file that was looked at."""
+        if self.session.apart != self._apart:
+            self._draw_status()
         if author == "steps":
             return
         self.cleaning.set_visibility(bool(self.session.spec.strip()))
@@ -242,14 +277,25 @@ class DataView:
             first["channel"] = next(iter(spec_text.names(data, "inputs")), "")
         self.session.edit("more steps", spec_text.with_row, _STEPS, {"step": kind, **first})
 
+    def _whole_file(self) -> tuple[str, Mapping[str, Any]]:
+        """A file and its curves: of the training data that were checked, the file looked at where there are none."""
+        session, checked = self.session, self.session.checked
+        if checked is None:
+            if session.found is None or session.data is None:
+                return "", {}
+            return session.data.name, session.found["curves"]
+        trained = [Path(file) for file in checked["files"]]
+        place = next((place for place in (session.data, *session.raw) if place in trained), None)
+        return ("", {}) if place is None else (place.name, session.raw.get(place, {}))
+
     def follow_check(self) -> None:
         """Curves of the file, and of the training data after preparation; why they cannot be drawn."""
-        session, found, checked = self.session, self.session.found, self.session.checked
+        session, checked = self.session, self.session.checked
         with redrawn(self.refusal):
             if session.stale:
                 note(sentence(session.refused), "bad")
         prepared = {} if checked is None else checked["curves"]
-        raw = {} if found is None else found["curves"]
+        whole, raw = self._whole_file()
         cleaned = bool(checked and checked["prepared"])
         rows = []
         shown = [curve["column"] for curve in prepared.values()] or list(raw)
@@ -263,7 +309,8 @@ class DataView:
                     unit, name = curve["unit"], channel
             if drawn:
                 rows.append((f"{name} [{unit}]" if unit else name, drawn))
-        state = (rows, cleaned, checked and checked["prepared"], checked and checked["rows"])
+        other = f"; {session.data.name} is no part of them" if session.apart and session.data else ""
+        state = (rows, cleaned, whole, other, checked and checked["prepared"], checked and checked["rows"])
         if state == self._curves:
             return
         self._curves = state
@@ -272,10 +319,10 @@ class DataView:
                 text("The curves of a file are drawn here, once there is one.", "p", "hint")
                 return
             plot(curves_figure(rows), f"Curves of {', '.join(label for label, _ in rows)} over time.")
-            told = "The whole file"
+            told = f"All of {whole}"
             if prepared:
-                grey = ", in grey the whole file" * bool(raw)
-                told = f"In colour the training data{', after preparation' * cleaned}{grey}"
+                grey = f", in grey all of {whole}" * bool(raw)
+                told = f"In colour the training data{', after preparation' * cleaned}{grey}{other}"
             text(f"{told}. Drag to zoom, double-click for all.", "p", "hint")
             for done in (checked or {}).get("prepared", ()):
                 text(f"Done: {done}", "p", "hint")

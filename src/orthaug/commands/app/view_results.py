@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 from functools import partial
+from pathlib import Path
 
 from nicegui import ui
 
 from orthaug.commands.app.session import Session
+from orthaug.commands.app.spec_text import files
 from orthaug.commands.app.widgets import button, card, choice, field, link, named, note, redrawn, text
 
 _REPORTS = {"report.html": "of the fit", "comparison.html": "of the comparison"}
@@ -86,7 +88,7 @@ class ExportView:
 
     def follow_work(self) -> None:
         session = self.session
-        state = (bool(session.spec), tuple(session.results), tuple(session.exports.items()))
+        state = (bool(session.spec), tuple(session.results), tuple(session.exports.items()), self._beside())
         if state == self._state:
             return
         self._state = state
@@ -110,8 +112,14 @@ class ExportView:
             return
         text("The same on the command line:", "p", "small")
         text("orthaug fit spec.toml --out result", "pre")
-        if session.data is not None and session.data.parent == session.folder:
-            text(f"The spec names {session.data.name}: let the two stand in one folder.", "p", "hint")
+        if beside := self._beside():
+            them = "the two" if len(beside) == 1 else "them and the spec"
+            named = " and ".join(", ".join(beside).rsplit(", ", 1))
+            text(f"The spec names {named}: let {them} stand in one folder.", "p", "hint")
+
+    def _beside(self) -> list[str]:
+        """The files that the spec names without a folder, since they were dropped."""
+        return [file for file in files(self.session.content()) if not Path(file).is_absolute()]
 
     def _draw_code(self) -> None:
         session = self.session

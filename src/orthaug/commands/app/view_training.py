@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from html import escape
 from typing import Any
 
 from nicegui import ui
 
-from orthaug.commands.app.processes import Command
+from orthaug.commands.app.processes import Command, Run
 from orthaug.commands.app.session import Session
 from orthaug.commands.app.spec_text import names, section
-from orthaug.commands.app.widgets import button, card, loss_figure, note, number, plot, redrawn, table, text
+from orthaug.commands.app.widgets import (
+    button,
+    card,
+    loss_figure,
+    note,
+    number,
+    of_several,
+    plot,
+    redrawn,
+    run_name,
+    table,
+    text,
+)
 
 _MOST = 1500  # points of a curve of the loss
 _LEAST = 8  # points that are worth a curve
@@ -69,7 +82,7 @@ class TrainingView:
             self._state = state
             self._draw_results()
 
-    def _draw_losses(self, losses: Sequence[tuple[int, int, float]]) -> None:
+    def _draw_losses(self, losses: Sequence[tuple[Run, int, float | None]]) -> None:
         losses = losses if len(losses) >= _LEAST else []
         if len(losses) == self._told:
             return
@@ -78,8 +91,11 @@ class TrainingView:
             with redrawn(self.losses):
                 told = "Loss of every run over its iterations, on a logarithmic axis."
                 self._curve = plot(figure, told) if losses else None
+                self.caption = text("", "p", "hint")
         else:
             self._curve.update_figure(figure)
+        if losses:
+            self.caption.set_content(escape(_runs_told({run for run, _, _ in losses})))
         self._told = len(losses)
 
     def _tell(self, command: Command) -> None:
@@ -88,7 +104,9 @@ class TrainingView:
         if command.running:
             now = "reading and compiling"
             if told:
-                now = f"run {told['run']} of {told['runs']}, iteration {told['iteration']}"
+                name = run_name(Run.told(told), of_structure=command.arguments[0] == "compare")
+                name = f" ({name})" if told.get("structure") else ""
+                now = f"run {told['run']} of {told['runs']}{name}, iteration {told['iteration']}"
                 now += f", loss {number(told['loss'], 4)}"
             if command.stopping or command.ending:
                 now = "stopping …" if command.stopping else "ending with the best so far …"
@@ -117,6 +135,18 @@ class TrainingView:
                     if (verdict := session.verdicts.get(kind)) is not None:  # that the report begins with
                         note(" ".join(verdict["sentences"]), verdict["level"])
                     draw(result, session.units if same else {})
+
+
+def _runs_told(runs: set[Run]) -> str:
+    """What the curves are."""
+    told = "Each curve is a run: one training"
+    if any(run.start for run in runs):
+        kinds = ", ".join(sorted({run.regularization for run in runs if run.start}))
+        told += " from one start, which is first weights of the learner drawn at random"
+        told += f", with one regularization of them ({kinds})" if kinds else ""
+    if of_several(runs):
+        told += ". The colour tells the structure; point at a curve for its run"
+    return f"{told}."
 
 
 def _fit(result: Mapping[str, Any], units: Mapping[str, str]) -> None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from html import escape
 from typing import Any, TypeVar
 
 from nicegui import ui
+
+from orthaug.commands.app.processes import Run
+from orthaug.commands.job import ALONE
 
 Drawn = TypeVar("Drawn", bound=ui.element)
 _SHORT = 12  # letters that stand on one line
@@ -135,6 +138,8 @@ def note(what: str, kind: str = "") -> ui.html:
     return text(what, "p", f"note {kind}").props("role=alert" if kind == "bad" else "role=status")
 
 
+_MOST_ENTRIES = 8  # of a legend
+_ENTRY = 19  # px of one
 _COLORS = ("#3b82d0", "#d9730d", "#159a7c", "#9a5fd6", "#c2498a", "#8a7a12")
 
 
@@ -158,21 +163,50 @@ def curves_figure(rows: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], unit:
     return {"data": traces, "layout": layout, "config": _CONFIG}
 
 
-def loss_figure(losses: Sequence[tuple[int, int, float | None]]) -> dict[str, Any]:
-    """The loss of every run over its iterations."""
-    runs: dict[int, tuple[list[int], list[float | None]]] = {}
+def run_name(run: Run, *, of_structure: bool = False, of_regularization: bool = True) -> str:
+    """What is known of a run; its number where that is nothing."""
+    words = [run.structure] if of_structure and run.structure else []
+    words += [f"start {run.start}"] if run.start else []
+    if of_regularization and run.regularization:
+        words.append(run.regularization)
+    return ", ".join(words) or run.structure or f"run {run.number}"
+
+
+def of_several(runs: Iterable[Run]) -> bool:
+    """Whether they are of more structures than one."""
+    return len({run.structure for run in runs if run.structure}) > 1
+
+
+def loss_figure(losses: Sequence[tuple[Run, int, float | None]]) -> dict[str, Any]:
+    """The loss of every run over its iterations: each named below the axis, of several structures each one."""
+    runs: dict[Run, tuple[list[int], list[float | None]]] = {}
     for run, iteration, loss in losses:
         x, y = runs.setdefault(run, ([], []))
         x.append(iteration)
         y.append(loss)
-    layout = _layout(260)
+    several = of_several(runs)
+    differ = len({run.regularization for run in runs if run.structure != ALONE}) > 1
+    names = {run: run_name(run, of_structure=several, of_regularization=differ) for run in runs}
+    groups = {run: (run.structure or "run made again") if several else names[run] for run in runs}
+    entries = list(dict.fromkeys(groups[run] for run in sorted(runs)))
+    shown = 1 < len(entries) <= _MOST_ENTRIES
+    layout = _layout(260 + _ENTRY * len(entries) * shown)
     layout["xaxis"] |= {"title": _small("iteration")}
+    layout |= {
+        "hovermode": "closest",
+        "legend": {"yref": "container", "y": 0, "yanchor": "bottom", "x": 0, "tracegroupgap": 0},
+    }
+    layout["margin"]["b"] += _ENTRY * len(entries) * shown
     layout["yaxis"] = {"type": "log", "title": _small("loss"), "automargin": True, "exponentformat": "e", "nticks": 5}
-    own = {"type": "scatter", "mode": "lines+markers", "marker": {"size": 4}, "showlegend": 1 < len(runs) <= 6}
-    traces = [
-        {**own, "name": f"run {run}", "x": x, "y": y, "line": {"width": 1.5, "color": _COLORS[i % len(_COLORS)]}}
-        for i, (run, (x, y)) in enumerate(sorted(runs.items()))
-    ]
+    own = {"type": "scatter", "mode": "lines+markers", "marker": {"size": 4}}
+    traces, named = [], set[str]()
+    for run, (x, y) in sorted(runs.items()):
+        group = groups[run]
+        color = _COLORS[entries.index(group) % len(_COLORS)]
+        hover = f"{escape(names[run])}<br>iteration %{{x}}, loss %{{y:.4g}}<extra></extra>"
+        told = {"name": escape(group), "legendgroup": group, "showlegend": shown and group not in named}
+        traces.append({**own, **told, "x": x, "y": y, "hovertemplate": hover, "line": {"width": 1.5, "color": color}})
+        named.add(group)
     return {"data": traces, "layout": layout, "config": _CONFIG}
 
 

@@ -158,6 +158,7 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
         told["refusal"] = None if refused is None else str(refused)
     return told | {
         "rows": {part.name: len(part.record) for part in job.parts},
+        "files": [os.path.abspath(job.path.parent / entry.file) for entry in job.train.files],
         "step": job.train.record.sampling_time,
         "units": _units(job),
         "prepared": [done.text for done in job.train.record.prepared],
