@@ -19,8 +19,9 @@ import orthaug as oa
 from orthaug._base.views import MAKERS
 from orthaug.commands import bars
 from orthaug.models.learners import MLP
+from orthaug.reports.findings import BiasResult
 from orthaug.reports.html import card_of_result, html_of
-from orthaug.reports.result import BiasResult, FitResult, ParameterResult, WarningResult
+from orthaug.reports.result import FitResult, ParameterResult, WarningResult
 
 VOID = {"br", "meta", "hr", "link", "img", "input"}
 KINDS = ("free_run", "one_step", "residuals", "learned", "parameters", "bode")

@@ -118,7 +118,7 @@ def test_every_extra_is_told(page):
 def test_the_image_sees_what_it_copies():
     kept = [line[1:] for line in text(".dockerignore").splitlines() if line.startswith("!")]
     (line,) = [line for line in text("packaging/Containerfile").splitlines() if line.startswith("COPY pyproject")]
-    assert {*line.split()[1:-1], "docs/spec.md", "src"} == set(kept)
+    assert {*line.split()[1:-1], "packaging/about.md", "docs/spec.md", "src"} == set(kept)
 
 
 def test_the_suite_runs_on_the_python_that_is_set_up():

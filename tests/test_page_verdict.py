@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from orthaug.reports.fields import WarningResult
-from orthaug.reports.findings import ChangeResult, DiagnosisResult, ValidationResult
+from orthaug.reports.findings import BiasResult, ChangeResult, DiagnosisResult, ValidationResult
 from orthaug.reports.page_verdict import compare_verdict, fit_verdict
 from orthaug.reports.result import (
-    BiasResult,
     CompareResult,
     DataResult,
     FitResult,

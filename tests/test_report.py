@@ -23,6 +23,7 @@ from orthaug.commands.fit import fit_report
 from orthaug.commands.job import origin_of
 from orthaug.data.record import Channel
 from orthaug.models.response import Response, Trajectory
+from orthaug.reports.findings import BiasResult
 from orthaug.reports.learned_part import Curve, curve_limits
 from orthaug.reports.page import fit_page
 from orthaug.reports.page_blocks import interval, number, percent
@@ -30,7 +31,6 @@ from orthaug.reports.page_compare import ComparePage, compare_sections
 from orthaug.reports.page_fit import FitPage, fit_sections
 from orthaug.reports.page_runs import Run, compared_plots, error_band, packed, run_plots
 from orthaug.reports.page_verdict import compare_verdict, fit_verdict
-from orthaug.reports.result import BiasResult
 
 SUSPECT = '[[suspects]]\nname = "square"\non = "u[k-1]**2"\n'
 FIT = ["Verdict", "Parameters", "Free run", "Physics and learner", "What was learned", "Residual tests", "Stability",

@@ -42,6 +42,14 @@ class CertificateResult(Content):
     sentence: str
 
 
+class BiasResult(Content):
+    """The bias of a parameter by what the learner found: estimate less truth, its cause, the cause's share of it."""
+
+    value: Number
+    cause: str
+    share: Number
+
+
 class PhysicalBias(Content):
     """What the guessed coefficient does to a physical parameter."""
 

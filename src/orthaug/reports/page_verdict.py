@@ -9,9 +9,9 @@ import numpy as np
 
 from orthaug.analysis.budget import SURE_SHARE
 from orthaug.analysis.changes import Change
+from orthaug.reports.findings import BiasResult
 from orthaug.reports.page_blocks import number, percent
 from orthaug.reports.result import (
-    BiasResult,
     CompareResult,
     DataResult,
     FitResult,

@@ -13,6 +13,7 @@ from orthaug.physics.baseline import Parameter
 from orthaug.physics.parameters import PhysicalParameter
 from orthaug.reports.fields import ByName, Content, Flag, Number, Numbers, WarningResult, Whole
 from orthaug.reports.findings import (
+    BiasResult,
     DiagnosisResult,
     MissingLagsResult,
     MotionCheckResult,
@@ -98,14 +99,6 @@ class RestartResult(Content):
     regularization: str | float
     validation: Number
     score: Number = None
-
-
-class BiasResult(Content):
-    """The bias of a parameter by what the learner found: estimate less truth, its cause, the cause's share of it."""
-
-    value: Number
-    cause: str
-    share: Number
 
 
 class ParameterResult(Content):
