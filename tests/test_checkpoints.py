@@ -12,6 +12,7 @@ from test_engines import BASELINE, FLIGHT, SPEC, fitted, folder, from_files  # n
 from typer.testing import CliRunner
 
 import orthaug as oa
+from orthaug._base.progress import Progress
 from orthaug.commands.cli import app
 from orthaug.commands.fit import fit_job, keeping, write_result
 from orthaug.commands.kinds import open_job
@@ -152,7 +153,7 @@ def test_a_command_that_was_killed_goes_on(folder, tmp_path):  # noqa: F811
     path.write_text(f"{text}checkpoint = 0.0\n", encoding="utf-8")
     out = tmp_path / "out"
     with pytest.raises(Killed):
-        fit_job(keeping(open_job(path), out), dies_at(11))
+        fit_job(keeping(open_job(path), out), Progress(dies_at(11)))
     assert (tmp_path / "out.training" / "training.json").exists()
     run = CliRunner().invoke(app, ["fit", str(path), "--out", str(out), "--resume"])
     assert run.exit_code == 0, run.output
@@ -160,7 +161,7 @@ def test_a_command_that_was_killed_goes_on(folder, tmp_path):  # noqa: F811
     model = oa.load(out / "model")
     assert [p["value"] for p in expected["parameters"]] == list(model.theta)
     with pytest.raises(Killed):
-        fit_job(keeping(open_job(path), out), dies_at(11))
+        fit_job(keeping(open_job(path), out), Progress(dies_at(11)))
     path.write_text(f"{text}checkpoint = 1.0\n", encoding="utf-8")
     run = CliRunner().invoke(app, ["fit", str(path), "--out", str(out), "--force", "--resume"])
     assert run.exit_code == 2 or isinstance(run.exception, oa.InputError)

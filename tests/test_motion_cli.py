@@ -187,7 +187,7 @@ def test_a_result_has_what_a_motion_has_and_null_for_the_rest(result):
     own = {"states": ["x", "v"], "integrator": "rk4", "substeps": 1, "hold": "zero-order"}
     assert {key: result["motion"][key] for key in own} == own
     assert set(result["motion"]) == {*own, "window", "parts", "substep_bias"}
-    for key in ("physical_parameters", "physical_consistency", "sensitivities", "bias", "missing_lags"):
+    for key in ("physical_parameters", "physical_consistency", "sensitivities", "missing_lags"):
         assert result[key] is None
     found = result["residuals"]
     assert found["verdict"] == "white" and "white" in found["text"] and found["one_step"] == []
@@ -196,7 +196,7 @@ def test_a_result_has_what_a_motion_has_and_null_for_the_rest(result):
 
 def test_the_folder_has_figures_and_a_page(folder, printed, result):
     figures = {path.stem for path in (folder / "out" / "figures").iterdir()}
-    assert figures == {"simulation", "prediction", "residual", "states", "components", "learner"}
+    assert figures == {"simulation", "prediction", "residual", "states", "components", "learner", "bias"}
     page = (folder / "out" / "report.html").read_text()
     assert ">(force - c*v - k*x)/m</td>" in page and ">dv/dt</th>" in page
     (part,) = result["motion"]["parts"]
