@@ -74,6 +74,16 @@ def test_what_nothing_is_shared_with_is_removed_by_the_learner():
     assert drag.removed_by == "learner" and drag.bias == (0.0,)
 
 
+@pytest.mark.parametrize(("rows", "named"), [(6, False), (60, True)])
+def test_no_cause_is_named_where_hardly_a_row_is_left_over(rows, named):
+    rng = np.random.default_rng(0)
+    u = rng.uniform(-1, 1, rows)
+    record = Record.from_arrays(u, 2 * u + u**3 + 0.05 * rng.normal(size=rows))
+    options = {"learner": Terms(("u[k]**3",)), "structure": Orthogonal(shared="all")}
+    fit = estimate(record, Baseline.from_terms([Term("gain", "u[k]")]), **options)
+    assert (bias_budget(fit, [Suspect("cubic", "u[k]**3")]) is not None) == named
+
+
 def test_the_papers_data_sets():
     """Sets 2 and 3 are biased by the square, by 8 and 14 % of θ₃; set 1 is not. The bias told is within a tenth."""
     for number in (1, 2, 3):

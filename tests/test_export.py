@@ -503,6 +503,14 @@ def test_vectors_of_a_model_without_values_at_zero(tmp_path, term, rows):
     assert done.stdout.startswith(f"{len(lines) - 1} steps")
 
 
+def test_vectors_start_where_the_outputs_stay_finite_for_longest(tmp_path):
+    """From zero the second step has no value, from one the third."""
+    model = lagged([oa.Term("a", "log(y[k-1] + 1e-9)")], (), None, ("y",), ("u",))
+    oa.export(model, tmp_path / "c", "c")
+    head, first, *_ = csv.reader((tmp_path / "c" / "vectors.csv").read_text().splitlines())
+    assert float(first[next(i for i, name in enumerate(head) if "y" in name)]) == 1.0
+
+
 def test_equations_in_latex(tmp_path):
     for name in MODELS:
         oa.export(case(name).model, tmp_path, "latex")
