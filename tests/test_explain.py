@@ -103,6 +103,14 @@ def test_a_function_from_another_toolbox_is_explained_as_it_is():
     assert [moved.value_with for moved in told.parameters] == pytest.approx(list(TRUE.values()))
 
 
+def test_an_expression_with_commas_is_told_as_it_is_written():
+    given = fitted(-0.3, learner=None).problem
+    plant = lambda x: (x @ [0.6, -0.2, 1.0] + x[:, 2] - np.clip(x[:, 2], -0.4, 0.4))[:, None]  # noqa: E731
+    told = oa.explain(oa.orthogonalize(given.record, given.baseline, plant))
+    (term,) = told.terms
+    assert term.kind == "dead_zone" and ", " in term.expression and told.text.startswith(f"{term.expression} explains")
+
+
 def test_of_a_level_a_root_is_tried_and_no_friction_and_of_a_velocity_the_reverse():
     rng = np.random.default_rng(4)
     kinds = {}
@@ -259,6 +267,9 @@ def test_wrong_use_is_told_in_a_line(project):
     write_csv(project / "short.csv", u=np.ones(9), y=np.ones(9))
     assert one_line(run("explain", project / "plant", project / "short.csv").err, "at least 20 are needed")
     assert one_line(run("explain", project, project / "run.csv").err, "no saved model")
+    for option in ("--terms", "--degree"):
+        refused = run("explain", project / "plant", project / "run.csv", option, "0")
+        assert refused.code == 2 and one_line(refused.err, f"`{option}` must be a whole number of")
 
 
 @pytest.mark.parametrize(

@@ -239,7 +239,7 @@ def test_nul_bytes_in_a_csv(tmp_path, content):
 @pytest.mark.parametrize("content", ["u;y\n12,5;1.234\n", "u;y\n1.234;1\n2;12,5\n", "u;y;n\n1.234;2;0\n3;4.5;0,5\n"])
 def test_a_point_beside_decimal_commas_may_be_one_of_thousands(tmp_path, content):
     (tmp_path / "run.csv").write_text(content)
-    with pytest.raises(InputError, match=r"found '(1\.234|4\.5)'; expected a finite number"):
+    with pytest.raises(InputError, match=r"found '(1\.234|4\.5)'; expected decimals with commas, as in other cells"):
         read_record(tmp_path / "run.csv", inputs=["u"], outputs=["y"])
 
 

@@ -131,8 +131,7 @@ CELLS = ["abc", "NaN", "nan", "inf", "-inf", "NA", "null", "None", "0x10", "1 00
 @pytest.mark.parametrize("cell", CELLS)
 def test_a_cell_that_is_no_finite_number(tmp_path, cell):
     path = put(tmp_path, f"u,y\n1,2\n3,4\n5,{cell}\n7,8\n")
-    found = "inf" if cell == "1e400" else cell
-    with pytest.raises(InputError, match=rf"line 4 \(row 2\), column 'y': found '{found}'; expected a finite number"):
+    with pytest.raises(InputError, match=rf"line 4 \(row 2\), column 'y': found '{cell}'; expected a finite number"):
         read(path)
     assert len(read(path, rows=[0, 2])) == 2
     assert len(read(path, outputs=[])) == 4
@@ -292,7 +291,7 @@ def test_dates_are_seconds_since_the_first_row(tmp_path, instants, step):
         (("noon", "one", "two"), "line 2 .*'when': found 'noon'; expected a finite number"),
         (
             ("2024-03-01 12:00",) * 5 + ("-",) + ("2024-03-01 12:00",) * 5,
-            r"line 7 \(row 5\), column 'when': found '-'; expected a date, as in the other rows",
+            r"line 7 \(row 5\), column 'when': found '-'; expected a date, as in other cells",
         ),
         (("2024-03-01", "2024-03-02", "2024-03-04"), "a step of 172800 s where 86400 s is usual"),
     ],

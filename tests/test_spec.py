@@ -269,6 +269,7 @@ VALUES = [  # (changed in FULL), the key, what was found, what is expected
     ("sampling_time = 0.01", "sampling_time = true", "data.sampling_time", "true", "number"),
     ("sampling_time = 0.01", "sampling_time = 0", "data.sampling_time", "0", "greater than 0"),
     ("sampling_time = 0.01", "sampling_time = -0.01", "data.sampling_time", "-0.01", "greater than 0"),
+    ("sampling_time = 0.01", "sampling_time = 1e300", "data.sampling_time", "1e+300", "less than or equal to"),
     ("sampling_time = 0.01", "sampling_time = inf", "data.sampling_time", "inf", "finite"),
     ('inputs = ["force", "voltage"]', 'inputs = "force"', "data.inputs", '"force"', "list"),
     ('outputs = ["position", "angle"]', "outputs = []", "data.outputs", "[]", "at least one entry"),

@@ -14,6 +14,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.memory import available
 from orthaug.commands.sections import Count, Finite, KindSection, Positive, Section, with_kinds
 from orthaug.data.preparation import STEPS
+from orthaug.data.record import LONGEST_STEP
 
 if TYPE_CHECKING:
     from orthaug.models.rows import Engine
@@ -53,7 +54,7 @@ class PrepareSection(KindSection):
 class Data(Section):
     """Channels, sampling time and parts."""
 
-    sampling_time: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    sampling_time: Annotated[float, Field(gt=0, le=LONGEST_STEP, allow_inf_nan=False)] | None = None
     time: Annotated[str, Field(min_length=1)] | None = None
     experiment: Annotated[str, Field(min_length=1)] | None = None
     inputs: list[str] = []

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from orthaug._base.checks import check_count
 from orthaug.commands import streams
 from orthaug.commands.program import (
     AsJson,
@@ -146,6 +147,8 @@ def explain(
 
     And what to write into the physics.
     """
+    check_count(degree, "--degree", of="factors")
+    check_count(most, "--terms", of="terms")
     from orthaug.commands.run import Reading, explain_model, open_run, read_rows
     from orthaug.reports.explanation import explain_text
 

@@ -16,6 +16,7 @@ import numpy as np
 from orthaug._base.checks import Vector, check_choice, check_count, check_type
 from orthaug._base.errors import InputError, MissingSampleError, shown
 from orthaug._base.lines import counted
+from orthaug.data.layouts import text_number
 from orthaug.data.preparation import check_steps, prepared_experiments
 from orthaug.data.record import Channel, Experiment, Record, as_channels, check_step, same_step, unbroken
 from orthaug.data.steps import Fill, Outliers, Resample, Run
@@ -308,7 +309,9 @@ def _check_cells(table: Table, columns: Sequence[str], start: int, stop: int) ->
             text = table.cell(name, row)
             what = f"found '{text}'" if text else "the cell is empty"
             error = MissingSampleError if text.strip().lower() in _MISSING else InputError
-            wanted = "a date, as in the other rows" if name == table.dated else "a finite number"
+            dated, number = name == table.dated, np.isfinite(text_number(text))
+            kind = "a date" if dated else "decimals with commas" if number else ""
+            wanted = f"{kind}, as in other cells" if kind else "a finite number"
             raise error(f"{table.path}: {table.where(row)}, column '{name}': {what}; expected {wanted}.")
 
 

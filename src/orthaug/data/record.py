@@ -13,7 +13,7 @@ from orthaug._base.errors import LONGEST, InputError, shown, visible
 from orthaug._base.views import Shown
 from orthaug.data.expressions import RESERVED, is_name
 
-_LONGEST_STEP = 1e12  # s; a longer one overflows somewhere in a time axis
+LONGEST_STEP = 1e12  # s; a longer one overflows somewhere in a time axis
 _DERIVED = ("model", "baseline", "learner", "model_low", "model_high")  # columns of result tables
 
 
@@ -88,9 +88,9 @@ def as_channels(given: Any, what: str) -> tuple[Channel, ...]:
 
 def check_step(value: Any) -> float:
     """Return `value` if it is a sampling time in seconds, otherwise raise InputError."""
-    if not is_number(value) or not 0 < value <= _LONGEST_STEP:
+    if not is_number(value) or not 0 < value <= LONGEST_STEP:
         raise InputError(
-            f"the sampling time must be a positive number of seconds, at most {_LONGEST_STEP:g}; got {shown(value)}."
+            f"the sampling time must be a positive number of seconds, at most {LONGEST_STEP:g}; got {shown(value)}."
         )
     return float(value)
 

@@ -177,7 +177,7 @@ def _cells(
     import pandas as pd
 
     def read(**options: Any) -> pd.DataFrame:
-        return pd.read_csv(
+        frame = pd.read_csv(
             path,
             sep=found.separator,
             header=None,
@@ -191,6 +191,9 @@ def _cells(
             nrows=most,
             **options,
         )[used]
+        if np.isinf(frame.select_dtypes("number")).any(axis=None):
+            raise ValueError("a number beyond double precision")
+        return frame
 
     if not commas:
         with suppress(ValueError):  # something is no number: read again as text, to be able to name it

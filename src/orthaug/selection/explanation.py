@@ -210,7 +210,7 @@ def _told(space: Space, chosen: list[Candidate], fitted: Fit, dropped: bool) -> 
     physics, spec = _physics(ground, terms, moved) if terms else (None, None)
     share = share if chosen else 0.0
     if terms:
-        named = " and ".join(", ".join(term.expression for term in terms).rsplit(", ", 1)) if len(terms) < 3 else ""
+        named = " and ".join(term.expression for term in terms) if len(terms) < 3 else ""
         what = named or f"{len(terms)} terms"
         verb = "explains" if len(terms) == 1 else "explain"
         text = f"{what} {verb} {percent(share, 3)} of what the learner adds beside the physics."
