@@ -127,7 +127,7 @@ TRIALS = [
             f"{name} after {after} s",
             f"ended {name} {after}; c=$?; test ! -e deep && exit $c",
             code,
-            "nothing was written",
+            "nothing is written",
         )
         for name, code in (("TERM", 143), ("HUP", 129))
         for after in (0.5, 1.5, 12)

@@ -12,6 +12,7 @@ from test_engines import BASELINE, FLIGHT, SPEC, fitted, folder, from_files  # n
 from typer.testing import CliRunner
 
 import orthaug as oa
+from orthaug._base.folders import PARTIALS
 from orthaug._base.progress import Progress
 from orthaug.commands.cli import app
 from orthaug.commands.fit import fit_job, keeping, write_result
@@ -155,6 +156,7 @@ def test_a_command_that_was_killed_goes_on(folder, tmp_path):  # noqa: F811
     with pytest.raises(Killed):
         fit_job(keeping(open_job(path), out), Progress(dies_at(11)))
     assert (tmp_path / "out.training" / "training.json").exists()
+    assert tmp_path / "out.training" in PARTIALS.placed, "Ctrl-C names it"
     run = CliRunner().invoke(app, ["fit", str(path), "--out", str(out), "--resume"])
     assert run.exit_code == 0, run.output
     assert not (tmp_path / "out.training").exists() and (out / "result.json").exists()

@@ -486,9 +486,7 @@ def test_ctrl_c_during_training_leaves_nothing(project, monkeypatch, before):
     kept = {path: path.read_bytes() for path in project.parent.rglob("*") if path.is_file()}
     done = run("fit", project, "--out", "deep/out")
     assert (done.code, done.out) == (130, "")
-    assert one_line(
-        done.err, "interrupted", " of 4", "iteration 3", "nothing was written"
-    )  # whichever thread was first
+    assert one_line(done.err, "interrupted", " of 4", "iteration 3", "nothing is written")  # whichever thread was first
     assert {path: path.read_bytes() for path in project.parent.rglob("*") if path.is_file()} == kept
     assert before or not Path("deep").exists()
 
@@ -498,7 +496,7 @@ def test_ctrl_c_while_the_demo_trains(tmp_path, monkeypatch):
     small_run(monkeypatch, interrupt)
     done = run("demo", "--out", "out")
     assert done.code == 130
-    assert one_line(done.err, "interrupted", "nothing was written")
+    assert one_line(done.err, "interrupted", "nothing is written")
     assert listing(tmp_path) == []
 
 

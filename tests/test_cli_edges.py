@@ -85,7 +85,7 @@ def test_ctrl_c_of_a_real_process(tmp_path, tmp_path_factory):
     finally:
         process.kill()
     assert (process.returncode, out) == (130, "")
-    assert one_line(err, "interrupted during run ", " of 2, iteration ", "loss ", "; nothing was written")
+    assert one_line(err, "interrupted during run ", " of 2, iteration ", "loss ", "; nothing is written")
     assert contents(tmp_path) == before
     assert not (tmp_path / "deep").exists()
 

@@ -92,7 +92,7 @@ def test_a_signal_while_a_folder_is_written(tmp_path, number, words):
     finally:
         process.kill()
     assert time.monotonic() - began < 5
-    assert (process.returncode, err) == (128 + number, f"{words}; nothing was written\n")
+    assert (process.returncode, err) == (128 + number, f"{words}; nothing is written\n")
     assert not list(tmp_path.iterdir())
 
 

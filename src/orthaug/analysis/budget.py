@@ -19,6 +19,7 @@ from orthaug._base.lines import percent, plain_number
 from orthaug._base.warning import Warning
 from orthaug.analysis.bias import SuspectedBias
 from orthaug.analysis.measure_bias import Ground, physical_with_bias
+from orthaug.analysis.motion_bias import TermBias
 from orthaug.analysis.remedies import remedies
 from orthaug.analysis.suspects import Suspect, usual_suspects, usual_terms
 from orthaug.fitting.estimates import Estimate
@@ -151,13 +152,13 @@ def named_cause(ground: Ground, suspects: Sequence[Suspect], least: float = LEAS
     Of what no one declared only what the learner sees counts: the rest is no likely cause of what it found.
     """
     for table in (_declared(ground, suspects), _usual(ground)):
-        best = max(table, key=_explains, default=None)
-        if best is not None and _explains(best) >= least:
+        best = max(table, key=explains, default=None)
+        if best is not None and explains(best) >= least:
             return best
     return None
 
 
-def _explains(entry: SuspectedBias) -> float:
+def explains(entry: SuspectedBias | TermBias) -> float:
     """Its share of the learner."""
     return entry.explained or 0.0
 
@@ -179,7 +180,7 @@ def rival_of(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) 
     assert cause.explained
     if cause.suspect in suspects:
         return None
-    equal = [entry for entry in _usual(ground) if _explains(entry) >= AS_MUCH * cause.explained]
+    equal = [entry for entry in _usual(ground) if explains(entry) >= AS_MUCH * cause.explained]
     to_coordinates, own = ground.weighed.projection.to_coordinates, _moved(cause)
 
     def apart(entry: SuspectedBias) -> float:
@@ -195,9 +196,9 @@ def near_causes(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect
     if cause.suspect in suspects or cause.explained >= SURE_SHARE:
         return []
     others = [entry for entry in _usual(ground) if entry.suspect != cause.suspect and entry.explained]
-    near = [entry for entry in others if _explains(entry) >= _NEAR * cause.explained]
+    near = [entry for entry in others if explains(entry) >= _NEAR * cause.explained]
     best: dict[str, SuspectedBias] = {}
-    for entry in sorted(near, key=_explains, reverse=True):
+    for entry in sorted(near, key=explains, reverse=True):
         best.setdefault(entry.suspect.on or entry.suspect.expression, entry)
     return list(best.values())[:_MOST_RIVALS]
 
@@ -212,7 +213,7 @@ def left_over(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect])
     rest, others = ground.without(cause), tuple(suspect for suspect in suspects if suspect != cause.suspect)
     found = [best for group in {others, ()} if (best := named_cause(rest, group, 0.0)) is not None]
     rows = [_moved(cause) * np.sqrt((1 - cause.explained) / cause.explained)]
-    rows += [_moved(max(found, key=_explains))] if found else []
+    rows += [_moved(max(found, key=explains))] if found else []
     rival = rival_of(ground, cause, suspects)
     return np.array([*rows, *([] if rival is None else [_moved(rival) - _moved(cause)])])
 
@@ -265,7 +266,7 @@ def _warning(
     cures = remedies(ground, budget.cause, [entry.name for entry in large])
     other = "" if rival is None else f" ({rival.suspect.name} explains as much and would move them elsewhere)"
     if budget.share < SURE_SHARE:
-        close = ", ".join(f"{entry.suspect.name} {percent(_explains(entry))}" for entry in near)
+        close = ", ".join(f"{entry.suspect.name} {percent(explains(entry))}" for entry in near)
         beside = f"; next: {close}" if near else ""
         return Warning(
             "biased",

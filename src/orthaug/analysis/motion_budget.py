@@ -19,6 +19,7 @@ from orthaug.analysis.budget import (
     LEAST_SHARE,
     SURE_SHARE,
     ParameterBias,
+    explains,
     parameter_biases,
     told_biases,
     with_bias,
@@ -102,19 +103,14 @@ def motion_budget(
 
 def rivals_of(cause: TermBias, table: Sequence[TermBias]) -> list[TermBias]:
     """Terms that explain about as much of the learner as a cause, which cannot be told from it."""
-    most = min(max(_AS_CLOSE * (1 - _explains(cause)), _CLOSE), 1 - LEAST_SHARE)
-    return [entry for entry in table if entry is not cause and 1 - _explains(entry) <= most]
+    most = min(max(_AS_CLOSE * (1 - explains(cause)), _CLOSE), 1 - LEAST_SHARE)
+    return [entry for entry in table if entry is not cause and 1 - explains(entry) <= most]
 
 
 def _next_after(fit: MotionEstimate, cause: TermBias, table: Sequence[TermBias]) -> TermBias | None:
     """The term that explains most of what a cause leaves of the learner."""
     ground = ground_after(fit)
-    return None if ground is None else max(ground.after(cause, table), key=_explains, default=None)
-
-
-def _explains(entry: TermBias) -> float:
-    """Its share of the learner."""
-    return entry.explained or 0.0
+    return None if ground is None else max(ground.after(cause, table), key=explains, default=None)
 
 
 def _moved(entry: TermBias) -> Vector:
@@ -124,8 +120,8 @@ def _moved(entry: TermBias) -> Vector:
 
 def _of_learner(table: Sequence[TermBias], smooth: Sequence[TermBias]) -> tuple[TermBias, float, float, float] | None:
     """The term that explains most of the learner: its coefficient, share, and how unsure the coefficient is."""
-    best, other = max(table, key=_explains, default=None), max(smooth, key=_explains, default=None)
-    if best is not None and other is not None and _explains(best) < AS_MUCH * _explains(other):
+    best, other = max(table, key=explains, default=None), max(smooth, key=explains, default=None)
+    if best is not None and other is not None and explains(best) < AS_MUCH * explains(other):
         best = other
     if best is None or best.explained is None or best.explained < LEAST_SHARE or best.coefficient_found is None:
         return None
@@ -154,8 +150,8 @@ def _motion_warning(budget: MotionBudget, rivals: Sequence[TermBias], *, learns:
     large = [entry for entry in budget.parameters if (entry.errors or 0.0) > 1]
     if not large:
         return None
-    cause, first = budget.cause, sorted(rivals, key=_explains, reverse=True)[:2]
-    named = " and ".join(f"{rival.suspect.name}, {percent(_explains(rival))}" for rival in first)
+    cause, first = budget.cause, sorted(rivals, key=explains, reverse=True)[:2]
+    named = " and ".join(f"{rival.suspect.name}, {percent(explains(rival))}" for rival in first)
     other = f" (near it: {named}, and would move them elsewhere)" if rivals else ""
     cure = f"add it to the equation of {cause.equation}, with its size as a parameter"
     what = "the learner" if learns else "the squares that the free run leaves"

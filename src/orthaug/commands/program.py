@@ -86,7 +86,7 @@ def main() -> None:
     except TrainingError as error:
         _fail(f"training failed: {error}", 1)
     except (Interrupted, KeyboardInterrupt) as interrupt:
-        _fail(f"interrupted{''.join(f' during {text}' for text in interrupt.args)}; nothing was written", 130)
+        _fail(f"interrupted{''.join(f' during {text}' for text in interrupt.args)}; nothing is written", 130)
     except (Unread, BrokenPipeError):
         streams.silence(sys.stdout)
         sys.exit(0)

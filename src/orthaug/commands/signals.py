@@ -93,9 +93,9 @@ class Watch:
             during = self._during()
             if partials is not None:
                 partials.discard_all()
-            kept = f"{', '.join(map(str, partials.placed))} is written" if partials and partials.placed else ""
+            kept = ", ".join(str(path) for path in getattr(partials, "placed", ()) if path.exists())
             self._stop_drawing()
-            line = f"{words}{f' during {during}' if during else ''}; {kept or 'nothing was written'}\n"
+            line = f"{words}{f' during {during}' if during else ''}; {kept or 'nothing'} is written\n"
             with suppress(OSError):
                 os.write(2, line.encode("utf-8" if sys.stderr is None else sys.stderr.encoding, "backslashreplace"))
         finally:

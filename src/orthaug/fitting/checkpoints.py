@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.errors import InputError
+from orthaug._base.folders import PARTIALS
 from orthaug._base.jax import jax
 from orthaug.fitting.normal_equations import Normal
 from orthaug.fitting.solvers.compiled import State
@@ -119,6 +120,8 @@ class Kept:
 
         folder = self.checkpoints.folder
         folder.mkdir(parents=True, exist_ok=True)
+        if folder not in PARTIALS.placed:
+            PARTIALS.placed.append(folder)
         if not (folder / _ABOUT).exists():
             _replace(folder / _ABOUT, json.dumps({"fingerprint": self.checkpoints.fingerprint}).encode())
         leaves = jax.tree.leaves(state)

@@ -95,14 +95,3 @@ def forward(equations: Equations, known: Collection[int], most: int, *, least: f
             break
         picks.append(Pick(best, float(min(project_out(best) / before, 1.0))))
     return picks
-
-
-def left_of(equations: Equations, known: Collection[int]) -> Vector:
-    """Share of each column's squared norm that the `known` ones leave."""
-    gram = equations.scaled().hessian
-    columns = np.asarray(sorted(known), dtype=int)
-    if not len(columns):
-        return np.diag(gram).copy()
-    inner = np.linalg.pinv(gram[np.ix_(columns, columns)], rcond=1e-13, hermitian=True)
-    across = gram[columns]
-    return np.clip(np.diag(gram) - np.einsum("ij,ij->j", across, inner @ across), 0.0, None)
