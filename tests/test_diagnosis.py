@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
 from orthaug.analysis.diagnosis import diagnose
-from orthaug.data.record import Record
+from orthaug.analysis.predictability import Predictable
+from orthaug.analysis.verdict_text import _shares
+from orthaug.data.record import Channel, Record
 from orthaug.data.regressors import Lags
 from orthaug.fitting.criteria import Prediction, Simulation
 from orthaug.fitting.estimation import estimate
@@ -420,3 +423,20 @@ def test_no_input():
     for k in range(2, 600):
         y[k] = 1.5 * y[k - 1] - 0.7 * y[k - 2] + e[k]
     assert of(Record.from_arrays(None, y), Baseline.from_terms(list(PHYSICS.terms[:2]))).verdict == "equation_noise"
+
+
+def test_shares_are_told_of_the_output_that_follows_something():
+    """Of two outputs of which nothing could be predicted, the one whose residual tests reject."""
+
+    def test_of(name, followed):
+        return SimpleNamespace(name=name, follows=lambda: followed, curved_over=lambda share: [])
+
+    record = SimpleNamespace(outputs=[Channel("p", "Pa"), Channel("T", "K")])
+    seen = SimpleNamespace(
+        predictable=[Predictable(name, 1.0, 0.0, 0.0, 0.0) for name in ("p", "T")],
+        own=[test_of("p", []), test_of("T", ["q"])],
+        fit=SimpleNamespace(
+            problem=SimpleNamespace(record=SimpleNamespace(outputs=[Channel("p", "Pa"), Channel("T", "K")]))
+        ),
+    )
+    assert _shares(seen).startswith("Of its variance of T 0 %") and "0 K at most" in _shares(seen)

@@ -241,10 +241,11 @@ def _size(seen: Finding) -> str:
 
 
 def _shares(seen: Finding) -> str:
-    """How much could be predicted, of the output of which most could."""
+    """How much could be predicted, of the output of which most could; of equal ones that which follows something."""
     if not seen.predictable:
         return ""
-    one = max(seen.predictable, key=lambda entry: entry.largest())
+    told = {test.name for test in seen.own if test.follows() or test.curved_over(SHARE)}
+    one = max(seen.predictable, key=lambda entry: (entry.largest(), entry.name in told))
     of = f" of {one.name}" if len(seen.predictable) > 1 else ""
     unit = next((c.unit for c in seen.fit.problem.record.outputs if c.name == one.name), "")
     size = float(np.sqrt(one.largest())) * one.rms
