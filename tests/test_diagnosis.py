@@ -435,8 +435,6 @@ def test_shares_are_told_of_the_output_that_follows_something():
     seen = SimpleNamespace(
         predictable=[Predictable(name, 1.0, 0.0, 0.0, 0.0) for name in ("p", "T")],
         own=[test_of("p", []), test_of("T", ["q"])],
-        fit=SimpleNamespace(
-            problem=SimpleNamespace(record=SimpleNamespace(outputs=[Channel("p", "Pa"), Channel("T", "K")]))
-        ),
+        fit=SimpleNamespace(problem=SimpleNamespace(record=record)),
     )
     assert _shares(seen).startswith("Of its variance of T 0 %") and "0 K at most" in _shares(seen)
