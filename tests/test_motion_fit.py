@@ -343,6 +343,7 @@ def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(fitted:
     np.testing.assert_array_equal(robust.values, alone.values)
     np.testing.assert_array_equal(robust.plain_std, alone.std)
     assert (robust.std > 1.2 * alone.std).all() and robust.freedom < 31
+    assert "batch means" in "\n".join(robust.lines()) and "batch means" not in "\n".join(alone.lines())
 
 
 @pytest.mark.parametrize("samples", [0, 5])

@@ -16,7 +16,7 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import Layout
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion
-from orthaug.fitting.estimates import AnyFit, Restart, parameter_frame, parameter_lines
+from orthaug.fitting.estimates import ROBUST_FLOWN, AnyFit, Restart, parameter_frame, parameter_lines
 from orthaug.fitting.held_out import HeldOut
 from orthaug.fitting.motion_measures import field_under, wobble
 from orthaug.fitting.status import Status
@@ -187,6 +187,8 @@ class MotionEstimate(AnyFit):
         ]
         if bound is not None:
             lines += [f"shared      {shared_in_words(self.shared)}", f"measure     {self.split_by.name}"]
+        if self.plain_covariance is not None:
+            lines.append(f"std         {ROBUST_FLOWN}")
         lines += ["", *parameter_lines(motion.parameters, self.values, self.std, self.interval)]
         return [*lines, *term_lines(learned_terms(self.model))]
 
