@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -19,13 +20,15 @@ from orthaug._base.lines import percent, plain_number
 from orthaug._base.warning import Warning
 from orthaug.analysis.bias import SuspectedBias
 from orthaug.analysis.measure_bias import Ground, physical_with_bias
-from orthaug.analysis.motion_bias import TermBias
 from orthaug.analysis.remedies import remedies
 from orthaug.analysis.suspects import Suspect, usual_suspects, usual_terms
 from orthaug.fitting.estimates import Estimate
 from orthaug.inference.covariance import interval
 from orthaug.inference.measures import Measure, Training, weigh_problem
 from orthaug.physics.parameters import PhysicsMap
+
+if TYPE_CHECKING:
+    from orthaug.analysis.motion_bias import TermBias
 
 LEAST_SHARE = 0.5  # of the learner's energy that a cause must explain to be named
 _NOTHING = 0.01  # of the noise: a learner that is smaller found nothing that could be explained
