@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -495,10 +496,13 @@ def test_no_cluster_in_reach_is_told(folder, monkeypatch):
 def test_workers_of_another_version_are_refused():
     from orthaug.models.cluster import check_versions, versions
 
-    class Client:
-        def run(self, function):
-            return {"tcp://there:1": function(), "tcp://there:2": function() | {"jax": "0.1"}}
+    def client(*answers):
+        return SimpleNamespace(run=lambda _, on_error: {f"tcp://there:{i}": found for i, found in enumerate(answers)})
 
-    with pytest.raises(oa.InputError, match=r"the worker tcp://there:2 has orthaug .*, jax 0.1; here is"):
-        check_versions(Client())
+    same = versions()
+    check_versions(client(same, OSError("killed"), same))  # one that dies while it is asked takes no part
+    with pytest.raises(oa.InputError, match=r"the worker tcp://there:1 has orthaug .*, jax 0.1; here is"):
+        check_versions(client(same, same | {"jax": "0.1"}))
+    with pytest.raises(oa.InputError, match=r"the worker tcp://there:0 has No module named 'orthaug'; here is"):
+        check_versions(client(ModuleNotFoundError("No module named 'orthaug'")))
     assert set(versions()) == {"orthaug", "jax"}
