@@ -556,7 +556,9 @@ class Tab:
     open: ClassVar[list[Tab]] = []
 
     def __init__(self, browser, server: Server, width: int = 1280, scheme: str = "light") -> None:
-        self.context = browser.new_context(viewport={"width": width, "height": 844}, color_scheme=scheme, reduced_motion="reduce")
+        self.context = browser.new_context(
+            viewport={"width": width, "height": 844}, color_scheme=scheme, reduced_motion="reduce"
+        )
         self.page, self.told, self.server = self.context.new_page(), [], server
         self.page.set_default_timeout(LATE)
         self.asked: set[str] = set()

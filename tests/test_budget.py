@@ -242,3 +242,25 @@ def test_a_missing_lag_is_named():
     assert fine is not None and not fine.missing and not fine.warnings
     assert [test.lag for test in fine.tests] == ["y[k-1]", "y[k-2]", "u[k-1]"]
     assert missing_lags(estimate(fits[0].problem.record, LINEAR, solver=LevenbergMarquardt(2))) is None
+
+
+def test_every_output_has_its_cause():
+    """Two outputs that lack a term each: the larger one does not hide what the other biases."""
+    rng = np.random.default_rng(0)
+    u, y = rng.uniform(-1, 1, (800, 2)), np.zeros((800, 2))
+    for k in range(1, 800):
+        y[k, 0] = 0.8 * y[k - 1, 0] + 0.3 * u[k - 1, 0] + 0.1 * u[k - 1, 0] ** 3 + 0.005 * rng.normal()
+        y[k, 1] = 0.7 * y[k - 1, 1] + 5 * u[k - 1, 1] + 2 * u[k - 1, 1] ** 3 + 0.02 * rng.normal()
+    u_names, y_names = ("u1", "u2"), ("y1", "y2")
+    record = Record.from_arrays(u, y, inputs=u_names, outputs=y_names)
+    reads = {"a1": "y1[k-1]", "b1": "u1[k-1]", "a2": "y2[k-1]", "b2": "u2[k-1]"}
+    physics = Baseline.from_terms([Term(name, text, output=f"y{name[1]}") for name, text in reads.items()])
+    learner, solver = MLP((8,)), LevenbergMarquardt(60)
+    fit = estimate(record, physics, learner=learner, solver=solver)
+    budget = bias_budget(fit)
+    assert [cause.suspect.name for cause in budget.causes] == [f"cubic of u{i}[k-1] in y{i}" for i in (2, 1)]
+    assert budget.of("b2").cause == "cubic of u2[k-1] in y2" and budget.of("b1").cause == "cubic of u1[k-1] in y1"
+    for name, value in (("a1", 0.8), ("b1", 0.3), ("a2", 0.7), ("b2", 5.0)):
+        low, high = budget.of(name).ci95
+        assert low < value < high
+    assert [f"of the learner in y{i} and moves b{i}" in w.text for i, w in zip((2, 1), budget.warnings, strict=True)]

@@ -13,7 +13,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import jnp
 from orthaug.analysis.budget import AS_MUCH
 from orthaug.analysis.motion_bias import ground_after, softened_bias, usual_biases
-from orthaug.analysis.motion_budget import motion_budget, rivals_of, told_budget
+from orthaug.analysis.motion_budget import motion_budget, one_of_each, rivals_of, told_budget
 from orthaug.analysis.motion_suspects import check_motion_suspects, usual_motion_suspects
 from orthaug.physics.motion_problem import MotionProblem, pose_motion
 
@@ -288,10 +288,10 @@ def test_what_a_cause_leaves_of_the_learner_may_be_another_s(learned: oa.MotionE
     rows = [suspect.values(ground.motion, learned.values, ground.field.x, ground.field.u) for suspect in (dry, drag)]
     both = replace(ground, learned=(rows[0] + 0.5 * rows[1])[:, None])
     first, second = both.table([dry, drag])
-    (after,) = both.after(replace(first, coefficient_found=1.0), [first, second])
+    (after,) = both.after([replace(first, coefficient_found=1.0)], [first, second])
     assert after.suspect is drag and after.explained == pytest.approx(1.0)
     assert after.coefficient_found == pytest.approx(0.5)
-    assert both.after(replace(first, seen=False), [second]) == []
+    assert both.after([replace(first, seen=False)], [second]) == []
 
 
 def test_a_jump_that_is_there_stays_one(learned: oa.MotionEstimate) -> None:
@@ -304,3 +304,64 @@ def test_a_jump_that_is_there_stays_one(learned: oa.MotionEstimate) -> None:
     (entry,) = oa.suspected_bias(learned, [drag])
     little = replace(entry, explained=0.99 * AS_MUCH)
     assert motion_budget(learned, [replace(entry, explained=0.985)], [little]).cause.suspect is drag
+
+
+@pytest.fixture(scope="module")
+def masses() -> oa.MotionEstimate:
+    """Two masses whose coupling hardens: the force stands in both equations, and the learner sees the distance."""
+    rng, step = np.random.default_rng(0), 0.005
+    force, x = np.repeat(rng.uniform(-6, 6, 60), 10), np.zeros((600, 4))
+
+    def slope(s: np.ndarray, u: float) -> np.ndarray:
+        between = 20 * (s[0] - s[2]) + 0.5 * (s[1] - s[3]) + 60 * (s[0] - s[2]) ** 3
+        return np.array([s[1], u - between - 4 * s[0], s[3], 2 * (between - 0.4 * s[3])])
+
+    for k, u in enumerate(force[:-1]):
+        x[k + 1] = x[k]
+        for _ in range(10):
+            middle = x[k + 1] + step / 2 * slope(x[k + 1], u)
+            x[k + 1] = x[k + 1] + step * slope(middle, u)
+    y = x[:, ::2] + 1e-3 * rng.normal(size=(600, 2))
+    record = oa.Record.from_arrays(force, y, sampling_time=10 * step, inputs=["u"], outputs=["a", "b"])
+    motion = oa.Motion.from_equations(
+        states=[
+            oa.State("x1", "v1", start="a"),
+            oa.State("v1", "(u - f - 4*x1)/m", start="derivative of a", learned=True),
+            oa.State("x2", "v2", start="b"),
+            oa.State("v2", "2*(f - d*v2)", start="derivative of b", learned=True),
+        ],
+        outputs=[oa.Output("a", "x1"), oa.Output("b", "x2")],
+        inputs=["u"],
+        parameters=positive(m=0.8, k=15.0, c=0.3, d=0.3),
+        define={"f": "k*(x1 - x2) + c*(v1 - v2)"},
+    )
+    learner = oa.MLP((6,), inputs=("x1-x2",))
+    return oa.estimate(record, motion, learner=learner, criterion=WHOLE, blocks=0, restarts=1)
+
+
+def test_a_force_between_two_masses_is_named_in_both_equations(masses: oa.MotionEstimate) -> None:
+    found = told_budget(masses, (), [])
+    assert [str(cause.suspect.name) for cause in found.causes] == ["cubic of x1-x2 in v1", "cubic of x1-x2 in v2"]
+    one, two = (cause.coefficient_found for cause in found.causes)
+    assert one == pytest.approx(-60, rel=0.2) and two == pytest.approx(120, rel=0.2) and found.share > 0.9
+    (low, high), stiffness = found.of("k").ci95, masses.values[1]
+    assert low < 20 < high and stiffness - 20 > high - low
+    (warning,) = found.warnings
+    assert "and cubic of x1-x2 in v2 of size" in warning.text and "explain 100 % of" in warning.text
+    assert "add them to the equations of v1 and v2, with their sizes as parameters" in warning.text
+
+
+def test_terms_of_each_equation_are_chosen_beside_those_of_the_others(masses: oa.MotionEstimate) -> None:
+    """What two terms make together is found though another one explains more alone; their order tells nothing."""
+    ground = ground_after(masses)
+    table = ground.table(ground.usual())
+    names = [entry.suspect.name for entry in table]
+    one, two = (table[names.index(f"{kind} of x1-x2 in {v}")] for kind, v in (("dead_zone", "v1"), ("cubic", "v2")))
+    values = 3.0 * ground._rows(one.suspect, 1) - 40.0 * ground._rows(two.suspect, 3)
+    for entries in (table, table[::-1]):
+        each = {found[0].equation: found[0] for found in one_of_each(replace(ground, learned=values), entries)}
+        assert each["v1"].suspect == one.suspect and each["v2"].suspect == two.suspect
+        assert each["v1"].coefficient_found == pytest.approx(3.0) and each["v1"].explained == pytest.approx(1.0)
+        assert each["v2"].coefficient_found == pytest.approx(-40.0)
+    alone = [entry for entry in table if entry.equation == "v1"]
+    assert one_of_each(ground, alone) == []

@@ -1,8 +1,8 @@
 """What the learner found, explained by a cause, and the bias of every parameter that follows from it.
 
 With F the learner's values under the measure and Δ a cause's, the coefficient is that of P⊥F on P⊥Δ and the bias,
-estimate less truth, `Φ_μ⁺Δ` times it. Only one cause is named: the declared suspect that explains most of ‖P⊥F‖² if
-that is enough, else the usual suspect or product of lags that does.
+estimate less truth, `Φ_μ⁺Δ` times it. One cause is named: the declared suspect that explains most of ‖P⊥F‖² if that is
+enough, else the usual suspect or product of lags that does; one of each output where none is sure to be all of it.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
@@ -21,10 +21,11 @@ from orthaug._base.warning import Warning
 from orthaug.analysis.bias import SuspectedBias
 from orthaug.analysis.measure_bias import Ground, physical_with_bias
 from orthaug.analysis.remedies import remedies
-from orthaug.analysis.suspects import Suspect, usual_suspects, usual_terms
+from orthaug.analysis.suspects import Suspect, saturations, usual_suspects, usual_terms
 from orthaug.fitting.estimates import Estimate
 from orthaug.inference.covariance import interval
 from orthaug.inference.measures import Measure, Training, weigh_problem
+from orthaug.physics.output_weights import times
 from orthaug.physics.parameters import PhysicsMap
 
 if TYPE_CHECKING:
@@ -57,13 +58,22 @@ class ParameterBias:
 
 @dataclass(frozen=True, eq=False)
 class Budget:
-    """The bias of every parameter by the cause that explains `share` of the learner."""
+    """The bias of every parameter by the causes that explain the learner, that of the largest part first."""
 
-    cause: SuspectedBias
-    share: float
+    causes: tuple[SuspectedBias, ...]
     parameters: tuple[ParameterBias, ...]
     physical: tuple[ParameterBias, ...]
     warnings: tuple[Warning, ...]
+
+    @property
+    def cause(self) -> SuspectedBias:
+        """What explains most."""
+        return self.causes[0]
+
+    @property
+    def share(self) -> float:
+        """How much of the learner that explains; where each output has a cause, of what is learned of its own."""
+        return explains(self.cause)
 
     def of(self, name: str) -> ParameterBias | None:
         """The bias of a parameter or physical parameter."""
@@ -126,27 +136,54 @@ def budget_on(ground: Ground, fit: Estimate, suspects: Sequence[Suspect]) -> Bud
     if fit.freedom < _FEWEST_LEFT:
         return None
     noise = fit.model.statistics.noise
-    if noise is not None and np.all(np.mean(ground.learned**2, axis=0) < _NOTHING**2 * np.diag(noise)):
+    least = 0.0 if noise is None else _NOTHING**2 * np.diag(noise)
+    something = np.mean(ground.learned**2, axis=0) >= least
+    found = _causes(ground, suspects, something) if something.any() else []
+    if not found:
         return None
-    cause = named_cause(ground, suspects)
-    if cause is None or cause.explained is None or cause.coefficient_found is None:
-        return None
-    share, coefficient = cause.explained, cause.coefficient_found
-    rest, bias = left_over(ground, cause, suspects), coefficient * np.array(cause.bias)
+    causes, moved = tuple(cause for _, cause in found), np.array([_moved(cause) for _, cause in found])
+    bias, rest = moved.sum(axis=0), np.concatenate([left_over(own, cause, suspects) for own, cause in found])
     std = np.full(len(bias), np.nan) if fit.std is None else fit.std
     ends = with_bias(fit.theta, std, fit.freedom, bias, np.linalg.norm(rest, axis=0))
-    names, why = ground.problem.baseline.names, (cause.suspect.name, share)
-    parameters, rows, warnings = parameter_biases(names, fit.theta, std, bias, ends, *why), (), []
+    names = ground.problem.baseline.names
+    parameters, rows, warnings = parameter_biases(names, fit.theta, std, bias, ends, _owners(causes, moved)), (), []
     if ground.physics is not None:
-        physical = fit.physical(ground.physics)
+        physical, slopes = fit.physical(ground.physics), ground.slopes
         own = np.array([np.nan if s is None else s for s in physical.std])
         spread = rest.T @ rest + (0.0 if fit.covariance is None else fit.covariance)
-        moved, ends = physical_with_bias(ground, bias, fit.covariance, spread, fit.freedom)
-        rows = parameter_biases(physical.names, physical.value, own, moved, ends, *why)
+        shifts, ends = physical_with_bias(ground, bias, fit.covariance, spread, fit.freedom)
+        owners = _owners(causes, moved @ np.array([slopes[0][name] for name in physical.names]).T) if slopes else []
+        rows = parameter_biases(physical.names, physical.value, own, shifts, ends, owners)
         warnings += _unbounded(physical.names, own, ends)
-    found = Budget(cause, share, parameters, rows, ())
-    biased = _warning(ground, found, rival_of(ground, cause, suspects), near_causes(ground, cause, suspects))
-    return replace(found, warnings=(*([] if biased is None else [biased]), *warnings))
+    told = (_warning(own, cause, (*rows, *parameters), suspects, len(found) > 1) for own, cause in found)
+    return Budget(causes, parameters, rows, (*(warning for warning in told if warning is not None), *warnings))
+
+
+def _causes(
+    ground: Ground, suspects: Sequence[Suspect], something: Bool[np.ndarray, "ny"]
+) -> list[tuple[Ground, SuspectedBias]]:
+    """What explains the learner, with the ground that it does so on: all of it, or what is learned of one output.
+
+    Args:
+        something: whether anything is learned of an output.
+    """
+    whole, outputs = named_cause(ground, suspects), ground.problem.outputs
+    found = [] if whole is None else [(ground, whole)]
+    if len(outputs) == 1 or (whole is not None and explains(whole) >= SURE_SHARE):
+        return found
+    each = []
+    for i in np.flatnonzero(something):
+        own = replace(ground, learned=np.asarray(ground.learned) * np.eye(len(outputs))[i])
+        cause = named_cause(own, suspects)
+        if cause is not None and cause.suspect.column_of(outputs) == i:
+            each.append((own, cause))
+    each.sort(key=lambda part: -np.linalg.norm(times(ground.weighed.unit, np.asarray(part[0].learned))))
+    return each if len(each) > len(found) else found
+
+
+def _owners(causes: Sequence[SuspectedBias], moved: Float[np.ndarray, "k n"]) -> list[tuple[str, float]]:
+    """Of each parameter the cause that moves it most, and its share."""
+    return [(causes[i].suspect.name, explains(causes[i])) for i in np.argmax(np.abs(moved), axis=0)]
 
 
 def named_cause(ground: Ground, suspects: Sequence[Suspect], least: float = LEAST_SHARE) -> SuspectedBias | None:
@@ -183,7 +220,9 @@ def rival_of(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) 
     assert cause.explained
     if cause.suspect in suspects:
         return None
-    equal = [entry for entry in _usual(ground) if explains(entry) >= AS_MUCH * cause.explained]
+    usual = _usual(ground)
+    usual += ground.table(saturations([entry.suspect for entry in usual]), certify=False, every=False)
+    equal = [entry for entry in usual if explains(entry) >= AS_MUCH * cause.explained]
     to_coordinates, own = ground.weighed.projection.to_coordinates, _moved(cause)
 
     def apart(entry: SuspectedBias) -> float:
@@ -236,11 +275,11 @@ def with_bias(value: Vector, std: Vector, freedom: float, bias: Vector, rest: Ve
 
 
 def parameter_biases(
-    names: Sequence[str], value: Vector, std: Vector, bias: Vector, ends: Matrix, cause: str, share: float
+    names: Sequence[str], value: Vector, std: Vector, bias: Vector, ends: Matrix, causes: Sequence[tuple[str, float]]
 ) -> tuple[ParameterBias, ...]:
-    """A row for each parameter whose bias is known; `ends` are those of its interval."""
+    """A row for each parameter whose bias is known; `ends` are those of its interval, `causes` names and shares."""
     found = []
-    for name, v, s, b, ci in zip(names, value, std, bias, ends, strict=True):
+    for name, v, s, b, ci, (cause, share) in zip(names, value, std, bias, ends, causes, strict=True):
         if np.isfinite(b):
             errors, relative = float(abs(b) / s) if s > 0 else None, float(b / v) if v else None
             limits = (float(ci[0]), float(ci[1])) if np.isfinite(ci).all() else None
@@ -258,28 +297,28 @@ def _unbounded(names: Sequence[str], std: Vector, ends: Matrix) -> list[Warning]
 
 
 def _warning(
-    ground: Ground, budget: Budget, rival: SuspectedBias | None, near: Sequence[SuspectedBias]
+    ground: Ground, cause: SuspectedBias, rows: Sequence[ParameterBias], suspects: Sequence[Suspect], several: bool
 ) -> Warning | None:
-    """What is biased by more than its standard error: cause, size, remedies; and how sure the cause is."""
-    every = (*budget.physical, *budget.parameters)
-    large = [entry for entry in every if (entry.errors or 0.0) > 1 and abs(entry.relative or 1.0) > _ROUNDING]
+    """What a cause biases by more than the standard error: its size, remedies; and how sure the cause is."""
+    own, name = [row for row in rows if row.cause == cause.suspect.name], cause.suspect.name
+    large = [row for row in own if (row.errors or 0.0) > 1 and abs(row.relative or 1.0) > _ROUNDING]
     if not large:
         return None
-    listed = told_biases(large)
-    cures = remedies(ground, budget.cause, [entry.name for entry in large])
+    listed, share, there = told_biases(large), explains(cause), f" in {cause.suspect.output}" if several else ""
+    rival, cures = rival_of(ground, cause, suspects), remedies(ground, cause, [row.name for row in large])
     other = "" if rival is None else f" ({rival.suspect.name} explains as much and would move them elsewhere)"
-    if budget.share < SURE_SHARE:
+    if share < SURE_SHARE:
+        near = near_causes(ground, cause, suspects)
         close = ", ".join(f"{entry.suspect.name} {percent(explains(entry))}" for entry in near)
         beside = f"; next: {close}" if near else ""
         return Warning(
             "biased",
-            f"what the learner found looks most like {budget.cause.suspect.name} ({percent(budget.share)} of it"
-            f"{beside}), which would move {listed}, and the standard errors do not cover that{other}: if it is "
-            f"that term, {' or '.join(cures)}.",
+            f"what the learner found{there} looks most like {name} ({percent(share)} of it{beside}), which would move "
+            f"{listed}, and the standard errors do not cover that{other}: if it is that term, {' or '.join(cures)}.",
         )
     return Warning(
         "biased",
-        f"{budget.cause.suspect.name} explains {100 * budget.share:.0f} % of the learner and moves {listed}, "
+        f"{name} explains {100 * share:.0f} % of the learner{there} and moves {listed}, "
         f"which the standard errors do not cover{other}: {' or '.join(cures)}.",
     )
 

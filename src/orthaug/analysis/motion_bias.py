@@ -153,7 +153,8 @@ class MotionGround:
         course = place.course if len(place.w) else place.course.alone
         x, u = course.trajectory(place.c, place.w, place.states)
         there = np.isfinite(x).all(axis=1)
-        return usual_motion_suspects(self.motion, x[there], u[there])
+        on = [entry.text for entry in course.problem.features]
+        return usual_motion_suspects(self.motion, x[there], u[there], on)
 
     def table(
         self, suspects: Sequence[MotionSuspect], used: float | None = None, steps: int | None = None
@@ -207,18 +208,36 @@ class MotionGround:
         told = (response.cosine(k), response.size(k), seen, explained, found, certificate)
         return TermBias(*own, *told, None if seen else residual)
 
-    def after(self, cause: TermBias, table: Sequence[TermBias]) -> list[TermBias]:
-        """What terms that the learner sees explain of it without a cause that it sees; nothing of another cause."""
-        if self.learned is None or not cause.seen:
+    def after(self, causes: Sequence[TermBias], table: Sequence[TermBias]) -> list[TermBias]:
+        """What terms that the learner sees explain of it without causes that it sees; nothing of other causes."""
+        if self.learned is None or not all(cause.seen for cause in causes):
             return []
-        own = self._rows(cause.suspect, cause.suspect.place(self.motion))
-        rest, found = replace(self, learned=self.learned - (cause.coefficient_found or 0.0) * own), []
+        rest, gone = np.array(self.learned), {cause.suspect for cause in causes}
+        for cause in causes:
+            rest -= (cause.coefficient_found or 0.0) * self._rows(cause.suspect, cause.suspect.place(self.motion))
+        return self.again(rest, [entry for entry in table if entry.suspect not in gone])
+
+    def again(self, learned: Matrix | None, table: Sequence[TermBias]) -> list[TermBias]:
+        """What terms that the learner sees explain of other values of it."""
+        rest, found = replace(self, learned=learned), []
         for entry in table:
-            if entry.seen and entry.suspect != cause.suspect:
-                rows = self._rows(entry.suspect, entry.suspect.place(self.motion))
-                explained, coefficient = rest._explained(self._weighed(rows))
+            if entry.seen:
+                explained, coefficient = rest._explained(self.held(entry.suspect))
                 found.append(replace(entry, explained=explained, coefficient_found=coefficient))
         return found
+
+    def held(self, suspect: MotionSuspect) -> Matrix:
+        """A term that the learner sees (M, nl), weighed."""
+        return self._weighed(self._rows(suspect, suspect.place(self.motion)))
+
+    def told(self) -> Matrix:
+        """The learner (M, nl), weighed, beside the shared directions."""
+        return self.beside(self._weighed(np.asarray(self.learned)))
+
+    def beside(self, values: Matrix) -> Matrix:
+        """What the shared directions leave of values (M, nl) that are weighed."""
+        basis = self.shared.basis
+        return values - self.phi.phi @ self.phi.solve_along(values, basis) if basis.shape[1] else values
 
     def _rows(self, suspect: MotionSuspect, place: int) -> Matrix:
         """The term (M, nl) in the learned equations, 0 where it acts elsewhere."""
@@ -233,12 +252,7 @@ class MotionGround:
         """How much of the learner a term explains, and with which coefficient, beside the shared directions."""
         if self.learned is None:
             return None, None
-
-        def left(values: Matrix) -> Matrix:
-            basis = self.shared.basis
-            return values - self.phi.phi @ self.phi.solve_along(values, basis) if basis.shape[1] else values
-
-        rest, tilde, size = left(held), left(self._weighed(self.learned)), np.linalg.norm(held)
+        rest, tilde, size = self.beside(held), self.told(), np.linalg.norm(held)
         norm = np.linalg.norm(rest)
         if not np.any(tilde) or norm <= IN_SPAN * size:
             return None, None

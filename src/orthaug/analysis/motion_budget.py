@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from orthaug._base.checks import Vector
+from orthaug._base.checks import Matrix, Vector
 from orthaug._base.lines import percent
 from orthaug._base.warning import Warning
 from orthaug.analysis.budget import (
@@ -24,7 +24,7 @@ from orthaug.analysis.budget import (
     told_biases,
     with_bias,
 )
-from orthaug.analysis.motion_bias import TermBias, ground_after, softened_bias, usual_biases
+from orthaug.analysis.motion_bias import MotionGround, TermBias, ground_after, softened_bias, usual_biases
 from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.fitting.motion_estimates import MotionEstimate
 
@@ -33,18 +33,29 @@ _CLOSE = 0.005  # of the learner: what leaves no more is as good as any
 _SURE = 3.3  # standard errors of a coefficient that the residual tells: one in a thousand is so large by chance
 _ELSEWHERE = 0.5  # of a bias, from which that of a rival is another one
 _NOTHING = 0.01  # of the learned equations: a learner that is smaller, and biases nothing, found nothing
+_SAME = 1e-6  # of a term's squares: what others leave of it is none
 _UNMOVED = 0.1  # standard errors of every parameter
 
 
 @dataclass(frozen=True, eq=False)
 class MotionBudget:
-    """The bias of every parameter by the term that explains `share` of the learner, or of what the free run leaves."""
+    """The bias of every parameter by the terms that explain the learner, or what the free run leaves."""
 
-    cause: TermBias
-    coefficient: float
+    causes: tuple[TermBias, ...]
+    """One, or one of each learned equation that explain `share` together."""
     share: float
     parameters: tuple[ParameterBias, ...]
     warnings: tuple[Warning, ...]
+
+    @property
+    def cause(self) -> TermBias:
+        """The first of them."""
+        return self.causes[0]
+
+    @property
+    def coefficient(self) -> float:
+        """Its size."""
+        return _size(self.cause)
 
     def of(self, name: str) -> ParameterBias | None:
         """The bias of a parameter."""
@@ -70,7 +81,7 @@ def told_budget(
 def motion_budget(
     fit: MotionEstimate, table: Sequence[TermBias], smooth: Sequence[TermBias] = ()
 ) -> MotionBudget | None:
-    """By the suspect that explains most; None where none explains enough.
+    """By the suspect that explains most, or one in each learned equation; None where none explains enough.
 
     Args:
         table: what every suspect does to the fit.
@@ -78,27 +89,37 @@ def motion_budget(
             clearly more of a learner.
     """
     learns = fit.model.form.bound is not None
-    named = _of_learner(table, smooth) if learns else _of_residual(table)
-    if named is None:
+    found = _of_learner(fit, table, smooth) if learns else _of_residual(table)
+    if found is None:
         return None
-    cause, coefficient, share, spread = named
-    rivals = rivals_of(cause, (*table, *smooth)) if learns else []
-    bias, value = coefficient * cause.per_unit, fit.values
-    std, none = np.full(len(value), np.nan) if fit.std is None else fit.std, np.zeros(len(value))
+    value, bias, causes = fit.values, found.moved, found.causes
+    std = np.full(len(value), np.nan) if fit.std is None else fit.std
     if learns and (fit.split_by.share or 0.0) < _NOTHING and not np.any(np.abs(bias) > _UNMOVED * std):
         return None
-    apart = [np.abs(_moved(rival) - bias) for rival in rivals]
-    after = _next_after(fit, cause, (*table, *smooth)) if learns else None
-    beside = none if after is None else _moved(after)
-    rest = np.linalg.norm([spread * cause.per_unit, beside, np.max([none, *apart], axis=0)], axis=0)
-    ends = with_bias(value, std, fit.freedom, bias, rest)
+    ends = with_bias(value, std, fit.freedom, bias, np.linalg.norm(found.unsure, axis=0))
     parameters = fit.problem.motion.parameters
     ends = np.clip(ends, [[p.min] for p in parameters], [[p.max] for p in parameters])
-    rows = parameter_biases(cause.names, value, std, bias, ends, cause.suspect.name, share)
-    found = MotionBudget(cause, coefficient, share, rows, ())
-    far = [rival for rival, by in zip(rivals, apart, strict=True) if np.any(by > _ELSEWHERE * np.abs(bias))]
-    warning = _motion_warning(found, far, learns=learns)
-    return found if warning is None else replace(found, warnings=(warning,))
+    name = " and ".join(cause.suspect.name for cause in causes)
+    rows = parameter_biases(causes[0].names, value, std, bias, ends, [(name, found.share)] * len(bias))
+    warning = _motion_warning(found, rows, learns=learns)
+    return MotionBudget(causes, found.share, rows, () if warning is None else (warning,))
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """Causes, what they move the parameters by (np,), standard deviations (k, np) of what they leave, and rivals."""
+
+    causes: tuple[TermBias, ...]
+    share: float
+    moved: Vector
+    unsure: Matrix
+    rivals: tuple[TermBias, ...] = ()
+
+
+def _size(cause: TermBias) -> float:
+    """The coefficient by the learner, else by what the free run leaves."""
+    told = cause.coefficient_found if cause.residual is None else cause.residual.coefficient
+    return told or 0.0
 
 
 def rivals_of(cause: TermBias, table: Sequence[TermBias]) -> list[TermBias]:
@@ -107,29 +128,87 @@ def rivals_of(cause: TermBias, table: Sequence[TermBias]) -> list[TermBias]:
     return [entry for entry in table if entry is not cause and 1 - explains(entry) <= most]
 
 
-def _next_after(fit: MotionEstimate, cause: TermBias, table: Sequence[TermBias]) -> TermBias | None:
-    """The term that explains most of what a cause leaves of the learner."""
-    ground = ground_after(fit)
-    return None if ground is None else max(ground.after(cause, table), key=explains, default=None)
-
-
 def _moved(entry: TermBias) -> Vector:
     """What a term of the size found makes of the parameters."""
     return (entry.coefficient_found or 0.0) * entry.per_unit
 
 
-def _of_learner(table: Sequence[TermBias], smooth: Sequence[TermBias]) -> tuple[TermBias, float, float, float] | None:
-    """The term that explains most of the learner: its coefficient, share, and how unsure the coefficient is."""
+def _of_learner(fit: MotionEstimate, table: Sequence[TermBias], smooth: Sequence[TermBias]) -> _Found | None:
+    """The term that explains most of the learner, or one of each equation that together leave much less of it."""
     best, other = max(table, key=explains, default=None), max(smooth, key=explains, default=None)
     if best is not None and other is not None and explains(best) < AS_MUCH * explains(other):
         best = other
-    if best is None or best.explained is None or best.explained < LEAST_SHARE or best.coefficient_found is None:
-        return None
-    unsure = abs(best.coefficient_found) * np.sqrt((1 - best.explained) / best.explained)
-    return best, best.coefficient_found, best.explained, float(unsure)
+    ground, every = ground_after(fit), (*table, *smooth)
+    alone = [] if best is None else [[best, *(entry for entry in every if entry is not best)]]
+    share = 0.0 if best is None else explains(best)
+    if ground is not None and share < SURE_SHARE:
+        each = one_of_each(ground, every)
+        joint = explains(each[0][0]) if each else 0.0
+        enough = 1 - (1 - LEAST_SHARE) ** len(each)  # as much of what the others leave as one must explain of all
+        if joint >= enough and (share < LEAST_SHARE or 1 - share >= _AS_CLOSE * (1 - joint)):
+            alone, share = each, joint
+    return None if share < LEAST_SHARE else _weighed(ground, alone, share, every)
 
 
-def _of_residual(table: Sequence[TermBias]) -> tuple[TermBias, float, float, float] | None:
+def one_of_each(ground: MotionGround, table: Sequence[TermBias]) -> list[list[TermBias]]:
+    """Terms of each learned equation by what they explain of the learner beside the first of the others, best first.
+
+    The first ones explain most together. Nothing where terms of one equation alone explain any of it.
+    """
+    seen = [entry for entry in table if entry.seen and ground.again(ground.learned, [entry])[0].explained]
+    places = [entry.suspect.place(ground.motion) for entry in seen]
+    groups = [np.flatnonzero(np.equal(places, place)) for place in dict.fromkeys(places)]
+    if len(groups) < 2:
+        return []
+    rows = np.stack([*(ground.beside(ground.held(entry.suspect)).ravel() for entry in seen), ground.told().ravel()])
+    sizes = np.linalg.norm(rows, axis=1)
+    cosines = (rows @ rows.T) / np.outer(sizes, sizes)
+
+    def beside(others: list[int]) -> tuple[Vector, Vector]:
+        """The share of the learner that others explain with each term, and its coefficient."""
+        rest = cosines - cosines[:, others] @ np.linalg.pinv(cosines[np.ix_(others, others)]) @ cosines[others]
+        own, product = rest.diagonal()[:-1], rest[:-1, -1]
+        fitted = np.where(own > _SAME, product / np.where(own > _SAME, own, 1.0), 0.0)
+        return 1 - rest[-1, -1] + fitted * product, fitted * sizes[-1] / sizes[:-1]
+
+    def best_from(first: int) -> tuple[float, list[int]]:
+        """From one term on: the best of each equation beside the others, until each was chosen beside them."""
+        now, share = [first], 0.0
+        for k in (*range(1, len(groups)), *range(len(groups)), *range(len(groups))):
+            shares = beside(now[:k] + now[k + 1 :])[0][groups[k]]
+            now[k : k + 1], share = [int(groups[k][np.argmax(shares)])], float(np.max(shares))
+        return share, now
+
+    chosen, found = max(best_from(first) for first in groups[0].tolist())[1], []
+    for k, group in enumerate(groups):
+        shares, fitted = beside(chosen[:k] + chosen[k + 1 :])
+        told = [replace(seen[i], explained=float(shares[i]), coefficient_found=float(fitted[i])) for i in group]
+        found.append(sorted(told, key=explains, reverse=True))
+    return found
+
+
+def _weighed(
+    ground: MotionGround | None, each: Sequence[Sequence[TermBias]], share: float, table: Sequence[TermBias]
+) -> _Found:
+    """Causes with how unsure their sizes are, what the next one makes of the rest, and what they cannot be told from.
+
+    Args:
+        each: of an equation, or of all, its cause and then what may be it instead.
+    """
+    causes = tuple(entries[0] for entries in each)
+    bias, rivals = np.sum([_moved(cause) for cause in causes], axis=0), []
+    unsure = [np.sqrt((1 - share) / share) * bias]
+    for cause, *others in each:
+        near = rivals_of(cause, others)
+        apart = [np.abs(_moved(rival) - _moved(cause)) for rival in near]
+        unsure.append(np.max([np.zeros(len(bias)), *apart], axis=0))
+        rivals += [rival for rival, by in zip(near, apart, strict=True) if np.any(by > _ELSEWHERE * np.abs(bias))]
+    after = [] if ground is None else ground.after(causes, table)
+    unsure += [_moved(max(after, key=explains))] if after else []
+    return _Found(causes, share, bias, np.array(unsure), tuple(rivals))
+
+
+def _of_residual(table: Sequence[TermBias]) -> _Found | None:
     """The term that lowers the residual most, where that is no chance and most of what is no white noise.
 
     What stays beyond white noise counts as biased by as much for its size, of unknown sign.
@@ -142,29 +221,30 @@ def _of_residual(table: Sequence[TermBias]) -> tuple[TermBias, float, float, flo
     if told.share < LEAST_SHARE * (told.share + told.left):
         return None
     unsure = np.hypot(std, told.coefficient * np.sqrt(told.left / told.share))
-    return best, told.coefficient, told.share, float(unsure)
+    return _Found((best,), told.share, told.coefficient * best.per_unit, np.array([unsure * best.per_unit]))
 
 
-def _motion_warning(budget: MotionBudget, rivals: Sequence[TermBias], *, learns: bool) -> Warning | None:
-    """One sentence on what is biased by more than its standard error: cause, size, remedy."""
-    large = [entry for entry in budget.parameters if (entry.errors or 0.0) > 1]
+def _motion_warning(found: _Found, rows: Sequence[ParameterBias], *, learns: bool) -> Warning | None:
+    """One sentence on what is biased by more than its standard error: causes, their sizes, remedy."""
+    large = [entry for entry in rows if (entry.errors or 0.0) > 1]
     if not large:
         return None
-    cause, first = budget.cause, sorted(rivals, key=explains, reverse=True)[:2]
+    several, first = len(found.causes) > 1, sorted(found.rivals, key=explains, reverse=True)[:2]
     named = " and ".join(f"{rival.suspect.name}, {percent(explains(rival))}" for rival in first)
-    other = f" (near it: {named}, and would move them elsewhere)" if rivals else ""
-    cure = f"add it to the equation of {cause.equation}, with its size as a parameter"
+    other = f" (near it: {named}, and would move them elsewhere)" if first else ""
+    where = " and ".join(cause.equation for cause in found.causes)
+    cure = f"add it to the equation of {where}, with its size as a parameter"
+    cure = f"add them to the equations of {where}, with their sizes as parameters" if several else cure
     what = "the learner" if learns else "the squares that the free run leaves"
-    size = f"{budget.coefficient:.3g} {cause.suspect.unit}".rstrip()
-    if learns and budget.share < SURE_SHARE:
+    told = " and ".join(f"{c.suspect.name} of size {_size(c):.3g} {c.suspect.unit}".rstrip() for c in found.causes)
+    if learns and found.share < SURE_SHARE:
         return Warning(
             "biased",
-            f"what the learner found looks most like {cause.suspect.name} of size {size} ({percent(budget.share)} of "
-            f"it), which would move {told_biases(large)}, and the standard errors do not cover that{other}: if it is "
-            f"that term, {cure}.",
+            f"what the learner found looks most like {told} ({percent(found.share)} of it), which would move "
+            f"{told_biases(large)}, and the standard errors do not cover that{other}: if it is that, {cure}.",
         )
     return Warning(
         "biased",
-        f"{cause.suspect.name} of size {size} explains {100 * budget.share:.0f} % of {what} and moves "
+        f"{told} explain{'' if several else 's'} {100 * found.share:.0f} % of {what} and move{'' if several else 's'} "
         f"{told_biases(large)}, which the standard errors do not cover{other}: {cure}.",
     )

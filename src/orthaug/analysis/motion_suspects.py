@@ -22,6 +22,7 @@ from orthaug.physics.suspected_motion import AddedTerm
 _OF_STATES = ("coulomb", "quadratic_drag", "cubic")
 _WIDTHS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # of friction that turns round smoothly, in median sizes of what it acts on
 _OF_INPUTS = ("cubic", "dead_zone", "saturation")
+_OF_FEATURES = (*_OF_STATES, "dead_zone")
 
 
 @dataclass(frozen=True)
@@ -193,21 +194,29 @@ def softened(
     return tuple(found)
 
 
-def usual_motion_suspects(motion: Motion, x: Matrix, u: Matrix) -> tuple[MotionSuspect, ...]:
+def usual_motion_suspects(motion: Motion, x: Matrix, u: Matrix, on: Sequence[str] = ()) -> tuple[MotionSuspect, ...]:
     """What is often missing: friction, drag and hardening of every state, what bends an input, an offset.
 
     Args:
         x: states (M, nx) that it is about; with inputs u (M, nu) they tell the widths.
+        on: expressions that the learner sees, such as the distance of two masses.
     """
-    moving = [(name, True, row) for name, row in zip(motion.names_of_states, x.T, strict=True) if np.ptp(row) > 0]
-    moving += [(name, False, row) for name, row in zip(motion.inputs, u.T, strict=True) if np.ptp(row) > 0]
+    names, inputs = motion.names_of_states, motion.inputs
+    features = [text for text in dict.fromkeys(on) if text not in (*names, *inputs)]
+    seen = [MotionSuspect(text, text).values(motion, motion.initial, x, u) for text in features]
+    moving = [
+        (name, kinds, row)
+        for of, rows, kinds in ((names, x.T, _OF_STATES), (inputs, u.T, _OF_INPUTS), (features, seen, _OF_FEATURES))
+        for name, row in zip(of, rows, strict=True)
+        if np.ptp(row) > 0
+    ]
     places = usual_places(motion)
     found = []
     for place in places:
         equation = motion.states[place].name
         where = f" in {equation}" if len(places) > 1 else ""
-        for name, is_state, row in moving:
-            for kind in _OF_STATES if is_state else _OF_INPUTS:
+        for name, kinds, row in moving:
+            for kind in kinds:
                 if kind in ODD_JUMPS and not changes_sign(row):
                     continue
                 width = motion_width(name, motion, x, u) if kind in WIDTHS else None

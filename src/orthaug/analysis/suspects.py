@@ -292,6 +292,15 @@ def usual_suspects(problem: Problem) -> tuple[Suspect, ...]:
     return tuple(suspects)
 
 
+def saturations(suspects: Sequence[Suspect]) -> list[Suspect]:
+    """What is left of the channel beside each dead zone: data of a physics with that channel cannot tell the two."""
+    zones = [suspect for suspect in suspects if suspect.name.startswith("dead_zone")]
+    return [
+        replace(s, name=s.name.replace("dead_zone", "saturation"), expression=f"{s.on} - ({s.expression})")
+        for s in zones
+    ]
+
+
 def changes_sign(values: Vector) -> bool:
     """Whether values (N,) lie clearly on both sides of zero; otherwise what jumps there is as good as a constant."""
     edge = _CLEARLY * np.abs(values).max(initial=0.0)

@@ -171,7 +171,8 @@ def _analysed(job: MotionJob, fit: MotionEstimate, free_run: Response, warnings:
         table = suspected_bias(fit, job.suspects) if job.suspects else []
         budget = told_budget(fit, job.suspects, table)
         warnings.extend(budget.warnings if budget else ())
-        usual = [] if budget is None or budget.cause in table else [budget.cause]
+        listed = {entry.suspect for entry in table}
+        usual = [cause for cause in (budget.causes if budget else ()) if cause.suspect not in listed]
         return [entry.as_dict() for entry in (*table, *usual)] or None, budget
 
     points = job.reach(fit.model, job.train.record)[0]

@@ -1,4 +1,4 @@
-"""Which biases by suspected terms a heat map shows, and how they are written in its cells."""
+"""Parameters by what biases them; which biases by suspected terms a heat map shows, and how its cells are written."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from orthaug._base.checks import Matrix
 from orthaug._base.lines import counted, plain_number
 from orthaug.reports.findings import SuspectResult
+from orthaug.reports.result import ParameterResult
 
 _MOST_COLUMNS = 12  # more cells beside each other are too narrow for their numbers on paper
 _MOST_CELLS = 200
@@ -45,6 +46,15 @@ class BiasMap:
     def cells(self) -> list[list[str]]:
         """What is written in them."""
         return [[_cell(value) for value in row] for row in self.shares]
+
+
+def biased_by(rows: Sequence[ParameterResult]) -> dict[tuple[str, float], list[ParameterResult]]:
+    """Parameters with a bias, by its cause and the share that this explains."""
+    found: dict[tuple[str, float], list[ParameterResult]] = {}
+    for row in rows:
+        if row.bias:
+            found.setdefault((row.bias.cause, row.bias.share or 0.0), []).append(row)
+    return found
 
 
 def bias_map(suspects: Sequence[SuspectResult]) -> BiasMap:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from orthaug.models.response import Response
+from orthaug.reports.biases import biased_by
 from orthaug.reports.learned_part import LearnedPart
 from orthaug.reports.page_blocks import (
     CATEGORIES,
@@ -122,17 +123,13 @@ def _parameters(result: FitResult) -> list[Any]:
     blocks: list[Any] = [Table(caption, columns, [_parameter_cells(row, biased, shared) for row in rows])]
     plot = interval_plot(rows)
     blocks += [plot] if plot else []
-    cause = next((row.bias for row in rows if row.bias), None)
-    if cause is not None:
-        blocks.append(
-            Text(
-                f"The bias budget: {percent(cause.share)} of what the learner found is {cause.cause}, once what the "
-                "physics can imitate is taken out of both; what is drawn over one input alone may tell less."
-                if result.learns
-                else f"The bias budget: {cause.cause} explains {percent(cause.share)} of the squares that the free run "
-                "leaves."
-            )
-        )
+    causes = [f"{percent(share)} is {cause}" for cause, share in biased_by(rows)]
+    if causes:
+        told, more = f"{' in one equation' if len(causes) > 1 else ''} {', in another '.join(causes)}", ""
+        if result.learns:
+            more = ", once what the physics can imitate is taken out of both; drawn over one input it may tell less"
+        what = "what the learner found" if result.learns else "the squares that the free run leaves"
+        blocks.append(Text(f"The bias budget: of {what}{told}{more}."))
     if result.physical_consistency:
         blocks.append(Text(result.physical_consistency.text))
     if result.shared is not None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from orthaug._base.lines import fold, percent, plain_number, table
 from orthaug.analysis.budget import SURE_SHARE
+from orthaug.reports.biases import biased_by
 from orthaug.reports.fields import WarningResult
 from orthaug.reports.findings import SharedResult, SuspectResult
 from orthaug.reports.result import (
@@ -183,25 +184,26 @@ def _suspect_lines(suspects: Sequence[SuspectResult]) -> list[str]:
 
 def _bias_lines(result: FitResult) -> list[str]:
     """The bias of every parameter by what the learner found, and the interval that covers it."""
-    rows = [row for row in (*result.parameters, *(result.physical_parameters or ())) if row.bias is not None]
-    if not rows or rows[0].bias is None:
-        return _unexplained(result)
-    cause, share, width = rows[0].bias.cause, rows[0].bias.share or 0.0, _width(rows)
-    what = "learner found" if result.learns else "free run leaves"
-    lines = [f"{100 * share:.0f} % of what the {what} is {cause}. The bias that implies:"]
-    if result.learns and share < SURE_SHARE:
-        lines = [f"What the learner found looks most like {cause}: {percent(share)} of it. The bias if it is that:"]
-    lines.append(f"{'parameter':<{width}}  {'bias':>11}  {'of std':>7}  {'of value':>9}  {'95 % interval with it':^29}")
-    for row in rows:
-        bias = row.bias.value if row.bias else None
-        bias = None if bias is None else _rounded(bias / (row.value or 1.0)) * (row.value or 1.0)
-        if bias is not None and row.value is not None:
-            errors = f"{plain_number(abs(bias) / row.std) if row.std else '–':>7}"
-            part = f"{percent(_rounded(bias / row.value), sign='+') if row.value else '–':>9}"
-            reach = row.ci95_with_bias
-            limits = f"[{_limit(reach[0])}, {_limit(reach[1])}]" if reach else f"{'–':^29}"
-            lines.append(f"{row.name:<{width}}  {bias:+11.3g}  {errors}  {part}  {limits}".rstrip())
-    return lines
+    rows = [*result.parameters, *(result.physical_parameters or ())]
+    lines, width, causes = [], _width([row for row in rows if row.bias]), biased_by(rows)
+    what = ("learner found" if result.learns else "free run leaves") + (" in one equation" if len(causes) > 1 else "")
+    for (cause, share), own in causes.items():
+        if result.learns and share < SURE_SHARE:
+            lines.append(f"What the {what} looks most like {cause}: {percent(share)} of it. The bias if it is that:")
+        else:
+            lines.append(f"{100 * share:.0f} % of what the {what} is {cause}. The bias that implies:")
+        head = f"{'parameter':<{width}}  {'bias':>11}  {'of std':>7}  {'of value':>9}  {'95 % interval with it':^29}"
+        lines += [head, *(_bias_line(row, width) for row in own if row.value is not None)]
+    return lines or _unexplained(result)
+
+
+def _bias_line(row: ParameterResult, width: int) -> str:
+    value, bias, reach = row.value or 0.0, row.bias.value if row.bias else None, row.ci95_with_bias
+    bias = _rounded((bias or 0.0) / (value or 1.0)) * (value or 1.0)
+    errors = f"{plain_number(abs(bias) / row.std) if row.std else '–':>7}"
+    part = f"{percent(_rounded(bias / value), sign='+') if value else '–':>9}"
+    limits = f"[{_limit(reach[0])}, {_limit(reach[1])}]" if reach else f"{'–':^29}"
+    return f"{row.name:<{width}}  {bias:+11.3g}  {errors}  {part}  {limits}".rstrip()
 
 
 def _unexplained(result: FitResult) -> list[str]:
