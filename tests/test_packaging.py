@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 import orthaug
-from orthaug.commands.keys import keys_of_a_spec, schema_of_a_spec
+from orthaug.commands.schema import keys_of_a_spec, schema_of_a_spec
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))

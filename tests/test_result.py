@@ -14,9 +14,9 @@ import pytest
 from test_cli import MLP, SPEC, make_project, run
 
 from orthaug._base.warning import Warning
+from orthaug.commands.schema import RESULTS, schema_of
 from orthaug.reports.fields import Content, Flag, Number, Numbers, WarningResult, Whole
 from orthaug.reports.result import DataResult, FitResult, ParameterResult, ScoreResult
-from orthaug.reports.schemas import RESULTS, schema_of
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 

@@ -281,8 +281,7 @@ def schema(
     ] = "fit",
 ) -> None:
     """The JSON schema of a result or a spec; keys: in words."""
-    from orthaug.commands.keys import keys_of_a_spec, schema_of_a_spec
-    from orthaug.reports.schemas import RESULTS, schema_of
+    from orthaug.commands.schema import RESULTS, keys_of_a_spec, schema_of, schema_of_a_spec
 
     if check_choice(command, (*RESULTS, "spec", "keys"), "WHAT") == "keys":
         streams.echo(keys_of_a_spec())
