@@ -40,7 +40,7 @@ settings.register_profile(
 settings.load_profile("orthaug")
 
 
-_MOST_MAPS = 30_000  # of memory, of 65,530 that Linux gives a process: each compiled program takes one or more
+_MOST_MAPS = 50_000  # of memory, of 65,530 that Linux gives a process: each compiled program takes one or more
 
 
 def pytest_xdist_auto_num_workers() -> int:
