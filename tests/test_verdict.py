@@ -238,6 +238,8 @@ def test_harm_outside_the_training_range_is_called_so():
 def test_harm_elsewhere_is_not_blamed_on_extrapolation():
     found = judge([Trial("tests.far", 1.0, 0.5), Trial("tests.near", 1.0, 2.0)], [BEYOND])
     assert found.text.startswith("The learner hurts. ")
+    seldom = judge([Trial("tests.far", 1.0, 2.0)], [replace(BEYOND, share=0.02)])
+    assert seldom.text.startswith("The learner hurts. ") and "outside on 2 % of its rows" in seldom.text
 
 
 def test_what_diverges_is_null_in_json_and_told():

@@ -26,6 +26,7 @@ from orthaug.models.response import Response
 
 _BEYOND, _FAR = 0.01, 0.1  # of the training range: an excursion that is told, and one that counts on any row
 _OFTEN = 0.01  # of the rows: a smaller excursion counts from there on
+_MUCH = 0.1  # of a part's rows outside: what is wrong there may be that
 _LIKELY = 0.9  # ratio of errors below which an interval that holds 1 leaves undecided what is not shown
 
 
@@ -214,7 +215,7 @@ def judge(trials: Sequence[Trial], extrapolation: Sequence[Extrapolation] = ()) 
         ratios.append(ratio)
     worst = next(code for code in ("hurts", "no_help", "helps") if code in codes)
     hurt = {where for (where, _), code in zip(groups, codes, strict=True) if code == "hurts"}
-    beyond = [e for e in extrapolation if e.part in hurt]
+    beyond = [e for e in extrapolation if e.part in hurt and e.share > _MUCH]
     ratio = ratios[codes.index(worst)]
     likely = ratio.value < _LIKELY and ratio.high > 1
     opening = {
