@@ -41,7 +41,7 @@ nb = 2
 [learner]
 hidden = [3]
 [training]
-iterations = 20
+iterations = 8
 regularization = {regularization}
 [structure]
 kind = "{structure}"
@@ -199,7 +199,7 @@ def test_a_frame_on_a_cluster_as_a_record(folder, cluster):
         oa.open_frame(emptied, client=cluster, **COLUMNS)
 
 
-FLIGHT = {"regularization": "evidence", "blocks": 0, "fallback": False, "solver": oa.LevenbergMarquardt(20)}
+FLIGHT = {"regularization": "evidence", "blocks": 0, "fallback": False, "solver": oa.LevenbergMarquardt(8)}
 
 
 def flown_lagged(record, engine=None):
