@@ -266,7 +266,8 @@ def _is(names: list[str]) -> str:
 
 def _then(result: FitResult) -> str:
     """The first thing to do."""
-    cause = next((row.bias for row in _rows(result) if _biased(row) and row.bias), None)
+    causes = [row.bias for row in _rows(result) if _biased(row) and row.bias]
+    cause = max(causes, key=lambda bias: bias.share or 0.0, default=None)
     missing = result.residuals.missing.terms if result.residuals and result.residuals.missing else []
     significant = result.residuals is not None and result.residuals.verdict == "unmodelled"
     if _code(result) == "hurts":
