@@ -340,11 +340,9 @@ def _de_bruijn(levels: int, order: int, rng: np.random.Generator) -> np.ndarray:
 
 def _van_der_corput(count: int) -> Vector:
     """The first `count` radical inverses in base 2, spread to the multiples of 1/count in [0, 1)."""
-    index, inverse, place = np.arange(count), np.zeros(count), 0.5
-    while index.any():
-        inverse += place * (index & 1)
-        index, place = index >> 1, place / 2
-    return np.argsort(np.argsort(inverse)) / count
+    from scipy.stats import qmc
+
+    return np.argsort(np.argsort(qmc.Halton(1, scramble=False).random(count)[:, 0])) / count
 
 
 def _held(bits: Any, hold: int, samples: int) -> Vector:
