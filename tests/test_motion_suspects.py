@@ -336,7 +336,7 @@ def masses() -> oa.MotionEstimate:
         define={"f": "k*(x1 - x2) + c*(v1 - v2)"},
         substeps=1,
     )
-    learner = oa.MLP((3,), inputs=("x1-x2",))
+    learner = oa.MLP((4,), inputs=("x1-x2",))
     return oa.estimate(record, motion, learner=learner, criterion=WHOLE, blocks=0, restarts=1)
 
 
