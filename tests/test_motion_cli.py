@@ -382,7 +382,7 @@ def test_compare_puts_physics_alone_and_saved_models_beside(folder, printed, res
 def test_check_tells_what_cannot_be_told_apart_and_which_hold_is_right(tmp_path):
     """A sensor gain scales mass, damper and spring; the input runs straight between samples."""
     text = SPEC.replace('position = "x"', 'position = "g*x"').replace(
-        "[learner]", "g = { initial = 1.1, min = 0 }\n[learner]"
+        "[learner]", "g = { initial = 1.1, min = 0 }\n[motion]\nsubsteps = 1\n[learner]"
     )
     spec = put(tmp_path, text.replace("tests.steps", "# tests.steps"))
     np.savetxt(tmp_path / "run.csv", ramps(300), delimiter=",", header="force,position", comments="")
@@ -455,7 +455,7 @@ inputs = ["V"]
 outputs = ["W", "I"]
 train = { files = ["motor.csv"] }
 [motion]
-substeps = 2
+substeps = 1
 [motion.states]
 w = { derivative = "(K*i - b*w)/J", start = "W", learned = true }
 i = { derivative = "(V - R*i - K*w)/L", start = "I" }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -57,8 +58,14 @@ def record(rows: int = 60) -> oa.Record:
 
 
 def run(form: Moving, made: Numbers, data: oa.Record, start) -> np.ndarray:
-    inputs, made = form.inputs(data.experiments[0], data), form.prepared(made)
-    return np.asarray(jax.lax.scan(lambda x, row: (form.step(made, x, row)[0], x), np.asarray(start), inputs)[1])
+    inputs = form.inputs(data.experiments[0], data)
+
+    @jax.jit
+    def states(made: Numbers, start, inputs):
+        made = form.prepared(made)
+        return jax.lax.scan(lambda x, row: (form.step(made, x, row)[0], x), start, inputs)[1]
+
+    return np.asarray(states(made, np.asarray(start), inputs))
 
 
 @pytest.mark.parametrize("hold", ["zero-order", "first-order"])
@@ -110,13 +117,14 @@ def test_inputs_between_samples() -> None:
     np.testing.assert_allclose(spline[:-1, -1], u[1:], atol=1e-12)
 
 
-@pytest.mark.parametrize(("integrator", "substeps", "hold"), [("rk4", 1, "zero-order"), ("rk4", 3, "spline")])
+@pytest.mark.parametrize(("integrator", "substeps", "hold"), [("rk4", 1, "zero-order"), ("rk4", 2, "spline")])
 def test_the_adjoint_of_the_stages_gives_the_derivatives(integrator: str, substeps: int, hold: str) -> None:
     form, made = with_learner(spring(integrator=integrator, hold=hold, learned=True), substeps)
     rng = np.random.default_rng(3)
     points = {"zero-order": 1, "spline": 2 * substeps + 1}[hold]
     state, inputs = rng.normal(size=(2, 5)), rng.normal(size=(points, 5))
-    ours, plain = form.local(made, state, inputs), Differentiated.local(form, made, state, inputs)
+    given = (made, state, inputs)
+    ours, plain = jax.jit(form.local)(*given), jax.jit(partial(Differentiated.local, form))(*given)
     for one, other in zip(ours, plain, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-13)
 

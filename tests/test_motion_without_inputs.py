@@ -172,6 +172,7 @@ def test_starts_that_settle_slowly_are_no_poor_minimum():
         states=[oa.State("x", "a*x - b*x*y", start="prey"), oa.State("y", "c*x*y - d*y", start="pred")],
         outputs=[oa.Output("prey", "x"), oa.Output("pred", "y")],
         parameters=[oa.PhysicalParameter(n, v, min=0) for n, v in dict(a=1.0, b=0.3, c=0.1, d=0.3).items()],
+        substeps=1,
     )
     record = oa.Record.from_arrays(None, run, outputs=["prey", "pred"], sampling_time=0.1)
     fit = oa.estimate(record, motion, learner=None)

@@ -39,14 +39,15 @@ def linear_lagged():
     return replace(model, numbers=numbers), oa.Noise(of([[0.02, 0.01], [0.01, 0.05]]), of([[0.1, 0.02], [0.02, 0.3]]))
 
 
-def linear_motion(hold="zero-order", features=(), learner=None):
+def linear_motion(hold="zero-order", features=(), learner=None, integrator="exact"):
     motion = oa.Motion.from_equations(
         states=[oa.State("x", "v", start="y"), oa.State("v", "(u - 0.4*v - k*x)/m", learned=learner is not None)],
         outputs=[oa.Output("y", "x")],
         inputs=["u"],
         parameters=[oa.PhysicalParameter("m", 1.3), oa.PhysicalParameter("k", 9.0)],
         hold=hold,
-        integrator="exact",
+        integrator=integrator,
+        substeps=1,
     )
     model = moving(motion, features, learner, substeps=1)
     numbers = model.numbers._replace(theta_aux=np.zeros(2), gain=0 * model.numbers.gain + 2.0)
@@ -127,7 +128,7 @@ def nonlinear_lagged():
 
 
 def nonlinear_motion():
-    return linear_motion(features=("v",), learner=oa.MLP((4,)))
+    return linear_motion(features=("v",), learner=oa.MLP((4,)), integrator="rk4")
 
 
 @cache
@@ -304,7 +305,7 @@ def test_a_model_by_itself_goes_by_how_it_was_trained():
 
 def test_a_fit_keeps_noises_by_the_likelihood_of_its_data(tmp_path):
     """Disturbances of a motion make its errors coloured; what share of them they make no rule knows."""
-    model, _ = linear_motion()
+    model, _ = linear_motion(integrator="rk4")
     noise = oa.Noise(of([[0, 0], [0, 0.001]]), of([[0.01]]))
     records = [record_of(model, u, y) for y, _, _, u in (simulated(model, noise, 2000, seed) for seed in (11, 12))]
     fit = oa.estimate(records[0], model.form.motion, learner=None, criterion=oa.Simulation(segment=0, washout=0))
