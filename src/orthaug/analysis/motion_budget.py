@@ -142,8 +142,8 @@ def _of_learner(fit: MotionEstimate, table: Sequence[TermBias], smooth: Sequence
     alone = [] if best is None else [[best, *(entry for entry in every if entry is not best)]]
     share = 0.0 if best is None else explains(best)
     if ground is not None and share < SURE_SHARE:
-        each = one_of_each(ground, every)
-        joint = explains(each[0][0]) if each else 0.0
+        found = [(explains(each[0][0]), each) for terms in (table, every) if (each := one_of_each(ground, terms))]
+        joint, each = next((pair for pair in found if pair[0] >= AS_MUCH * found[-1][0]), (0.0, []))
         enough = 1 - (1 - LEAST_SHARE) ** len(each)  # as much of what the others leave as one must explain of all
         if joint >= enough and (share < LEAST_SHARE or 1 - share >= _AS_CLOSE * (1 - joint)):
             alone, share = each, joint
