@@ -147,7 +147,7 @@ def test_states_of_another_fit_are_refused(tmp_path):
         Checkpoints(place, "another fit").opened(resume=False)
 
 
-def test_a_command_that_was_killed_goes_on(folder, tmp_path):  # noqa: F811
+def test_a_command_that_was_killed_goes_on(folder, tmp_path, without_figures):  # noqa: F811
     expected = fitted(folder, "stream")
     path = folder / "kept.toml"
     text = SPEC.format(kind="stream", structure="orthogonal", regularization='"none"')

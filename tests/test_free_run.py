@@ -597,9 +597,8 @@ def test_standard_deviations_of_the_physics(criterion):
 
 
 def test_standard_deviations_beside_a_regularised_learner():
-    theta, std = monte_carlo(
-        60, learner=MLP((2,)), criterion=Simulation(64, 8, 10), regularization="evidence", solver=LM
-    )
+    criterion, solver = Simulation(64, 8, 10), LevenbergMarquardt(12)
+    theta, std = monte_carlo(60, learner=MLP((2,)), criterion=criterion, regularization="evidence", solver=solver)
     np.testing.assert_allclose(std.mean(axis=0), theta.std(axis=0, ddof=1), rtol=0.25)
 
 

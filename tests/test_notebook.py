@@ -183,7 +183,8 @@ def test_a_motion_has_a_page_too(motion):
     speed = np.zeros(121)
     for k in range(120):
         speed[k + 1] = np.exp(-0.05) * speed[k] + (1 - np.exp(-0.05)) * u[k]
-    record = oa.Record.from_arrays(u, speed[:120], sampling_time=0.1, outputs=["x"])
+    measured = speed[:120] + 0.01 * np.random.default_rng(0).normal(size=120)
+    record = oa.Record.from_arrays(u, measured, sampling_time=0.1, outputs=["x"])
     assert "c*v" in oa.estimate(record, motion, learner=None).report().html
 
 

@@ -328,7 +328,7 @@ def test_intervals_cover_the_truth():
     physics = spring(start=tuple(TRUTH))
     theta = physics.theta(TRUTH)
     cov = relative(theta)
-    draws = np.random.default_rng(0).multivariate_normal(theta, cov, 4000)
+    draws = scipy.stats.qmc.MultivariateNormalQMC(theta, cov, seed=0).random(1024)
     inside = np.zeros(3)
     for draw in draws:
         ci = np.array(solve(physics, draw, cov, freedom=math.inf, starts=0).ci95)

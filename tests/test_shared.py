@@ -271,7 +271,12 @@ def test_an_additive_fit_is_split_along_the_same_directions():
 
 def test_on_the_free_run():
     fit = estimate(
-        oscillator(), OSCILLATOR, learner=VELOCITY, criterion=Simulation(100, 20), solver=LevenbergMarquardt(30)
+        oscillator(),
+        OSCILLATOR,
+        learner=VELOCITY,
+        criterion=Simulation(100, 20),
+        solver=LevenbergMarquardt(30),
+        blocks=0,
     )
     assert physical(fit.theta)[2] == pytest.approx(1000, rel=2e-3) and fit.defect <= 1e-12
 

@@ -30,6 +30,12 @@ ROWS = 300
 NET = MLP((4,))
 
 
+@pytest.fixture
+def coarser(monkeypatch):
+    """The uniform measure's rule has 2¹² of its 2²⁰ nodes, which integrate smooth functions to rounding as well."""
+    monkeypatch.setattr("orthaug.inference.measures._NODES", (1 << 12, 512, 64))
+
+
 def plant() -> Record:
     """Two inputs and two outputs, coupled, with squares that the physics below does not know."""
     u, y = RNG.uniform(-1, 1, (ROWS, 2)), np.zeros((ROWS, 2))
@@ -126,7 +132,7 @@ def fit(request):
 
 
 @pytest.mark.parametrize("measure", [Training(), Training(rows=(40, 90)), Symmetrized(), Uniform()])
-def test_no_split_changes_a_prediction(fit, measure):
+def test_no_split_changes_a_prediction(fit, measure, coarser):
     found = fit.split(measure).model.predict(fit.problem.record).model
     before = fit.model.predict(fit.problem.record).model
     assert np.nanmax(np.abs(found - before) / np.nanmax(np.abs(before), axis=0)) <= 1e-12
@@ -162,7 +168,7 @@ def test_theta_on_a_part_of_the_rows(curve):
 
 
 @pytest.mark.parametrize("measure", [Training(), Symmetrized(), Uniform()])
-def test_the_rest_is_orthogonal_under_the_measure(fit, measure):
+def test_the_rest_is_orthogonal_under_the_measure(fit, measure, coarser):
     assert 0 < fit.split(measure).defect <= 1e-12
 
 
@@ -194,7 +200,7 @@ def test_a_split_says_what_it_is(curve):
     )
 
 
-def test_a_measure_beyond_the_data_is_warned_of(curve):
+def test_a_measure_beyond_the_data_is_warned_of(curve, coarser):
     found = curve.split(Uniform({"u[k]": (-3, 3)}))
     assert found.measure.support == pytest.approx(0.29, abs=0.02)
     assert any(
@@ -206,17 +212,17 @@ def test_a_measure_beyond_the_data_is_warned_of(curve):
 
 
 @pytest.mark.parametrize("data_set", [2, 3])
-def test_the_uniform_measure_finds_the_papers_parameters(data_set):
+def test_the_uniform_measure_finds_the_papers_parameters(data_set, coarser):
     """θ̂ errs by 0.0796 and 0.1433 under the training measure, however good the fit (F3)."""
     example = static(data_set)
     for seed in range(2):
-        fit = estimate(example.train, example.baseline, seed=seed, regularization="none")
+        fit = estimate(example.train, example.baseline, seed=seed, regularization="none", blocks=0)
         biased = {2: 0.0795547, 3: 0.1433322}[data_set]
         assert np.linalg.norm(fit.theta - example.theta) == pytest.approx(biased, abs=1e-7)
         assert np.linalg.norm(fit.split(WIDE).theta - example.theta) <= 5e-5
 
 
-def test_estimate_under_a_measure_is_the_split():
+def test_estimate_under_a_measure_is_the_split(coarser):
     example = static(3)
     given = {"learner": NET, "solver": QUICK}
     direct = estimate(example.train, example.baseline, structure=Orthogonal(measure=WIDE), **given)
@@ -231,7 +237,7 @@ def test_estimate_under_a_measure_is_the_split():
 
 def test_a_model_trained_on_its_free_run():
     example = plant()
-    given = {"learner": NET, "solver": LevenbergMarquardt(5), "criterion": Simulation(32, 4, 5)}
+    given = {"learner": NET, "solver": LevenbergMarquardt(5), "criterion": Simulation(32, 4, 5), "blocks": 0}
     fit = estimate(example, Baseline.from_terms(TERMS), **given)
     found = fit.split(Symmetrized())
     rows = columns_of(fit)
@@ -240,7 +246,7 @@ def test_a_model_trained_on_its_free_run():
     assert (found.std > 0).all()
 
 
-def test_an_ensemble_has_no_standard_errors_and_says_so():
+def test_an_ensemble_has_no_standard_errors_and_says_so(coarser):
     example = static(3)
     given = {"learner": NET, "solver": QUICK, "restarts": 3, "ensemble": True}
     fit = estimate(example.train, example.baseline, **given)
@@ -254,7 +260,7 @@ def test_an_ensemble_has_no_standard_errors_and_says_so():
     assert any("no standard errors" in str(text) for text in found.warnings)
 
 
-def test_physics_alone_keeps_theta_under_any_measure():
+def test_physics_alone_keeps_theta_under_any_measure(coarser):
     example = static(1, noise=True)
     fit = estimate(example.train, example.baseline, learner=None)
     found = fit.split(WIDE)
@@ -264,7 +270,7 @@ def test_physics_alone_keeps_theta_under_any_measure():
     assert found.defect is None
 
 
-def test_a_model_of_another_toolbox():
+def test_a_model_of_another_toolbox(coarser):
     example = static(3)
     fit = orthogonalize(example.train, example.baseline, lambda x: 0.01 + x - 0.5 * x**2 + 0.1 * x**3)
     found = fit.split(WIDE)
@@ -294,7 +300,7 @@ def test_a_learner_that_reads_other_lags_than_the_physics():
 # --- refusals
 
 
-def test_bounds_hold_under_the_training_measure_only():
+def test_bounds_hold_under_the_training_measure_only(coarser):
     example = static(3)
     bounded = Baseline.from_terms([Term("theta1", "u[k]", max=0.9), Term("theta3", "u[k]**3")])
     with pytest.raises(InputError, match="theta1 have bounds, which hold under the training measure only.* Drop the b"):
@@ -343,7 +349,7 @@ def saved(two, tmp_path_factory):
         (["--rows", "10:200"], Training(rows=(12, 200))),
     ],
 )
-def test_a_saved_model_splits_the_same(two, saved, options, measure):
+def test_a_saved_model_splits_the_same(two, saved, options, measure, coarser):
     done = run("split", saved / "model", saved / "run.csv", *options, "--json")
     assert (done.code, done.err) == (0, "")
     rows, expected = json.loads(done.out)["parameters"], two.split(measure)
@@ -352,7 +358,7 @@ def test_a_saved_model_splits_the_same(two, saved, options, measure):
     np.testing.assert_allclose([row["ci95"] for row in rows], expected.interval, rtol=1e-8)
 
 
-def test_a_split_model_is_saved_as_it_is(curve, tmp_path):
+def test_a_split_model_is_saved_as_it_is(curve, tmp_path, coarser):
     found = curve.split(WIDE).model
     save(found, tmp_path / "model")
     again = load(tmp_path / "model")

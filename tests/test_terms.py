@@ -105,7 +105,7 @@ def test_on_the_free_run_the_truth_is_inside_the_intervals():
     clean = cubic(noise=0.0)
     y = clean.experiments[0].outputs[:, 0] + 0.02 * rng.normal(size=600)
     record = oa.Record.from_arrays(u=clean.experiments[0].inputs[:, 0], y=y)
-    fit = oa.estimate(record, PHYSICS, learner=oa.Terms(TERMS), criterion=oa.Simulation(128, 20))
+    fit = oa.estimate(record, PHYSICS, learner=oa.Terms(TERMS), criterion=oa.Simulation(128, 20), blocks=0)
     low, high = fit.interval.T
     assert (low < [0.5, 1.0]).all() and (high > [0.5, 1.0]).all()
     assert (fit.terms.loc[list(TERMS), "ci95_low"] < [-0.1, -0.2]).all()
@@ -126,7 +126,7 @@ def test_terms_that_say_nothing_of_their_own_are_left_out_and_told():
 
 
 def test_what_the_terms_span_is_shared():
-    beside = oa.estimate(cubic(), PHYSICS, learner=oa.Terms(("sin(u[k-1])", "u[k-1] - sin(u[k-1])")))
+    beside = oa.estimate(cubic(), PHYSICS, learner=oa.Terms(("sin(u[k-1])", "u[k-1] - sin(u[k-1])")), blocks=0)
     assert [dict(d) for d in beside.problem.shared.directions] == [] and len(beside.terms) == 1
     motion = spring(learned=True)
     fit = oa.estimate(data(), motion, learner=oa.Terms(("v", "sign(v)")), criterion=WHOLE, blocks=0)
