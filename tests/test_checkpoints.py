@@ -71,7 +71,7 @@ def test_a_free_run_goes_on_bit_by_bit(folder, tmp_path, engine):  # noqa: F811
     """Killed once in the run of physics alone, once in that of the learner."""
     problem = pose(from_files(folder), BASELINE, oa.Lags(na=2, nb=2))
     chosen = {"learner": MLP(hidden=(3,)), "criterion": oa.Simulation(40, 20, start_iterations=0), "engine": engine}
-    chosen |= FLIGHT
+    chosen |= FLIGHT | {"solver": oa.LevenbergMarquardt(20)}
     whole = fit(problem, **chosen)
     for step in (2, 17):
         kept = Checkpoints(tmp_path / "kept", "this fit", every=0.0).opened(resume=step > 2)
@@ -154,7 +154,7 @@ def test_a_command_that_was_killed_goes_on(folder, tmp_path, without_figures):  
     path.write_text(f"{text}checkpoint = 0.0\n", encoding="utf-8")
     out = tmp_path / "out"
     with pytest.raises(Killed):
-        fit_job(keeping(open_job(path), out), Progress(dies_at(11)))
+        fit_job(keeping(open_job(path), out), Progress(dies_at(5)))
     assert (tmp_path / "out.training" / "training.json").exists()
     assert tmp_path / "out.training" in PARTIALS.placed, "Ctrl-C names it"
     run = CliRunner().invoke(app, ["fit", str(path), "--out", str(out), "--resume"])
@@ -163,7 +163,7 @@ def test_a_command_that_was_killed_goes_on(folder, tmp_path, without_figures):  
     model = oa.load(out / "model")
     assert [p["value"] for p in expected["parameters"]] == list(model.theta)
     with pytest.raises(Killed):
-        fit_job(keeping(open_job(path), out), Progress(dies_at(11)))
+        fit_job(keeping(open_job(path), out), Progress(dies_at(5)))
     path.write_text(f"{text}checkpoint = 1.0\n", encoding="utf-8")
     run = CliRunner().invoke(app, ["fit", str(path), "--out", str(out), "--force", "--resume"])
     assert run.exit_code == 2 or isinstance(run.exception, oa.InputError)
