@@ -2,6 +2,13 @@
 
 `python tests/test_references.py FOLDER` writes src/orthaug/studies/references.json anew from measurements in a folder,
 static_example.json and mass_spring_damper.json with one entry per run.
+
+These are the authors' published scripts (Python, JAX, jax-sysid 1.0.1, jaxopt), unchanged in method, their printing
+silenced, run with jax 0.10.2 in double precision on one CPU core, once per initialisation. Per configuration: mean,
+smallest and largest value over the runs. test_rmse is a true root mean square, test_sse the sum of squares over the
+static example's 1024 test samples, which is what the scripts print; theta_error is the norm of the error of theta in
+the static example and of its relative error in the mass-spring-damper, test_rmse there one step ahead [m]; seconds
+include compilation.
 """
 
 from __future__ import annotations
@@ -23,14 +30,7 @@ SHIPPED = files("orthaug.studies").joinpath("references.json")
 MEASURED = Path(__file__).resolve().parents[2] / "shared" / "reference"
 AXES = {"static": ("data_set", "noise_30dB", "structure"), "mass_spring_damper": ("structure", "weight")}
 TEST_SAMPLES = 1024  # of the static example
-MADE = (
-    "The authors' published scripts (Python, JAX, jax-sysid 1.0.1, jaxopt), unchanged in method, their printing "
-    "silenced, run with jax 0.10.2 in double precision on one CPU core, once per initialisation. Per configuration: "
-    "mean, smallest and largest value over the runs. test_rmse is a true root mean square, test_sse the sum of squares "
-    "over the static example's 1024 test samples, which is what the scripts print; theta_error is the norm of the "
-    "error of theta in the static example and of its relative error in the mass-spring-damper, test_rmse there one "
-    "step ahead [m]; seconds include compilation."
-)
+MADE = "by the authors' published scripts; tests/test_references.py says how"
 
 
 def summary(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """What the authors' published scripts gave when they were run: per configuration mean, smallest and largest value.
 
-`references.json` says how these were measured. `python tests/test_references.py FOLDER` makes it from
-the single runs.
+`python tests/test_references.py FOLDER` makes `references.json` from the single runs, and says how they were measured.
 """
 
 from __future__ import annotations
