@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -36,7 +37,7 @@ def keys_of_a_spec() -> str:
     """docs/spec.md, which a wheel carries beside this file, and a checkout in its folder docs."""
     carried = files("orthaug.commands").joinpath("spec.md")
     page = carried if carried.is_file() else Path(__file__).parents[3] / "docs" / "spec.md"
-    return page.read_text(encoding="utf-8").rstrip()
+    return re.sub("<!--.*-->\n", "", page.read_text(encoding="utf-8")).rstrip()
 
 
 def schema_of_a_spec() -> dict[str, Any]:
