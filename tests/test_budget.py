@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
 from orthaug._base.errors import InputError
-from orthaug.analysis.budget import SURE_SHARE, bias_budget, ground_of, near_causes
+from orthaug.analysis.budget import SURE_SHARE, bias_budget, budget_on, ground_of, near_causes
 from orthaug.analysis.measure_bias import Ground
 from orthaug.analysis.missing_lags import missing_lags
 from orthaug.analysis.suspects import Suspect, usual_suspects
@@ -264,3 +265,24 @@ def test_every_output_has_its_cause():
         low, high = budget.of(name).ci95
         assert low < value < high
     assert [f"of the learner in y{i} and moves b{i}" in w.text for i, w in zip((2, 1), budget.warnings, strict=True)]
+
+
+def test_an_output_without_a_cause_widens_what_it_could_bias():
+    """A learner of the second output that no term explains half of: the interval of its gain is wider than without."""
+    rng = np.random.default_rng(0)
+    u, y = rng.uniform(-1, 1, (400, 2)), np.zeros((400, 2))
+    y[1:] = 2 * u[:-1] + u[:-1] ** 3 * [1, 0] + 0.02 * rng.normal(size=(399, 2))
+    record = Record.from_arrays(u, y, inputs=("u1", "u2"), outputs=("y1", "y2"))
+    physics = Baseline.from_terms([Term(f"b{i}", f"u{i}[k-1]", output=f"y{i}") for i in (1, 2)])
+    fit = estimate(record, physics, learner=MLP((6,)), solver=LevenbergMarquardt(40))
+    ground = ground_of(fit, Training())
+    x, size = ground.weighed.points.x, np.abs(ground.learned[:, 0]).max()
+    at = [str(lag) for lag in ground.problem.layout].index("u2[k-1]")
+    parts = np.sign(np.sin(9 * x[:, at])) + np.sign(x[:, at])
+    budgets = [
+        budget_on(replace(ground, learned=np.stack([ground.learned[:, 0], s * size * parts], axis=1)), fit, ())
+        for s in (0.0, 0.3)
+    ]
+    assert all(budget.of("b1").cause == "cubic of u1[k-1] in y1" for budget in budgets)
+    narrow, wide = (np.ptp(budget.of("b2").ci95) for budget in budgets)
+    assert wide > 2 * narrow

@@ -138,11 +138,12 @@ def budget_on(ground: Ground, fit: Estimate, suspects: Sequence[Suspect]) -> Bud
     noise = fit.model.statistics.noise
     least = 0.0 if noise is None else _NOTHING**2 * np.diag(noise)
     something = np.mean(ground.learned**2, axis=0) >= least
-    found = _causes(ground, suspects, something) if something.any() else []
+    found, nameless = _causes(ground, suspects, something) if something.any() else ([], [])
     if not found:
         return None
     causes, moved = tuple(cause for _, cause in found), np.array([_moved(cause) for _, cause in found])
-    bias, rest = moved.sum(axis=0), np.concatenate([left_over(own, cause, suspects) for own, cause in found])
+    bias, rest = moved.sum(axis=0), [row for own, cause in found for row in left_over(own, cause, suspects)]
+    rest = np.array([*rest, *map(_moved, nameless)])
     std = np.full(len(bias), np.nan) if fit.std is None else fit.std
     ends = with_bias(fit.theta, std, fit.freedom, bias, np.linalg.norm(rest, axis=0))
     names = ground.problem.baseline.names
@@ -155,30 +156,35 @@ def budget_on(ground: Ground, fit: Estimate, suspects: Sequence[Suspect]) -> Bud
         owners = _owners(causes, moved @ np.array([slopes[0][name] for name in physical.names]).T) if slopes else []
         rows = parameter_biases(physical.names, physical.value, own, shifts, ends, owners)
         warnings += _unbounded(physical.names, own, ends)
-    told = (_warning(own, cause, (*rows, *parameters), suspects, len(found) > 1) for own, cause in found)
+    told = (_warning(own, cause, (*rows, *parameters), suspects, own is not ground) for own, cause in found)
     return Budget(causes, parameters, rows, (*(warning for warning in told if warning is not None), *warnings))
 
 
 def _causes(
     ground: Ground, suspects: Sequence[Suspect], something: Bool[np.ndarray, "ny"]
-) -> list[tuple[Ground, SuspectedBias]]:
+) -> tuple[list[tuple[Ground, SuspectedBias]], list[SuspectedBias]]:
     """What explains the learner, with the ground that it does so on: all of it, or what is learned of one output.
 
     Args:
         something: whether anything is learned of an output.
+
+    Returns:
+        The causes; and of each output without one what explains most, where that is less than half.
     """
     whole, outputs = named_cause(ground, suspects), ground.problem.outputs
     found = [] if whole is None else [(ground, whole)]
     if len(outputs) == 1 or (whole is not None and explains(whole) >= SURE_SHARE):
-        return found
-    each = []
+        return found, []
+    each, nameless = [], []
     for i in np.flatnonzero(something):
         own = replace(ground, learned=np.asarray(ground.learned) * np.eye(len(outputs))[i])
-        cause = named_cause(own, suspects)
-        if cause is not None and cause.suspect.column_of(outputs) == i:
+        cause = named_cause(own, suspects) or named_cause(own, suspects, 0.0)
+        if cause is not None and explains(cause) < LEAST_SHARE:
+            nameless.append(cause)
+        elif cause is not None and cause.suspect.column_of(outputs) == i:
             each.append((own, cause))
     each.sort(key=lambda part: -np.linalg.norm(times(ground.weighed.unit, np.asarray(part[0].learned))))
-    return each if len(each) > len(found) else found
+    return each if len(each) > len(found) else found, nameless
 
 
 def _owners(causes: Sequence[SuspectedBias], moved: Float[np.ndarray, "k n"]) -> list[tuple[str, float]]:
@@ -297,14 +303,14 @@ def _unbounded(names: Sequence[str], std: Vector, ends: Matrix) -> list[Warning]
 
 
 def _warning(
-    ground: Ground, cause: SuspectedBias, rows: Sequence[ParameterBias], suspects: Sequence[Suspect], several: bool
+    ground: Ground, cause: SuspectedBias, rows: Sequence[ParameterBias], suspects: Sequence[Suspect], of_one: bool
 ) -> Warning | None:
     """What a cause biases by more than the standard error: its size, remedies; and how sure the cause is."""
     own, name = [row for row in rows if row.cause == cause.suspect.name], cause.suspect.name
     large = [row for row in own if (row.errors or 0.0) > 1 and abs(row.relative or 1.0) > _ROUNDING]
     if not large:
         return None
-    listed, share, there = told_biases(large), explains(cause), f" in {cause.suspect.output}" if several else ""
+    listed, share, there = told_biases(large), explains(cause), f" in {cause.suspect.output}" if of_one else ""
     rival, cures = rival_of(ground, cause, suspects), remedies(ground, cause, [row.name for row in large])
     other = "" if rival is None else f" ({rival.suspect.name} explains as much and would move them elsewhere)"
     if share < SURE_SHARE:
