@@ -365,3 +365,12 @@ def test_terms_of_each_equation_are_chosen_beside_those_of_the_others(masses: oa
         assert each["v2"].coefficient_found == pytest.approx(-40.0)
     alone = [entry for entry in table if entry.equation == "v1"]
     assert one_of_each(ground, alone) == []
+
+
+def test_the_size_of_a_cause_is_that_of_what_tells_of_it(alone: oa.MotionEstimate, learned: oa.MotionEstimate) -> None:
+    """Of a learner by what it found, also where the residual tells of the term; without a learner by the residual."""
+    told = oa.suspected_bias(alone, SUSPECTS)[0].residual
+    (entry,) = oa.suspected_bias(learned, [FRICTION])
+    budget = motion_budget(learned, [replace(entry, residual=told)])
+    assert budget.coefficient == entry.coefficient_found != told.coefficient
+    assert motion_budget(alone, oa.suspected_bias(alone, [FRICTION])).coefficient == told.coefficient

@@ -118,8 +118,9 @@ class _Found:
 
 def _size(cause: TermBias) -> float:
     """The coefficient by the learner, else by what the free run leaves."""
-    told = cause.coefficient_found if cause.residual is None else cause.residual.coefficient
-    return told or 0.0
+    if cause.explained is None and cause.residual is not None:
+        return cause.residual.coefficient
+    return cause.coefficient_found or 0.0
 
 
 def rivals_of(cause: TermBias, table: Sequence[TermBias]) -> list[TermBias]:
