@@ -280,9 +280,10 @@ def test_an_output_without_a_cause_widens_what_it_could_bias():
     at = [str(lag) for lag in ground.problem.layout].index("u2[k-1]")
     parts = np.sign(np.sin(9 * x[:, at])) + np.sign(x[:, at])
     budgets = [
-        budget_on(replace(ground, learned=np.stack([ground.learned[:, 0], s * size * parts], axis=1)), fit, ())
+        budget_on(replace(ground, learned=np.stack([ground.learned[:, 0], s * size * parts], axis=1)), fit, declared)
         for s in (0.0, 0.3)
+        for declared in ((), [Suspect("unlikely", "u1[k-1]**2", "y2")])
     ]
     assert all(budget.of("b1").cause == "cubic of u1[k-1] in y1" for budget in budgets)
-    narrow, wide = (np.ptp(budget.of("b2").ci95) for budget in budgets)
-    assert wide > 2 * narrow
+    narrow, narrow_too, wide, wide_too = (np.ptp(budget.of("b2").ci95) for budget in budgets)
+    assert wide > 2 * narrow and wide_too == pytest.approx(wide) and narrow_too == pytest.approx(narrow)

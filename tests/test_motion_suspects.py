@@ -352,8 +352,10 @@ def test_a_force_between_two_masses_is_named_in_both_equations(masses: oa.Motion
     assert "add them to the equations of v1 and v2, with their sizes as parameters" in warning.text
 
 
-def test_terms_of_each_equation_are_chosen_beside_those_of_the_others(masses: oa.MotionEstimate) -> None:
+@pytest.mark.parametrize("points", [50, 20_000])
+def test_terms_of_each_equation_are_chosen_beside_those_of_the_others(masses, points, monkeypatch) -> None:
     """What two terms make together is found though another one explains more alone; their order tells nothing."""
+    monkeypatch.setattr("orthaug.analysis.motion_budget.CERTIFIED_POINTS", points)
     ground, table = ground_after(masses), usual_biases(masses)[0]
     names = [entry.suspect.name for entry in table]
     one, two = (table[names.index(f"{kind} of x1-x2 in {v}")] for kind, v in (("dead_zone", "v1"), ("cubic", "v2")))

@@ -178,7 +178,7 @@ def _causes(
     each, nameless = [], []
     for i in np.flatnonzero(something):
         own = replace(ground, learned=np.asarray(ground.learned) * np.eye(len(outputs))[i])
-        cause = named_cause(own, suspects) or named_cause(own, suspects, 0.0)
+        cause = named_cause(own, suspects) or _likeliest(own, suspects)
         if cause is not None and explains(cause) < LEAST_SHARE:
             nameless.append(cause)
         elif cause is not None and cause.suspect.column_of(outputs) == i:
@@ -202,6 +202,12 @@ def named_cause(ground: Ground, suspects: Sequence[Suspect], least: float = LEAS
         if best is not None and explains(best) >= least:
             return best
     return None
+
+
+def _likeliest(ground: Ground, suspects: Sequence[Suspect]) -> SuspectedBias | None:
+    """What explains most of the learner, however little, declared or not."""
+    found = [best for group in {tuple(suspects), ()} if (best := named_cause(ground, group, 0.0)) is not None]
+    return max(found, key=explains, default=None)
 
 
 def explains(entry: SuspectedBias | TermBias) -> float:
@@ -258,10 +264,9 @@ def left_over(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect])
     what the next best cause makes of it, and by how far a rival of the cause would move θ elsewhere.
     """
     assert cause.explained
-    rest, others = ground.without(cause), tuple(suspect for suspect in suspects if suspect != cause.suspect)
-    found = [best for group in {others, ()} if (best := named_cause(rest, group, 0.0)) is not None]
+    after = _likeliest(ground.without(cause), [suspect for suspect in suspects if suspect != cause.suspect])
     rows = [_moved(cause) * np.sqrt((1 - cause.explained) / cause.explained)]
-    rows += [_moved(max(found, key=explains))] if found else []
+    rows += [] if after is None else [_moved(after)]
     rival = rival_of(ground, cause, suspects)
     return np.array([*rows, *([] if rival is None else [_moved(rival) - _moved(cause)])])
 

@@ -39,7 +39,7 @@ from orthaug.physics.projection import Projection
 from orthaug.physics.shared import Shared, moves
 
 _SAME = 1e-6  # of its size: what a term may change over a move that the learner does not see
-CERTIFIED_POINTS = 20_000  # of a measure at most, over which certificates are sought
+CERTIFIED_POINTS = 20_000  # of a measure at most, over which certificates and terms of each equation are sought
 
 
 @dataclass(frozen=True)
@@ -212,16 +212,12 @@ class MotionGround:
         """What terms that the learner sees explain of it without causes that it sees; nothing of other causes."""
         if self.learned is None or not all(cause.seen for cause in causes):
             return []
-        rest, gone = np.array(self.learned), {cause.suspect for cause in causes}
+        learned, gone = np.array(self.learned), {cause.suspect for cause in causes}
         for cause in causes:
-            rest -= (cause.coefficient_found or 0.0) * self._rows(cause.suspect, cause.suspect.place(self.motion))
-        return self.again(rest, [entry for entry in table if entry.suspect not in gone])
-
-    def again(self, learned: Matrix | None, table: Sequence[TermBias]) -> list[TermBias]:
-        """What terms that the learner sees explain of other values of it."""
+            learned -= (cause.coefficient_found or 0.0) * self._rows(cause.suspect, cause.suspect.place(self.motion))
         rest, found = replace(self, learned=learned), []
         for entry in table:
-            if entry.seen:
+            if entry.seen and entry.suspect not in gone:
                 explained, coefficient = rest._explained(self.held(entry.suspect))
                 found.append(replace(entry, explained=explained, coefficient_found=coefficient))
         return found

@@ -24,7 +24,14 @@ from orthaug.analysis.budget import (
     told_biases,
     with_bias,
 )
-from orthaug.analysis.motion_bias import MotionGround, TermBias, ground_after, softened_bias, usual_biases
+from orthaug.analysis.motion_bias import (
+    CERTIFIED_POINTS,
+    MotionGround,
+    TermBias,
+    ground_after,
+    softened_bias,
+    usual_biases,
+)
 from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.fitting.motion_estimates import MotionEstimate
 
@@ -143,7 +150,8 @@ def _of_learner(fit: MotionEstimate, table: Sequence[TermBias], smooth: Sequence
     alone = [] if best is None else [[best, *(entry for entry in every if entry is not best)]]
     share = 0.0 if best is None else explains(best)
     if ground is not None and share < SURE_SHARE:
-        found = [(explains(each[0][0]), each) for terms in (table, every) if (each := one_of_each(ground, terms))]
+        tables = (table, every) if smooth else (table,)
+        found = [(explains(each[0][0]), each) for terms in tables if (each := one_of_each(ground, terms))]
         joint, each = next((pair for pair in found if pair[0] >= AS_MUCH * found[-1][0]), (0.0, []))
         enough = 1 - (1 - LEAST_SHARE) ** len(each)  # as much of what the others leave as one must explain of all
         if joint >= enough and (share < LEAST_SHARE or 1 - share >= _AS_CLOSE * (1 - joint)):
@@ -154,14 +162,16 @@ def _of_learner(fit: MotionEstimate, table: Sequence[TermBias], smooth: Sequence
 def one_of_each(ground: MotionGround, table: Sequence[TermBias]) -> list[list[TermBias]]:
     """Terms of each learned equation by what they explain of the learner beside the first of the others, best first.
 
-    The first ones explain most together. Nothing where terms of one equation alone explain any of it.
+    The first ones explain most together, over 20,000 points at most. Nothing where terms of one
+    equation alone explain any of it.
     """
-    seen = [entry for entry in table if entry.seen and ground.again(ground.learned, [entry])[0].explained]
+    seen = [entry for entry in table if entry.seen and entry.explained]
     places = [entry.suspect.place(ground.motion) for entry in seen]
     groups = [np.flatnonzero(np.equal(places, place)) for place in dict.fromkeys(places)]
     if len(groups) < 2:
         return []
-    rows = np.stack([*(ground.beside(ground.held(entry.suspect)).ravel() for entry in seen), ground.told().ravel()])
+    values = (*(ground.beside(ground.held(entry.suspect)) for entry in seen), ground.told())
+    rows = np.stack([row[:: 1 + len(row) // CERTIFIED_POINTS].ravel() for row in values])
     sizes = np.linalg.norm(rows, axis=1)
     cosines = (rows @ rows.T) / np.outer(sizes, sizes)
 
