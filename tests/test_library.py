@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_cli import make_project, run, signals
+from test_cli import make_project, run, signals, write_csv
 from test_compare import STARTED
 
 import orthaug as oa
@@ -103,3 +103,21 @@ def test_what_cannot_be_opened_or_written(job, tmp_path):
     ):
         with pytest.raises(InputError, match=message):
             call()
+
+
+@pytest.mark.parametrize(("wave", "told"), [(0.06, True), (0.0, False)])
+def test_what_a_learner_that_does_not_help_hides_is_told(tmp_path, wave, told):
+    u = np.random.default_rng(0).uniform(-1, 1, 900)
+    y = 2 * u + wave * np.sin(12 * u) + 0.02 * np.random.default_rng(1).normal(size=900)
+    y[600:] += 0.5 * np.random.default_rng(2).normal(size=300)  # noise that hides on the test part what was learned
+    write_csv(tmp_path / "run.csv", u=u, y=y)
+    (tmp_path / "static.toml").write_text(
+        '[data]\ninputs = ["u"]\noutputs = ["y"]\nsampling_time = 1\n'
+        'train = { files = ["run.csv"], rows = [0, 600] }\ntests.noisy = { files = ["run.csv"], rows = [600, 900] }\n'
+        '[[baseline.terms]]\nparameter = "gain"\nregressor = "u[k]"\n[learner]\nhidden = [8]\n'
+    )
+    result = oa.fit_spec(tmp_path / "static.toml").result
+    assert result.validation and result.residuals
+    assert (result.validation.verdict, result.residuals.verdict) == ("no_help", "white")
+    hidden = [warning.text for warning in result.warnings if warning.code == "unexplained"]
+    assert len(hidden) == told and all("may belong to gain" in text for text in hidden)

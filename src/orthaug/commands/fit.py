@@ -86,9 +86,31 @@ def judged(fitted: Fitted) -> Fitted:
         told = f"whether the learner helps is not judged: no part is held out, and {why}."
         warnings.append(WarningResult(code="not_judged", text=told))
     if verdict is not None and fit.model.form.bound is not None:
-        warnings += [WarningResult.model_validate(warning) for warning in verdict.warnings]
+        told = list(verdict.warnings) if verdict.code == "helps" else [*verdict.warnings, *_hidden(fitted)]
+        warnings += [WarningResult.model_validate(warning) for warning in told]
     result = FitResult.model_validate({**dict(fitted.result), "validation": verdict, "warnings": warnings})
     return replace(fitted, result=result)
+
+
+def _hidden(fitted: Fitted) -> list[Warning]:
+    """That a learner which does not help took up what physics alone leaves, where no cause tells what it is."""
+    from orthaug.analysis.diagnosis import diagnose
+
+    result = fitted.result
+    rows = [*result.parameters, *(result.physical_parameters or ())]
+    shared = [row.name for row in rows if row.shared]
+    if not shared or any(row.bias for row in rows) or not result.residuals or result.residuals.verdict == "unmodelled":
+        return []
+    failed: list[Warning] = []
+    physics = fitted.job.run(Variant(ALONE))
+    alone = attempt("the residual of physics alone", lambda: diagnose(physics), failed, None) if physics.status.ok else None
+    if alone is None or alone.verdict != "unmodelled":
+        return failed
+    told = (
+        "physics alone leaves more than noise, which the learner takes up without better free runs: a part of that may "
+        f"belong to {', '.join(shared)}, and no interval counts it. See `orthaug explain`, and `learner.inputs`."
+    )
+    return [Warning("unexplained", told)]
 
 
 def keeping(job: Job, folder: Path, *, resume: bool = False) -> Job:
