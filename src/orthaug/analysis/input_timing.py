@@ -107,9 +107,8 @@ def refitted(
         InputError: the motion does not take the record.
     """
     plan = task.plan
-    motion = replace(motion, substeps=plan.dynamics.substeps)
     course = MotionCourse.of(replace(plan.problem, motion=motion, record=record), None, plan.criterion)
-    course = course.from_states(flight.end.flown.states)
+    course = course.alone.refined(plan.dynamics.substeps).from_states(flight.end.flown.states)
     again = course.descend(course.objective(), flight.end.flown.theta, solver.at_most(_REFITTED))
     return course, again if again.ending.usable else None
 

@@ -103,8 +103,8 @@ def _hidden(fitted: Fitted) -> list[Warning]:
         return []
     failed: list[Warning] = []
     physics = fitted.job.run(Variant(ALONE))
-    alone = attempt("the residual of physics alone", lambda: diagnose(physics), failed, None) if physics.status.ok else None
-    if alone is None or alone.verdict != "unmodelled":
+    alone = physics.status.ok and attempt("the residual of physics alone", lambda: diagnose(physics), failed, None)
+    if not alone or alone.verdict != "unmodelled":
         return failed
     told = (
         "physics alone leaves more than noise, which the learner takes up without better free runs: a part of that may "

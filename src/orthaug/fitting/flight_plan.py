@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.data.regressors import Features
 from orthaug.fitting.course import Course, Layout
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.elimination import Elimination, Fixed, eliminate
@@ -23,6 +22,8 @@ from orthaug.fitting.structures import Structure
 from orthaug.models.lagged import Lagged
 from orthaug.models.learners import Bound
 from orthaug.physics.problem import Problem
+
+_SMALL = 4096  # steps: a run over more of them than are needed takes less time than to compile for their number
 
 
 def lagged(task: OneStepTask) -> Lagged:
@@ -57,14 +58,15 @@ class FlightPlan(Course):
     """Entries of an orthogonal θ that are known to stand at a bound beside the learner."""
 
     @classmethod
-    def of(cls, task: OneStepTask, criterion: Criterion) -> FlightPlan:
-        """Lay the problem's record out as a criterion of several steps declares.
+    def of(cls, task: OneStepTask, criterion: Criterion, like: FlightPlan | None = None) -> FlightPlan:
+        """Lay the problem's record out as a criterion of several steps declares, in the shapes of a plan that is small.
 
         Raises:
             InputError: nothing would be scored.
         """
         dynamics, record, sums = lagged(task), task.problem.record, SegmentSums.of(task.engine)
-        laid = Layout.of(record, dynamics, criterion, shares=task.engine.shares)
+        small = like is not None and like.segments.scored.size <= _SMALL
+        laid = Layout.of(record, dynamics, criterion, like if small else None, task.engine.shares)
         return cls(**laid._asdict(), **declared(task, criterion), dynamics=dynamics, sums=sums)
 
     @property
@@ -78,7 +80,7 @@ class FlightPlan(Course):
     @cached_property
     def alone(self) -> FlightPlan:
         """The same rows and segments without a learner."""
-        alone, task = replace(self.dynamics, features=Features(()), bound=None), self.task.alone
+        alone, task = self.dynamics.alone, self.task.alone
         return replace(self, task=task, dynamics=alone, scaling=task.scaling, unit=task.unit, fixed={})
 
     @property
@@ -93,7 +95,8 @@ class FlightPlan(Course):
         return replace(self, segments=self._laid(segment, washout), flown=flown)
 
     def _laid(self, segment: int, washout: int) -> Any:
-        return lay_segments(self.record, self.dynamics, segment, washout, shares=self.shares)
+        like = self.whole if self.criterion.simulates and not segment else None
+        return lay_segments(self.record, self.dynamics, segment, washout, like, self.shares)
 
     def objective(self, structure: Structure) -> StructuredObjective:
         """The criterion as a function of θ and the weights."""

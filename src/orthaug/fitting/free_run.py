@@ -60,7 +60,8 @@ class FreeRunTask(FlightTask):
 
     def on(self, record: Record) -> FreeRunTask:
         """The same problem on another record."""
-        return FreeRunTask.of(self.rows_task.on(record), self.criterion)
+        like = None if isinstance(self.plan, SourcePlan) else self.plan
+        return FreeRunTask(FlightPlan.of(self.rows_task.on(record), self.criterion, like))
 
     def flown_alone(
         self, solver: LevenbergMarquardt, structure: Structure, tell: RunTell

@@ -106,7 +106,8 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) ->
     slope = None if learned.scores is None else learned.scores.slope
     errors = learned.errors
     alone = np.asarray(learned.coefficients if task.physics is None else task.physics.end.flown.theta)
-    trained = Trained(plan.flown.segment, plan.flown.washout, np.asarray(states), slope, alone)
+    laid = (plan.flown.segment, plan.flown.washout, plan.segments.count)
+    trained = Trained(*laid, np.asarray(states), slope, alone)
     model = replace(_model(plan, structure, learned), trained=trained)
     reason = ALONE.get(learned.ending, "") if learned.bound is None or task.physics is None else ""
     if reason and not learned.ending.usable and (where := task.problem.without_value(np.any)):
@@ -209,10 +210,10 @@ def reopened(model: MotionModel, record: Record) -> MotionEstimate:
     course = MotionCourse.of(problem, form.bound, criterion).refined(form.substeps)
     centre, half = (numbers.centre, numbers.halfwidth) if form.bound is not None else (np.zeros(0), np.ones(0))
     course = replace(course, scaling=Scaling(np.asarray(centre), np.asarray(half)), unit=np.asarray(numbers.gain))
-    if np.asarray(course.segments.start).shape != np.shape(kept.states):
+    if course.segments.count != kept.rows or np.shape(course.segments.start) != np.shape(kept.states):
         raise InputError(
-            f"the model was trained on other rows: these {len(record)} give other segments than those it keeps the "
-            "starts of. Give the files, and --rows, that it was trained on."
+            f"the model was trained on other rows: on {kept.rows} where these have {course.segments.count}, or in "
+            "other experiments. Give the files, and --rows, that it was trained on."
         )
     c = np.asarray(numbers.theta - numbers.theta_aux)
     return MotionEstimate(

@@ -100,8 +100,8 @@ class OneStepTask(LaidRows):
     @property
     def alone(self) -> OneStepTask:
         """The same rows without a learner."""
-        problem = replace(self.problem, features=Features(()))
-        return replace(self, problem=problem, bound=None, unit=np.zeros_like(self.unit))
+        problem, scaling = replace(self.problem, features=Features(())), Scaling(np.zeros(0), np.ones(0))
+        return replace(self, problem=problem, bound=None, scaling=scaling, unit=np.zeros_like(self.unit))
 
     def physics_alone(self) -> tuple[OneStepTask, Learned]:
         """The rows without a learner, and least squares on them."""

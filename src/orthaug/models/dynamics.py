@@ -35,6 +35,11 @@ class Numbers(NamedTuple):
     scheme: Any = None
     """What `Dynamics.prepared` makes of them for all steps of a run."""
 
+    @property
+    def alone(self) -> Numbers:
+        """Those of the physics, in the shapes of a fit without a learner, whose programs then serve."""
+        return Numbers(self.theta, np.zeros_like(self.theta), *[np.zeros(0)] * 3, gain=np.ones_like(self.gain))
+
 
 class Parts(NamedTuple):
     """The output of a step in parts: `baseline` = φθ + fixed terms, `learner` = f − φθ_aux, `raw` = f; each (ny,)."""

@@ -6,7 +6,7 @@ As dynamics its state is the past outputs, newest first, and a step puts its own
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -32,6 +32,11 @@ class Lagged:
     layout: Layout
     outputs: tuple[str, ...]
     bound: Bound | None
+
+    @property
+    def alone(self) -> Lagged:
+        """The same physics without a learner."""
+        return replace(self, features=Features(()), bound=None)
 
     @property
     def linear(self) -> bool:

@@ -109,8 +109,7 @@ class Model(OnRecords, Shown):
     @property
     def alone(self) -> Model:
         """Its physics without the learner."""
-        numbers = self.numbers._replace(theta_aux=np.zeros_like(self.theta), weights=np.zeros(0), tilt=None)
-        return replace(self, form=replace(self.form, bound=None), numbers=numbers)
+        return replace(self, form=self.form.alone, numbers=self.numbers.alone)
 
     def learner_at(self, x: Float[np.ndarray, "M nx"]) -> Float[np.ndarray, "M ny"]:
         """f, before any split, at regressors of the form's layout; in the outputs' units."""

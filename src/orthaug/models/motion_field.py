@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
-from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.jax import Array, jax, jnp, padded_length
 from orthaug.data.expressions import Expression
 from orthaug.models.dynamics import Numbers
 from orthaug.models.learners import Bound
@@ -94,8 +94,10 @@ def parts_at(form: MotionField, numbers: Numbers, x: Matrix, u: Matrix) -> tuple
     Args:
         x: states (M, nx); `u` inputs (M, nu) at the same instants.
     """
+    count = len(x)
+    x, u = (np.pad(part, ((0, padded_length(count) - count), (0, 0)), mode="edge") for part in (x, u))
     physics, learner = _parts(form, numbers, x, u)
-    return np.asarray(physics), np.asarray(learner)
+    return np.asarray(physics)[:count], np.asarray(learner)[:count]
 
 
 def labels_of(form: MotionField) -> tuple[tuple[str, str], ...]:

@@ -26,7 +26,7 @@ from orthaug.models.motion_field import parts_at
 from orthaug.models.moving import Moving
 from orthaug.models.on_records import RUNAWAY, OnRecords, trajectory
 from orthaug.models.response import Response, Trajectory
-from orthaug.models.settling import LOOSE, Windows, settle
+from orthaug.models.settling import LOOSE, Windows, padded_steps, settle
 from orthaug.models.statistics import Statistics
 from orthaug.models.stepping import checked_row, one_experiment, step_arguments, step_inputs, with_scheme
 from orthaug.physics.parameters import PhysicalParameter
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
 FIRST_ROWS = 64  # that tell where a free run starts
 _SIDE_BY_SIDE = 256  # windows of predictions
-_SHORTEST = 32  # steps of these that a program is made for at least
 _GUESS_ITERATIONS, _WINDOW_ITERATIONS = 30, 6
 
 
@@ -68,12 +67,13 @@ def _last(
 class Trained(NamedTuple):
     """What a later split under a measure needs beside the training data: how segments lay, and where they started.
 
-    `alone` (np,) are the coordinates of physics alone; `slope` (k, m, nx, n) is how the starts `states` (k, nx, m)
-    follow the unknowns, less its sign; None where that is not known.
+    `rows` counts the rows that were scored, `alone` (np,) are the coordinates of physics alone; `slope` (k, m, nx, n)
+    is how the starts `states` (k, nx, m) follow the unknowns, less its sign; None where that is not known.
     """
 
     segment: int
     washout: int
+    rows: int
     states: Any
     slope: Any
     alone: Vector
@@ -132,8 +132,7 @@ class MotionModel(OnRecords, Shown):
     @property
     def alone(self) -> MotionModel:
         """Its physics without the learner."""
-        numbers = self.numbers._replace(theta_aux=np.zeros_like(self.theta), weights=np.zeros(0))
-        return replace(self, form=self.form.alone, numbers=numbers)
+        return replace(self, form=self.form.alone, numbers=self.numbers.alone)
 
     def simulate(self, record: Record, initial: str | Any = "measured") -> Response:
         """Free run from the first row on.
@@ -342,7 +341,7 @@ class MotionModel(OnRecords, Shown):
         with np.errstate(all="ignore"):
             known = np.isfinite(run[begins]).all(axis=1, keepdims=True)
         states[:, hidden] = np.where(known, run[begins], states)[:, hidden]
-        length, pieces = max(_SHORTEST, 1 << (steps - 1).bit_length()), []  # few horizons have programs of their own
+        length, pieces = padded_steps(steps), []  # few horizons have programs of their own
         for begin in range(0, len(begins), _SIDE_BY_SIDE):
             chosen = begins[begin : begin + _SIDE_BY_SIDE]
             padded = np.concatenate([chosen, np.repeat(chosen[-1:], _SIDE_BY_SIDE - len(chosen))])

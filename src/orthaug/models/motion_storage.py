@@ -19,6 +19,7 @@ from orthaug.physics.motion import Motion, Output, State
 from orthaug.physics.parameters import PhysicalParameter
 
 _LIMITS = {"min": -math.inf, "max": math.inf}
+_LAID = ("segment", "washout", "rows")  # of `Trained`
 
 
 def declare(model: MotionModel) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -32,7 +33,7 @@ def declare(model: MotionModel) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         "learner": declaration_of(form.bound),
         "substeps": form.substeps,
         "window": model.window,
-        "trained": None if trained is None else {"segment": trained.segment, "washout": trained.washout},
+        "trained": None if trained is None else {key: getattr(trained, key) for key in _LAID},
     }
     arrays = arrays_of(model) | {"loose": np.asarray(model.loose)}
     arrays |= {} if model.seen is None else {"seen": np.asarray(model.seen)}
@@ -61,7 +62,7 @@ def rebuild(
     kept = declared["trained"]
     trained = None
     if kept is not None:
-        laid = (int(kept["segment"]), int(kept["washout"]))
+        laid = (int(kept[key]) for key in _LAID)
         trained = Trained(*laid, arrays["trained.states"], arrays.get("trained.slope"), arrays["trained.alone"])
     return MotionModel(
         form=form,

@@ -23,6 +23,7 @@ from orthaug.models.lagged import Lagged
 from orthaug.models.learners import Bound
 
 CHUNK_ROWS = 5000  # fastest of 500 … 10000 at 10⁴×81 and 10⁵×257, see benchmarks/
+_FEW, _SHARED = 1024, 256  # rows: so few take less time than to compile for their number, or for that of a fold
 
 
 class Chunk(NamedTuple):
@@ -216,10 +217,11 @@ def row_fold(function: Callable[[Any], tuple[Any, Any]], rows: Any) -> tuple[Any
 
 
 def chunk_shape(rows: int, limit: int = CHUNK_ROWS) -> tuple[int, int]:
-    """(number of chunks, rows in each) for `rows` rows in equal chunks of about `limit`."""
+    """(number of chunks, rows in each) for `rows` rows in equal chunks of about `limit`; few rows in few sizes."""
     count = max(1, -(-rows // limit))
     size = -(-rows // count)
-    return count, -(-size // 8) * 8
+    unit = _SHARED if rows <= _FEW <= limit else 8
+    return count, -(-size // unit) * unit
 
 
 def in_chunks(

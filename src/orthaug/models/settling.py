@@ -17,6 +17,7 @@ from orthaug.models.dynamics import Dynamics, Numbers
 
 LOOSE = 1e3  # times the size of a state: how far a start may be from its guess before that counts as one error
 _FIRST_DAMPING = 1e-3
+_SHORTEST, _LANES = 64, 16  # steps, and windows side by side
 _SETTLED = 1e-10  # relative decrease that is not worth a step
 
 
@@ -27,6 +28,21 @@ class Windows(NamedTuple):
     target: Float[Any, "T ny m"]
     scored: Any
     """(T, m)."""
+
+    def padded(self) -> tuple[Windows, int]:
+        """Longer and more, for few shapes have programs of their own, on the device; and T."""
+        steps, count = np.shape(self.scored)
+        more = padded_steps(steps) - steps, -count % _LANES
+
+        def repeated(part: Any) -> Any:
+            return np.pad(part, ((0, more[0]), *((0, 0),) * (part.ndim - 2), (0, more[1])), mode="edge")
+
+        return Windows(*(jax.device_put(repeated(np.asarray(part))) for part in self)), steps
+
+
+def padded_steps(steps: int) -> int:
+    """What to pad the steps of a window to."""
+    return max(_SHORTEST, 1 << (steps - 1).bit_length())
 
 
 def settle(
@@ -46,11 +62,12 @@ def settle(
         states: where to begin.
         loose: (n0,) how far a state may be from there before that counts as much as one error.
     """
-    begun = np.asarray(states, dtype=float)
+    count = np.shape(states)[1]
+    begun = np.pad(np.asarray(states, dtype=float), ((0, 0), (0, -count % _LANES)), mode="edge")
     prior = 1 / np.asarray(loose, dtype=float) ** 2
-    windows = Windows(*map(jax.device_put, windows))  # once for all iterations
+    laid = windows.padded()  # once for all iterations
     best, damping = begun, np.full(begun.shape[1], _FIRST_DAMPING)
-    matrix, right, misfit = _linearised(form, numbers, begun, windows, weight, begun, prior)
+    matrix, right, misfit = _linearised(form, numbers, begun, laid, weight, begun, prior)
     for _ in range(iterations):
         step = _steps(matrix, right, damping)
         with np.errstate(all="ignore"):
@@ -58,13 +75,13 @@ def settle(
         if ended.all():
             break
         trial = np.where(ended, best, best + step)
-        there = _linearised(form, numbers, trial, windows, weight, begun, prior)
+        there = _linearised(form, numbers, trial, laid, weight, begun, prior)
         lower = there[2] < misfit
         best = np.where(lower, trial, best)
         matrix = np.where(lower[:, None, None], there[0], matrix)
         right, misfit = np.where(lower[:, None], there[1], right), np.where(lower, there[2], misfit)
         damping = np.where(lower, damping / 8, damping * 8)
-    return best, misfit
+    return best[:, :count], misfit[:count]
 
 
 def _steps(
@@ -79,10 +96,10 @@ def _steps(
 
 
 def _linearised(
-    form: Dynamics, numbers: Numbers, states: Matrix, windows: Windows, weight: Matrix, begun: Matrix, prior: Vector
+    form: Dynamics, numbers: Numbers, states: Matrix, laid: Any, weight: Matrix, begun: Matrix, prior: Vector
 ) -> tuple[Any, Any, Any]:
     """Normal matrix (m, n0, n0), right-hand side (m, n0) and misfit (m,), infinite where a run is not finite."""
-    gram, square = (np.asarray(part) for part in _gram(form, numbers, states, *windows, weight))
+    gram, square = (np.asarray(part) for part in _gram(form, numbers, states, *laid, weight))
     n0, gone = len(states), begun - states
     matrix = np.moveaxis(gram[:, :n0], -1, 0) + np.diag(prior)
     right = np.moveaxis(gram[:, n0], -1, 0) + (prior[:, None] * gone).T
@@ -96,12 +113,14 @@ def _gram(
     form: Dynamics,
     numbers: Numbers,
     states: Float[Array, "n0 m"],
-    inputs: Float[Array, "T nu m"],
-    target: Float[Array, "T ny m"],
-    scored: Any,
+    windows: Windows,
+    steps: Any,
     weight: Float[Array, "ny ny"],
 ) -> tuple[Float[Array, "n0 n0+1 m"], Float[Array, "m"]]:
-    """Gram matrix of the sensitivities to the start with themselves and the error, and the error's square."""
+    """Gram matrix of the sensitivities to the start with themselves and the error, and the error's square.
+
+    Of the first `steps` of the windows.
+    """
     numbers = form.prepared(numbers)
     n0, m = states.shape
     directions = jnp.eye(n0)
@@ -115,9 +134,9 @@ def _gram(
         along = jax.vmap(lambda moved: jax.jvp(lambda x: both(x, row), (state,), (moved,)), out_axes=(None, -1))
         return along(directions)
 
-    def step(carry: tuple[Any, ...], row: tuple[Any, ...]) -> tuple[Any, None]:
+    def step(i: Any, carry: tuple[Any, ...]) -> tuple[Any, ...]:
         state, slopes, gram, square = carry
-        inputs, target, there = row
+        inputs, target, there = (part[i] for part in windows)
         value, slope = jax.vmap(sloped, -1, -1)(state, inputs)
         slope = jnp.where(jnp.isfinite(slope), slope, 0.0)
         slope: Any = sum(
@@ -128,8 +147,8 @@ def _gram(
         columns: Any = sum(weight[:, i, None, None] * columns[None, i] for i in range(len(weight)))
         gram = gram + sum(column[:n0, None] * column[None] for column in columns)
         square = square + sum(column[n0] ** 2 for column in columns)
-        return (value[:n0], slope[:n0], gram, square), None
+        return value[:n0], slope[:n0], gram, square
 
     first = jnp.broadcast_to(jnp.eye(n0)[..., None], (n0, n0, m))
     start = (states, first, jnp.zeros((n0, n0 + 1, m)), jnp.zeros(m))
-    return jax.lax.scan(step, start, (inputs, target, scored))[0][2:]
+    return jax.lax.fori_loop(0, steps, step, start)[2:]

@@ -183,12 +183,9 @@ class Problem:
 
     def physics_alone(self) -> Problem:
         """The problem without a learner. It is posed anew where the learner's lags took rows from the physics."""
-        if self.baseline.function is not None:
-            return replace(self, features=Features(()))
         outputs, inputs = self.outputs, tuple(channel.name for channel in self.record.inputs)
-        own = in_order(self.baseline.lags, outputs, inputs)
-        if own == self.layout:
-            return self
+        if self.baseline.function is not None or in_order(self.baseline.lags, outputs, inputs) == self.layout:
+            return replace(self, features=Features(()))
         return pose(self.record, self.baseline, output_weights=self.weight.choice)
 
     def on(self, record: Record) -> Problem:
