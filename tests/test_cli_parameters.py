@@ -465,6 +465,17 @@ def test_a_split_of_other_files_is_warned_of(inside, files):
     assert finite_json(run("split", "out", "copy.csv", "--json").out)["warnings"] == []
 
 
+def test_a_split_takes_the_rows_of_the_training(inside, tmp_path):
+    part = 'train = { files = ["run.csv"], rows = [0, 80] }'
+    Path("part.toml").write_text(SPEC.replace('train = { files = ["run.csv"] }', part))
+    fit = finite_json(run("fit", "part.toml", "--json", "--out", tmp_path / "part").out)
+    split = run("split", tmp_path / "part", "run.csv", "--json")
+    assert "note: rows 0:80 of each file" in split.err and finite_json(split.out)["warnings"] == []
+    assert values(finite_json(split.out)["parameters"]) == pytest.approx(values(fit["parameters"]), rel=1e-9)
+    other = finite_json(run("split", tmp_path / "part", "run.csv", "--rows", "0:90", "--json").out)
+    assert [warning["code"] for warning in other["warnings"]] == ["other_training_data"]
+
+
 def test_the_measure_of_the_spec_is_that_of_split(inside, tmp_path):
     text = (
         SPEC.replace('kind = "none"\n', MLP)
@@ -605,6 +616,31 @@ def test_the_sampling_time_need_not_be_declared(project):
     project.write_text(thinned + "[baseline.constants]\nTs = 0.01\n")
     done = run("check", project)
     assert done.code == 2 and one_line(done.err, "machine.toml: the constant 'Ts' is 0.01", "sampled every 0.02 s")
+
+
+def test_a_design_of_one_input_has_the_others_as_recorded(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rng, y = np.random.default_rng(0), np.zeros(200)
+    force, slope = rng.normal(size=200), 0.1 * np.sin(np.arange(200) / 20)
+    for k in range(1, 200):
+        y[k] = 0.9 * y[k - 1] + 0.2 * force[k - 1] - 0.5 * slope[k - 1] + 0.01 * rng.normal()
+    write_csv(tmp_path / "run.csv", force=force, slope=slope, y=y)
+    terms = "".join(
+        f'[[baseline.terms]]\nparameter = "{name}"\nregressor = "{lag}[k-1]"\n'
+        for name, lag in (("a", "y"), ("b", "force"), ("g", "slope"))
+    )
+    head = '[data]\nsampling_time = 1\ninputs = ["force", "slope"]\noutputs = ["y"]\ntrain = { files = ["run.csv"] }\n'
+    both = f'{head}{terms}[learner]\nkind = "none"\n[design]\nsamples = 300\namplitude = 1\n'
+    Path("both.toml").write_text(both)
+    assert one_line(
+        run("design", "both.toml", "--out", "u.csv").err, "`input` is missing: the one to design, of force,"
+    )
+    Path("both.toml").write_text(f'{both}input = "force"\n')
+    done = run("design", "both.toml", "--out", "u.csv")
+    assert (done.code, done.err) == (0, "note: slope: as recorded in the training data.\n")
+    table = pd.read_csv("u.csv")
+    np.testing.assert_allclose(table["slope"], np.resize(slope, 300))
+    assert list(table.columns) == ["time", "force", "slope"] and table["force"].abs().max() <= 1
 
 
 def test_design_writes_an_input_within_its_limits(project):

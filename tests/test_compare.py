@@ -8,6 +8,9 @@ from pathlib import Path
 import pytest
 from test_cli import MLP, SPEC, listing, make_project, one_line, run, signals, write_csv
 
+from orthaug.reports.result import CompareResult
+from orthaug.reports.text import _parameter_cells
+
 pytestmark = pytest.mark.usefixtures("without_figures")
 
 NETWORK = SPEC.replace('kind = "none"\n', MLP)
@@ -138,6 +141,18 @@ def test_the_models_can_join_the_next_comparison(compared, tmp_path):
         assert row["status"] == "saved" and row["scores"] == before[name]["scores"]
         assert [p["value"] for p in row["parameters"]] == [p["value"] for p in before[name]["parameters"]]
         assert all(p["std"] is None for p in row["parameters"])
+
+
+def test_a_row_with_other_parameters_has_its_own_columns(compared):
+    content = json.loads((compared / "out" / "result.json").read_text(encoding="utf-8"))
+    last = content["comparison"][-1]
+    last["parameters"].pop(1)
+    last["parameters"][0] |= {"name": "gain", "value": 0.25, "std": None}
+    result = CompareResult.model_validate(content)
+    head, *rows = _parameter_cells(result)
+    assert head[1:5] == ["a", "b", "c", "gain"] and {len(row) for row in rows} == {len(head)}
+    told = dict(zip(head, rows[-1], strict=True))
+    assert (told["a"], told["b"], told["gain"], told["weights"]) == ("–", "–", "0.25", str(last["weights"]))
 
 
 @pytest.mark.parametrize("model", ["nowhere", "run.csv", "empty"])

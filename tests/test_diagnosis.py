@@ -86,6 +86,19 @@ def test_a_missing_square_of_a_static_map_is_unmodelled():
     assert found.verdict == "unmodelled" and "curved over u[k]" in found.text
 
 
+def test_what_no_single_input_shows_is_found_between_neighbours():
+    """An interaction whose mean over each input is flat, of independent samples: neither lags nor curves see it."""
+    a, b, e = np.random.default_rng(0).uniform(-1, 1, (3, 800))
+    physics = Baseline.from_terms([Term("a", "a[k]"), Term("b", "b[k]")])
+    u, names = np.column_stack([a, b]), ["a", "b"]
+    found = of(Record.from_arrays(u, a - 2 * b + np.sin(4 * a) * b + 0.05 * e, inputs=names), physics)
+    assert found.one_step[0].white and not found.one_step[0].curved_regressors
+    assert found.verdict == "unmodelled" and found.predictable[0].functions > 0.9
+    assert found.changes[0].kind == "learner" and found.changes[0].fall > 0.7
+    noise = of(Record.from_arrays(u, a - 2 * b + 0.05 * e, inputs=names), physics)
+    assert (noise.verdict, noise.predictable[0].functions) == ("white", 0.0)
+
+
 @pytest.mark.parametrize("noise", [0.01, 0.1, 1.0])
 @pytest.mark.parametrize("seed", [0, 1, 3])
 def test_equation_noise(seed, noise):

@@ -278,3 +278,15 @@ def test_wrong_use_is_told_in_a_line(project):
 )
 def test_a_cube_of_what_is_no_name_has_brackets(on, expected):
     assert _written("cubic", on) == expected
+
+
+def test_no_difference_of_two_peaks_is_proposed():
+    """They cancel: large coefficients of terms that explain nothing alone."""
+    rng = np.random.default_rng(12)
+    a, b, e = rng.uniform(-1, 2, 800), rng.normal(size=800), 0.05 * rng.normal(size=800)
+    y = 2 + 3 * a - 1.5 * b + 0.8 * a * b + 0.5 * np.sin(3 * a) * b**2 + e
+    record = oa.Record.from_arrays(np.column_stack([a, b])[:600], y[:600], inputs=["a", "b"])
+    terms = [oa.Term(name, lag) for name, lag in (("ca", "a[k]"), ("cb", "b[k]"), ("c0", "1"))]
+    fit = oa.estimate(record, oa.Baseline.from_terms(terms), learner=oa.MLP(hidden=(8,)), restarts=3)
+    found = [term.expression for term in oa.explain(fit.model, record).terms]
+    assert "a[k]*b[k]" in found and sum("exp(" in text for text in found) < 2

@@ -623,3 +623,13 @@ def test_a_run_that_is_stopped_is_kept_and_tried_on_no_block():
     assert found.status.code == "stopped" and found.held_out is None
     assert found.status.loss < found.status.start_loss and found.model.form.bound is not None
     assert any("none was tried on held-out blocks" in w.text for w in found.warnings if w.code == "stopped")
+
+
+def test_a_theta_that_the_data_do_not_determine_beside_the_learner_has_a_sentence(monkeypatch):
+    nothing = np.full((3, 3), np.nan)
+    monkeypatch.setattr("orthaug.fitting.flights.theta_block", lambda *_: nothing)
+    fit = choosing(nonlinear(), PHYSICS, learner=NETWORK, criterion=FREE, solver=LevenbergMarquardt(3), blocks=0)
+    assert np.isnan(fit.std).all()
+    assert [w.text[:60] for w in fit.warnings if w.code == "no_standard_errors"] == [
+        "no standard errors: beside the learner's weights the data do"
+    ]

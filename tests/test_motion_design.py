@@ -86,3 +86,17 @@ def test_what_cannot_be_designed_is_refused() -> None:
         designed(parameters=[1.0, 0.8, -200.0])
     with pytest.raises(InputError, match="runs away under every input"):
         designed(parameters=[1.0, 0.8, 1e6])  # too fast for two substeps
+
+
+def test_an_input_that_is_known_tells_its_own_gain() -> None:
+    """Held at zero it tells nothing of it."""
+    states = [oa.State("x", "(b*u + g*w - x)/T")]
+    values = [oa.PhysicalParameter(name, 1.0) for name in ("T", "b", "g")]
+    motion = oa.Motion.from_equations(states, [oa.Output("y", "x")], values, ["u", "w"], substeps=1)
+    given = {"sampling_time": 0.2, "samples": 80, "amplitude": 1.0, "noise": 0.01, "channel": "u", "iterations": 1}
+    with pytest.raises(InputError, match="no candidate has a condition number"):
+        oa.design_motion_input(motion, **given)
+    known = np.sin(np.arange(80) / 5)
+    assert oa.design_motion_input(motion, **given, known_inputs={"w": known}).std[2] < 0.02
+    with pytest.raises(InputError, match="a channel of `known_inputs`"):
+        oa.design_motion_input(motion, **given, known_inputs={"z": known})

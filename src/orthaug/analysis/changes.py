@@ -83,7 +83,13 @@ def fall_of(share: float) -> float:
 
 
 def model_changes(
-    fit: Estimate, response: Response, *, flown: bool, skip: int = 0, one_step: Response | None = None
+    fit: Estimate,
+    response: Response,
+    *,
+    flown: bool,
+    skip: int = 0,
+    one_step: Response | None = None,
+    functions: float = 0.0,
 ) -> tuple[Change, ...]:
     """The best change of each kind that is worth making, the best one first.
 
@@ -91,13 +97,14 @@ def model_changes(
         response: of the training data, whose errors are to be explained: the prediction, or with `flown` the free run.
         skip: its leading rows that do not count.
         one_step: the prediction, for a free run that is far from what was measured; None to go along it all the same.
+        functions: what functions of the regressor are known to explain of the errors one step ahead.
     """
     off = float(np.max(rms_errors(response, skip) / fit.problem.deviation))
     with one_blas_thread():
         found: tuple[Change, ...] = ()
         if flown and one_step is not None and off > _FAR:
             found = Candidates(fit, one_step, True, skip, measured=True).changes()
-        return found or Candidates(fit, response, flown, skip).changes()
+        return found or Candidates(fit, response, flown, skip).changes(functions)
 
 
 def own_share(fit: Estimate, one_step: Response) -> Share:
@@ -231,8 +238,8 @@ class Candidates:
             past = np.concatenate([carried[k], past[:-ny]])
         return carried
 
-    def changes(self) -> tuple[Change, ...]:
-        """The best of each kind that is worth making, the best one first."""
+    def changes(self, functions: float = 0.0) -> tuple[Change, ...]:
+        """The best of each kind that is worth making, the best one first; as `model_changes`."""
         if not self.usable or not np.isfinite(self.sums.grams).all():
             return ()
         problem, of = self.fit.problem, "simulation" if self.flown else "prediction"
@@ -255,7 +262,8 @@ class Candidates:
         learned = [
             self.base + o * width + len(self.lags) + j for o in range(len(outputs)) for j in range(len(self.functions))
         ]
-        add(self.sums.share(learned, base), "learner", self._learner(), weight=_SIMPLER)
+        shares = (self.sums.share(learned, base), Share(functions, 0.0))
+        add(max(shares, key=lambda share: share.value), "learner", self._learner(), weight=_SIMPLER)
         best: dict[str, Change] = {}
         for _, change in sorted(found, key=lambda entry: -entry[0]):
             best.setdefault(change.kind, change)

@@ -51,6 +51,8 @@ class DesignPlant(Protocol):
     outputs: Sequence[str]
     start: int
     """The first row that is simulated."""
+    others: dict[str, np.ndarray]
+    """Inputs beside the one that is designed, (N, 1) or one number for all rows."""
 
     def rows(self, u: Float[np.ndarray, "N M"]) -> tuple[Float[np.ndarray, "M R ny nt+1"], np.ndarray]:
         """Rows `[Φ Δ]`, zero where they run away, and the weights of the outputs (M, 1, ny, 1)."""
@@ -136,11 +138,16 @@ def design_input(
     known = [suspect.sampled(sampling_time) for suspect in suspects]
     plant = Plant(baseline.sampled(sampling_time), (tuple(outputs), tuple(inputs)), known, theta, channel)
     samples = check_samples(samples, plant)
+    set_known(plant, known_inputs, samples)
+    plant.before = _numbers(initial_outputs, (plant.start, len(outputs)), "initial_outputs")
+    return searched(plant, limits, sampling_time, samples, noise, bool(suspects), weights, (seed, iterations))
+
+
+def set_known(plant: DesignPlant, known_inputs: Mapping[str, Any] | None, samples: int) -> None:
+    """Give a plant the samples (N,) of inputs beside the one that is designed, by name; InputError for wrong ones."""
     for name, values in (known_inputs or {}).items():
         check_choice(name, plant.others, "a channel of `known_inputs`")
         plant.others[name] = _numbers(values, (samples,), f"known_inputs['{name}']")[:, None]
-    plant.before = _numbers(initial_outputs, (plant.start, len(outputs)), "initial_outputs")
-    return searched(plant, limits, sampling_time, samples, noise, bool(suspects), weights, (seed, iterations))
 
 
 def check_samples(samples: Any, plant: DesignPlant) -> int:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -124,6 +125,7 @@ def _of_lagged(fit: Estimate, one_step: Response | None, free_run: Response | No
 def _concluded(seen: Finding) -> Diagnosis:
     """The verdict and its words."""
     misfit = any(t.follows() or t.curved_over(SHARE) for t in seen.tests) or seen.lacks
+    misfit = misfit or any(one.functions > _SMALL for one in seen.predictable)
     complete = seen.white and not misfit and not seen.follows(_SMALL)
     white = (seen.free_white and seen.white) or not seen.fit.model.form.states
     if seen.sensor:
@@ -170,11 +172,11 @@ def _effects(fit: Estimate, one_step: Response, free_run: Response | None, flown
     if response is None or several:  # it ran away, or is the error of some steps ahead
         return {}
     with one_blas_thread():
-        shares = predictable(fit.problem, response, skip)
-    return {
-        "predictable": shares,
-        "changes": model_changes(fit, response, flown=flown, skip=skip, one_step=one_step),
-    }
+        shares = predictable(fit.problem, response, skip, flown=flown)
+    squares = [(one.rms / deviation) ** 2 for one, deviation in zip(shares, fit.problem.deviation, strict=True)]
+    functions = 0.0 if flown else float(np.average([one.functions for one in shares], weights=squares))
+    told: dict[str, Any] = {"flown": flown, "skip": skip, "one_step": one_step, "functions": functions}
+    return {"predictable": shares, "changes": model_changes(fit, response, **told)}
 
 
 def _with_criterion(

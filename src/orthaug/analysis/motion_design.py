@@ -6,7 +6,7 @@ As `design_input`, with the sensitivities of the free run for Φ: `[∂y/∂p]` 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -16,7 +16,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector, check_choice, check_number
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax
-from orthaug.analysis.design import Design, check_samples, input_limits, searched
+from orthaug.analysis.design import Design, check_samples, input_limits, searched, set_known
 from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.analysis.plant import RUNS_AWAY
 from orthaug.models.dynamics import Numbers
@@ -139,6 +139,7 @@ def design_motion_input(
     weights: Vector | Matrix | None = None,
     condition: float = 1e3,
     channel: str | None = None,
+    known_inputs: Mapping[str, Any] | None = None,
     seed: int = 0,
     iterations: int = 30,
 ) -> Design:
@@ -155,7 +156,7 @@ def design_motion_input(
         parameters: p to simulate with; None for the initial values.
         substeps: of the integrator in a sample; None for the motion's, 1 where that has none.
         weights: W, (np,) for a diagonal, or (m, np); None for 1/|p|.
-        condition, channel, seed, iterations: as in `design_input`.
+        condition, channel, known_inputs, seed, iterations: as in `design_input`.
 
     Raises:
         InputError: numbers out of range, a suspect without coefficient, a motion that runs away, no candidate within
@@ -173,4 +174,5 @@ def design_motion_input(
     steps = substeps or motion.substeps or 1
     plant = MotionPlant(motion, suspects, p, sampling_time, steps, channel)
     samples = check_samples(samples, plant)
+    set_known(plant, known_inputs, samples)
     return searched(plant, limits, sampling_time, samples, noise, bool(suspects), weights, (seed, iterations))

@@ -25,6 +25,8 @@ BLOCKS = 8
 _PAST = 5  # lags of an output's own error
 _FURTHER = 10  # lags of inputs beyond the largest of the regressor
 _ROWS = 20_000
+_NEIGHBOURS = 4000  # rows whose neighbours are sought
+_APART = 10  # rows: those closer in time are no neighbours, for noise makes them alike
 _RIDGE = 1e-6  # of a column's sum of squares, so that columns that repeat each other do no harm
 
 
@@ -72,6 +74,16 @@ class Share:
     value: float
     error: float
 
+    @classmethod
+    def of(cls, without: Vector, together: Vector) -> Share:
+        """By how much a sum of squares over blocks (blocks,) is smaller than another one."""
+        total, gained = float(without.sum()), without - together
+        if not (total > 0 and np.isfinite(gained).all()):
+            return cls(0.0, 0.0)
+        value = float(gained.sum() / total)
+        off = gained - value * without  # of a ratio of sums: loud blocks may gain more (Cochran 1977, sect. 2.11)
+        return cls(value, float(np.sqrt(len(off)) * off.std(ddof=1) / total))
+
     @property
     def sure(self) -> float:
         """Two standard errors less, and not below 0."""
@@ -93,13 +105,7 @@ class BlockSums:
 
     def share(self, columns: Sequence[int], beside: Sequence[int] = ()) -> Share:
         """What `columns` explain of the target beyond those `beside` which they stand."""
-        without, together = self._missed(list(beside)), self._missed([*beside, *columns])
-        total, gained = float(without.sum()), without - together
-        if not (total > 0 and np.isfinite(gained).all()):
-            return Share(0.0, 0.0)
-        value = float(gained.sum() / total)
-        off = gained - value * without  # of a ratio of sums: loud blocks may gain more (Cochran 1977, sect. 2.11)
-        return Share(value, float(np.sqrt(len(off)) * off.std(ddof=1) / total))
+        return Share.of(self._missed(list(beside)), self._missed([*beside, *columns]))
 
     def _missed(self, columns: list[int]) -> Vector:
         """Sum of squared errors on every block of the regression on the others, (blocks,)."""
@@ -139,12 +145,32 @@ def from_lags(signal: Pieces, others: Sequence[Pieces], lags: Sequence[int]) -> 
     return sums.share(range(1, count), [0])
 
 
+def from_neighbours(x: Matrix, signal: Vector) -> Share:
+    """What a smooth function of the rows x explains of a signal (N,), whatever its form.
+
+    Where two rows lie close to each other, their values differ by the rest alone: half the mean square of that is the
+    variance of the rest (Rice 1984). Where they lie far apart, as in many dimensions, it explains less than there is.
+    """
+    from scipy.spatial import cKDTree
+
+    size = x.std(axis=0)
+    scaled = (x[:, size > 0] - x[:, size > 0].mean(axis=0)) / size[size > 0]
+    if not scaled.size or len(x) < 4 * BLOCKS * _APART:
+        return Share(0.0, 0.0)
+    near = cKDTree(scaled).query(scaled, 2 * _APART + 2)[1]
+    nearest = near[np.arange(len(x)), np.argmax(np.abs(near - np.arange(len(x))[:, None]) > _APART, axis=1)]
+    e = signal - signal.mean()
+    both = np.stack([e**2, (e - e[nearest]) ** 2 / 2])
+    return Share.of(*np.stack([part.sum(axis=1) for part in np.array_split(both, BLOCKS, axis=1)], axis=1))
+
+
 @dataclass(frozen=True)
 class Predictable:
     """Of one output's error, in the output's unit: its RMS, and which shares of its square could be predicted.
 
-    From its own past, from lagged inputs, and from functions and products of the regressors, each cross-validated and
-    with two standard errors taken off; 0 where that is not surely more than nothing.
+    From its own past, from lagged inputs, each cross-validated, and from functions of the regressors: products and
+    curves, cross-validated as well, or one step ahead whatever lets neighbours have like errors. Two standard errors
+    are taken off; 0 where that is not surely more than nothing.
     """
 
     name: str
@@ -158,13 +184,18 @@ class Predictable:
         return max(self.inputs, self.functions, self.own_past if own_past else 0.0)
 
 
-def predictable(problem: Problem, response: Response, skip: int = 0) -> tuple[Predictable, ...]:
-    """What could be predicted of a response's errors on the training data, after the first `skip` rows."""
+def predictable(problem: Problem, response: Response, skip: int = 0, *, flown: bool = False) -> tuple[Predictable, ...]:
+    """What could be predicted of a response's errors on the training data, after the first `skip` rows.
+
+    Args:
+        flown: a free run, whose errors are no function of the regressor.
+    """
     errors, functions, found = errors_of(response, skip), SimpleFunctions.of(problem), []
     starts = [run.start + skip for run in response.trajectories]
     inputs = [e.inputs[a:] for e, a in zip(problem.record.experiments, starts, strict=True)]
     x = np.concatenate([piece[skip:] for piece in by_experiment(problem, problem.rows.x)])
-    every = slice(None, None, -(-len(x) // _ROWS))
+    every, few = (slice(None, None, -(-len(x) // most)) for most in (_ROWS, _NEIGHBOURS))
+    read = [problem.layout.index(lag) for lag in problem.used]
     columns = np.column_stack([np.ones(len(x[every])), functions(x[every])])
     longest = max((lag.lag for lag in problem.layout), default=0) + _FURTHER
     for o, name in enumerate(problem.outputs):
@@ -175,6 +206,7 @@ def predictable(problem: Problem, response: Response, skip: int = 0) -> tuple[Pr
         curved = Share(0.0, 0.0)
         if len(columns) > 5 * columns.shape[1] > 5:
             curved = BlockSums.of(columns, whole[every]).share(range(1, columns.shape[1]), [0])
+        near = 0.0 if flown else from_neighbours(x[few][:, read], whole[few]).sure
         rms = float(np.sqrt(np.mean(whole**2)))
-        found.append(Predictable(name, rms, *(share.sure for share in (own, driven, curved))))
+        found.append(Predictable(name, rms, own.sure, driven.sure, max(curved.sure, near)))
     return tuple(found)

@@ -135,7 +135,8 @@ def _inconsistent(seen: Finding) -> bool:
 
 def _white(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     if seen.complete:
-        return "The one-step residual is white: the intervals hold, and no criterion is better than this one.", ()
+        told = "the intervals hold" if seen.fit.model.form.bound is None else "it is noise as far as it shows"
+        return f"The one-step residual is white: {told}, and no criterion is better than this one.", ()
     return _small(seen), ()
 
 

@@ -161,6 +161,8 @@ def design(
     check_file(out, *job.files, force=force)
     designed = designing.design_for(job)
     designing.write(job, designed, out, force=force)
+    for line in designing.notes(job):
+        streams.say(line)
     result = DesignResult.of(designed)
     tell(result, design_text(result), as_json, out)
 

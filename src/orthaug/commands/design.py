@@ -10,7 +10,7 @@ import numpy as np
 from orthaug._base.checks import check_choice
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_file
-from orthaug.analysis.design import Design, design_input
+from orthaug.analysis.design import MOST_SAMPLES, Design, design_input
 from orthaug.commands.job import Job
 from orthaug.commands.motion_job import MotionJob
 from orthaug.commands.suspects import declared
@@ -21,6 +21,7 @@ def design_for(job: Job) -> Design:
 
     θ is the spec's initial value, or least squares on the training data where none is given; the noise, where the spec
     states none, is what physics alone leaves of these data. The parameters of a motion are those of physics alone.
+    Inputs beside the one that is designed are as they were recorded.
 
     Raises:
         InputError: no `[design]` section, limits that cannot be met, suspects without a coefficient.
@@ -34,6 +35,7 @@ def design_for(job: Job) -> Design:
     asked = {name: getattr(section, name) for name in limits}
     try:
         asked["channel"] = _input(section.input, [channel.name for channel in job.problem.record.inputs])
+        asked["known_inputs"] = _others(job, asked["channel"], section.samples)
         asked["sampling_time"] = job.problem.record.sampling_time
         if isinstance(job, MotionJob):
             return _of_motion(job, asked, section.noise)
@@ -77,17 +79,34 @@ def _of_motion(job: MotionJob, asked: dict[str, Any], noise: float | None) -> De
     return design_motion_input(motion, suspects=job.suspects, **own, **asked)
 
 
-def _input(name: str | None, known: list[str]) -> str | None:
-    return None if name is None else check_choice(name, known, "`input`")
+def _input(name: str | None, known: list[str]) -> str:
+    if name is None and len(known) != 1:
+        raise InputError(f"`input` is missing: the one to design, of {', '.join(known) or 'none'}.")
+    return known[0] if name is None else check_choice(name, known, "`input`")
+
+
+def _others(job: Job, chosen: str, samples: int) -> dict[str, np.ndarray]:
+    """The other inputs as the longest experiment of the training data has them, repeated where it ends."""
+    record = job.problem.record
+    longest = max(record.experiments, key=len).inputs
+    named = zip((channel.name for channel in record.inputs), longest.T, strict=True)
+    return {name: np.resize(values, min(samples, MOST_SAMPLES)) for name, values in named if name != chosen}
+
+
+def notes(job: Job) -> list[str]:
+    """What stands in the inputs that are not designed."""
+    assert job.spec.design is not None
+    others = [c.name for c in job.problem.record.inputs if c.name != job.spec.design.input]
+    return [f"note: {', '.join(others)}: as recorded in the training data."] if others and job.spec.design.input else []
 
 
 def write(job: Job, design: Design, out: Path, *, force: bool = False) -> None:
     """The signal as CSV, `time` and every input, whole or not at all."""
     assert job.spec.design is not None
     names = [channel.name for channel in job.problem.record.inputs]
-    chosen = job.spec.design.input or names[0]
-    time = np.arange(len(design.signal)) * job.problem.record.sampling_time
-    columns = {"time": time} | {name: design.signal if name == chosen else 0.0 * design.signal for name in names}
+    chosen, count = job.spec.design.input or names[0], len(design.signal)
+    others = _others(job, chosen, count) | {chosen: design.signal}
+    columns = {"time": np.arange(count) * job.problem.record.sampling_time} | {name: others[name] for name in names}
     table = np.column_stack(list(columns.values()))
     with whole_file(out, force=force) as partial:
         np.savetxt(partial, table, fmt="%.17g", delimiter=",", header=",".join(columns), comments="")

@@ -86,29 +86,36 @@ def judged(fitted: Fitted) -> Fitted:
         told = f"whether the learner helps is not judged: no part is held out, and {why}."
         warnings.append(WarningResult(code="not_judged", text=told))
     if verdict is not None and fit.model.form.bound is not None:
-        told = list(verdict.warnings) if verdict.code == "helps" else [*verdict.warnings, *_hidden(fitted)]
+        told = (*verdict.warnings, *_unexplained(fitted, helps=verdict.code == "helps"))
         warnings += [WarningResult.model_validate(warning) for warning in told]
     result = FitResult.model_validate({**dict(fitted.result), "validation": verdict, "warnings": warnings})
     return replace(fitted, result=result)
 
 
-def _hidden(fitted: Fitted) -> list[Warning]:
-    """That a learner which does not help took up what physics alone leaves, where no cause tells what it is."""
+def _unexplained(fitted: Fitted, *, helps: bool) -> list[Warning]:
+    """That a learner may have taken from parameters that it could imitate, where no cause tells by how much.
+
+    One that does not help may still take up what physics alone leaves.
+    """
     from orthaug.analysis.diagnosis import diagnose
 
     result = fitted.result
     rows = [*result.parameters, *(result.physical_parameters or ())]
     shared = [row.name for row in rows if row.shared]
-    if not shared or any(row.bias for row in rows) or not result.residuals or result.residuals.verdict == "unmodelled":
+    if not shared or any(row.bias for row in rows):
         return []
-    failed: list[Warning] = []
-    physics = fitted.job.run(Variant(ALONE))
-    alone = physics.status.ok and attempt("the residual of physics alone", lambda: diagnose(physics), failed, None)
-    if not alone or alone.verdict != "unmodelled":
-        return failed
-    told = (
-        "physics alone leaves more than noise, which the learner takes up without better free runs: a part of that may "
-        f"belong to {', '.join(shared)}, and no interval counts it. See `orthaug explain`, and `learner.inputs`."
+    told, failed = "no suspect explains half of what the learner found", []
+    if not helps:
+        if not result.residuals or result.residuals.verdict == "unmodelled":
+            return []
+        physics = fitted.job.run(Variant(ALONE))
+        alone = physics.status.ok and attempt("the residual of physics alone", lambda: diagnose(physics), failed, None)
+        if not alone or alone.verdict != "unmodelled":
+            return failed
+        told = "physics alone leaves more than noise, which the learner takes up without better free runs"
+    told += (
+        f": a part of that may belong to {', '.join(shared)}, and no interval counts it. `orthaug explain` looks for "
+        "its terms, [[suspects]] declares them; another measure, or a learner that sees less, may tell them apart."
     )
     return [Warning("unexplained", told)]
 

@@ -118,14 +118,14 @@ def split(
     Without training again.
     """
     from orthaug.commands import split as splitting
-    from orthaug.commands.run import prepared_notes, read_rows
+    from orthaug.commands.run import read_rows
     from orthaug.reports.text import split_text
 
     opened = splitting.open_training(model, data, read_rows(rows))
     given = {"box": box or [], "samples": [samples] if samples else [], "weights": [weights] if weights else []}
     chosen = splitting.read_measure(measure, given, opened)
     prepare_jax()
-    for line in prepared_notes(opened.model, opened.record):
+    for line in opened.notes:
         streams.say(line)
     result = splitting.split_model(opened, chosen)
     tell(result, split_text(result), as_json)

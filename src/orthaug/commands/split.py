@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, get_origin
@@ -15,7 +15,7 @@ from orthaug._base.folders import file_digest
 from orthaug._base.registry import Key, keys_of, resolve
 from orthaug._base.warning import Warning
 from orthaug.commands.folder import results_beside
-from orthaug.commands.run import ModelOnData, Reading, record_for
+from orthaug.commands.run import ModelOnData, Reading, prepared_notes, record_for
 from orthaug.data.record import Record
 from orthaug.data.tables import check_readable
 from orthaug.inference.kinds import MEASURES
@@ -29,30 +29,38 @@ _UNKNOWN = Warning("no_statistics", "no standard errors: training left no statis
 
 
 def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | None) -> ModelOnData:
-    """A model with the files that it was trained on, `rows` of each."""
+    """A model with the files that it was trained on, `rows` of each; None for those that its result names."""
     from orthaug.models.storage import load
 
     for path in data:
         check_readable(path)
-    loaded = load(model)
-    reading = Reading("skip", rows, prepare=True)  # of rows with missing cells none were trained on
-    records = [record_for(loaded, path, loaded.outputs, reading) for path in data]
-    return ModelOnData(loaded, Record.join(records), data[0], warnings=tuple(_other_files(model, data)))
+    loaded, (trained, warnings) = load(model), _trained_on(model, data)
+    reading = Reading("skip", rows or trained, prepare=True)  # of rows with missing cells none were trained on
+    record = Record.join([record_for(loaded, path, loaded.outputs, reading) for path in data])
+    notes = prepared_notes(loaded, record)
+    if trained and rows is None:
+        notes += (f"note: rows {trained[0]}:{trained[1]} of each file, those of the training.",)
+    elif trained and rows != trained:
+        told = f"the model was trained on rows {trained[0]}:{trained[1]}, not on {rows[0]}:{rows[1]}."
+        warnings.append(Warning("other_training_data", told))
+    return ModelOnData(loaded, record, data[0], notes=notes, warnings=tuple(warnings))
 
 
-def _other_files(model: Path, data: Sequence[Path]) -> Iterator[Warning]:
-    """One where the files are not those that the result of a model has the checksums of."""
+def _trained_on(model: Path, data: Sequence[Path]) -> tuple[tuple[int, int] | None, list[Warning]]:
+    """The rows of each file that the result of a model names, and a warning where it has other files' checksums."""
     for content in results_beside(model):
         with suppress(KeyError, TypeError):
             kept = {file["sha256"]: file["file"] for file in content["data"]["train"]}
-            if kept.keys() != set(map(file_digest, data)):
-                text = (
-                    f"the model was trained on {', '.join(kept.values())}; by the checksums in its result.json that is "
-                    f"not what was given ({', '.join(path.name for path in data)}). Give the files that it was trained "
-                    "on: a split over other data does not belong to the fit."
-                )
-                yield Warning("other_training_data", text)
-            return
+            rows = content["spec"]["data"]["train"].get("rows")
+            if kept.keys() == set(map(file_digest, data)):
+                return rows and (int(rows[0]), int(rows[1])), []
+            text = (
+                f"the model was trained on {', '.join(kept.values())}; by the checksums in its result.json that is "
+                f"not what was given ({', '.join(path.name for path in data)}). Give the files that it was trained "
+                "on: a split over other data does not belong to the fit."
+            )
+            return None, [Warning("other_training_data", text)]
+    return None, []
 
 
 def read_measure(kind: str, given: Mapping[str, Sequence[str]], opened: ModelOnData) -> Measure:

@@ -32,6 +32,11 @@ from orthaug.physics.baseline import Baseline
 from orthaug.physics.excitation import ILL_CONDITIONED
 from orthaug.physics.problem import Problem, pose
 
+_UNDETERMINED = (
+    "no standard errors: beside the learner's weights the data do not determine θ to rounding. Use more data, a "
+    "smaller learner, or one that sees less."
+)
+
 
 def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estimate:
     """Solve θ, split it from the learner, and attach statistics.
@@ -59,6 +64,8 @@ def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estim
     if known and errors.covariance is None and learned.errors is None:
         text = "no standard errors: beside a learner that sees only some features, an ensemble leaves none."
         told.append(Warning("no_standard_errors", text))
+    elif known and errors.covariance is not None and np.isnan(np.diag(errors.covariance)).sum() > len(fixed):
+        told.append(Warning("no_standard_errors", _UNDETERMINED))
     reason = ALONE.get(ending, "") if learned.bound is None else ""
     return Estimate(
         model=_model(problem, structure, learned, ThetaSplit(theta, theta_aux, fixed), errors, noise),

@@ -281,7 +281,10 @@ def _doubts(split: MotionSplit, at_bound: tuple[str, ...], unseen: tuple[str, ..
         )
         told.append(Warning("not_unique", text))
     if at_bound:
-        text = f"at a bound: {', '.join(at_bound)}. What stands at a bound has no interval."
+        text = (
+            f"at a bound: {', '.join(at_bound)}. What stands at a bound has no interval, and the others and theirs "
+            "hold with it there; data that contradict a bound contradict the physics or the bound."
+        )
         told.append(Warning("at_a_bound", text))
     if unseen:
         text = (

@@ -194,7 +194,7 @@ def _bias_lines(result: FitResult) -> list[str]:
             lines.append(f"{100 * share:.0f} % of what the {what} is {cause}. The bias that implies:")
         head = f"{'parameter':<{width}}  {'bias':>11}  {'of std':>7}  {'of value':>9}  {'95 % interval with it':^29}"
         lines += [head, *(_bias_line(row, width) for row in own if row.value is not None)]
-    return lines or _unexplained(result)
+    return lines
 
 
 def _bias_line(row: ParameterResult, width: int) -> str:
@@ -204,18 +204,6 @@ def _bias_line(row: ParameterResult, width: int) -> str:
     part = f"{percent(_rounded(bias / value), sign='+') if value else '–':>9}"
     limits = f"[{_limit(reach[0])}, {_limit(reach[1])}]" if reach else f"{'–':^29}"
     return f"{row.name:<{width}}  {bias:+11.3g}  {errors}  {part}  {limits}".rstrip()
-
-
-def _unexplained(result: FitResult) -> list[str]:
-    """That a learner which matters may bias what it could imitate, where no cause tells by how much."""
-    shared = [row.name for row in (*result.parameters, *(result.physical_parameters or ())) if row.shared]
-    if not shared or result.validation is None or result.validation.verdict != "helps":
-        return []
-    names = ", ".join(shared)
-    return [
-        f"No suspect explains half of what the learner found: a part of that may belong to {names}, and no interval "
-        "counts it. `orthaug explain` looks for its terms; [[suspects]] declares them."
-    ]
 
 
 def _rounded(share: float) -> float:
@@ -296,14 +284,15 @@ def scores_text(scored: Scores, outputs: Sequence[Channel], horizon: int | None)
 
 
 def _parameter_cells(result: CompareResult) -> list[list[str]]:
-    names = [parameter.name for parameter in result.comparison[0].parameters]
+    names = list(dict.fromkeys(parameter.name for row in result.comparison for parameter in row.parameters))
     rows = [["structure", *names, "‖QᵀF̃‖/‖F‖", "‖F̃‖/‖Φθ̂‖", "weights", "time [s]"]]
     for row in result.comparison:
         defect, share = row.orthogonality_defect, row.learner_to_physics
+        own = {parameter.name: _estimate(parameter) for parameter in row.parameters}
         rows.append(
             [
                 row.name + (" *" if row.name == result.chosen else ""),
-                *(_estimate(parameter) for parameter in row.parameters),
+                *(own.get(name, "–") for name in names),
                 "–" if defect is None else f"{defect:.1e}",
                 "–" if share is None else f"{share:.2g}",
                 str(row.weights),

@@ -70,6 +70,11 @@ class Candidate:
         """What it is whatever its width."""
         return self.kind, self.text if self.on is None else self.on, self.place
 
+    @property
+    def form(self) -> tuple[str, str, int]:
+        """The same, both kinds of a peak alike."""
+        return self.kind.removesuffix("_gauss"), *self.identity[1:]
+
 
 @dataclass(frozen=True, eq=False)
 class Space:
@@ -210,12 +215,14 @@ def _share(space: Space, chosen: Sequence[Candidate]) -> float:
 def _grown(space: Space, chosen: list[Candidate]) -> list[Candidate]:
     """One term more: beside all that are in, or a pair beside all but one; widths refined, the simplest of the best.
 
-    Friction has the sum of a jump and of a peak, neither of which is the best term alone.
+    Friction has the sum of a jump and of a peak, neither of which is the best term alone. Two peaks on one variable, or
+    two widths of another kind, are the difference of nearly the same, and no law.
     """
     trials = [[*chosen, one] for one in _best_single(space, chosen)]
     for i in range(len(chosen)):
         others = chosen[:i] + chosen[i + 1 :]
         trials += [[*others, *pair] for pair in _best_pairs(space, others)]
+    trials = [trial for trial in trials if len({one.form for one in trial}) == len(trial)]
     trials = [_refined(space, trial, _ROUGH) for trial in trials]
     shares = [_share(space, trial) for trial in trials]
     best = max(shares, default=0.0)
