@@ -413,7 +413,7 @@ def test_a_term_that_is_there_already_moves_the_run_as_its_parameter_does() -> N
     m, _, k = fit.values
     np.testing.assert_allclose(-k / m * added, own, rtol=0, atol=0.02 * np.abs(own).max())
     errors = fit.course.objective().errors(fit.theta, np.zeros(0), fit.states, fit.course.segments)
-    np.testing.assert_allclose(errors[..., 0].ravel(), np.ravel(found.errors), rtol=1e-9)
+    np.testing.assert_allclose(np.ravel(errors), np.ravel(found.errors), rtol=1e-9)
 
 
 def test_what_stands_at_a_bound_is_a_constant_to_the_others() -> None:

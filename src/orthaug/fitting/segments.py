@@ -20,7 +20,6 @@ from orthaug.models.rows import gram
 CHUNK = 256  # segments that run side by side
 _BLOCK = 1 << 15  # numbers: slopes that are known at once
 _FEWEST = 8  # steps for which that pays
-_SHORT = 1024  # steps: a segment beside few others that nobody reads takes less time than to compile for it
 
 
 class Segments(NamedTuple):
@@ -64,7 +63,8 @@ def lay_segments(
         pieces += [segment_of(experiment, inputs, begin, steps, washout, dynamics) for begin in begins]
     count = len(pieces)
     chunks = -(-count // (CHUNK * shares)) * shares
-    width = padded_width(-(-count // chunks), steps)
+    width = -(-count // chunks)
+    width += -width % 8 if width > 8 else 0  # about as many segments run by the same program
     if like is not None and chunks * width <= like.scored.shape[0] * like.scored.shape[2]:
         chunks, width = like.scored.shape[0], like.scored.shape[2]
     nothing = Segments(*(np.zeros_like(part) for part in pieces[0]))
@@ -72,13 +72,6 @@ def lay_segments(
     stacked = (np.stack(part, axis=-1) for part in zip(*pieces, strict=True))
     cut = (np.moveaxis(part.reshape(*part.shape[:-1], chunks, width), -2, 0) for part in stacked)
     return Segments(*map(jax.device_put, cut))
-
-
-def padded_width(width: int, steps: int) -> int:
-    """How many segments are run where there are `width`: about as many then run by the same program."""
-    if width > 8:
-        return width + -width % 8
-    return 1 << max(width - 1, 1).bit_length() if steps <= _SHORT else width
 
 
 def begins_of(rows: int, steps: int, washout: int) -> list[int]:

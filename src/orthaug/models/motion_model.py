@@ -132,7 +132,7 @@ class MotionModel(OnRecords, Shown):
     @property
     def alone(self) -> MotionModel:
         """Its physics without the learner."""
-        return replace(self, form=self.form.alone, numbers=self.numbers.alone)
+        return replace(self, form=self.form.alone, numbers=self.numbers.alone._replace(gain=np.ones(0)))
 
     def simulate(self, record: Record, initial: str | Any = "measured") -> Response:
         """Free run from the first row on.
