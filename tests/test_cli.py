@@ -104,6 +104,11 @@ def make_project(folder: Path, spec: str = SPEC) -> Path:
     return folder / "plant.toml"
 
 
+@pytest.fixture(autouse=True)
+def _only_what_tests_share_is_drawn(monkeypatch):
+    monkeypatch.setattr("orthaug.commands.fit._draw", lambda *_: None)
+
+
 @pytest.fixture
 def project(tmp_path, monkeypatch) -> Path:
     """The spec of a project in a folder of its own, which is the current one."""
@@ -510,7 +515,7 @@ def test_ctrl_c_while_the_result_is_written(project, monkeypatch):
     def fail(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("orthaug.reports.plots.save", fail)
+    monkeypatch.setattr("orthaug.commands.fit._draw", fail)
     before = listing(project.parent)
     done = run("fit", project, "--out", "out")
     assert done.code == 130
