@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orthaug._base.errors import InputError, KeyedError
+from orthaug._base.errors import InputError, KeyedError, Warning
 from orthaug._base.progress import SILENT, Progress
-from orthaug._base.warning import Warning
 from orthaug.commands.data_sections import engine_of
 from orthaug.commands.job import ALONE, AS_DECLARED, Job, Variant
 from orthaug.commands.parts import load_parts
