@@ -21,11 +21,10 @@ from orthaug.data.expressions import Lag
 from orthaug.data.record import Record, check_channels
 from orthaug.data.regressors import Layout, lag_rows, largest_lag
 from orthaug.data.sources import RecordSource
-from orthaug.fitting.cost import check_cost
 from orthaug.fitting.independent_terms import independent_terms
 from orthaug.fitting.kinds import STRUCTURES
-from orthaug.fitting.rules import check_scored
-from orthaug.inference.measure_files import MeasurePlace
+from orthaug.fitting.rules import check_cost, check_scored
+from orthaug.inference.kinds import MeasurePlace
 from orthaug.inference.measures import Measure, Weighed, weigh_problem
 from orthaug.physics.parameters import PhysicsMap, with_initial
 from orthaug.physics.problem import Problem, check_defined, pose, regressor_of

@@ -26,12 +26,10 @@ from orthaug.data.record import Channel
 from orthaug.data.regressors import Lags
 from orthaug.data.tables import check_readable
 from orthaug.fitting.criteria import Criterion
-from orthaug.fitting.kinds import CRITERIA, SOLVERS, STRUCTURES
+from orthaug.fitting.kinds import CRITERIA, SOLVERS, STRUCTURES, Solver
 from orthaug.fitting.rules import check_solver, check_starts, tried
-from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Structure
-from orthaug.inference.kinds import MEASURES
-from orthaug.inference.measure_files import MeasurePlace
+from orthaug.inference.kinds import MEASURES, MeasurePlace
 from orthaug.inference.measures import Measure
 from orthaug.models.kinds import LEARNERS
 from orthaug.models.learners import Learner

@@ -17,8 +17,7 @@ from orthaug.commands.folder import results_beside
 from orthaug.commands.run import ModelOnData, Reading, prepared_notes, record_for
 from orthaug.data.record import Record
 from orthaug.data.tables import check_readable
-from orthaug.inference.kinds import MEASURES
-from orthaug.inference.measure_files import MeasurePlace
+from orthaug.inference.kinds import MEASURES, MeasurePlace
 from orthaug.inference.measures import Measure, Support
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel

@@ -12,7 +12,7 @@ from typing import Any
 from nicegui import ui
 
 from orthaug._base.errors import InputError
-from orthaug._base.log import LOG
+from orthaug._base.progress import LOG
 from orthaug.commands.app.session import Session
 from orthaug.commands.app.view_data import DataView
 from orthaug.commands.app.view_model import ModelView
