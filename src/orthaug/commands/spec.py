@@ -17,10 +17,17 @@ from pydantic import Field, ValidationError, create_model, model_validator
 
 from orthaug._base.errors import InputError
 from orthaug._base.registry import resolve
-from orthaug.commands.data_sections import Data, EngineSection
-from orthaug.commands.motion_spec import MotionSection
-from orthaug.commands.sections import Count, Finite, KindSection, PhysicalSection, Positive, Section, with_kinds
-from orthaug.commands.spec_errors import first_message
+from orthaug.commands.data_sections import Data, EngineSection, MotionSection
+from orthaug.commands.sections import (
+    Count,
+    Finite,
+    KindSection,
+    PhysicalSection,
+    Positive,
+    Section,
+    first_message,
+    with_kinds,
+)
 from orthaug.data.expressions import SAMPLING_TIME
 from orthaug.data.record import Channel
 from orthaug.data.regressors import Lags
