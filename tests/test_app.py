@@ -247,7 +247,7 @@ def test_curves_of_the_loss_are_named_by_start_or_by_structure():
 
 @served
 def test_a_part_of_the_page_that_fails_keeps_no_other_from_what_is_new(tmp_path, monkeypatch):
-    from orthaug.commands.app.page import Page
+    from orthaug.commands.app.routes import Page
 
     session = Session("key", tmp_path, Desk())
     page, told, seen = Page(session), [], []

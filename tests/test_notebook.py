@@ -209,9 +209,9 @@ def test_the_page_of_a_fit(fit, tmp_path):
 )
 def test_pages_that_cannot_be_made(fit, options, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("orthaug.commands.from_python.judged", lambda fitted: fitted)
-    monkeypatch.setattr("orthaug.commands.from_python.told_of", lambda job, fit: fit)
-    monkeypatch.setattr("orthaug.commands.from_python.fit_report", lambda fitted, origin: "")
+    monkeypatch.setattr("orthaug.commands.library.judged", lambda fitted: fitted)
+    monkeypatch.setattr("orthaug.commands.library.told_of", lambda job, fit: fit)
+    monkeypatch.setattr("orthaug.commands.library.fit_report", lambda fitted, origin: "")
     with pytest.raises(oa.InputError, match=message):
         fit.report(**options)
     assert list(tmp_path.iterdir()) == []

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from test_cli import MLP, SPEC, make_project, run
 
-from orthaug._base.warning import Warning
+from orthaug._base.errors import Warning
 from orthaug.commands.schema import RESULTS, schema_of
 from orthaug.reports.fields import Content, Flag, Number, Numbers, WarningResult, Whole
 from orthaug.reports.result import DataResult, FitResult, ParameterResult, ScoreResult

@@ -12,7 +12,7 @@ from orthaug._base import memory
 from orthaug._base.errors import InputError
 from orthaug.analysis.design import design_input
 from orthaug.data.readers import read_record
-from orthaug.fitting.cost import check_cost
+from orthaug.fitting.rules import check_cost
 from orthaug.physics.baseline import Parameter
 from orthaug.physics.problem import pose
 

@@ -13,7 +13,7 @@ import pytest
 from test_cli import SPEC, make_project, run
 
 from orthaug._base.lines import WIDTH, fit_screen, fold, table
-from orthaug._base.log import LOG, show_log
+from orthaug._base.progress import LOG, show_log
 from orthaug.commands import bars, streams
 
 pytestmark = pytest.mark.usefixtures("without_figures")

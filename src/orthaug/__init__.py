@@ -25,7 +25,7 @@ def _plot(fit: Any) -> Any:
 
 
 def _report(fit: Any, path: Any, tests: Any) -> Any:
-    from orthaug.commands.from_python import page_of, page_of_spec
+    from orthaug.commands.library import page_of, page_of_spec
 
     return (page_of_spec if hasattr(fit, "job") else page_of)(fit, path, tests)
 

@@ -1,10 +1,13 @@
-"""What can go wrong because of what was asked, always with the remedy in the text, on one line."""
+"""What can go wrong because of what was asked, always with the remedy in the text, on one line; and warnings.
+
+A warning is what the user must know about a result that stands all the same.
+"""
 
 from __future__ import annotations
 
 import math
 import re
-from typing import Any
+from typing import Any, NamedTuple
 
 LONGEST = 60  # characters of a name or value in a message
 _FEW = 4  # entries of an array that is shown
@@ -99,3 +102,13 @@ class TrainingError(ArithmeticError):
 
     def __init__(self, text: str = "") -> None:
         super().__init__(message(str(text)))
+
+
+class Warning(NamedTuple):  # noqa: A001  (the field's word; Python's own is never meant here)
+    """A `code` for programs, in words_with_underscores, and a sentence for people."""
+
+    code: str
+    text: str
+
+    def __str__(self) -> str:
+        return self.text

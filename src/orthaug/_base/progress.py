@@ -1,10 +1,17 @@
-"""Progress of training: from the iteration of a run to whoever shows it."""
+"""What is told of work: progress of training, to whoever shows it, and the logger `orthaug`, silent until one listens.
+
+Stages of a fit are INFO, what was tried instead is DEBUG. What a user must know stands in warnings of results.
+"""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
+
+LOG = logging.getLogger("orthaug")
+LOG.addHandler(logging.NullHandler())
 
 Tell = Callable[[int, int, float], None]
 """Called now and then with the number of the run, its iteration and the loss; it may raise to stop the training.
@@ -72,3 +79,14 @@ class Progress:
 
 
 SILENT = Progress()
+
+
+def show_log(level: str) -> None:
+    """Write the log to standard error from `level` on, info or debug, with the time of each line."""
+    if any(isinstance(handler, logging.StreamHandler) for handler in LOG.handlers):
+        return
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s", "%H:%M:%S"))
+    LOG.addHandler(handler)
+    LOG.setLevel(level.upper())
+    LOG.propagate = False

@@ -15,9 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import percent, plain_number
-from orthaug._base.warning import Warning
 from orthaug.analysis.bias import SuspectedBias
 from orthaug.analysis.measure_bias import Ground, physical_with_bias
 from orthaug.analysis.remedies import remedies

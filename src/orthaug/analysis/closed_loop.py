@@ -12,9 +12,9 @@ import numpy as np
 import scipy.special
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.errors import Warning
 from orthaug._base.lines import percent
 from orthaug._base.parallel import one_blas_thread
-from orthaug._base.warning import Warning
 from orthaug.analysis.predictability import BlockSums, Share
 from orthaug.data.record import Record
 

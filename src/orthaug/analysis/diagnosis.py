@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import check_type
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import counted, percent
 from orthaug._base.parallel import one_blas_thread
-from orthaug._base.warning import Warning
 from orthaug.analysis.changes import Change, fall_of, model_changes, own_share
 from orthaug.analysis.motion_diagnosis import diagnose_motion
 from orthaug.analysis.predictability import predictable

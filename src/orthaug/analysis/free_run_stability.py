@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from orthaug._base.checks import Matrix
+from orthaug._base.errors import Warning
 from orthaug._base.lines import percent
-from orthaug._base.warning import Warning
 from orthaug.analysis.boundedness import divergence_scaling, margin
 from orthaug.analysis.contraction import Contraction, contraction
 from orthaug.analysis.feedback import Feedback, feedback

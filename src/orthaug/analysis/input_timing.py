@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.errors import InputError
-from orthaug._base.warning import Warning
+from orthaug._base.errors import InputError, Warning
 from orthaug.data.record import Record
 from orthaug.fitting.course import Flight
 from orthaug.fitting.criteria import Criterion

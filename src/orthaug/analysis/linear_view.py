@@ -15,8 +15,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from orthaug._base.checks import Matrix, Vector, check_choice
-from orthaug._base.errors import InputError
-from orthaug._base.warning import Warning
+from orthaug._base.errors import InputError, Warning
 from orthaug.analysis.linear_system import Continuous, System
 from orthaug.analysis.measured_response import MeasuredResponse
 from orthaug.analysis.operating_points import OperatingPoint

@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Vector, check_choice, check_type
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import percent
-from orthaug._base.warning import Warning
 from orthaug.analysis.linear_steps import (
     MotionStep,
     difference_widths,

@@ -15,8 +15,8 @@ import scipy.special
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.errors import Warning
 from orthaug._base.lines import percent
-from orthaug._base.warning import Warning
 from orthaug.analysis.absorbed import Smoother
 from orthaug.analysis.residuals import errors_of
 from orthaug.fitting.estimates import Estimate

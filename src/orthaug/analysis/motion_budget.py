@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.errors import Warning
 from orthaug._base.lines import percent
-from orthaug._base.warning import Warning
 from orthaug.analysis.budget import (
     AS_MUCH,
     LEAST_SHARE,

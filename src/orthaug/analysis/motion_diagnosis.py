@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from orthaug._base.errors import Warning
 from orthaug._base.lines import percent
 from orthaug._base.parallel import one_blas_thread
-from orthaug._base.warning import Warning
 from orthaug.analysis.input_timing import DeadTime, dead_times, on_longest
 from orthaug.analysis.missing_terms import MissingTest, missing_terms
 from orthaug.analysis.predictability import Predictable, from_lags, from_own_past

@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
+from orthaug._base.errors import Warning
 from orthaug._base.jax import Array, jax
 from orthaug._base.lines import percent
-from orthaug._base.warning import Warning
 from orthaug.analysis.boundedness import divergence_scaling, margin
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Numbers

@@ -21,9 +21,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.errors import Warning
 from orthaug._base.jax import Array, jax, jnp
 from orthaug._base.lines import percent
-from orthaug._base.warning import Warning
 from orthaug.analysis.absorbed import Waves
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.initial_states import InitialStates

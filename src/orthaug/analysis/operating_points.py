@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector, is_number, nearest
-from orthaug._base.errors import InputError, shown
-from orthaug._base.warning import Warning
+from orthaug._base.errors import InputError, Warning, shown
 from orthaug.analysis.linear_steps import Step, at_rest, difference_widths, sizes_of
 from orthaug.models.dynamics import Numbers
 from orthaug.models.model import Model

@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Matrix, check_count, check_type
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import percent
 from orthaug._base.parallel import Threads
-from orthaug._base.warning import Warning
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout
 from orthaug.fitting.estimates import Estimate

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from orthaug._base.errors import Warning
 from orthaug._base.lines import percent
-from orthaug._base.warning import Warning
 from orthaug.analysis.changes import WORTH, Change, fall_of
 from orthaug.analysis.missing_terms import MissingTest
 from orthaug.analysis.predictability import Predictable

@@ -7,9 +7,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from orthaug._base.errors import InputError
-from orthaug._base.log import LOG
-from orthaug._base.warning import Warning
+from orthaug._base.errors import InputError, Warning
+from orthaug._base.progress import LOG
 
 T = TypeVar("T")
 _NUMERICAL = (ArithmeticError, np.linalg.LinAlgError)

@@ -1,4 +1,4 @@
-"""The sections [data] and [engine] of a spec: channels, files, and who sums over the rows of training."""
+"""The sections [data], [engine] and [motion] of a spec: channels, files, who sums over rows, equations of motion."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from pydantic import Field, model_validator
 from orthaug._base.checks import check_label
 from orthaug._base.errors import InputError
 from orthaug._base.memory import available
-from orthaug.commands.sections import Count, Finite, KindSection, Positive, Section, with_kinds
+from orthaug.commands.sections import Count, Finite, KindSection, PhysicalSection, Positive, Section, with_kinds
 from orthaug.data.preparation import STEPS
 from orthaug.data.record import LONGEST_STEP
+from orthaug.physics.motion import HOLDS, INTEGRATORS, MOST_SUBSTEPS, Motion, Output, State
 
 if TYPE_CHECKING:
     from orthaug.models.rows import Engine
@@ -23,6 +24,7 @@ _PARQUET = ".parquet"
 _SHARE = 0.25  # of the memory that is free: what the files may take before they are streamed
 _COPIES = 4  # of a file's bytes, in a fit in memory at least
 Range = Annotated[list[Count], Field(min_length=2, max_length=2)]
+Text = Annotated[str, Field(min_length=1)]
 
 
 class PartSection(Section):
@@ -149,3 +151,76 @@ def engine_of(section: EngineSection, kind: str) -> Engine:
     from orthaug.models.streaming import Stream
 
     return Stream() if kind == "stream" else InMemory()
+
+
+class StateSection(Section):
+    """A state: its equation, where it starts, whether a learner is added to the equation."""
+
+    derivative: Text | Finite | None = None
+    next: Text | Finite | None = None
+    start: Finite | Text | None = None
+    learned: bool = False
+    unit: str = ""
+
+
+class OutputSection(Section):
+    """An output as an expression of the states, and whether a learner is added to it."""
+
+    expression: Text
+    learned: bool = False
+
+
+class MotionSection(Section):
+    """Equations of motion: states, outputs, parameters, and how they are integrated."""
+
+    integrator: Literal[INTEGRATORS] = "rk4"  # type: ignore[valid-type]
+    substeps: Literal["auto"] | Annotated[int, Field(ge=1, le=MOST_SUBSTEPS, strict=True)] = "auto"
+    hold: Literal[HOLDS] = "zero-order"  # type: ignore[valid-type]
+    states: Annotated[dict[str, StateSection], Field(min_length=1)]
+    outputs: Annotated[dict[str, Text | OutputSection], Field(min_length=1)]
+    parameters: Annotated[dict[str, PhysicalSection], Field(min_length=1)]
+    define: dict[str, Text] = {}
+    constants: dict[str, Finite] = {}
+
+    @model_validator(mode="after")
+    def _check_equations(self) -> MotionSection:
+        """Each state has the equation that its integrator reads."""
+        discrete = self.integrator == "discrete"
+        own, other = ("next", "derivative") if discrete else ("derivative", "next")
+        kind = "a discrete motion" if discrete else f'`integrator = "{self.integrator}"`'
+        for name, state in self.states.items():
+            if getattr(state, other) is not None:
+                raise ValueError(f"`states.{name}` has the key `{other}`; {kind} reads `{own}`")
+            if getattr(state, own) is None:
+                raise ValueError(f"`states.{name}` has no `{own}`; expected its equation")
+        return self
+
+    @property
+    def learns(self) -> bool:
+        """Whether a learner is added to any equation or output."""
+        outputs = (output.learned for output in self.outputs.values() if not isinstance(output, str))
+        return any(state.learned for state in self.states.values()) or any(outputs)
+
+    def declared(self, inputs: Sequence[str], outputs: Sequence[str]) -> Motion:
+        """The motion, its channels in the order of the data.
+
+        Raises:
+            InputError: names and expressions that cannot be, and what else `Motion.from_equations` refuses.
+        """
+        given = {name: OutputSection(expression=o) if isinstance(o, str) else o for name, o in self.outputs.items()}
+        known = [*(name for name in outputs if name in given), *(name for name in given if name not in outputs)]
+        states = []
+        for name, state in self.states.items():
+            equation = state.next if self.integrator == "discrete" else state.derivative
+            states.append(State(name, str(equation), state.start, state.learned, state.unit))
+        return Motion.from_equations(
+            states=states,
+            outputs=[Output(name, given[name].expression, given[name].learned) for name in known],
+            parameters=[section.declared(name) for name, section in self.parameters.items()],
+            inputs=inputs,
+            constants=self.constants,
+            define=self.define,
+            integrator=self.integrator,
+            substeps=None if self.substeps == "auto" else self.substeps,
+            hold=self.hold,
+        )

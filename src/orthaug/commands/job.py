@@ -15,10 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from orthaug import __version__
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, Warning
 from orthaug._base.parallel import Threads
 from orthaug._base.progress import SILENT, Plan, Progress
-from orthaug._base.warning import Warning
 from orthaug.commands.parts import Part
 from orthaug.commands.spec import Spec, load_spec
 from orthaug.data.record import Record

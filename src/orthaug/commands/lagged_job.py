@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orthaug._base.errors import InputError, KeyedError
+from orthaug._base.errors import InputError, KeyedError, Warning
 from orthaug._base.progress import SILENT, Progress
-from orthaug._base.warning import Warning
 from orthaug.commands.data_sections import engine_of
 from orthaug.commands.job import ALONE, AS_DECLARED, Job, Variant
 from orthaug.commands.parts import load_parts
@@ -22,11 +21,10 @@ from orthaug.data.expressions import Lag
 from orthaug.data.record import Record, check_channels
 from orthaug.data.regressors import Layout, lag_rows, largest_lag
 from orthaug.data.sources import RecordSource
-from orthaug.fitting.cost import check_cost
 from orthaug.fitting.independent_terms import independent_terms
 from orthaug.fitting.kinds import STRUCTURES
-from orthaug.fitting.rules import check_scored
-from orthaug.inference.measure_files import MeasurePlace
+from orthaug.fitting.rules import check_cost, check_scored
+from orthaug.inference.kinds import MeasurePlace
 from orthaug.inference.measures import Measure, Weighed, weigh_problem
 from orthaug.physics.parameters import PhysicsMap, with_initial
 from orthaug.physics.problem import Problem, check_defined, pose, regressor_of

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orthaug._base.errors import InputError
-from orthaug._base.warning import Warning
+from orthaug._base.errors import InputError, Warning
 from orthaug.analysis.closed_loop import closed_loop
 from orthaug.analysis.imitation import Imitation, imitation
 from orthaug.analysis.measure_bias import Ground, bias_under

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from orthaug._base.errors import Warning
 from orthaug._base.folders import whole_file
-from orthaug._base.warning import Warning
 from orthaug.commands.run import Reading, check_instants, held_outputs
 from orthaug.data.parquet_source import open_parquet
 from orthaug.data.sources import Source

@@ -18,10 +18,9 @@ from orthaug.commands.spec import Spec
 from orthaug.commands.suspects import declared_terms
 from orthaug.data.record import Record, check_channels
 from orthaug.data.regressors import Layout
-from orthaug.fitting.cost import check_cost
-from orthaug.fitting.rules import check_motion_choices, check_scored, check_solver, tried
+from orthaug.fitting.rules import check_cost, check_motion_choices, check_scored, check_solver, tried
 from orthaug.fitting.structures import Structure
-from orthaug.inference.measure_files import MeasurePlace
+from orthaug.inference.kinds import MeasurePlace
 from orthaug.inference.measures import Measure, Support
 from orthaug.physics.motion import Motion
 from orthaug.physics.motion_problem import MotionProblem, layout_of, pose_motion

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orthaug._base.errors import InputError, RankError
-from orthaug._base.warning import Warning
+from orthaug._base.errors import InputError, RankError, Warning
 from orthaug.analysis.closed_loop import closed_loop
 from orthaug.commands.attempt import attempt, attempt_warned
 from orthaug.commands.motion_job import MotionJob

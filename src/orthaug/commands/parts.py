@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, Warning
 from orthaug._base.folders import file_digest
 from orthaug._base.lines import counted
 from orthaug._base.memory import few_arenas
-from orthaug._base.warning import Warning
 from orthaug.commands.data_sections import PartSection
 from orthaug.commands.spec import Spec
 from orthaug.data.parquet_source import open_parquet

@@ -136,7 +136,7 @@ def options(
     """What stands before a command: -v, -vv or ORTHAUG_LOG ask for the log."""
     level, levels = os.environ.get("ORTHAUG_LOG", "").lower(), ("info", "debug")
     if verbose or level:
-        from orthaug._base.log import show_log
+        from orthaug._base.progress import show_log
 
         show_log(levels[min(verbose, 2) - 1] if verbose else check_choice(level, levels, "ORTHAUG_LOG"))
 

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from orthaug._base.checks import check_choice, nearest
-from orthaug._base.errors import InputError, MissingSampleError
+from orthaug._base.errors import InputError, MissingSampleError, Warning
 from orthaug._base.folders import whole_file
 from orthaug._base.lines import percent
-from orthaug._base.warning import Warning
 from orthaug.commands.parts import long_stretches
 from orthaug.data.preparation import MENDING, SAMPLING, steps_again
 from orthaug.data.readers import read_record

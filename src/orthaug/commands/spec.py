@@ -17,21 +17,26 @@ from pydantic import Field, ValidationError, create_model, model_validator
 
 from orthaug._base.errors import InputError
 from orthaug._base.registry import resolve
-from orthaug.commands.data_sections import Data, EngineSection
-from orthaug.commands.motion_spec import MotionSection
-from orthaug.commands.sections import Count, Finite, KindSection, PhysicalSection, Positive, Section, with_kinds
-from orthaug.commands.spec_errors import first_message
+from orthaug.commands.data_sections import Data, EngineSection, MotionSection
+from orthaug.commands.sections import (
+    Count,
+    Finite,
+    KindSection,
+    PhysicalSection,
+    Positive,
+    Section,
+    first_message,
+    with_kinds,
+)
 from orthaug.data.expressions import SAMPLING_TIME
 from orthaug.data.record import Channel
 from orthaug.data.regressors import Lags
 from orthaug.data.tables import check_readable
 from orthaug.fitting.criteria import Criterion
-from orthaug.fitting.kinds import CRITERIA, SOLVERS, STRUCTURES
+from orthaug.fitting.kinds import CRITERIA, SOLVERS, STRUCTURES, Solver
 from orthaug.fitting.rules import check_solver, check_starts, tried
-from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Structure
-from orthaug.inference.kinds import MEASURES
-from orthaug.inference.measure_files import MeasurePlace
+from orthaug.inference.kinds import MEASURES, MeasurePlace
 from orthaug.inference.measures import Measure
 from orthaug.models.kinds import LEARNERS
 from orthaug.models.learners import Learner

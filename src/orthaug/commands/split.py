@@ -10,16 +10,14 @@ from typing import Any, get_origin
 import numpy as np
 
 from orthaug._base.checks import check_choice
-from orthaug._base.errors import InputError, KeyedError
+from orthaug._base.errors import InputError, KeyedError, Warning
 from orthaug._base.folders import file_digest
 from orthaug._base.registry import Key, keys_of, resolve
-from orthaug._base.warning import Warning
 from orthaug.commands.folder import results_beside
 from orthaug.commands.run import ModelOnData, Reading, prepared_notes, record_for
 from orthaug.data.record import Record
 from orthaug.data.tables import check_readable
-from orthaug.inference.kinds import MEASURES
-from orthaug.inference.measure_files import MeasurePlace
+from orthaug.inference.kinds import MEASURES, MeasurePlace
 from orthaug.inference.measures import Measure, Support
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, Warning
 from orthaug._base.folders import file_digest, whole_folder
-from orthaug._base.warning import Warning
 from orthaug.commands.folder import not_a_result, results_beside
 from orthaug.commands.run import Reading, record_for
 from orthaug.commands.split import open_training

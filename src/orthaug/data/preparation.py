@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import check_type
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, Warning
 from orthaug._base.registry import Registry
-from orthaug._base.warning import Warning
 from orthaug.data.filters import Decimate, Highpass, Lowpass
 from orthaug.data.record import Experiment, Prepared, Record, same_step, unbroken
 from orthaug.data.steps import Detrend, Fill, Outliers, Resample, Run, Shift, Step

@@ -15,8 +15,8 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, nearest
 from orthaug._base.errors import InputError, MissingColumnError
-from orthaug._base.log import LOG
 from orthaug._base.memory import check_memory
+from orthaug._base.progress import LOG
 from orthaug.data.headers import dated, in_seconds
 from orthaug.data.layouts import Layout, as_number, layout, numbers_only, read_sheet, text_number
 from orthaug.data.variables import ENDINGS, foreign, read_variables, short, variable_names

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.warning import Warning
+from orthaug._base.errors import Warning
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
 from orthaug.fitting.elimination import Fixed, ThetaSplit, directions, eliminate, split_theta

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_count, check_type
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import fold
 from orthaug._base.views import ShownFit
-from orthaug._base.warning import Warning
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout, lag_rows
 from orthaug.fitting.block_scores import FreeRunScores

@@ -17,18 +17,17 @@ from orthaug.data.regressors import Lags
 from orthaug.data.sources import Source, witness
 from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.conclusion import conclude
-from orthaug.fitting.cost import check_cost
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.free_run import FreeRunTask
 from orthaug.fitting.independent_terms import independent_terms
+from orthaug.fitting.kinds import Solver
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_estimation import DEFAULT, fit_motion, pose_for
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.reweighting import reweighted
-from orthaug.fitting.rules import check_solver, checked_starts, tried
+from orthaug.fitting.rules import check_cost, check_solver, checked_starts, tried
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.fitting.training import Choice, PlannedRun, planned, train
 from orthaug.inference.measures import Training

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.errors import Warning
 from orthaug._base.progress import RunTell, quiet
-from orthaug._base.warning import Warning
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.course import Flight

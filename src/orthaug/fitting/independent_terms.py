@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from orthaug._base.errors import InputError
-from orthaug._base.warning import Warning
+from orthaug._base.errors import InputError, Warning
 from orthaug.data.regressors import Features
 from orthaug.models.learners import Learner
 from orthaug.models.terms import Terms

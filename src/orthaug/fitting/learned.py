@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.errors import Warning
 from orthaug._base.progress import RunTell, quiet
-from orthaug._base.warning import Warning
 from orthaug.data.record import Record
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion

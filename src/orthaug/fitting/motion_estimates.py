@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector, check_type
-from orthaug._base.errors import InputError
-from orthaug._base.warning import Warning
+from orthaug._base.errors import InputError, Warning
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout
 from orthaug.fitting.block_scores import FreeRunScores

@@ -14,13 +14,13 @@ from orthaug.data.record import Record
 from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.conclusion import without_loss
 from orthaug.fitting.criteria import Criterion, Simulation
+from orthaug.fitting.kinds import Solver
 from orthaug.fitting.learned import Learned
 from orthaug.fitting.motion_course import MotionCourse
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.rules import check_motion_choices, check_solver, checked_starts, tried
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.status import ALONE, Ending, Status
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.fitting.training import Choice, planned, train

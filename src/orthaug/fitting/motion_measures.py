@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, Warning
 from orthaug._base.jax import Array, jax, jnp
-from orthaug._base.warning import Warning
 from orthaug.fitting.segments import Segments
 from orthaug.inference.measures import Measure, Support
 from orthaug.inference.motion_split import Field, rest_of

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, Warning
 from orthaug._base.jax import jnp
 from orthaug._base.progress import RunTell, quiet
-from orthaug._base.warning import Warning
 from orthaug.data.record import Record
 from orthaug.data.regressors import Features
 from orthaug.data.sources import RecordSource, witness

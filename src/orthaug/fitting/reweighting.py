@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from orthaug._base.warning import Warning
+from orthaug._base.errors import Warning
 from orthaug.fitting.estimates import Estimate
 from orthaug.inference.covariance import whitening
 from orthaug.physics.output_weights import by_covariance

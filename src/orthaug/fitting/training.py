@@ -11,20 +11,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from orthaug._base.checks import finite_or_none
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, Warning
 from orthaug._base.jax import jax
 from orthaug._base.lines import counted, percent
-from orthaug._base.log import LOG
 from orthaug._base.parallel import Threads, one_blas_thread
-from orthaug._base.progress import Tell
-from orthaug._base.warning import Warning
+from orthaug._base.progress import LOG, Tell
 from orthaug.data.record import Record
 from orthaug.fitting.conclusion import conclude
 from orthaug.fitting.estimates import Restart
 from orthaug.fitting.held_out import HeldOut, Pieces, blocked, mean_square, squared_errors
+from orthaug.fitting.kinds import Solver
 from orthaug.fitting.learned import Learned, Task
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.solvers.solver import Solver
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Structure
 from orthaug.models.learners import Bound

@@ -17,8 +17,7 @@ import scipy.special
 from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector, nearest
-from orthaug._base.errors import InputError
-from orthaug._base.warning import Warning
+from orthaug._base.errors import InputError, Warning
 from orthaug.inference.covariance import interval
 from orthaug.physics.excitation import excitation
 from orthaug.physics.parameters import PhysicsMap, magnitude, tied

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.errors import InputError
-from orthaug._base.warning import Warning
+from orthaug._base.errors import InputError, Warning
 from orthaug.data.sources import Partition
 from orthaug.inference.measures import Measure, Points, Support, weigh
 from orthaug.models.learners import Bound

@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Vector
-from orthaug._base.errors import InputError
-from orthaug._base.warning import Warning
+from orthaug._base.errors import InputError, Warning
 from orthaug.data.terms import TermLibrary, products_of
 from orthaug.fitting.criteria import Prediction
 from orthaug.physics.problem import Problem

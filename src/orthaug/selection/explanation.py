@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import check_count, check_type, is_number
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, Warning, shown
 from orthaug._base.lines import percent
-from orthaug._base.warning import Warning
 from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.analysis.suspects import Suspect
 from orthaug.data.record import Record

@@ -8,8 +8,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from orthaug._base.checks import check_count, check_type
-from orthaug._base.errors import InputError
-from orthaug._base.warning import Warning
+from orthaug._base.errors import InputError, Warning
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags, in_order
 from orthaug.fitting.criteria import Criterion, Simulation

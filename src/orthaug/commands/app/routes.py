@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import os
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from html import escape
+from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, RedirectResponse, Response
@@ -14,9 +19,111 @@ from nicegui import ui
 from starlette.requests import ClientDisconnect
 
 from orthaug._base.errors import InputError
+from orthaug._base.progress import LOG
 from orthaug.commands.app.gate import PLAIN
-from orthaug.commands.app.page import MARK, Page
-from orthaug.commands.app.session import Sessions
+from orthaug.commands.app.session import Session, Sessions
+from orthaug.commands.app.view_data import DataView
+from orthaug.commands.app.view_model import ModelView
+from orthaug.commands.app.view_results import ExportView, ReportView
+from orthaug.commands.app.view_training import TrainingView
+from orthaug.commands.app.widgets import sentence, text
+
+_OFTEN = 0.25  # s between looks at what has changed
+_PARTS = ("Data", "Model", "Training", "Report", "Export")
+MARK = (
+    "<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'><rect width='32' height='32' rx='7' fill='#0550ae'/>"
+    "<path d='M9 7v16h16' stroke='#fff' stroke-width='3.4' fill='none' stroke-linecap='round'/>"
+    "<path d='M9 17h6v6' stroke='#9cc8ff' stroke-width='2.2' fill='none'/></svg>"
+)
+"""The mark of the program, as a picture."""
+
+
+class Page:
+    """What one browser tab shows of a session. Several may show the same."""
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self.data, self.model = DataView(session), ModelView(session)
+        self.training, self.report, self.export = TrainingView(session), ReportView(session), ExportView(session)
+        self.seen = dict(session.versions)
+
+    def draw(self) -> None:
+        place = files("orthaug.commands.app")
+        for tag, name in (("style", "page.css"), ("script", "page.js")):
+            ui.add_head_html(f"<{tag}>{(place / name).read_text(encoding='utf-8')}</{tag}>")
+        ui.context.client.on_exception(self._complain)
+        with ui.element("div").classes("head"):
+            ui.html(MARK, sanitize=False, tag="span").classes("logo").props("aria-hidden=true")
+            text("orthaug", "h1")
+            self.title = text("", "p", "hint")
+        with ui.tabs().props("no-caps align=left active-color=tab indicator-color=tab dense").classes("tabs") as tabs:
+            for name in _PARTS:
+                ui.tab(name)
+        start = "Training" if self.session.commands else "Data"
+        self._keep_history(tabs, start)
+        parts = (self.data, self.model, self.training, self.report, self.export)
+        with ui.tab_panels(tabs, value=start).props("animated=false").classes("parts"):
+            for name, part in zip(_PARTS, parts, strict=True):
+                with ui.tab_panel(name):
+                    part.draw()
+        self._name()
+        ui.timer(_OFTEN, self.follow)
+
+    def _keep_history(self, tabs: ui.tabs, start: str) -> None:
+        """Let Back and Forward of the browser go through the parts, and a reload show the same one."""
+
+        def go(event: Any) -> None:
+            if event.args in _PARTS:
+                tabs.set_value(event.args)
+
+        def reopen(event: Any) -> None:
+            if tabs.value == start:  # else somebody was faster
+                go(event)
+
+        ui.on("part", go)
+        ui.on("reopened", reopen)
+        tabs.on_value_change(lambda event: ui.run_javascript(f"shown({json.dumps(str(event.value))}, false)"))
+        opened = "location.hash ? emitEvent('reopened', location.hash.slice(1)) : shown({}, true)"
+        ui.timer(_OFTEN, lambda: ui.run_javascript(opened.format(json.dumps(start))), once=True)
+
+    def follow(self) -> None:
+        """Let each part see what has changed since the last look."""
+        now, seen = dict(self.session.versions), self.seen
+        self.seen = now
+
+        def moved(what: str) -> bool:
+            return now.get(what, 0) != seen.get(what, 0)
+
+        looks: list[Callable[[], None]] = []
+        if moved("data"):
+            looks += [self.data.follow_data, self.model.follow_data]
+        if moved("spec"):
+            authors = set(self.session.authors[seen.get("spec", 0) :])
+            author = authors.pop() if len(authors) == 1 else ""
+            looks += [partial(self.data.follow_spec, author), partial(self.model.follow_spec, author)]
+        if moved("check"):
+            looks += [self.data.follow_check, self.model.follow_check]
+        if moved("work") or moved("spec") or moved("data") or self.session.running is not None:
+            looks.append(self.training.follow_work)
+        elif moved("check"):
+            looks.append(self.training.follow_check)
+        if moved("work") or moved("spec"):
+            looks += [self.report.follow_work, self.export.follow_work]
+        if now != seen:
+            looks.append(self._name)
+        for look in looks:
+            try:
+                look()
+            except Exception as error:  # a part that fails keeps no other from what is new
+                LOG.exception("a part of the page failed")
+                self._complain(error)
+
+    def _name(self) -> None:
+        self.title.set_content(escape(self.session.title or "from data to a model"))
+
+    def _complain(self, error: Exception) -> None:
+        told = str(error) if isinstance(error, InputError) else f"this did not work ({type(error).__name__})."
+        ui.notify(sentence(told), type="negative")
 
 
 def application(sessions: Sessions, spec: Path | None) -> FastAPI:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from orthaug._base.errors import InputError
-from orthaug._base.log import LOG
+from orthaug._base.progress import LOG
 from orthaug.commands.app.processes import Command, Desk
 from orthaug.commands.app.spec_text import absolute, files, in_file, keep, kept_title, plain, section, with_value
 from orthaug.data.tables import KNOWN
