@@ -151,13 +151,13 @@ def from_neighbours(x: Matrix, signal: Vector) -> Share:
     Where two rows lie close to each other, their values differ by the rest alone: half the mean square of that is the
     variance of the rest (Rice 1984). Where they lie far apart, as in many dimensions, it explains less than there is.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     size = x.std(axis=0)
     scaled = (x[:, size > 0] - x[:, size > 0].mean(axis=0)) / size[size > 0]
     if not scaled.size or len(x) < 4 * BLOCKS * _APART:
         return Share(0.0, 0.0)
-    near = cKDTree(scaled).query(scaled, 2 * _APART + 2)[1]
+    near = np.asarray(KDTree(scaled).query(scaled, 2 * _APART + 2)[1])
     nearest = near[np.arange(len(x)), np.argmax(np.abs(near - np.arange(len(x))[:, None]) > _APART, axis=1)]
     e = signal - signal.mean()
     both = np.stack([e**2, (e - e[nearest]) ** 2 / 2])

@@ -38,7 +38,7 @@ def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | Non
     notes = prepared_notes(loaded, record)
     if trained and rows is None:
         notes += (f"note: rows {trained[0]}:{trained[1]} of each file, those of the training.",)
-    elif trained and rows != trained:
+    elif trained and rows and rows != trained:
         told = f"the model was trained on rows {trained[0]}:{trained[1]}, not on {rows[0]}:{rows[1]}."
         warnings.append(Warning("other_training_data", told))
     return ModelOnData(loaded, record, data[0], notes=notes, warnings=tuple(warnings))

@@ -62,8 +62,9 @@ def rebuild(
     kept = declared["trained"]
     trained = None
     if kept is not None:
-        laid = (int(kept[key]) for key in _LAID)
-        trained = Trained(*laid, arrays["trained.states"], arrays.get("trained.slope"), arrays["trained.alone"])
+        laid = {key: int(kept[key]) for key in _LAID}
+        own = {key: arrays.get(f"trained.{key}") for key in ("states", "slope", "alone")}
+        trained = Trained(**laid, **own)  # type: ignore[arg-type]
     return MotionModel(
         form=form,
         **fields_from(declared, arrays),
