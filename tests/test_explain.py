@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -229,6 +230,22 @@ def test_the_command_tells_what_to_write_and_that_can_be_read(project):
     assert [term.parameter for term in load_spec(grown).baseline.terms] == ["a", "b", "g", "cubic"]
     page = run("explain", project / "plant", project / "run.csv").out
     assert page.startswith("y[k-1]**3 explains 9") and "[[baseline.terms]]" in page and "1/m**2" in page
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_where_the_spec_has_a_map_to_physical_parameters_the_lines_for_it_are_told(project, tmp_path):
+    names = ("a", "b", "g")
+    own = "[physics.parameters]\n" + "".join(f"p{name} = {{ initial = 1.0 }}\n" for name in names)
+    own += "cubic = { initial = -0.2 }\n[physics.theta]\n" + "".join(f'{name} = "p{name}"\n' for name in names)
+    shutil.copytree(project / "plant", tmp_path / "plant")
+    result = json.loads((project / "plant" / "result.json").read_text(encoding="utf-8"))
+    result["spec"]["physics"] = {"theta": dict(zip(names, names, strict=True))}
+    (tmp_path / "plant" / "result.json").write_text(json.dumps(result), encoding="utf-8")
+    plain, mapped = (run("explain", model / "plant", project / "run.csv", "--json") for model in (project, tmp_path))
+    assert plain.err == "" and mapped.err.startswith("note: the spec has [physics]") and '"drag"' in mapped.err
+    term = "".join(line for line in json.loads(mapped.out)["spec"].splitlines(True) if not line.startswith("initial"))
+    (project / "mapped.toml").write_text(SPEC + term + "\n" + own + 'cubic = "cubic"\n' + ALONE, encoding="utf-8")
+    assert load_spec(project / "mapped.toml").baseline.terms[3].parameter == "cubic"
 
 
 @pytest.mark.parametrize(("text", "unit"), [("T**3", "W/degC**3"), ("sign(T)", "W"), ("T", "W/degC")])

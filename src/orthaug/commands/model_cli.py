@@ -149,7 +149,7 @@ def explain(
     """
     check_count(degree, "--degree", of="factors")
     check_count(most, "--terms", of="terms")
-    from orthaug.commands.run import Reading, explain_model, open_run, read_rows
+    from orthaug.commands.run import Reading, explain_model, explain_notes, open_run, read_rows
     from orthaug.reports.explanation import explain_text
 
     opened = open_run(model, data, reading=Reading(rows=read_rows(rows), prepare=True))
@@ -157,6 +157,8 @@ def explain(
     for line in opened.notes:
         streams.say(line)
     result = explain_model(opened, degree=degree, functions=functions or (), most=most)
+    for line in explain_notes(model) if result.spec else ():
+        streams.say(line)
     tell(result, explain_text(result), as_json)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ from orthaug._base.checks import check_choice, nearest
 from orthaug._base.errors import InputError, MissingSampleError, Warning
 from orthaug._base.folders import whole_file
 from orthaug._base.lines import percent
+from orthaug.commands.folder import results_beside
 from orthaug.commands.parts import long_stretches
 from orthaug.data.preparation import MENDING, SAMPLING, steps_again
 from orthaug.data.readers import read_record
@@ -310,6 +312,18 @@ def _table(response: Response, opened: ModelOnData) -> Any:
     first = stretches[0]
     time = first.start_time + (np.arange(opened.rows) - first.offset) * response.sampling_time
     return whole.assign(time=whole["time"].fillna(pd.Series(time)))
+
+
+def explain_notes(model: Path) -> list[str]:
+    """What to write beside proposed terms, where the result of the model has a map to physical parameters."""
+    for content in results_beside(model):
+        with suppress(AttributeError, KeyError, TypeError):
+            if content["spec"].get("physics"):
+                return [
+                    "note: the spec has [physics]: a term from here also takes a line of [physics.theta], such as "
+                    'drag = "drag", its parameter in [physics.parameters] with that `initial`, and none in the term.'
+                ]
+    return []
 
 
 def explain_model(opened: ModelOnData, *, degree: int, functions: Sequence[str], most: int) -> ExplainResult:
