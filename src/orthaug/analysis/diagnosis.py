@@ -124,7 +124,8 @@ def _of_lagged(fit: Estimate, one_step: Response | None, free_run: Response | No
 def _concluded(seen: Finding) -> Diagnosis:
     """The verdict and its words."""
     misfit = any(t.follows() or t.curved_over(SHARE) for t in seen.tests) or seen.lacks
-    misfit = misfit or any(one.functions > _SMALL for one in seen.predictable)
+    if not seen.fit.criterion.simulates:  # errors along a free run are slow, and look like functions of what is slow
+        misfit = misfit or any(one.functions > _SMALL for one in seen.predictable)
     complete = seen.white and not misfit and not seen.follows(_SMALL)
     white = (seen.free_white and seen.white) or not seen.fit.model.form.states
     if seen.sensor:

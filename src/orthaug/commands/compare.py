@@ -81,10 +81,11 @@ def _verdicts(job: Job, fitted: dict[str, Fitted]) -> dict[str, Verdict]:
         return {}
     blocks, flown = wanted_blocks(job), job.spec.declared_criterion().simulates
     if flown or not blocks:  # free runs were chosen by the same trials
-        verdicts = {kind: judge_fit(fitted[kind], None, fitted[ALONE]) for kind in kinds}
+        trials = [None] * len(kinds)
     else:
         trials = cross_validated(job, blocks, [Variant(kind) for kind in kinds])
-        verdicts = {k: judge_fit(fitted[k], tried, fitted[ALONE]) for k, tried in zip(kinds, trials, strict=True)}
+    ran = fitted[ALONE].responses
+    verdicts = {k: judge_fit(fitted[k], lambda: alone, own, ran) for k, own in zip(kinds, trials, strict=True)}
     return {kind: verdict for kind, verdict in verdicts.items() if verdict is not None}
 
 

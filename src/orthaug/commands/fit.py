@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -76,7 +77,8 @@ def judged(fitted: Fitted) -> Fitted:
     if not fit.status.ok or (fit.model.form.bound is None and fit.held_out is None):
         return fitted
     failed: list[Any] = []
-    verdict = attempt("the judgement of the learner", lambda: judge_fit(fitted), failed, None)
+    physics = cache(partial(fitted.job.run, Variant(ALONE)))
+    verdict = attempt("the judgement of the learner", lambda: judge_fit(fitted, physics), failed, None)
     warnings += failed
     asked = fit.model.form.bound is not None and job.spec.validation.blocks != 0
     if verdict is None and asked and not failed:
@@ -85,16 +87,17 @@ def judged(fitted: Fitted) -> Fitted:
         told = f"whether the learner helps is not judged: no part is held out, and {why}."
         warnings.append(WarningResult(code="not_judged", text=told))
     if verdict is not None and fit.model.form.bound is not None:
-        told = (*verdict.warnings, *_unexplained(fitted, helps=verdict.code == "helps"))
+        told = (*verdict.warnings, *_unexplained(fitted, None if verdict.code == "helps" else physics))
         warnings += [WarningResult.model_validate(warning) for warning in told]
     result = FitResult.model_validate({**dict(fitted.result), "validation": verdict, "warnings": warnings})
     return replace(fitted, result=result)
 
 
-def _unexplained(fitted: Fitted, *, helps: bool) -> list[Warning]:
+def _unexplained(fitted: Fitted, physics: Callable[[], Any] | None) -> list[Warning]:
     """That a learner may have taken from parameters that it could imitate, where no cause tells by how much.
 
-    One that does not help may still take up what physics alone leaves.
+    Args:
+        physics: the fit without the learner, where that does not help: it may still take up what physics alone leaves.
     """
     from orthaug.analysis.diagnosis import diagnose
 
@@ -104,11 +107,11 @@ def _unexplained(fitted: Fitted, *, helps: bool) -> list[Warning]:
     if not shared or any(row.bias for row in rows):
         return []
     told, failed = "no suspect explains half of what the learner found", []
-    if not helps:
+    if physics is not None:
         if not result.residuals or result.residuals.verdict == "unmodelled":
             return []
-        physics = fitted.job.run(Variant(ALONE))
-        alone = physics.status.ok and attempt("the residual of physics alone", lambda: diagnose(physics), failed, None)
+        own = physics()
+        alone = own.status.ok and attempt("the residual of physics alone", lambda: diagnose(own), failed, None)
         if not alone or alone.verdict != "unmodelled":
             return failed
         told = "physics alone leaves more than noise, which the learner takes up without better free runs"
@@ -187,15 +190,21 @@ def _for_observers(fit: Any, verdict: str, warnings: list[Any]) -> Any:
     return replace(fit, model=replace(fit.model, statistics=kept))
 
 
-def judge_fit(fitted: Fitted, blocks: Sequence[Trial] | None = None, alone: Fitted | None = None) -> Verdict | None:
+def judge_fit(
+    fitted: Fitted,
+    physics: Callable[[], Any],
+    blocks: Sequence[Trial] | None = None,
+    alone: Mapping[str, tuple[Response, Response]] | None = None,
+) -> Verdict | None:
     """Whether the learner earns its place: free runs against physics alone on what was not fitted.
 
     Where the fit fell back to physics alone, that is judged by which it did.
 
     Args:
+        physics: gives the fit of physics alone, where a part is held out.
         blocks: trials of blocked cross-validation; None for those by which the fit was chosen, or to make them, where
             there is no validation or test part or where the spec asks for them.
-        alone: the physics alone; None to fit it.
+        alone: the responses of physics alone by part, where they are there already.
     """
     from orthaug.analysis.validation import extrapolation, judge, trial_on, trials_of
 
@@ -210,13 +219,12 @@ def judge_fit(fitted: Fitted, blocks: Sequence[Trial] | None = None, alone: Fitt
             blocks = trials_of(chosen_by)
         else:
             blocks = cross_validated(job, wanted, [AS_DECLARED])[0] if wanted and not _stopped(fitted.fit) else ()
-    physics = job.run(Variant(ALONE)).model if alone is None else alone.fit.model
     trials, beyond = list(blocks), []
     for part in held_out:
-        ran = None if alone is None else alone.responses[part.name][1]
+        ran = None if alone is None else alone[part.name][1]
         response = fitted.responses[part.name][1]
         trials.append(
-            trial_on(part.name, part.record, part.skips, physics, model, alone_response=ran, response=response)
+            trial_on(part.name, part.record, part.skips, physics().model, model, alone_response=ran, response=response)
         )
         beyond += extrapolation(part.name, job.reach(model, part.record)[0], *job.reach(model, job.train.record))
     return judge(trials, beyond)
