@@ -18,7 +18,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 # Most of a test's time is XLA compiling small programs. The first two leave out what only makes large ones faster: it
 # takes half of the time then. The third compiles a program in one piece: pieces are for idle cores, and there are none.
-# Unset, it passes as well. The workers share the cores; BLAS needs no threads of its own.
+# Unset, it passes as well. The workers share the cores; BLAS and XLA need no threads of their own.
 _FLAGS = (
     "xla_cpu_use_fusion_emitters=false",
     "xla_backend_optimization_level=0",
@@ -26,6 +26,7 @@ _FLAGS = (
 )
 os.environ.setdefault("XLA_FLAGS", " ".join(f"--{flag}" for flag in _FLAGS))
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("NPROC", "1")
 # Where in the source each operation was written is not looked up for the compiler.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 

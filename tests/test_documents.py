@@ -24,7 +24,7 @@ BLOCKS = {name: list(blocks(page.read_text(encoding="utf-8"))) for name, page in
 RUNNING = [name for name, found in BLOCKS.items() if any(block.not_run is None for block in found)]
 REFERENCE = "".join(page.read_text(encoding="utf-8") for page in sorted((ROOT / "docs" / "reference").glob("*.md")))
 RESULTS = ("analysis", "selection", "inference")  # rooms whose classes are results
-NOT_RUN = 10
+NOT_RUN = 11
 OPTIONAL = ("casadi", "control", "dask", "distributed", "pyarrow", "sklearn")
 
 
