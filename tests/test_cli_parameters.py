@@ -470,7 +470,7 @@ def test_a_split_takes_the_rows_of_the_training(inside, tmp_path):
     Path("part.toml").write_text(SPEC.replace('train = { files = ["run.csv"] }', part))
     fit = finite_json(run("fit", "part.toml", "--json", "--out", tmp_path / "part").out)
     split = run("split", tmp_path / "part", "run.csv", "--json")
-    assert "note: rows 0:80 of each file" in split.err and finite_json(split.out)["warnings"] == []
+    assert "note: run.csv: rows 0:80, those of the training." in split.err and finite_json(split.out)["warnings"] == []
     assert values(finite_json(split.out)["parameters"]) == pytest.approx(values(fit["parameters"]), rel=1e-9)
     other = finite_json(run("split", tmp_path / "part", "run.csv", "--rows", "0:90", "--json").out)
     assert [warning["code"] for warning in other["warnings"]] == ["other_training_data"]

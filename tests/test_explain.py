@@ -152,7 +152,7 @@ def test_the_loop_ends_at_the_friction_law():
     speed = "(position[k-1] - position[k-2])/Ts"
     options = {"learner": oa.MLP(hidden=(8,)), "solver": oa.LevenbergMarquardt(iterations=1500)}
     first = oa.explain(oa.estimate(record, oa.Baseline.from_terms(terms), **options))
-    assert not first.warnings, "training ended at a minimum"
+    assert [warning.code for warning in first.warnings] == ["conditional_on_selection"], "training ended at a minimum"
     coulomb, peak = first.terms
     assert coulomb.expression == f"sign({speed})" and coulomb.unit == "m"
     assert peak.kind == "stribeck_gauss" and peak.on == speed and peak.width == pytest.approx(0.1, rel=0.05)
@@ -266,11 +266,23 @@ def test_a_coefficient_within_an_equation_has_the_unit_of_the_sum_over_that_of_i
 
 
 @pytest.mark.usefixtures("without_figures")
-def test_explain_takes_the_rows_of_training(project):
+def test_explain_takes_the_rows_of_training_and_several_files(project, tmp_path):
     one, other = (json.loads(run("explain", project / "plant", project / "run.csv", "--json", *more).out)
                   for more in ((), ("--rows", "0:300")))  # fmt: skip
-    assert other["points"] == 300 - (len(system(-0.3)["y"]) - one["points"]) < one["points"]
+    lost = len(system(-0.3)["y"]) - one["points"]
+    assert other["points"] == 300 - lost < one["points"]
     assert run("explain", project / "plant", project / "run.csv", "--rows", "x").code == 2
+    assert [warning["code"] for warning in one["warnings"]] == ["conditional_on_selection"]
+
+    shutil.copytree(project / "plant", tmp_path / "part")
+    result = json.loads((project / "plant" / "result.json").read_text(encoding="utf-8"))
+    result["spec"]["data"]["train"]["rows"] = [[0, 150], [200, 350]]
+    (tmp_path / "part" / "result.json").write_text(json.dumps(result), encoding="utf-8")
+    whole = system(-0.3)
+    write_csv(tmp_path / "more.csv", **{name: column[:200] for name, column in whole.items()})
+    part = run("explain", tmp_path / "part", project / "run.csv", tmp_path / "more.csv", "--json")
+    assert json.loads(part.out)["points"] == 150 + 150 + 200 - 3 * lost
+    assert part.err == "note: run.csv: rows 0:150 and 200:350, those of the training; --rows takes others.\n"
 
 
 @pytest.mark.usefixtures("without_figures")

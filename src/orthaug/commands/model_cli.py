@@ -134,7 +134,7 @@ def split(
 @app.command()
 def explain(
     model: ModelPath,
-    data: DataPath,
+    data: Annotated[list[Path], typer.Argument(metavar="DATA…", help="Best the files that the model was trained on.")],
     degree: Annotated[int, typer.Option("--degree", metavar="D", help="Of products of what the learner sees.")] = 3,
     functions: Annotated[
         list[str] | None, typer.Option("--function", metavar="NAME", help="In products, such as abs; any number.")
@@ -149,10 +149,10 @@ def explain(
     """
     check_count(degree, "--degree", of="factors")
     check_count(most, "--terms", of="terms")
-    from orthaug.commands.run import Reading, explain_model, explain_notes, open_run, read_rows
+    from orthaug.commands.run import explain_model, explain_notes, open_explained, read_rows
     from orthaug.reports.explanation import explain_text
 
-    opened = open_run(model, data, reading=Reading(rows=read_rows(rows), prepare=True))
+    opened = open_explained(model, data, read_rows(rows))
     prepare_jax()
     for line in opened.notes:
         streams.say(line)

@@ -13,7 +13,7 @@ import numpy as np
 
 from orthaug._base.checks import check_choice, nearest
 from orthaug._base.errors import InputError, MissingSampleError, Warning
-from orthaug._base.folders import whole_file
+from orthaug._base.folders import file_digest, whole_file
 from orthaug._base.lines import percent
 from orthaug.commands.folder import results_beside
 from orthaug.commands.parts import long_stretches
@@ -35,7 +35,8 @@ class Reading:
     """Which rows and columns of a data file are read, as a part of a spec says it."""
 
     missing: str = "error"
-    rows: tuple[int, int] | None = None
+    rows: Any = None
+    """A half-open range of rows, or several; None for all."""
     every: int = 1
     columns: Mapping[str, str] = field(default_factory=dict)
     prepare: bool | None = None
@@ -80,6 +81,44 @@ def read_rows(text: str | None) -> tuple[int, int] | None:
     if not (start.isdecimal() and stop.isdecimal() and text.isascii()):
         raise InputError(f"--rows: found '{text}'; expected a half-open range of rows such as 0:1000.")
     return int(start), int(stop)
+
+
+def trained_reading(model: Path, data: Path) -> Reading | None:
+    """How a file was read to train a model, by the result beside that; None where it is none of its files."""
+    for content in results_beside(model):
+        with suppress(AttributeError, KeyError, TypeError):
+            if any(file["sha256"] == file_digest(data) for file in content["data"]["train"]):
+                part = content["spec"]["data"]["train"]
+                columns, every = part.get("columns") or {}, part.get("every") or 1
+                return Reading("skip", part.get("rows"), every, columns, prepare=True)
+    return None
+
+
+def open_explained(model: Path, data: Sequence[Path], rows: tuple[int, int] | None) -> ModelOnData:
+    """A model with files to explain it over: of those that it was trained on, where no `rows` are given, those rows.
+
+    Raises:
+        InputError: as `open_run`.
+    """
+    opened, notes = [], []
+    for path in data:
+        check_readable(path)
+        trained = trained_reading(model, path)
+        reading = trained or Reading("skip", prepare=True)
+        opened.append(open_run(model, path, reading=replace(reading, rows=rows or reading.rows)))
+        taken = rows_taken(trained) if trained and not rows else ""
+        notes += [*opened[-1].notes]
+        notes += [f"note: {path.name}: {taken}, those of the training; --rows takes others."] if taken else []
+    whole = Record.join([one.record for one in opened]) if len(opened) > 1 else opened[0].record
+    return replace(opened[0], record=whole, notes=tuple(dict.fromkeys(notes)))
+
+
+def rows_taken(reading: Reading) -> str:
+    """Which rows of a file are read, where that is not all."""
+    if not reading.rows:
+        return ""
+    ranges = reading.rows if isinstance(reading.rows[0], list | tuple) else [reading.rows]
+    return "rows " + " and ".join(f"{start}:{stop}" for start, stop in ranges)
 
 
 def open_run(

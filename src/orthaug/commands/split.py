@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_origin
 
@@ -14,7 +15,7 @@ from orthaug._base.errors import InputError, KeyedError, Warning
 from orthaug._base.folders import file_digest
 from orthaug._base.registry import Key, keys_of, resolve
 from orthaug.commands.folder import results_beside
-from orthaug.commands.run import ModelOnData, Reading, prepared_notes, record_for
+from orthaug.commands.run import ModelOnData, Reading, prepared_notes, record_for, rows_taken, trained_reading
 from orthaug.data.record import Record
 from orthaug.data.tables import check_readable
 from orthaug.inference.kinds import MEASURES, MeasurePlace
@@ -32,33 +33,36 @@ def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | Non
 
     for path in data:
         check_readable(path)
-    loaded, (trained, warnings) = load(model), _trained_on(model, data)
-    reading = Reading("skip", rows or trained, prepare=True)  # of rows with missing cells none were trained on
-    record = Record.join([record_for(loaded, path, loaded.outputs, reading) for path in data])
-    notes = prepared_notes(loaded, record)
-    if trained and rows is None:
-        notes += (f"note: rows {trained[0]}:{trained[1]} of each file, those of the training.",)
-    elif trained and rows and rows != trained:
-        told = f"the model was trained on rows {trained[0]}:{trained[1]}, not on {rows[0]}:{rows[1]}."
-        warnings.append(Warning("other_training_data", told))
-    return ModelOnData(loaded, record, data[0], notes=notes, warnings=tuple(warnings))
+    loaded, warnings = load(model), _other_files(model, data)
+    trained = [trained_reading(model, path) for path in data]
+    read, notes = [], []
+    for path, own in zip(data, trained, strict=True):
+        reading = own or Reading("skip", prepare=True)  # of rows with missing cells none were trained on
+        taken = rows_taken(reading)
+        if rows is None:
+            notes += [f"note: {path.name}: {taken}, those of the training."] if taken else []
+        elif own and own.rows != list(rows):
+            told = f"the model was trained on {taken or 'all rows'} of {path.name}, not on rows {rows[0]}:{rows[1]}."
+            warnings.append(Warning("other_training_data", told))
+        read.append(record_for(loaded, path, loaded.outputs, replace(reading, rows=rows or reading.rows)))
+    record = Record.join(read)
+    return ModelOnData(loaded, record, data[0], 0, (*prepared_notes(loaded, record), *notes), tuple(warnings))
 
 
-def _trained_on(model: Path, data: Sequence[Path]) -> tuple[tuple[int, int] | None, list[Warning]]:
-    """The rows of each file that the result of a model names, and a warning where it has other files' checksums."""
+def _other_files(model: Path, data: Sequence[Path]) -> list[Warning]:
+    """A warning where the result of a model has other files' checksums."""
     for content in results_beside(model):
         with suppress(KeyError, TypeError):
             kept = {file["sha256"]: file["file"] for file in content["data"]["train"]}
-            rows = content["spec"]["data"]["train"].get("rows")
             if kept.keys() == set(map(file_digest, data)):
-                return rows and (int(rows[0]), int(rows[1])), []
+                return []
             text = (
                 f"the model was trained on {', '.join(kept.values())}; by the checksums in its result.json that is "
                 f"not what was given ({', '.join(path.name for path in data)}). Give the files that it was trained "
                 "on: a split over other data does not belong to the fit."
             )
-            return None, [Warning("other_training_data", text)]
-    return None, []
+            return [Warning("other_training_data", text)]
+    return []
 
 
 def read_measure(kind: str, given: Mapping[str, Sequence[str]], opened: ModelOnData) -> Measure:

@@ -46,6 +46,10 @@ _LEVEL = 0.01  # at which the learner is something beside its own errors
 _ENDED = ("converged", "exact")
 _SHOWN = 8  # terms, each as the only one
 _OUTSIDE = 0.05  # share of rows beyond the training data that is told of
+_CONDITIONAL = (
+    "the terms were chosen on these data: intervals of a fit with them to the same data are conditional on the choice; "
+    "a fit to other data has intervals that are not."
+)
 _NAMES = {"coulomb": "coulomb", "quadratic_drag": "drag", "stribeck_gauss": "stribeck", TERM: "term"}
 
 
@@ -217,6 +221,8 @@ def _told(space: Space, chosen: list[Candidate], fitted: Fit, dropped: bool) -> 
     if ground.outside > _OUTSIDE:
         reach = f"{100 * ground.outside:.0f} % of the rows lie beyond what the learner saw in training"
         told.append(Warning("beyond_training", f"{reach}: there it shows how it extrapolates."))
+    if terms:
+        told.append(Warning("conditional_on_selection", _CONDITIONAL))
     points = len(ground.target)
     return Explanation(terms, share, noise, p, singles, parameters, physics, spec, points, text, tuple(told))
 
