@@ -3,7 +3,7 @@
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test check docs wheel smoke bench claims clean
+.PHONY: help setup demo test proofs check docs wheel smoke bench claims clean
 
 BIN := .venv/bin
 STAMP := .venv/ready
@@ -23,6 +23,9 @@ demo: $(STAMP)  ## fit the built-in mass-spring-damper example
 
 test: $(STAMP)  ## run the whole test suite, a file at a time on every core
 	@$(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder
+
+proofs: $(STAMP)  ## run the slow proofs, which the suite leaves out, and print what they measured
+	@$(BIN)/python -m pytest -q -m proof -n auto --dist loadfile --no-loadscope-reorder
 
 check: $(STAMP) docs  ## ruff, pyright, the architecture test and the site of the documents
 	@$(BIN)/ruff check .

@@ -67,6 +67,15 @@ def pytest_collection_finish() -> None:
     gc.set_threshold(100_000, 20, 100)
 
 
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """What the proofs have measured, as the table of benchmarks/README.md."""
+    ended = [report for outcome in ("passed", "failed") for report in terminalreporter.getreports(outcome)]
+    for report in sorted(ended, key=lambda report: report.nodeid):
+        if "proof" in report.keywords and report.when == "call":
+            measured = "; ".join(f"{name}: {value}" for name, value in report.user_properties) or report.outcome
+            terminalreporter.write_line(f"| {report.nodeid.rpartition('test_')[2].replace('_', ' ')} | {measured} |")
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _programs_are_let_go() -> Iterator[None]:
     """A worker compiles thousands of programs; where it could map no more memory, XLA would crash."""

@@ -152,7 +152,8 @@ def test_no_degrees_of_freedom_is_said():
     assert fit.parameters["std"].isna().all() and "–" in fit.summary()
 
 
-def test_coverage_of_the_intervals(network):
+@pytest.mark.proof
+def test_coverage_of_the_intervals(network, record_property):
     """95 % intervals of θ over noise draws on static set 1, each trained on from one fit.
 
     θ̂ = θ + Φ⁺e, and the error is independent of the residual that the width is of: the width of each draw has a
@@ -173,6 +174,7 @@ def test_coverage_of_the_intervals(network):
         low, high = fit.interval.T
         inside += (low <= example.theta) & (example.theta <= high)
         covered += 2 * scipy.stats.norm.cdf((high - low) / 2 / true) - 1
+    record_property("covered by 95 % [%]", ", ".join(f"{100 * share:.2f}" for share in covered / draws))
     assert (covered / draws >= 0.945).all() and (covered / draws <= 0.955).all()
     assert (inside / draws >= 0.9).all() and (inside < draws).any()
     np.testing.assert_allclose(network.std, true, rtol=0.1)

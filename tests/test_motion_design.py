@@ -53,7 +53,8 @@ def best() -> Design:
     return designed()
 
 
-def test_the_prediction_is_the_scatter_of_fits_and_beats_a_random_input(best: Design) -> None:
+@pytest.mark.proof
+def test_the_prediction_is_the_scatter_of_fits_and_beats_a_random_input(best: Design, record_property) -> None:
     assert np.abs(best.signal).max() <= AMPLITUDE and best.names == ("m", "c", "k")
     own = errors(best.signal)
     ratio = np.sqrt(np.mean(own**2, axis=0)) / best.std
@@ -61,6 +62,8 @@ def test_the_prediction_is_the_scatter_of_fits_and_beats_a_random_input(best: De
     power = np.sqrt(np.mean(best.signal**2))
     random = power * np.sign(np.random.default_rng(7).normal(size=SAMPLES))  # of equal power
     relative = [np.sqrt(np.mean(np.sum((found / TRUTH) ** 2, axis=1))) for found in (own, errors(random))]
+    record_property("scatter over predicted", f"{ratio.min():.2f} to {ratio.max():.2f}")
+    record_property("error over that of a random input", f"{relative[0] / relative[1]:.2f}")
     assert relative[0] == pytest.approx(best.relative_error, rel=0.3)
     assert relative[0] < 0.4 * relative[1]
 

@@ -63,7 +63,8 @@ def fitted() -> oa.MotionEstimate:
     return oa.estimate(data(), spring(learned=True), learner=learner, criterion=WHOLE, blocks=0)
 
 
-def test_a_linear_motion_is_the_output_error_fit_of_the_lagged_form() -> None:
+@pytest.mark.proof
+def test_a_linear_motion_is_the_output_error_fit_of_the_lagged_form(record_property) -> None:
     """Held inputs and an exact integrator: the same family of functions of four parameters."""
     rng = np.random.default_rng(5)
     u, x, y = rng.normal(size=120), np.zeros(2), []
@@ -85,6 +86,7 @@ def test_a_linear_motion_is_the_output_error_fit_of_the_lagged_form() -> None:
     root = np.sqrt(np.mean(a**2))
     noise = float(np.sqrt(theirs.model.statistics.noise[0, 0] * theirs.freedom / len(a)))
     assert root == pytest.approx(noise, rel=1e-6)
+    record_property("error over that of the lagged form", f"1 + {root / noise - 1:.1e}")
     k, c = ours.values[:2]
     poles = np.exp(TS * np.roots([1, c, k]))
     assert np.poly(poles) == pytest.approx([1, *-theirs.theta[:2]], rel=1e-6)

@@ -340,10 +340,12 @@ def masses() -> oa.MotionEstimate:
     return oa.estimate(record, motion, learner=learner, criterion=WHOLE, blocks=0, restarts=1)
 
 
-def test_a_force_between_two_masses_is_named_in_both_equations(masses: oa.MotionEstimate) -> None:
+@pytest.mark.proof
+def test_a_force_between_two_masses_is_named_in_both_equations(masses: oa.MotionEstimate, record_property) -> None:
     found = told_budget(masses, (), [])
     assert [str(cause.suspect.name) for cause in found.causes] == ["cubic of x1-x2 in v1", "cubic of x1-x2 in v2"]
     one, two = (cause.coefficient_found for cause in found.causes)
+    record_property("coefficients, -60 and 120 in truth", f"{one:.1f}, {two:.1f}")
     assert one == pytest.approx(-60, rel=0.2) and two == pytest.approx(120, rel=0.2) and found.share > 0.9
     (low, high), stiffness = found.of("k").ci95, masses.values[1]
     assert low < 20 < high and stiffness - 20 > high - low
@@ -352,6 +354,7 @@ def test_a_force_between_two_masses_is_named_in_both_equations(masses: oa.Motion
     assert "add them to the equations of v1 and v2, with their sizes as parameters" in warning.text
 
 
+@pytest.mark.proof
 @pytest.mark.parametrize("points", [50, 20_000])
 def test_terms_of_each_equation_are_chosen_beside_those_of_the_others(masses, points, monkeypatch) -> None:
     """What two terms make together is found though another one explains more alone; their order tells nothing."""

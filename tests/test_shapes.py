@@ -30,6 +30,7 @@ print("shapes hold")
 """
 
 
+@pytest.mark.proof
 def test_shapes_of_whole_fits():
     pytest.importorskip("beartype")
     done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=False)

@@ -229,7 +229,8 @@ def test_auto_is_all_where_the_learner_sees_all_lags():
     np.testing.assert_array_equal(one.covariance, two.covariance)
 
 
-def test_intervals_cover_beside_a_learner():
+@pytest.mark.proof
+def test_intervals_cover_beside_a_learner(record_property):
     """A learner that is right, 200 draws of equation noise: θ without bias, 95 % intervals that hold in 95 %."""
     clean = np.random.default_rng(5).normal(size=(400, 2))
     truth = np.array([1.5, -0.7])
@@ -248,6 +249,7 @@ def test_intervals_cover_beside_a_learner():
         target = np.array([truth[0], split])
         thetas.append((fit.theta - target) / fit.std)
         holds.append((fit.interval[:, 0] <= target) & (target <= fit.interval[:, 1]))
+    record_property("covered by 95 % [%]", ", ".join(f"{100 * share:.1f}" for share in np.mean(holds, axis=0)))
     assert np.abs(np.mean(thetas, axis=0)).max() < 0.2
     assert np.all((np.mean(holds, axis=0) >= 0.91) & (np.mean(holds, axis=0) <= 0.985))
 

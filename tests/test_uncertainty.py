@@ -121,7 +121,8 @@ def draws(count, seed=0):
         yield Record.from_arrays(quiet.inputs, quiet.outputs + rng.normal(scale=NOISE_30_DB, size=quiet.outputs.shape))
 
 
-def test_intervals_cover_under_the_training_and_the_uniform_measure(clean):
+@pytest.mark.proof
+def test_intervals_cover_under_the_training_and_the_uniform_measure(clean, record_property):
     """120 draws: 99.9 % of the shares of a true 95 % lie above 0.885."""
     inside, thetas, std = np.zeros((2, 2)), [], []
     for record in draws(120):
@@ -131,6 +132,7 @@ def test_intervals_cover_under_the_training_and_the_uniform_measure(clean):
             inside[i] += (found.interval[:, 0] <= EXAMPLE.theta) & (EXAMPLE.theta <= found.interval[:, 1])
         thetas.append([found.theta for found in pair])
         std.append([found.std for found in pair])
+    record_property("covered by 95 % [%]", ", ".join(f"{100 * share:.1f}" for share in inside.ravel() / 120))
     assert (inside / 120 >= 0.885).all() and (inside < 120).any()
     np.testing.assert_allclose(np.std(thetas, axis=0), np.mean(std, axis=0), rtol=0.22)
 
