@@ -789,6 +789,7 @@ class Keys:
 
 
 @browsed
+@pytest.mark.proof
 def test_the_whole_path_by_keyboard_alone(server, browser, csv, tmp_path):
     (tmp_path / "rig.csv").write_text(csv.read_text().replace("u,y", "left,right"))
     tab = Tab(browser, server)

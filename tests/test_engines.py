@@ -333,6 +333,7 @@ assert len(jax.devices()) == 4
 """
 
 
+@pytest.mark.proof
 def test_devices_give_the_result_of_rows_in_memory(folder, in_memory):
     """Three of four from a spec, all four from Python."""
     script = DEVICES.format(tests=os.path.dirname(__file__), folder=str(folder))
