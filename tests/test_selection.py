@@ -223,7 +223,26 @@ def test_stopping_keeps_the_best_so_far():
 
     one = oa.select(plant(), PHYSICS, lags=LAGS, criterion=FLOWN, most=MOST, progress=stop)
     assert one.stopped and len(one.terms.rungs) == 3 and "stopped" in [note.code for note in one.notes]
-    assert isinstance(one.learner, oa.Terms) and set(one.learner.terms) <= TRUE
+    assert isinstance(one.learner, oa.Terms) and one.terms.chosen.score < one.terms.rungs[0].score
+
+
+SLOW = {
+    "y[k-1]**2": lambda y, u: y + 0.1 * (3 * u - 0.3 * y - 0.5 * y * abs(y)),
+    "u[k-1]**2": lambda y, u: y + 0.1 * (u**2 - 0.4 * y),
+}
+
+
+@pytest.mark.parametrize("term", SLOW)
+def test_a_term_of_a_slow_signal_is_of_the_lag_that_the_physics_reads(term):
+    """Where one way through all lags took `y[k-3]*u[k-3]`, and picks about physics alone `u[k-1]**3`."""
+    rng = np.random.default_rng(1)
+    u, y = np.repeat(rng.uniform(0.2, 1.0, 41), 20)[:800], np.zeros(800)
+    y[0] = 1.0
+    for k in range(1, 800):
+        y[k] = SLOW[term](y[k - 1], u[k - 1])
+    y += 0.1 * y.std() * rng.normal(size=800)
+    one = oa.select(oa.Record.from_arrays(u=u[:300], y=y[:300], sampling_time=0.1), PHYSICS)
+    assert one.learner.terms == (term,) and one.shares[term] > 0.5
 
 
 def test_a_network_is_as_wide_as_it_pays():

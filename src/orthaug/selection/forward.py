@@ -36,6 +36,12 @@ class Equations(NamedTuple):
         picked = np.asarray(columns, dtype=int)
         return self._replace(hessian=self.hessian[np.ix_(picked, picked)], right=self.right[picked])
 
+    def among(self, columns: Sequence[int], count: int) -> Equations:
+        """As these of `count` columns, of which the others are zero."""
+        picked, hessian, right = np.asarray(columns, dtype=int), np.zeros((count, count)), np.zeros(count)
+        hessian[np.ix_(picked, picked)], right[picked] = self.hessian, self.right
+        return self._replace(hessian=hessian, right=right)
+
     def scaled(self) -> Equations:
         """With columns of unit norm."""
         size = np.sqrt(np.maximum(np.diag(self.hessian), 0.0))

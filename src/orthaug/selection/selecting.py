@@ -217,7 +217,8 @@ def select(
     notes: list[Warning] = []
     if isinstance(learner, Terms) and not heard.stopped:
         runs, notes = _terms(problem, learner, largest, criterion)
-        path = climb(runs, blocks, min(most, len(problem.rows) // 10), heard.of("terms"), runner)
+        near = [baseline.lags, chosen.layout(problem.outputs, names)]
+        path = climb(runs, blocks, min(most, len(problem.rows) // 10), heard.of("terms"), runner, near)
         if not path.chosen.point.chosen:
             notes.append(Warning("nothing_helps", "no term lowers the error on blocks without which it was picked."))
     elif isinstance(learner, MLP) and not heard.stopped:

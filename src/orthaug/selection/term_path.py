@@ -1,15 +1,17 @@
 """How many terms, and which: a path of models, judged by free runs on blocks that were held out.
 
-Forward the terms come by what they lower the error by; from the best model on backward they go, the least missed first.
-The choice is the smallest model that is within one standard error of the best (Breiman et al. 1984), block by block in
-pairs, or worse by less than is worth a term. Blocks that had a say in the terms judge them too well: so the path is
-gone anew without each block, and no term is chosen where physics alone is as good there.
+Forward the terms come by what they lower the error by: of the lags that the physics reads alone, of those of the orders
+that were chosen, and of all, for a term of a slow signal looks like that of its neighbours. About the best model as
+many are picked anew, and from it on backward they go, the least missed first. The choice is the smallest model that is
+within one standard error of the best (Breiman et al. 1984), block by block in pairs, or worse by less than is worth a
+term; of as many terms those of fewer lags. Blocks that had a say in the terms judge them too well: so the path is gone
+anew without each block, and no term is chosen where physics alone is as good there.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
@@ -18,16 +20,18 @@ import numpy as np
 
 from orthaug._base.checks import Vector
 from orthaug._base.parallel import Threads, one_blas_thread
+from orthaug.data.expressions import Lag
 from orthaug.fitting.held_out import WORTH, blocked
 from orthaug.fitting.segments import Segments, lay_segments
 from orthaug.selection.forward import Equations, forward
-from orthaug.selection.term_runs import Point, TermRuns
+from orthaug.selection.term_runs import Able, Point, TermRuns
 
 _ONE_BY_ONE = 8  # terms are added singly up to here, later an eighth at a time
 _LEAST = 1e-6  # share of the squared error left below which nothing is worth adding
 _PATIENCE = 5  # additions that did not improve the score by `_BETTER` each, after which the path ends
 _BETTER = 0.005
 _FOLD_ITERATIONS = 10
+_ANEW = 5  # times that the terms are picked anew about the choice
 _HALVES = 50  # random halves of the data over which terms are chosen again
 _PARTS = 10  # of the training data, that halves are made of
 _SEED = 20_261_122
@@ -50,6 +54,8 @@ class Rung:
     seconds: float
     size: int
     """Number of terms, or of lags."""
+    lags: int = 0
+    """Number of lags that the model of terms reads."""
 
     @property
     def score(self) -> float:
@@ -83,7 +89,7 @@ def judge_all(rungs: Sequence[Rung], terms: bool = True) -> tuple[Judged, ...]:
         spread_of = rung.held.std(ddof=1) / np.sqrt(count) / (2 * rung.score) if finite and rung.score else np.inf
         found.append(Judged(rung, float(spread_of), within, False))
     able = [i for i, one in enumerate(found) if one.within]
-    chosen = min(able, key=lambda i: (rungs[i].size, rungs[i].score), default=0)
+    chosen = min(able, key=lambda i: (rungs[i].size, rungs[i].lags, rungs[i].score), default=0)
     found[chosen] = replace(found[chosen], chosen=True)
     return tuple(found)
 
@@ -118,9 +124,9 @@ class Blocks:
             self.folds.append((runs.on(kept), laid))
         self.given = runs, self.folds
 
-    def along(self, points: Sequence[Point | None], count: int) -> tuple[list[Point], Vector]:
+    def along(self, points: Sequence[Point | None], count: int, able: Able) -> tuple[list[Point], Vector]:
         """The path anew without each block, by as many terms; and the mean squared errors on the blocks."""
-        items = [(i, point, count) for i, point in enumerate(points)]
+        items = [(i, point, count, able) for i, point in enumerate(points)]
         points, errors = zip(*self.runner.map(_along, self.given, items), strict=True)
         return list(points), np.array(errors)
 
@@ -157,14 +163,14 @@ def _on_fold(given: _Given, item: tuple[Point, int], tell: Callable[..., None]) 
     return runs.errors(runs.fit(own, point.chosen, _FOLD_ITERATIONS), held), time.monotonic() - began
 
 
-def _along(given: _Given, item: tuple[int, Point | None, int], tell: Callable[..., None]) -> tuple[Point, float]:
+def _along(given: _Given, item: tuple[int, Point | None, int, Able], tell: Callable[..., None]) -> tuple[Point, float]:
     """Physics alone, or some terms more, picked without a block; and the mean squared error on the block."""
-    number, point, count = item
+    number, point, count, able = item
     runs, held = given[1][number]
     if point is None:
         point = runs.fit(runs.start(), ())
     elif np.isfinite(point.loss):
-        point = _grown(runs, point, count)
+        point = _grown(runs, point, count, able)
     return point, runs.errors(point, held) if np.isfinite(point.loss) else np.inf
 
 
@@ -174,6 +180,14 @@ class TermPath(Search):
 
     runs: TermRuns
     confirmed: bool = True
+    ways: tuple[tuple[int, ...], ...] = ()
+    """Terms that ways forward kept to, before the one that had all."""
+
+    @property
+    def way(self) -> Able:
+        """The terms of the first way that has those of the choice."""
+        chosen = set(self.chosen.point.chosen)
+        return next((able for able in self.ways if chosen <= set(able)), None)
 
     def judged(self) -> tuple[Judged, ...]:
         return judge_all(self.rungs, self.confirmed)
@@ -189,7 +203,7 @@ class TermPath(Search):
         As many terms are picked as the choice has, by the equations about the chosen model.
         """
         runs, rung = self.runs, self.chosen
-        parts, nt, most = _parts(runs, rung.point), len(rung.point.c), rung.size
+        parts, nt, most = _parts(runs, rung.point, self.way), len(rung.point.c), rung.size
         if not most or len(parts) < 4:
             return {}
         rng, count = np.random.default_rng(_SEED), np.zeros(len(runs.library))
@@ -207,30 +221,49 @@ def climb(
     most: int,
     told: Told = lambda rung: None,
     runner: Any = Threads(),  # noqa: B008  (it holds nothing)
+    near: Sequence[Collection[Lag]] = (),
 ) -> TermPath:
     """The path of up to `most` terms forward, and from the best model on backward.
+
+    Args:
+        near: lags whose terms have a way forward of their own, before the one that has all.
 
     Raises:
         InputError: too few rows for so many blocks.
     """
     with one_blas_thread():
-        folds, rungs, confirmed = Blocks(runs, blocks, runner), [], True
+        folds, rungs, ways = Blocks(runs, blocks, runner), [], _ways(runs, near)
+        confirmed = True
 
         def judged(point: Point, change: Sequence[str], began: float) -> Rung:
             held, _ = next(folds.judge([point]))
-            rung = Rung(point, tuple(change), held, time.monotonic() - began, len(point.chosen))
+            lags = frozenset[Lag]().union(*(runs.lags[i] for i in point.chosen))
+            rung = Rung(point, tuple(change), held, time.monotonic() - began, len(point.chosen), len(lags))
             rungs.append(rung)
             told(rung)
             return rung
 
+        def path() -> TermPath:
+            return TermPath(tuple(rungs), runs, confirmed, ways)
+
         try:
-            _forward(runs, most, judged)
-            confirmed = _confirmed(folds, TermPath(tuple(rungs), runs).chosen.size)
-            _backward(TermPath(tuple(rungs), runs, confirmed), judged)
+            began = time.monotonic()
+            alone = judged(runs.fit(runs.start(), ()), (), began)
+            for able in (*ways, None):
+                _forward(runs, alone, most, able, judged)
+            _anew(path, judged)
+            confirmed = _confirmed(folds, path().chosen.size, path().way)
+            _backward(path(), judged)
         except KeyboardInterrupt:
             if not rungs:
                 raise
-    return TermPath(tuple(rungs), runs, confirmed)
+    return path()
+
+
+def _ways(runs: TermRuns, near: Sequence[Collection[Lag]]) -> tuple[tuple[int, ...], ...]:
+    """The terms of some lags by number, where these are some and not all, nor those of the lags before."""
+    own = [tuple(i for i, lags in enumerate(runs.lags) if lags <= frozenset(given)) for given in near if given]
+    return tuple(able for able in dict.fromkeys(own) if 0 < len(able) < len(runs.library))
 
 
 def steps(most: int) -> int:
@@ -246,14 +279,12 @@ def _added_to(size: int) -> int:
     return 1 if size < _ONE_BY_ONE else max(1, size // 8)
 
 
-def _forward(runs: TermRuns, most: int, judged: Any) -> None:
-    texts, began = runs.library.texts, time.monotonic()
-    point = runs.fit(runs.start(), ())
-    best, waited = judged(point, (), began).score, 0
+def _forward(runs: TermRuns, alone: Rung, most: int, able: Able, judged: Any) -> None:
+    texts, point, best, waited = runs.library.texts, alone.point, alone.score, 0
     while len(point.chosen) < most and waited < _PATIENCE and np.isfinite(point.loss):
         began = time.monotonic()
         count = min(_added_to(len(point.chosen)), most - len(point.chosen))
-        before, point = point, _grown(runs, point, count)
+        before, point = point, _grown(runs, point, count, able)
         new = point.chosen[len(before.chosen) :]
         if not new or not point.loss < before.loss:
             break
@@ -262,22 +293,44 @@ def _forward(runs: TermRuns, most: int, judged: Any) -> None:
         best = min(best, rung.score)
 
 
-def _grown(runs: TermRuns, point: Point, count: int) -> Point:
+def _grown(runs: TermRuns, point: Point, count: int, able: Able) -> Point:
     """With the terms more that lower the error most; the point itself where none does."""
     nt = len(point.c)
     known = [*range(nt), *(nt + i for i in point.chosen)]
-    new = [pick.column - nt for pick in forward(runs.equations(point), known, count, least=_LEAST)]
+    new = [pick.column - nt for pick in forward(runs.equations(point, able), known, count, least=_LEAST)]
     return runs.fit(point, (*point.chosen, *new)) if new else point
 
 
-def _confirmed(folds: Blocks, size: int) -> bool:
+def _anew(path: Callable[[], TermPath], judged: Any) -> None:
+    """As many terms picked at once about the choice, where the free run bends otherwise than about physics alone."""
+    for _ in range(_ANEW):
+        began, rung, runs = time.monotonic(), path().chosen, path().runs
+        if not rung.size:
+            return
+        nt, texts, before = len(rung.point.c), runs.library.texts, set(rung.point.chosen)
+        equations = runs.equations(rung.point, path().way)
+        new = tuple(pick.column - nt for pick in forward(equations, range(nt), rung.size))
+        if any({*new} == set(other.point.chosen) for other in path().rungs):
+            return
+        change = [f"+ {texts[i]}" for i in new if i not in before] + [f"− {texts[i]}" for i in sorted(before - {*new})]
+        judged(_refitted(runs, rung.point, equations, new), change, began)
+
+
+def _refitted(runs: TermRuns, point: Point, equations: Equations, chosen: tuple[int, ...]) -> Point:
+    """With other terms than the point, from where its equations have them."""
+    nt = len(point.c)
+    p = equations.of([*range(nt), *(nt + i for i in chosen)]).solve()
+    return runs.fit(point._replace(chosen=chosen, c=p[:nt], w=p[nt:]), chosen)
+
+
+def _confirmed(folds: Blocks, size: int, able: Able) -> bool:
     """Whether up to `size` terms beat physics alone on blocks without which they were picked."""
     points: Sequence[Point | None] = [None] * len(folds.folds)
     rungs: list[Rung] = []
     while size and (not rungs or rungs[-1].size < size):
         before = rungs[-1].size if rungs else 0
         count = min(_added_to(before), size - before) if rungs else 0
-        points, held = folds.along(points, count)
+        points, held = folds.along(points, count, able)
         rungs.append(Rung(Point((), held, held), (), held, 0.0, before + count))
     return bool(size) and not judge_all(rungs)[0].within
 
@@ -288,25 +341,24 @@ def _backward(path: TermPath, judged: Any) -> None:
     nt, texts = len(rung.point.c), runs.library.texts
     while rung.size > 1 and path.chosen is rung:
         began, point = time.monotonic(), rung.point
-        equations = runs.equations(point)
+        equations = runs.equations(point, path.way)
         own = equations.of([*range(nt), *(nt + i for i in point.chosen)]).scaled()
         inverse = np.linalg.pinv(own.hessian, rcond=1e-13, hermitian=True)
         missed = (inverse @ own.right)[nt:] ** 2 / np.maximum(np.diag(inverse)[nt:], 1e-300)
         gone = point.chosen[int(np.argmin(missed))]
         left = tuple(i for i in point.chosen if i != gone)
-        p = equations.of([*range(nt), *(nt + i for i in left)]).solve()  # the others take over what it did
-        point = runs.fit(point._replace(chosen=left, c=p[:nt], w=p[nt:]), left)
+        point = _refitted(runs, point, equations, left)  # the others take over what it did
         rung = judged(point, [f"− {texts[gone]}"], began)
         path = replace(path, rungs=(*path.rungs, rung))
 
 
-def _parts(runs: TermRuns, point: Point) -> list[Equations]:
+def _parts(runs: TermRuns, point: Point, able: Able) -> list[Equations]:
     """The equations about a point over parts of the data, one after another."""
     if runs.laid is None:
-        blocks = runs.step_blocks
-        edges = np.linspace(0, len(blocks), min(_PARTS, len(blocks)) + 1).astype(int)
-        return [Equations.sum_of(blocks[a:b]) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        chunks = len(runs.step_blocks)
+        edges = np.linspace(0, chunks, min(_PARTS, chunks) + 1).astype(int)
+        return [runs.equations(point, able, slice(a, b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
     scored = np.asarray(runs.laid.scored)
     order = np.cumsum(np.moveaxis(scored, 1, -1).reshape(-1)).reshape(*scored.shape[::2], scored.shape[1])
     place = np.moveaxis((order - 1) * _PARTS // max(int(scored.sum()), 1), -1, 1)
-    return [runs.equations(point, scored & (place == part)) for part in range(_PARTS)]
+    return [runs.equations(point, able, scored & (place == part)) for part in range(_PARTS)]

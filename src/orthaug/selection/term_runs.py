@@ -6,7 +6,7 @@ not to one step: noise in measured lags does not count as structure, and what pa
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import jax, jnp
-from orthaug.data.expressions import parse
+from orthaug.data.expressions import Lag, parse
 from orthaug.data.record import Record
 from orthaug.data.regressors import Features, in_order
 from orthaug.data.terms import TermLibrary, products_of
@@ -84,6 +84,10 @@ class Menu(Lagged):
         # a kink without a derivative counts as flat
         slope, feedback = (jnp.where(jnp.isfinite(d), d, 0.0) for d in (slope, back))
         return value, slope, feedback
+
+
+Able = Collection[int] | None
+"""Terms that may be chosen, by number; None for all."""
 
 
 class Point(NamedTuple):
@@ -163,6 +167,12 @@ class TermRuns:
         """The same on another record."""
         return TermRuns.of(self.problem.on(record), self.library, self.criterion, like=self)
 
+    @cached_property
+    def lags(self) -> tuple[frozenset[Lag], ...]:
+        """Those that each term reads."""
+        own = [parse(text).lags for text in self.library.factors]
+        return tuple(frozenset(lag for i in product for lag in own[i]) for product in self.library.products)
+
     def start(self) -> Point:
         """Physics alone, one step ahead."""
         return Point(
@@ -186,27 +196,32 @@ class TermRuns:
         loss = flown.misfit * self.rms**2 / self.laid.count if np.isfinite(flown.misfit) else np.inf
         return Point(chosen, flown.c, flown.w[: len(chosen)], flown.states, loss)
 
-    def equations(self, point: Point, scored: Any = None) -> Equations:
+    def equations(self, point: Point, able: Able = None, scored: Any = None) -> Equations:
         """The normal equations of physics and all terms about a point, for p itself: its chosen terms are in the error.
 
         Args:
-            scored: which steps of the segments count; None for all.
+            able: terms that may be chosen, beside those that are; the columns of others are zero.
+            scored: which steps of the segments count, or chunks of rows one step ahead; None for all.
         """
+        nt, terms = len(point.c), len(self.library)
+        taken = range(terms) if able is None else sorted({*able, *point.chosen})
+        columns = [*range(nt), *(nt + i for i in taken)]
         if self.laid is None:
-            return self.step_equations
-        everything = range(len(self.library))
-        objective = _Chosen.of(self, tuple(everything), exactly=True)
+            own = self.step_equations if scored is None else Equations.sum_of(self.step_blocks[scored])
+            return own if able is None else own.of(columns).among(columns, nt + terms)
+        objective = _Chosen.of(self, tuple(taken), exactly=True)
         if scored is not None:
             objective = replace(objective, segments=self.laid._replace(scored=scored))
-        w = np.zeros(len(self.library))
+        w = np.zeros(terms)
         w[list(point.chosen)] = point.w
-        p = np.concatenate([point.c, w])
+        p = np.concatenate([point.c, w[list(taken)]])
         flown = objective.fly(p, Start(point.states))
         linear = objective.linearise(flown)
         hessian, right = linear.information, linear.gradient
         bent = hessian @ p
         square = flown.misfit + 2 * p @ right + p @ bent
-        return Equations(hessian, right + bent, float(square), objective.segments.count)
+        own = Equations(hessian, right + bent, float(square), objective.segments.count)
+        return own.among(columns, nt + terms)
 
     @cached_property
     def step_blocks(self) -> tuple[Equations, ...]:
