@@ -250,7 +250,7 @@ def climb(
             began = time.monotonic()
             alone = judged(runs.fit(runs.start(), ()), (), began)
             for able in (*ways, None):
-                _forward(runs, alone, most, able, judged)
+                _forward(runs, alone, most, able, judged, again=len(rungs) > 1)
             _anew(path, judged)
             confirmed = _confirmed(folds, path().chosen.size, path().way)
             _backward(path(), judged)
@@ -267,11 +267,11 @@ def _ways(runs: TermRuns, near: Sequence[Collection[Lag]]) -> tuple[tuple[int, .
 
 
 def steps(most: int) -> int:
-    """How many models the path forward has at most, physics alone among them."""
-    count, size = 1, 0
+    """How many models are judged at most before terms go: physics alone, three ways forward, the choice picked anew."""
+    count, size = 0, 0
     while size < most:
         count, size = count + 1, size + _added_to(size)
-    return count
+    return 1 + 3 * count + _ANEW
 
 
 def _added_to(size: int) -> int:
@@ -279,7 +279,7 @@ def _added_to(size: int) -> int:
     return 1 if size < _ONE_BY_ONE else max(1, size // 8)
 
 
-def _forward(runs: TermRuns, alone: Rung, most: int, able: Able, judged: Any) -> None:
+def _forward(runs: TermRuns, alone: Rung, most: int, able: Able, judged: Any, *, again: bool) -> None:
     texts, point, best, waited = runs.library.texts, alone.point, alone.score, 0
     while len(point.chosen) < most and waited < _PATIENCE and np.isfinite(point.loss):
         began = time.monotonic()
@@ -288,7 +288,8 @@ def _forward(runs: TermRuns, alone: Rung, most: int, able: Able, judged: Any) ->
         new = point.chosen[len(before.chosen) :]
         if not new or not point.loss < before.loss:
             break
-        rung = judged(point, [f"+ {texts[i]}" for i in new], began)
+        change = ["physics alone"] * (again and not before.chosen) + [f"+ {texts[i]}" for i in new]
+        rung = judged(point, change, began)
         waited = 0 if rung.score < (1 - _BETTER) * best else waited + 1
         best = min(best, rung.score)
 
