@@ -283,6 +283,9 @@ def test_explain_takes_the_rows_of_training_and_several_files(project, tmp_path)
     part = run("explain", tmp_path / "part", project / "run.csv", tmp_path / "more.csv", "--json")
     assert json.loads(part.out)["points"] == 150 + 150 + 200 - 3 * lost
     assert part.err == "note: run.csv: rows 0:150 and 200:350, those of the training; --rows takes others.\n"
+    result["spec"]["data"]["train"]["rows"] = "abc"
+    (tmp_path / "part" / "result.json").write_text(json.dumps(result), encoding="utf-8")
+    assert run("explain", tmp_path / "part", project / "run.csv", "--json").err == ""
 
 
 @pytest.mark.usefixtures("without_figures")

@@ -85,12 +85,13 @@ def read_rows(text: str | None) -> tuple[int, int] | None:
 
 def trained_reading(model: Path, data: Path) -> Reading | None:
     """How a file was read to train a model, by the result beside that; None where it is none of its files."""
+    digest = file_digest(data)
     for content in results_beside(model):
-        with suppress(AttributeError, KeyError, TypeError):
-            if any(file["sha256"] == file_digest(data) for file in content["data"]["train"]):
+        with suppress(AttributeError, KeyError, TypeError, ValueError):
+            if digest in [file["sha256"] for file in content["data"]["train"]]:
                 part = content["spec"]["data"]["train"]
-                columns, every = part.get("columns") or {}, part.get("every") or 1
-                return Reading("skip", part.get("rows"), every, columns, prepare=True)
+                rows = np.reshape(part.get("rows") or [], (-1, 2)).astype(int).tolist() or None
+                return Reading("skip", rows, int(part.get("every") or 1), dict(part.get("columns") or {}), True)
     return None
 
 
@@ -107,18 +108,15 @@ def open_explained(model: Path, data: Sequence[Path], rows: tuple[int, int] | No
         reading = trained or Reading("skip", prepare=True)
         opened.append(open_run(model, path, reading=replace(reading, rows=rows or reading.rows)))
         taken = rows_taken(trained) if trained and not rows else ""
-        notes += [*opened[-1].notes]
+        notes += opened[-1].notes
         notes += [f"note: {path.name}: {taken}, those of the training; --rows takes others."] if taken else []
     whole = Record.join([one.record for one in opened]) if len(opened) > 1 else opened[0].record
     return replace(opened[0], record=whole, notes=tuple(dict.fromkeys(notes)))
 
 
 def rows_taken(reading: Reading) -> str:
-    """Which rows of a file are read, where that is not all."""
-    if not reading.rows:
-        return ""
-    ranges = reading.rows if isinstance(reading.rows[0], list | tuple) else [reading.rows]
-    return "rows " + " and ".join(f"{start}:{stop}" for start, stop in ranges)
+    """Which rows of a file were trained on, where that is not all."""
+    return "rows " + " and ".join(f"{start}:{stop}" for start, stop in reading.rows) if reading.rows else ""
 
 
 def open_run(

@@ -41,7 +41,7 @@ def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | Non
         taken = rows_taken(reading)
         if rows is None:
             notes += [f"note: {path.name}: {taken}, those of the training."] if taken else []
-        elif own and own.rows != list(rows):
+        elif own and own.rows != [list(rows)]:
             told = f"the model was trained on {taken or 'all rows'} of {path.name}, not on rows {rows[0]}:{rows[1]}."
             warnings.append(Warning("other_training_data", told))
         read.append(record_for(loaded, path, loaded.outputs, replace(reading, rows=rows or reading.rows)))
