@@ -15,20 +15,30 @@ def row(model: Model, signals: dict[str, np.ndarray], k: int) -> tuple[np.ndarra
     """(φθ + fixed terms, f − φθ_aux, f) at time k, each (ny,), from the signals before k (inputs up to k)."""
     form, numbers = model.form, model.numbers
     names = {**FUNCTIONS, **dict(form.baseline.constants), **signals, "k": k}
+    inside, share = names, 1.0  # where the correction is read, and how much of it is left
     baseline, moved, raw = np.zeros((3, len(form.outputs)))
+    if form.bound is not None:
+        z = np.array([float(eval(str(e), {"__builtins__": {}}, names)) for e in form.features.entries])
+        if numbers.limits is not None:
+            low, high = numbers.limits
+            held = np.minimum(np.maximum(z, low), high)
+            apart = (z - held) / ((high - low) / 2)
+            share = float(np.exp(-((np.linalg.norm(apart) / 0.25) ** 2))) if form.beyond == "fade" else 1.0
+            inside = names | {name: values.copy() for name, values in signals.items()}
+            for lag, move in zip(form.layout, numbers.pull @ (held - z), strict=True):
+                inside[lag.channel][k - lag.lag] += move
+            z = held
+        raw = np.asarray(numbers.gain) * network(model, (z - numbers.centre) / numbers.halfwidth)
     for term in form.baseline.terms:
         i = form.outputs.index(term.output or form.outputs[0])
-        value = eval(term.regressor, {"__builtins__": {}}, names)
+        value, there = (eval(term.regressor, {"__builtins__": {}}, own) for own in (names, inside))
         if term.fixed:
             baseline[i] += term.initial * value
         else:
             j = form.baseline.names.index(term.parameter)
             baseline[i] += numbers.theta[j] * value
-            moved[i] += numbers.theta_aux[j] * value
-    if form.bound is not None:
-        z = np.array([float(eval(str(e), {"__builtins__": {}}, names)) for e in form.features.entries])
-        raw = np.asarray(numbers.gain) * network(model, (z - numbers.centre) / numbers.halfwidth)
-    return baseline, raw - moved, raw
+            moved[i] += numbers.theta_aux[j] * there
+    return baseline, share * (raw - moved), raw
 
 
 def network(model: Model, z: np.ndarray) -> np.ndarray:

@@ -23,6 +23,7 @@ from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.status import ALONE, Ending, Status
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.inference.covariance import degrees_of_freedom, noise_covariance, theta_covariance
+from orthaug.models.beyond import limits_of, pull_of
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
 from orthaug.models.learners import Bound, External, Function, Scaling
@@ -97,9 +98,11 @@ def _model(
     middle = _middle(problem, learned, noise)
     decoupled = structure.projects and directions(structure, problem) is None
     held = {} if decoupled else parameters.fixed
+    form = Lagged(problem.baseline, problem.features, problem.layout, problem.outputs, learned.bound)
+    limits, pull = _limits(problem, form)
     return Model(
-        form=Lagged(problem.baseline, problem.features, problem.layout, problem.outputs, learned.bound),
-        numbers=Numbers(*numbers, learned.tilt),
+        form=form,
+        numbers=Numbers(*numbers, learned.tilt, limits=limits, pull=pull),
         outputs=record.outputs,
         inputs=record.inputs,
         sampling_time=record.sampling_time,
@@ -119,6 +122,14 @@ def _model(
             learned.errors is not None,
         ),
     )
+
+
+def _limits(problem: Problem, form: Lagged) -> tuple[Matrix | None, Matrix | None]:
+    """The range of the features, beyond which the correction is held or fades, and how x follows it there."""
+    limits = None if form.beyond == "free" else limits_of(problem.feature_range)
+    if limits is None:
+        return None, None
+    return limits, pull_of(lambda x: np.asarray(form.features.evaluate(x, form.layout, np)), problem.rows.x)
 
 
 def _one_step_errors(
@@ -278,5 +289,5 @@ def orthogonalize(
     return replace(concluded, model=replace(concluded.model, form=form))
 
 
-_GIVEN = Function(lambda w, z: z, lambda key: ())
+_GIVEN = Function(lambda w, z: z, lambda key: (), beyond="free")
 """The learner whose values are its features."""

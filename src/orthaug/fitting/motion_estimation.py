@@ -25,6 +25,7 @@ from orthaug.fitting.status import ALONE, Ending, Status
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.fitting.training import Choice, planned, train
 from orthaug.inference.motion_split import MotionSplit
+from orthaug.models.beyond import limits_of, pull_of
 from orthaug.models.learners import Learner, Scaling
 from orthaug.models.motion_model import MotionModel, Trained
 from orthaug.models.rows import Engine, InMemory
@@ -159,7 +160,21 @@ def _model(plan: MotionCourse, structure: Structure, learned: Learned) -> Motion
     if not learned.ending.usable:
         return model
     model = replace(model, window=_best_window(model, record))
-    return model if model.form.bound is None else replace(model, seen=_seen(model, record))
+    return model if model.form.bound is None else _limited(replace(model, seen=_seen(model, record)), record)
+
+
+def _limited(model: MotionModel, record: Record) -> MotionModel:
+    """The model with the range beyond which its correction is held or fades: of the features over the fitted run."""
+    limits = None if model.form.beyond == "free" or model.seen is None else limits_of(model.seen)
+    if limits is None:
+        return model
+    nx = model.form.states
+
+    def features(points: Matrix) -> Matrix:
+        return np.asarray(model.form.seen(points[:, :nx].T, points[:, nx:].T, np)).T
+
+    pull = pull_of(features, model.reach(record))
+    return replace(model, numbers=model.numbers._replace(limits=limits, pull=pull))
 
 
 def _seen(model: MotionModel, record: Record) -> Matrix | None:

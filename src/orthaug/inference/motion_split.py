@@ -222,12 +222,7 @@ def split_motion(
 
 def _learned_rows(form: Moving, q: Any, x: Any, u: Any) -> Any:
     """The physics of the learned equations and outputs (nl,) at one point."""
-    motion = form.motion
-    states, outputs = motion.learned
-    p = motion.coordinates.physical(q, jnp)
-    pieces = [motion.rates(x, u, p, jnp)[np.array(states, dtype=int)]]
-    pieces.append(motion.observed(x, u, p, jnp)[np.array(outputs, dtype=int)])
-    return jnp.concatenate(pieces)
+    return form.learned_rows(form.motion.coordinates.physical(q, jnp), x, u)
 
 
 def rest_of(form: Moving, numbers: Numbers, q: Any, c: Any, w: Any, x: Any, u: Any, size: Any) -> Any:

@@ -34,6 +34,15 @@ class Numbers(NamedTuple):
     """(members, nθ) of an ensemble: the physics that each member adds. `weights` has a row for each; None otherwise."""
     scheme: Any = None
     """What `Dynamics.prepared` makes of them for all steps of a run."""
+    limits: Any = None
+    """(2, nz), the range of the features over the training rows; None for a learner that goes on as it is beyond it."""
+    pull: Any = None
+    """(n, nz), by which the regressor, or states and inputs, follow the features onto that range (`models.beyond`)."""
+
+    @property
+    def free(self) -> Numbers:
+        """Those of the same function without limits: the learner goes on as it is beyond its training."""
+        return self if self.limits is None else self._replace(limits=None, pull=None)
 
     @property
     def alone(self) -> Numbers:

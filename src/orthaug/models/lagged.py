@@ -18,6 +18,7 @@ from orthaug._base.jax import Array, jax, jnp
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Experiment, Record
 from orthaug.data.regressors import Features, Layout, lag_matrix, largest_lag
+from orthaug.models.beyond import beyond_of, remaining, within
 from orthaug.models.dynamics import Numbers, Parts
 from orthaug.models.learners import Bound
 from orthaug.physics.baseline import Baseline
@@ -41,6 +42,11 @@ class Lagged:
     @property
     def linear(self) -> bool:
         return self.baseline.linear
+
+    @property
+    def beyond(self) -> str:
+        """What the learner's correction does beyond the range of its training."""
+        return "free" if self.bound is None else beyond_of(self.bound.learner, "hold")
 
     @property
     def differentiable(self) -> bool:
@@ -129,12 +135,18 @@ class Lagged:
         """The prediction at one regressor x (nx,), in parts."""
         phi = self.baseline.phi(x, self.layout, self.outputs, jnp)
         known = self.baseline.known(x, self.layout, self.outputs, jnp)
+        physics = known + phi @ numbers.theta
         if self.bound is None:
             raw = jnp.zeros(len(self.outputs))
-        else:
-            z = (self.features.evaluate(x, self.layout, jnp) - numbers.centre) / numbers.halfwidth
-            raw = _learned(self.bound, numbers, z, phi)
-        return Parts(known + phi @ numbers.theta, raw - phi @ numbers.theta_aux, raw)
+            return Parts(physics, raw - phi @ numbers.theta_aux, raw)
+        z = self.features.evaluate(x, self.layout, jnp)
+        share: Any = 1.0
+        if numbers.limits is not None:
+            inside = within(numbers.limits, z)
+            phi = self.baseline.phi(x + numbers.pull @ (inside - z), self.layout, self.outputs, jnp)
+            share, z = remaining(self.beyond, numbers.limits, z), inside
+        raw = _learned(self.bound, numbers, (z - numbers.centre) / numbers.halfwidth, phi)
+        return Parts(physics, share * (raw - phi @ numbers.theta_aux), raw)
 
     def prepared(self, numbers: Numbers) -> Numbers:
         """Nothing is common to all steps."""

@@ -21,6 +21,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, shown
 from orthaug._base.jax import Array, is_traced, jax, jnp
 from orthaug._base.registry import OneOf, check_fields
+from orthaug.models.beyond import BEYOND
 
 Tree = Any  # a pytree of weight arrays
 
@@ -71,6 +72,8 @@ class MLP:
         hidden: neurons of each hidden layer; () is a linear learner.
         activation: one of tanh, relu, gelu, sigmoid, silu, elu, softplus, identity.
         inputs: what it sees, as expressions or raw lags; None for all lags.
+        beyond: what the correction does beyond the range of its training: "hold", "fade" within a quarter of the
+            half-range, or "free"; "auto" holds it beside lagged physics and lets it fade in a motion.
 
     Examples:
         >>> MLP(hidden=(8, 8), inputs=("v[k-1]", "x[k-1] - x[k-2]"))
@@ -80,6 +83,7 @@ class MLP:
     hidden: tuple[Annotated[int, Ge(1)], ...] = (16,)
     activation: Annotated[str, OneOf(ACTIVATIONS)] = "tanh"
     inputs: tuple[str, ...] | None = None
+    beyond: Annotated[str, OneOf(BEYOND)] = field(default="auto", repr=False)
 
     def __post_init__(self) -> None:
         if not isinstance(self.hidden, tuple | list):
@@ -169,7 +173,9 @@ class PhysicsAlone:
 
 @dataclass(frozen=True)
 class Function:
-    """Any JAX function `f(weights, z) -> (ny,)` with `initial(key) -> weights`, a pytree. `inputs` as of `MLP`.
+    """Any JAX function `f(weights, z) -> (ny,)` with `initial(key) -> weights`, a pytree.
+
+    `inputs` and `beyond` as of `MLP`.
 
     Examples:
         >>> quadratic = Function(lambda w, z: w * z[:1] ** 2, initial=lambda key: jnp.zeros(1))
@@ -180,6 +186,10 @@ class Function:
     function: Callable[[Tree, Any], Any]
     initial: Callable[[Any], Tree]
     inputs: tuple[str, ...] | None = None
+    beyond: Annotated[str, OneOf(BEYOND)] = field(default="auto", repr=False)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     def init(self, key: Array, nz: int, ny: int) -> Tree:
         return self.initial(key)
@@ -190,10 +200,17 @@ class Function:
 
 @dataclass(frozen=True)
 class EquinoxModule:
-    """An Equinox module; `build(key)` makes it, and calling it with z (nz,) gives (ny,). `inputs` as of `MLP`."""
+    """An Equinox module; `build(key)` makes it, and calling it with z (nz,) gives (ny,).
+
+    `inputs` and `beyond` as of `MLP`.
+    """
 
     build: Callable[[Any], Any]
     inputs: tuple[str, ...] | None = None
+    beyond: Annotated[str, OneOf(BEYOND)] = field(default="auto", repr=False)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     @cached_property
     def _static(self) -> Any:
@@ -222,6 +239,7 @@ class External:
     """
 
     differentiable = False
+    beyond = "free"
 
     function: Callable[[np.ndarray], np.ndarray]
     inputs: tuple[str, ...] | None = None

@@ -15,6 +15,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, jnp
 from orthaug._base.views import Shown
 from orthaug.data.record import Channel, Experiment, Prepared, Record
+from orthaug.models.beyond import outside
 from orthaug.models.dynamics import Dynamics, Numbers, Parts
 from orthaug.models.filters import LaggedFilter
 from orthaug.models.lagged import Lagged
@@ -112,7 +113,13 @@ class Model(OnRecords, Shown):
         return replace(self, form=self.form.alone, numbers=self.numbers.alone)
 
     def learner_at(self, x: Float[np.ndarray, "M nx"]) -> Float[np.ndarray, "M ny"]:
-        """f, before any split, at regressors of the form's layout; in the outputs' units."""
+        """f, before any split, at regressors of the form's layout; in the outputs' units.
+
+        It is the learner itself, also beyond the range of its training, where the model holds the correction.
+        """
+        limits = self.numbers.limits
+        if limits is not None and outside(limits, self.form.features.evaluate(x, self.form.layout, np)).any():
+            return replace(self, numbers=self.numbers.free).parts_at(x).raw
         return self.parts_at(x).raw
 
     @property

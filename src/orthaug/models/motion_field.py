@@ -18,6 +18,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import Array, jax, jnp, padded_length
 from orthaug.data.expressions import Expression
+from orthaug.models.beyond import beyond_of, remaining, within
 from orthaug.models.dynamics import Numbers
 from orthaug.models.learners import Bound
 from orthaug.physics.motion import Motion
@@ -55,10 +56,40 @@ class MotionField:
         return xp.stack([xp.broadcast_to(column, x.shape[1:]) for column in columns])
 
     def learned(self, numbers: Numbers, x: Any, u: Any) -> Any:
-        """g (learned equations and outputs,) in their units, at one point."""
+        """g (learned equations and outputs,) in their units, at one point, also beyond the range of training."""
+        return self._values(numbers, self.seen(x, u))
+
+    def _values(self, numbers: Numbers, z: Any) -> Any:
         assert self.bound is not None
-        z = (self.seen(x, u) - numbers.centre) / numbers.halfwidth
-        return numbers.gain * self.bound.values(numbers.weights, z)
+        return numbers.gain * self.bound.values(numbers.weights, (z - numbers.centre) / numbers.halfwidth)
+
+    @property
+    def beyond(self) -> str:
+        """What the learner's correction does beyond the range of its training."""
+        return "free" if self.bound is None else beyond_of(self.bound.learner, "fade")
+
+    def added(self, numbers: Numbers, x: Any, u: Any) -> Any:
+        """What is added to the physics at c, learned equations and outputs first, at one point.
+
+        Within the range of training it is g. Beyond it the physics at p̂ goes on, and what it left there at x̄ is held
+        or fades: `f(x; p̂) − f(x; c) + a (f(x̄; c) − f(x̄; p̂) + g(z̄))`.
+        """
+        if numbers.limits is None:
+            return self.learned(numbers, x, u)
+        z = self.seen(x, u)
+        inside = within(numbers.limits, z)
+        moved = numbers.pull @ (inside - z)
+        share = remaining(self.beyond, numbers.limits, z)
+        x_in, u_in = x + moved[: len(x)], u + moved[len(x) :]
+        split, own = (self.motion.coordinates.physical(q, jnp) for q in (numbers.theta, numbers.theta - numbers.theta_aux))
+        held = self.learned_rows(own, x_in, u_in) - self.learned_rows(split, x_in, u_in) + self._values(numbers, inside)
+        return self.learned_rows(split, x, u) - self.learned_rows(own, x, u) + share * held
+
+    def learned_rows(self, p: Any, x: Any, u: Any) -> Any:
+        """The physics (nl,) of the learned equations, then of the learned outputs, with the parameters p."""
+        states, outputs = (np.array(rows, dtype=int) for rows in self.motion.learned)
+        rates, observed = self.motion.rates(x, u, p, jnp), self.motion.observed(x, u, p, jnp)
+        return jnp.concatenate([rates[states], observed[outputs]])
 
     def rates(self, numbers: Numbers, x: Any, u: Any) -> tuple[Any, Any]:
         """The equations' right-hand sides of physics and learner, each (nx,)."""
@@ -66,7 +97,7 @@ class MotionField:
         learned = jnp.zeros(self.states)
         states, _ = self.motion.learned
         if self.bound is not None and states:
-            learned = learned.at[np.array(states)].set(self.learned(numbers, x, u)[: len(states)])
+            learned = learned.at[np.array(states)].set(self.added(numbers, x, u)[: len(states)])
         return physics, learned
 
     def observed(self, numbers: Numbers, x: Any, u: Any) -> Any:
@@ -74,7 +105,7 @@ class MotionField:
         y = self.motion.observed(x, u, self.parameters(numbers), jnp)
         states, outputs = self.motion.learned
         if self.bound is not None and outputs:
-            y = y.at[np.array(outputs)].add(self.learned(numbers, x, u)[len(states) :])
+            y = y.at[np.array(outputs)].add(self.added(numbers, x, u)[len(states) :])
         return y
 
     def parameters(self, numbers: Numbers) -> Any:
@@ -121,16 +152,12 @@ def _rate(unit: str) -> str:
 def _parts(
     form: MotionField, numbers: Numbers, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
 ) -> tuple[Float[Array, "m nl"], Float[Array, "m nl"]]:
-    states, outputs = (np.array(learned, dtype=int) for learned in form.motion.learned)
-
     def physics(q: Any, x: Any, u: Any) -> Any:
-        p = form.motion.coordinates.physical(q, jnp)
-        rates, observed = form.motion.rates(x, u, p, jnp), form.motion.observed(x, u, p, jnp)
-        return jnp.concatenate([rates[states], observed[outputs]])
+        return form.learned_rows(form.motion.coordinates.physical(q, jnp), x, u)
 
     def at(x: Any, u: Any) -> tuple[Any, Any]:
         split = physics(numbers.theta, x, u)
         whole = physics(numbers.theta - numbers.theta_aux, x, u)
-        return split, whole - split + (form.learned(numbers, x, u) if form.bound is not None else 0.0)
+        return split, whole - split + (form.added(numbers, x, u) if form.bound is not None else 0.0)
 
     return jax.vmap(at)(x, u)

@@ -113,7 +113,7 @@ class Moving(MotionField, Differentiated):
         if numbers.scheme is not None:
             value, to_state, to_unknowns = super().local(numbers, states, inputs)
             return Local(value, to_state, to_unknowns + self._by_scheme(numbers, states, inputs))
-        if not self._by_stages:
+        if not self._by_stages or numbers.limits is not None:
             return super().local(numbers, states, inputs)
         following = jax.vmap(partial(sample_slopes, self, numbers), -1, -1)(states, inputs)
         output = jax.vmap(lambda x, row: output_slopes(self, numbers, x, self.now(row)), -1, -1)(states, inputs)

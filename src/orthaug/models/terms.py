@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -13,9 +13,10 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError, shown
 from orthaug._base.jax import Array, jnp
-from orthaug._base.registry import check_fields
+from orthaug._base.registry import OneOf, check_fields
 from orthaug.data.regressors import Lags
 from orthaug.data.terms import TermLibrary
+from orthaug.models.beyond import BEYOND
 from orthaug.models.learners import Scaling, Tree
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.motion import Motion
@@ -39,6 +40,7 @@ class Terms:
             signals.
         exclude: terms of the library to leave out.
         inputs: the signals that the library is made of; None for all lags, or all states and inputs of a motion.
+        beyond: as of `MLP`; "auto" is "free", for terms are an equation that goes on as it is.
 
     Examples:
         >>> Terms(degree=2, exclude=["1"]).over(["x", "v"]).terms
@@ -52,6 +54,7 @@ class Terms:
     functions: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
     inputs: tuple[str, ...] | None = None
+    beyond: Annotated[str, OneOf(BEYOND)] = field(default="auto", repr=False)
 
     def __post_init__(self) -> None:
         for name in ("terms", "functions", "exclude", "inputs"):
@@ -95,7 +98,7 @@ class Terms:
 
     def among(self, kept: Sequence[str]) -> Terms:
         """The same with some of its terms."""
-        return Terms(tuple(kept))
+        return Terms(tuple(kept), beyond=self.beyond)
 
     def scaling(self, features: Matrix) -> Scaling:
         """Each term by its largest size, without an offset: coefficients stay those of the terms."""

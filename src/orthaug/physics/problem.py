@@ -208,6 +208,12 @@ class Problem:
         """
         return feature_rows(self.features, self.rows, self.layout, self.record)
 
+    @cached_property
+    def feature_range(self) -> Float[np.ndarray, "2 nz"]:
+        """Least and largest value of each of the learner's features over the rows."""
+        z = self.feature_rows()
+        return np.stack([z.min(axis=0), z.max(axis=0)])
+
 
 @one_blas_thread()
 def pose(
