@@ -28,6 +28,7 @@ from orthaug.export.lowering import program_of
 from orthaug.export.nodes import Number, apply
 from orthaug.export.numpy_step import FUNCTIONS as NUMPY_FUNCTIONS
 from orthaug.export.numpy_step import NumpyStep, numpy_step
+from orthaug.models.beyond import pull_of
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
 from orthaug.models.learners import ACTIVATIONS, Bound
@@ -160,7 +161,12 @@ MODELS: dict[str, Callable[[], Model | MotionModel]] = {
         LINEAR, ("tanh(y[k-1])", "u[k-1]**2"), Terms(("tanh(y[k-1])", "u[k-1]**2")), ("y",), ("u",)
     ),
     "network": lambda: lagged(LINEAR, ("y[k-1]", "u[k-1]"), oa.MLP((16,)), ("y",), ("u",)),
-    "network of one input": lambda: lagged(LINEAR, ("y[k-1]",), oa.MLP((16, 1, 4)), ("y",), ("u",)),
+    "network that is held": lambda: limited(
+        lagged(LINEAR, ("y[k-1]", "u[k-1] - 2*u[k-2]"), oa.MLP((16,)), ("y",), ("u",))
+    ),
+    "network of one input, fading": lambda: limited(
+        lagged(LINEAR, ("y[k-1]",), oa.MLP((16, 1, 4), beyond="fade"), ("y",), ("u",))
+    ),
     "physics alone, no feedback": lambda: lagged([oa.Term("a", "double[k]")], (), None, ("flag",), ("double",)),
     "motion without inputs": lambda: moving(
         oa.Motion.from_equations(
@@ -174,10 +180,28 @@ MODELS: dict[str, Callable[[], Model | MotionModel]] = {
     "motion, first-order hold": lambda: moving(
         spring(hold="first-order"), ("v", "x*u"), oa.MLP((5, 4), "silu"), substeps=2
     ),
-    "motion, exact": lambda: moving(spring(integrator="exact"), ("v", "w"), oa.MLP((5,)), substeps=1),
+    "motion that fades": lambda: limited(moving(spring(), ("v", "x - w"), oa.MLP((5,)), substeps=2)),
+    "motion, exact, held": lambda: limited(
+        moving(spring(integrator="exact"), ("v", "w"), oa.MLP((5,), beyond="hold"), substeps=1)
+    ),
     "motion, one scaled input": lambda: moving(spring(), ("v/3",), oa.MLP((5,)), substeps=1),
     "motion, discrete, no inputs": lambda: moving(DISCRETE, substeps=1),
 }
+
+
+def limited(model):
+    """The same with a correction that is held, or fades, beyond half of what the tests reach."""
+    form, nz = model.form, len(model.numbers.centre)
+    n = len(form.layout) if isinstance(form, Lagged) else form.states + len(form.motion.inputs)
+
+    def features(points):
+        if isinstance(form, Lagged):
+            return np.asarray(form.features.evaluate(points, form.layout, np))
+        return np.asarray(form.seen(points[:, : form.states].T, points[:, form.states :].T, np)).T
+
+    points = np.random.default_rng(3).uniform(-1, 1, (50, n))
+    limits = np.stack([np.full(nz, -0.4), np.full(nz, 0.6)])
+    return replace(model, numbers=model.numbers._replace(limits=limits, pull=pull_of(features, points)))
 
 
 @dataclass(frozen=True)

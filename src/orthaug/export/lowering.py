@@ -13,6 +13,7 @@ from orthaug._base.errors import InputError
 from orthaug.data.expressions import Expression, Lag
 from orthaug.data.preparation import MENDING
 from orthaug.data.record import Channel
+from orthaug.export.holding import Held
 from orthaug.export.nodes import Apply, Entry, Name, Node, Number, apply, identifier, node_of, total
 from orthaug.export.program import Block, Constant, Layer, Network, Program, Scheme, Signal
 from orthaug.models.dynamics import Numbers
@@ -79,27 +80,39 @@ def _lagged(model: Model, name: str, digest: str) -> Program:
     lags |= {Lag(channel, 0): Entry("u", i) for i, channel in enumerate(memory.inputs)}
     constants = _Constants()
 
-    def written(expression: Expression) -> Node:
+    def written(expression: Expression, lags: Mapping[Lag, Node] = lags) -> Node:
         return node_of(expression, constants.of(expression), lags, dict(expression.constants))
 
-    effective = dict(zip(form.baseline.names, np.asarray(model.theta - model.theta_aux).tolist(), strict=True))
+    limited = numbers.limits is not None
+    features = [written(entry) for entry in form.features.entries]
+    held = Held.of(form, numbers, features, [lags[lag] for lag in form.layout]) if limited else None
+    constants.symbols |= {} if held is None else held.symbols
+    values = np.asarray(model.theta if limited else model.theta - model.theta_aux).tolist()
+    effective = dict(zip(form.baseline.names, values, strict=True))
+    moved = dict(zip(form.baseline.names, np.asarray(model.theta_aux).tolist(), strict=True))
     sums: list[list[Node]] = [[] for _ in form.outputs]
+    corrections: list[list[Node]] = [[] for _ in form.outputs]
     units = {parameter.name: parameter.unit for parameter in form.baseline.parameters}
     for term, expression in zip(form.baseline.terms, form.baseline.expressions, strict=True):
         value = (term.initial or 0.0) if term.fixed else effective[term.parameter]
         unit = term.unit or units.get(term.parameter, "")
-        what = "known" if term.fixed else "theta - theta_aux"
-        meaning = f"{term.parameter}{f' [{unit}]' if unit else ''}, {what}"
-        factor = constants.node("p", term.parameter, value, meaning)
+        what = "known" if term.fixed else "theta" if limited else "theta - theta_aux"
+        named = f"{term.parameter}{f' [{unit}]' if unit else ''}"
+        factor = constants.node("p", term.parameter, value, f"{named}, {what}")
         row = form.outputs.index(term.output) if term.output is not None else 0
         sums[row].append(apply("mul", factor, written(expression)))
+        if held is not None and not term.fixed and moved[term.parameter]:
+            aux = constants.node("p", f"{term.parameter}_aux", moved[term.parameter], f"{named}, theta_aux")
+            inside = dict(zip(form.layout, held.inside, strict=True))
+            corrections[row].append(apply("neg", apply("mul", aux, written(expression, inside))))
     network = None
     if form.bound is not None:
-        features = [written(entry) for entry in form.features.entries]
-        network = _network(form.bound, numbers, features, np.arange(len(form.outputs)))
+        seen = features if held is None else held.features
+        network = _network(form.bound, numbers, seen, np.arange(len(form.outputs)))
         for i, summands in enumerate(sums):
-            summands.append(Entry("g", i))
-    block = Block("output", (), network, tuple(map(total, sums)))
+            correction = total([Entry("g", i), *corrections[i]])
+            summands.append(correction if held is None else held.faded(correction))
+    block = Block("output", () if held is None else held.locals, network, tuple(map(total, sums)))
     lines = tuple((_signal(channels[channel]), depth) for channel, depth in memory.depths)
     states = tuple(
         Signal(str(lag), f"{identifier(lag.channel)}_{lag.lag}", channels[lag.channel].unit) for lag in memory.lags
@@ -138,25 +151,54 @@ def _motion(model: MotionModel, name: str, digest: str) -> Program:
     names |= {channel: Entry("u", i) for i, channel in enumerate(motion.inputs)}
     numeric = dict(motion.constants)
     defined: dict[str, Node] = {}
-    for key, expression in motion.definitions:
-        defined[f"v_{identifier(key)}"] = node_of(expression, names, {}, numeric)
-        names[key] = Name(f"v_{identifier(key)}")
-        constants.symbols[f"v_{identifier(key)}"] = key
 
-    def written(expression: Expression) -> Node:
+    def define(names: dict[str, Node], suffix: str = "") -> dict[str, Node]:
+        """The names with those of the definitions, in terms of the others."""
+        for key, expression in motion.definitions:
+            local = f"v_{identifier(key)}{suffix}"
+            defined[local] = node_of(expression, names, {}, numeric)
+            names = names | {key: Name(local)}
+            constants.symbols[local] = key
+        return names
+
+    names = define(names)
+
+    def written(expression: Expression, names: Mapping[str, Node] = names) -> Node:
         return node_of(expression, names, {}, numeric)
 
     features = [written(entry) for entry in form.features]
     learned_states, learned_outputs = motion.learned
-    results = {"rate": list(map(written, motion.equations.values())), "output": list(map(written, motion.observations))}
+    equations = {"rate": [*motion.equations.values()], "output": [*motion.observations]}
+    results = {kind: list(map(written, expressions)) for kind, expressions in equations.items()}
+    held, changed = None, [names] * 3
+    if numbers.limits is not None:
+        points: list[Node] = [*(Entry("x", i) for i in range(form.states)), *(names[key] for key in motion.inputs)]
+        held = Held.of(form, numbers, features, points)
+        defined |= dict(held.locals)
+        constants.symbols |= held.symbols
+        if np.any(numbers.theta_aux):  # the physics itself extrapolates with the parameters that were split off
+            at_split = np.asarray(motion.coordinates.physical(np.asarray(numbers.theta))).tolist()
+            split = {
+                parameter.name: constants.node("p", f"{parameter.name}_split", value, f"{parameter.name}, as estimated")
+                for parameter, value in zip(motion.parameters, at_split, strict=True)
+            }
+            inside = dict(zip((*motion.names_of_states, *motion.inputs), held.inside, strict=True))
+            bare = {key: node for key, node in names.items() if key not in dict(motion.definitions)}
+            changed = [define(bare | split, "_s"), define(bare | inside, "_h"), define(bare | inside | split, "_hs")]
     blocks = {}
     for kind, learned, first in (("output", learned_outputs, len(learned_states)), ("rate", learned_states, 0)):
         network = None
         if form.bound is not None and learned:
-            network = _network(form.bound, numbers, features, first + np.arange(len(learned)))
+            seen = features if held is None else held.features
+            network = _network(form.bound, numbers, seen, first + np.arange(len(learned)))
             for i, place in enumerate(learned):
-                results[kind][place] = apply("add", results[kind][place], Entry("g", i))
-        seen = features if network is not None else []
+                correction, physics = Entry("g", i), results[kind][place]
+                if held is not None and np.any(numbers.theta_aux):
+                    physics, own, split = (written(equations[kind][place], there) for there in changed)
+                    correction = apply("add", correction, apply("sub", own, split))
+                correction = correction if held is None else held.faded(correction)
+                results[kind][place] = apply("add", physics, correction)
+        seen = list(network.features) if network is not None else []
         blocks[kind] = Block(kind, _needed(defined, [*results[kind], *seen]), network, tuple(results[kind]))
     return Program(
         name=name,

@@ -81,7 +81,9 @@ class MotionField:
         moved = numbers.pull @ (inside - z)
         share = remaining(self.beyond, numbers.limits, z)
         x_in, u_in = x + moved[: len(x)], u + moved[len(x) :]
-        split, own = (self.motion.coordinates.physical(q, jnp) for q in (numbers.theta, numbers.theta - numbers.theta_aux))
+        split, own = (
+            self.motion.coordinates.physical(q, jnp) for q in (numbers.theta, numbers.theta - numbers.theta_aux)
+        )
         held = self.learned_rows(own, x_in, u_in) - self.learned_rows(split, x_in, u_in) + self._values(numbers, inside)
         return self.learned_rows(split, x, u) - self.learned_rows(own, x, u) + share * held
 
