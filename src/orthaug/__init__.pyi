@@ -40,6 +40,7 @@ from .fitting import AdamLBFGS as AdamLBFGS
 from .fitting import Additive as Additive
 from .fitting import AugmentedNARX as AugmentedNARX
 from .fitting import AugmentedRegressor as AugmentedRegressor
+from .fitting import Auto as Auto
 from .fitting import BaselinePenalty as BaselinePenalty
 from .fitting import Estimate as Estimate
 from .fitting import LevenbergMarquardt as LevenbergMarquardt

@@ -124,7 +124,7 @@ def _richly_excited(course: MotionCourse, wide: float) -> MotionCourse:
 def _on(course: MotionCourse, record: Record) -> MotionCourse:
     """The same segments on another record."""
     whole = MotionCourse.of(course.problem.on(record), None, course.criterion)
-    return whole if course.flown == course.criterion.flown else whole.over(course.flown.segment)
+    return whole if course.flown == course.criterion.flown else whole.over(course.flown.steps)
 
 
 def _levels(count: int, random: np.random.Generator) -> Vector:

@@ -17,6 +17,7 @@ from orthaug.commands.fit import Fitted, cross_validated, fit_variant, judge_fit
 from orthaug.commands.folder import not_a_result
 from orthaug.commands.job import ALONE, Job, Variant, origin_of
 from orthaug.data.record import same_step
+from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.models import storage
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
@@ -52,11 +53,15 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -
     """
     models = {str(path): _matching(path, job) for path in saved}
     fitted, left_out = {}, {}
+    criterion, decided = _criterion(job, progress)
     for number, kind in enumerate(job.compared):
-        variant = Variant(kind)
+        variant = Variant(kind, criterion=criterion)
         refusal = job.refusal(variant)
         if refusal is not None:
             left_out[kind] = refusal
+            continue
+        if decided is not None and kind == job.spec.structure.kind and decided.fit.model.form.bound is not None:
+            fitted[kind] = decided
             continue
         fitted[kind] = fit_variant(job, variant, progress.after(runs=number * job.run_count))
     verdicts = _verdicts(job, fitted)
@@ -66,11 +71,21 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -
         "spec": job.declaration,
         "data": job.data,
         "comparison": rows,
-        "chosen": _chosen(rows, job.spec.declared_criterion().simulates) if job.validation else None,
+        "chosen": _chosen(rows, criterion.simulates) if job.validation else None,
         "left_out": left_out,
         "warnings": job.warnings,
     }
     return Comparison(job, fitted, verdicts, CompareResult.model_validate(content))
+
+
+def _criterion(job: Job, progress: Progress) -> tuple[Criterion, Fitted | None]:
+    """The criterion that every structure is trained by, and the fit that decided it where the data were to decide."""
+    declared = job.spec.declared_criterion()
+    if not declared.automatic:
+        return declared, None
+    kind = job.spec.structure.kind if job.spec.structure.kind in job.compared else ALONE
+    fitted = fit_variant(job, Variant(kind), progress)
+    return (fitted.fit.criterion if fitted.fit.status.ok else Prediction()), fitted
 
 
 def _verdicts(job: Job, fitted: dict[str, Fitted]) -> dict[str, Verdict]:
@@ -79,11 +94,12 @@ def _verdicts(job: Job, fitted: dict[str, Fitted]) -> dict[str, Verdict]:
     kinds = [kind for kind, tried in fitted.items() if kind != ALONE and tried.fit.status.ok]
     if not kinds or not alone.status.ok:
         return {}
-    blocks, flown = wanted_blocks(job), job.spec.declared_criterion().simulates
+    criterion = alone.criterion
+    blocks, flown = wanted_blocks(job), criterion.simulates
     if flown or not blocks:  # free runs were chosen by the same trials
         trials = [None] * len(kinds)
     else:
-        trials = cross_validated(job, blocks, [Variant(kind) for kind in kinds])
+        trials = cross_validated(job, blocks, [Variant(kind, criterion=criterion) for kind in kinds])
     ran = fitted[ALONE].responses
     verdicts = {k: judge_fit(fitted[k], lambda: alone, own, ran) for k, own in zip(kinds, trials, strict=True)}
     return {kind: verdict for kind, verdict in verdicts.items() if verdict is not None}

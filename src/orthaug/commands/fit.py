@@ -16,7 +16,7 @@ from orthaug._base.parallel import one_blas_thread
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.views import MAKERS
 from orthaug.commands.attempt import attempt
-from orthaug.commands.folder import not_a_result
+from orthaug.commands.folder import PHYSICS, not_a_result
 from orthaug.commands.job import ALONE, AS_DECLARED, DEFAULT_BLOCKS, Job, Variant, origin_of
 from orthaug.commands.kinds import kind_of
 from orthaug.commands.parts import Part
@@ -77,7 +77,7 @@ def judged(fitted: Fitted) -> Fitted:
     if not fit.status.ok or (fit.model.form.bound is None and fit.held_out is None):
         return fitted
     failed: list[Any] = []
-    physics = cache(partial(fitted.job.run, Variant(ALONE)))
+    physics = cache(partial(_physics_alone, fitted))
     verdict = attempt("the judgement of the learner", lambda: judge_fit(fitted, physics), failed, None)
     warnings += failed
     asked = fit.model.form.bound is not None and job.spec.validation.blocks != 0
@@ -91,6 +91,12 @@ def judged(fitted: Fitted) -> Fitted:
         warnings += [WarningResult.model_validate(warning) for warning in told]
     result = FitResult.model_validate({**dict(fitted.result), "validation": verdict, "warnings": warnings})
     return replace(fitted, result=result)
+
+
+def _physics_alone(fitted: Fitted) -> Any:
+    """The fit of physics alone that the learner had to beat: the one that was made, or one by the same criterion."""
+    made = fitted.fit.physics_alone
+    return made if made is not None else fitted.job.run(Variant(ALONE, criterion=fitted.fit.criterion))
 
 
 def _unexplained(fitted: Fitted, physics: Callable[[], Any] | None) -> list[Warning]:
@@ -156,6 +162,11 @@ def told_of(job: Job, fit: Any) -> Fitted:
     if fit.status.ok:
         for part in job.parts:
             scores[part.name], responses[part.name] = score_part(fit.model, part, warnings)
+    physics, alone = fit.physics_alone, {}
+    if physics is not None and physics.status.ok:
+        alone = {part.name: score_part(physics.model, part, [])[0] for part in job.parts}
+    if fit.status.ok and job.spec.training.focus == "prediction" and fit.model.form.bound is not None:
+        warnings += _one_step_only(scores, alone, [part.name for part in job.parts if part not in job.tests])
     fit, told = kind_of(job).content(job, fit, responses, warnings)
     if fit.status.ok and told["residuals"] is not None:
         fit = _for_observers(fit, told["residuals"].verdict, warnings)
@@ -169,6 +180,8 @@ def told_of(job: Job, fit: Any) -> Fitted:
         "orthogonality_defect": fit.defect,
         "output_weights": None if fit.problem.weight.one_output else fit.problem.weight.as_dict(),
         "scores": scores,
+        "focus": fit.focus,
+        "physics_alone": {"scores": alone} if alone else None,
         "validation": None,
         "warnings": warnings,
     }
@@ -177,6 +190,26 @@ def told_of(job: Job, fit: Any) -> Fitted:
         written = {writing: equation(fit.model, writing) for writing in ("text", "latex")}
         content |= {"terms": terms, "equation": written}
     return Fitted(job, fit, FitResult.model_validate(content), responses)
+
+
+def _one_step_only(
+    scores: Mapping[str, PartScores], alone: Mapping[str, PartScores], parts: Sequence[str]
+) -> list[Warning]:
+    """That a model trained one step ahead by hand is of no use in free run: it diverges, or physics alone is better."""
+    diverges = any(scores[part].simulation.nrmse is None for part in parts)
+    worse = [
+        bool(np.all(np.asarray(scores[part].simulation.nrmse) > np.asarray(alone[part].simulation.nrmse)))
+        for part in parts
+        if part in alone and scores[part].simulation.nrmse is not None and alone[part].simulation.nrmse is not None
+    ]
+    if not diverges and not (worse and all(worse)):
+        return []
+    why = "its free run diverges" if diverges else "physics alone follows the outputs better in free run"
+    text = (
+        f'the model is for one-step prediction only: {why}. `focus = "auto"`, the default, trains the free run, too, '
+        "where one step ahead is not enough."
+    )
+    return [Warning("one_step_only", text)]
 
 
 def _for_observers(fit: Any, verdict: str, warnings: list[Any]) -> Any:
@@ -210,7 +243,7 @@ def judge_fit(
 
     job, model, chosen_by = fitted.job, fitted.fit.model, fitted.fit.held_out
     held_out = job.parts[1:]
-    simulated = job.spec.declared_criterion().simulates
+    simulated = fitted.fit.criterion.simulates
     if chosen_by is not None and model.form.bound is None:
         return judge(trials_of(chosen_by)) if simulated else None
     if blocks is None:
@@ -218,7 +251,11 @@ def judge_fit(
         if wanted and simulated and chosen_by is not None and job.validation is None:
             blocks = trials_of(chosen_by)
         else:
-            blocks = cross_validated(job, wanted, [AS_DECLARED])[0] if wanted and not _stopped(fitted.fit) else ()
+            blocks = (
+                cross_validated(job, wanted, [Variant(criterion=fitted.fit.criterion)])[0]
+                if wanted and not _stopped(fitted.fit)
+                else ()
+            )
     trials, beyond = list(blocks), []
     for part in held_out:
         ran = None if alone is None else alone[part.name][1]
@@ -245,7 +282,7 @@ def cross_validated(job: Job, blocks: int, variants: Sequence[Variant]) -> list[
     """Trials of every variant on every block; none where the record is too short for that."""
     from orthaug.analysis.validation import block_trials, cross_validate
 
-    fits = [job.fold_fit(variant) for variant in (Variant(ALONE), *variants)]
+    fits = [job.fold_fit(variant) for variant in (Variant(ALONE, criterion=variants[0].criterion), *variants)]
     try:
         options: dict[str, Any] = {"start": job.first_row, "runner": job.runner}
         errors = cross_validate(job.train.record, fits, blocks=blocks, **options)
@@ -312,6 +349,10 @@ def fill_result(fitted: Fitted, folder: Path) -> None:
         return
     (folder / "model").mkdir()
     storage.write(fitted.fit.model, folder / "model")
+    physics = fitted.fit.physics_alone
+    if physics is not None and physics.status.ok:
+        (folder / PHYSICS).mkdir()
+        storage.write(physics.model, folder / PHYSICS)
     (folder / "figures").mkdir()
     _draw(fitted, folder / "figures")
     (folder / "report.html").write_text(fit_report(fitted), encoding="utf-8")

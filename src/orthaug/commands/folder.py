@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from orthaug._base.checks import check_choice
 from orthaug._base.errors import InputError
 from orthaug._base.folders import check_new_file, check_replaceable, whole_file
 from orthaug.commands.job import Job
@@ -17,9 +18,12 @@ from orthaug.commands.job import Job
 if TYPE_CHECKING:
     from orthaug.reports.drawing import Figure
 
+PHYSICS = "model-physics"
+"""The folder of physics alone in a result folder."""
 _MODEL = r"(model\.json|arrays\.safetensors)"
 _KNOWN = re.compile(
-    rf"result\.json|report\.html|spec\.toml|table\.csv|(train|test)\.csv|figures/[a-z_]+\.png|model/{_MODEL}|models/[a-z-]+/{_MODEL}"
+    r"result\.json|report\.html|spec\.toml|table\.csv|(train|test)\.csv|figures/[a-z_]+\.png"
+    rf"|model(-physics)?/{_MODEL}|models/[a-z-]+/{_MODEL}"
 )
 
 
@@ -32,6 +36,23 @@ def not_a_result(folder: Path, names: Sequence[str]) -> str | None:
     except (OSError, ValueError, RecursionError):
         ours = False
     return (strange or [None if ours else names[0]])[0]
+
+
+def chosen_model(model: Path, which: str) -> Path:
+    """Return the folder of the model that a command runs: the fitted one, or `physics`, the one without a learner.
+
+    Raises:
+        InputError: neither of these, or a fit that has no physics alone beside its model.
+    """
+    check_choice(which, ("fitted", "physics"), "--model")
+    if which == "fitted":
+        return model
+    whole = model.parent if model.name == "model" else model
+    if not (whole / PHYSICS).is_dir():
+        raise InputError(
+            f"{whole}: holds no {PHYSICS}; expected a result of `orthaug fit` with a learner, or no --model physics."
+        )
+    return whole / PHYSICS
 
 
 def results_beside(model: Path) -> Iterator[Any]:

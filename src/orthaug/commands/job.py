@@ -26,6 +26,7 @@ from orthaug.reports.result import DataResult, PreparedResult
 
 if TYPE_CHECKING:
     from orthaug.fitting.checkpoints import Checkpoints
+    from orthaug.fitting.criteria import Criterion
     from orthaug.reports.page_fit import Origin
 
 DEFAULT_BLOCKS = 4
@@ -43,6 +44,8 @@ class Variant:
     kind: str | None = None
     """Of the structure, or `ALONE`; None for the structure that the spec declares."""
     fold: Record | None = None
+    criterion: Criterion | None = None
+    """None for the criterion that the spec declares."""
 
     @property
     def alone(self) -> bool:
@@ -190,7 +193,7 @@ class Job(ABC):
         validated = self.validation is not None and fold is None
         return {
             "learner": None if variant.alone else spec.declared_learner(),
-            "criterion": spec.declared_criterion(),
+            "criterion": variant.criterion or spec.declared_criterion(),
             "solver": solver if fold is None else solver.at_most(FOLD_ITERATIONS),
             "regularization": choices[0] if fold is not None and isinstance(choices, list) else choices,
             "restarts": training.restarts if fold is None else 1,

@@ -23,6 +23,7 @@ from orthaug.commands.program import (
     OutFolder,
     Prepare,
     Rows,
+    Which,
     app,
     prepare_jax,
     tell,
@@ -44,12 +45,14 @@ def simulate(
     every: Every = 1,
     column: Columns = None,
     prepare: Prepare = None,
+    which: Which = "fitted",
     force: Force = False,
 ) -> None:
     """Free run of a saved model on a data file."""
     from orthaug.commands import run
-    from orthaug.commands.folder import check_file
+    from orthaug.commands.folder import check_file, chosen_model
 
+    model = chosen_model(model, which)
     reading = run.Reading.of(missing, rows, every, column or (), prepare)
     if initial is None and _written_long(model, data, reading, out, force, free=True):
         return
@@ -76,12 +79,14 @@ def predict(
     every: Every = 1,
     column: Columns = None,
     prepare: Prepare = None,
+    which: Which = "fitted",
     force: Force = False,
 ) -> None:
     """H-step-ahead prediction of a saved model."""
     from orthaug.commands import run
-    from orthaug.commands.folder import check_file
+    from orthaug.commands.folder import check_file, chosen_model
 
+    model = chosen_model(model, which)
     reading = run.Reading.of(missing, rows, every, column or (), prepare)
     plain = horizon == 1 and initial is None and not observer
     if plain and _written_long(model, data, reading, out, force, free=False):
@@ -168,11 +173,14 @@ def export(
     to: Annotated[str, typer.Option("--to", metavar="TARGET", help="c, casadi, control, fmu, numpy, onnx or latex.")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the code.")],
     name: Annotated[str, typer.Option("--name", help="Of files and functions.")] = "model",
+    which: Which = "fitted",
     force: Force = False,
 ) -> None:
     """A saved model as code that needs no orthaug."""
     from orthaug.commands import export as exporting
+    from orthaug.commands.folder import chosen_model
 
+    model = chosen_model(model, which)
     exporting.check(model, to, out, name, force=force)
     prepare_jax()
     for line in exporting.run(model, to, out, name, force=force):

@@ -52,6 +52,9 @@ app = typer.Typer(
 _NO_READER = (errno.EPIPE, errno.EINVAL) if os.name == "nt" else (errno.EPIPE,)
 SpecPath = Annotated[Path, typer.Argument(metavar="SPEC", help="Spec file (TOML).")]
 ModelPath = Annotated[Path, typer.Argument(metavar="MODEL", help="Result folder of `fit`, or its model/.")]
+Which = Annotated[
+    str, typer.Option("--model", metavar="fitted|physics", help="The fitted model, or the physics without a learner.")
+]
 DataPath = Annotated[Path, typer.Argument(metavar="DATA", help="Data file with the model's channels.")]
 OutFolder = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Result folder.")]
 OutFile = Annotated[Path | None, typer.Option("--out", metavar="FILE", help="CSV file; standard output without it.")]

@@ -139,7 +139,7 @@ def _largest(spec: Spec) -> Lags | None:
 
 def _criterion(spec: Spec) -> Criterion:
     """The declared one; the free run where the spec does not say."""
-    focus = spec.training.focus if "focus" in spec.training.model_fields_set else "simulation"
+    focus = "simulation" if spec.training.focus == "auto" else spec.training.focus
     return spec.training.declared(CRITERIA, focus)
 
 

@@ -156,7 +156,7 @@ class TrainingSection(KindSection):
 
     registries = {"solver": SOLVERS, "focus": CRITERIA}
     solver: str = "levenberg-marquardt"
-    focus: str = "prediction"
+    focus: str = "auto"
     restarts: Positive = 1
     ensemble: bool = False
     fallback: bool = True
@@ -298,7 +298,7 @@ class Spec(Section):
         training = self.training
         if self.motion is None:
             return resolve(training.declared(CRITERIA, training.focus))
-        focus = training.focus if "focus" in training.model_fields_set else "simulation"
+        focus = "simulation" if training.focus == "auto" else training.focus
         washout = {} if "washout" in training.model_fields_set else {"washout": 0}
         return resolve(training.model_copy(update=washout).declared(CRITERIA, focus))
 
@@ -326,7 +326,7 @@ class Spec(Section):
     def brought(self) -> bool:
         """Whether training reads all rows into memory: of a motion, and of free runs over whole experiments."""
         flown = self.declared_criterion().flown
-        return self.motion is not None or (flown is not None and not flown.segment)
+        return self.motion is not None or (flown is not None and not flown.steps)
 
     def regularizations(self, *, linear: bool, validated: bool, kind: str | None = None) -> tuple[str | float, ...]:
         """Those that every start is run with, in the structure that is declared or another kind."""

@@ -1,4 +1,5 @@
 from .conclusion import orthogonalize as orthogonalize
+from .criteria import Auto as Auto
 from .criteria import Prediction as Prediction
 from .criteria import Simulation as Simulation
 from .estimates import Estimate as Estimate

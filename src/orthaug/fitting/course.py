@@ -71,8 +71,8 @@ class Layout(NamedTuple):
         longest = max(len(e) for e in record.experiments) - dynamics.first_row
         check_scored(criterion, longest)
         shapes = (None, None) if like is None else (like.segments, like.whole)
-        segments = lay_segments(record, dynamics, flown.segment, flown.washout, shapes[0], shares)
-        if not (criterion.simulates and flown.segment):
+        segments = lay_segments(record, dynamics, flown.steps, flown.washout, shapes[0], shares)
+        if not (criterion.simulates and flown.steps):
             return cls(segments, segments, None)
         whole, colour = lay_segments(record, dynamics, 0, flown.washout, shapes[1]), None
         if segments.steps < COLOURED_STEPS <= longest:

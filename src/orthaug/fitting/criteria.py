@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Protocol, runtime_checkable
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, runtime_checkable
 
+import numpy as np
 from annotated_types import Ge
 
+from orthaug._base.checks import check_count
 from orthaug._base.errors import KeyedError
 from orthaug._base.registry import LIBRARY_ONLY, check_fields
 
@@ -36,13 +38,33 @@ class Criterion(Protocol):
         ...
 
     @property
+    def automatic(self) -> bool:
+        """Whether the data decide between one step ahead and the free run."""
+        ...
+
+    @property
     def flown(self) -> Simulation | None:
         """The free run that training makes; None for one step ahead."""
+        ...
+
+    def on(self, record: Record, first_row: int = 0) -> Any:
+        """The criterion with what it leaves to the record."""
+        ...
+
+    @property
+    def streamed(self) -> Any:
+        """The criterion with what it leaves to a record whose rows are not in memory."""
         ...
 
     def response(self, model: Model, record: Record) -> Response:
         """The response whose error judges a model on a validation part."""
         ...
+
+
+Steps = Annotated[int, Ge(0)] | Literal["auto"]
+LONG, SHORT = 4096, 512
+"""Steps: experiments of up to so many are one segment of a free run; longer ones are cut, but no shorter than that."""
+_MEMORIES = 20  # times that the outputs remember themselves: a segment shows their slowest mode
 
 
 @dataclass(frozen=True)
@@ -55,6 +77,7 @@ class Prediction:
     """
 
     simulates = False
+    automatic = False
     washout = 0
 
     horizon: Annotated[int, Ge(1)] = 1
@@ -72,6 +95,15 @@ class Prediction:
         """The free run that gives it: segments of `horizon` steps whose last one is scored; None for one step."""
         return Simulation(self.horizon, self.horizon - 1, exact_start=True) if self.horizon > 1 else None
 
+    def on(self, record: Record, first_row: int = 0) -> Prediction:
+        """Return itself: nothing of it depends on a record."""
+        return self
+
+    @property
+    def streamed(self) -> Prediction:
+        """Itself."""
+        return self
+
     def response(self, model: Model, record: Record) -> Response:
         """The prediction."""
         return model.predict(record, self.horizon)
@@ -85,7 +117,8 @@ class Simulation:
     unknowns too (`InitialStates`). Segments without a washout start exactly from what was measured.
 
     Args:
-        segment: steps of a segment; 0 for whole experiments.
+        segment: steps of a segment; 0 for whole experiments; "auto" for whole experiments of up to 4096 steps and, of
+            longer ones, 20 times as many steps as the outputs remember themselves, 512 or more.
         washout: leading steps of a segment that are not scored, until its start is forgotten.
         start_iterations: one-step iterations that training starts from.
         exact_start: whether a segment starts exactly from what was measured; None for the rule above.
@@ -97,15 +130,17 @@ class Simulation:
 
     one_step = False
     simulates = True
+    automatic = False
 
-    segment: Annotated[int, Ge(0)] = 512
+    segment: Steps = "auto"
     washout: Annotated[int, Ge(0)] = 40
     start_iterations: Annotated[int, Ge(0)] = 20
     exact_start: bool | None = field(default=None, metadata=LIBRARY_ONLY)
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if self.segment and self.washout >= self.segment:
+        _check_segment(self.segment)
+        if isinstance(self.segment, int) and self.segment and self.washout >= self.segment:
             raise KeyedError(
                 f"`washout` must be shorter than `segment`; got {self.washout} and {self.segment}: nothing is scored.",
                 "washout",
@@ -117,6 +152,20 @@ class Simulation:
         """Itself: the free run that training makes."""
         return self
 
+    @property
+    def steps(self) -> int:
+        """Steps of a segment, 0 for whole experiments; the fewest where their number is left to a record."""
+        return max(SHORT, 2 * self.washout) if isinstance(self.segment, str) else self.segment
+
+    def on(self, record: Record, first_row: int = 0) -> Simulation:
+        """Return the same with segments of so many steps as a record asks for, where that is left to it."""
+        return self if self.segment != "auto" else replace(self, segment=segment_for(record, first_row, self.washout))
+
+    @property
+    def streamed(self) -> Simulation:
+        """The same with the shortest segments, where their length is left to the record."""
+        return replace(self, segment=self.steps)
+
     def response(self, model: Model, record: Record) -> Response:
         """The free run."""
         return model.simulate(record)
@@ -127,3 +176,75 @@ class Simulation:
         if self.exact_start is not None:
             return not self.exact_start
         return self.washout > 0 or self.segment == 0
+
+
+@dataclass(frozen=True)
+class Auto:
+    """Declaration: the error one step ahead, and that of the free run where one step ahead is not enough.
+
+    A fit one step ahead stays where its free run is finite and no worse than that of physics alone where nothing was
+    fitted, and where its residual is noise of the equation. Otherwise physics and learner are trained on the free run
+    as well, and the best of all in free run is handed over (`Estimate.focus`). The arguments are those of `Simulation`.
+    """
+
+    one_step = True
+    simulates = False
+    automatic = True
+
+    segment: Steps = "auto"
+    washout: Annotated[int, Ge(0)] = 40
+    start_iterations: Annotated[int, Ge(0)] = 20
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        Simulation(self.segment, self.washout, self.start_iterations)
+
+    @property
+    def flown(self) -> None:
+        """None: it begins one step ahead."""
+        return None
+
+    @property
+    def simulation(self) -> Simulation:
+        """The free run that is trained where one step ahead is not enough."""
+        return Simulation(self.segment, self.washout, self.start_iterations)
+
+    def on(self, record: Record, first_row: int = 0) -> Auto:
+        """Return itself: it is one step ahead that it begins with."""
+        return self
+
+    @property
+    def streamed(self) -> Prediction:
+        """One step ahead, for rows that are not in memory."""
+        return Prediction()
+
+    def response(self, model: Model, record: Record) -> Response:
+        """The free run."""
+        return model.simulate(record)
+
+
+def segment_for(record: Record, first_row: int, washout: int) -> int:
+    """Return how many steps a segment of a free run has; 0 for whole experiments.
+
+    It is 20 times as long as the outputs remember themselves (their autocorrelation is below 1/e), so that it shows
+    the slowest mode that they have, and longer than its washout.
+    """
+    longest = max(record.experiments, key=len)
+    steps = len(longest) - first_row
+    if steps <= LONG:
+        return 0
+    outputs = longest.outputs[: 2 * LONG * _MEMORIES]
+    centred = np.nan_to_num(outputs - np.nanmean(outputs, axis=0))
+    size = 2 ** int(np.ceil(np.log2(2 * len(centred))))
+    spectrum = np.abs(np.fft.rfft(centred, size, axis=0)) ** 2
+    correlation = np.fft.irfft(spectrum, size, axis=0)[: len(centred)]
+    short = (correlation <= correlation[0] / np.e).all(axis=1)
+    remembered = int(np.argmax(short)) if np.any(short) else len(centred)
+    segment = max(SHORT, _MEMORIES * remembered, 2 * washout)
+    return 0 if 2 * segment > steps else segment
+
+
+def _check_segment(segment: object) -> None:
+    """Raise InputError for what is no number of steps."""
+    if segment != "auto":
+        check_count(segment, "segment", least=0)

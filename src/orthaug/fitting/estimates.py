@@ -17,7 +17,7 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import Layout, lag_rows
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion, Prediction
-from orthaug.fitting.held_out import HeldOut
+from orthaug.fitting.held_out import Focus, HeldOut
 from orthaug.fitting.status import Status
 from orthaug.inference.covariance import interval, joint_covariance, robust_covariance, robust_split_covariance
 from orthaug.inference.learned_terms import equation, learned_terms, term_frame, term_lines
@@ -115,6 +115,10 @@ class Estimate(AnyFit):
     """Parameters that stand at a bound, with its value."""
     held_out: HeldOut | None = None
     """By what the run was chosen; None where the lowest training loss chose."""
+    focus: Focus | None = None
+    """What `Auto` chose, and why; None where the criterion was declared."""
+    physics_alone: Any = field(default=None, repr=False)
+    """The estimate of physics alone that the learner had to beat; None without a learner."""
     warnings: tuple[Warning, ...] = ()
     plain_covariance: Matrix | None = None
     """Cov θ̂ for white noise, where `covariance` is robust; None where it is not."""

@@ -19,6 +19,7 @@ from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.conclusion import conclude
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.estimates import Estimate
+from orthaug.fitting.focus import choose_focus
 from orthaug.fitting.free_run import FreeRunTask
 from orthaug.fitting.independent_terms import independent_terms
 from orthaug.fitting.kinds import Solver
@@ -203,6 +204,15 @@ def fit(
     _check_types(learner=learner, structure=structure, criterion=criterion, solver=solver)
     _check_types(initial=initial, validation=validation)
     _check_splittable(structure, problem.baseline, learner)
+    if criterion.automatic:
+        if _undecided(problem, solver, structure, warm=initial is not None, ensemble=ensemble):
+            options: dict[str, Any] = {"learner": learner, "structure": structure, "solver": solver, "seed": seed}
+            options |= {"regularization": regularization, "restarts": restarts, "blocks": blocks, "fallback": fallback}
+            options |= {"validation": validation, "progress": progress, "engine": engine, "checkpoints": checkpoints}
+            return choose_focus(problem, fit, options, criterion)
+        criterion = Prediction()
+    streamed = isinstance(problem, StreamedProblem)
+    criterion = criterion.on(problem.record, problem.first_row) if not streamed else criterion.streamed
     blocks = _check_blocks(blocks)
     conditions = {"linear": problem.baseline.linear, "validated": validation is not None}
     choices = tried(regularization, solver, criterion, structure, learner=learner, **conditions)
@@ -241,6 +251,12 @@ def fit(
         return fit(problem, structure=structure, criterion=criterion, solver=solver, progress=progress, **more)
 
     return reweighted(estimate, again)
+
+
+def _undecided(problem: Problem, solver: Solver, structure: Structure, *, warm: bool, ensemble: bool) -> bool:
+    """Whether the data may decide for the free run: not where nothing but one step ahead can be trained."""
+    able = solver.gauss_newton and problem.baseline.linear and not isinstance(problem, StreamedProblem)
+    return able and not (warm or ensemble or structure.from_initial)
 
 
 def _for_runs(engine: Engine, problem: Problem, runs: int) -> Engine:

@@ -129,7 +129,7 @@ class FlightTask(ABC):
         """One where runs cannot be compared over whole experiments."""
         if self.physics is None or self.plan.whole is not self.plan.segments:
             return ()
-        if not self.criterion.simulates or not self.plan.flown.segment:
+        if not self.criterion.simulates or not self.plan.flown.steps:
             return ()
         text = (
             "the free run of physics alone diverges over whole experiments of the training data, so `loss` counts its "

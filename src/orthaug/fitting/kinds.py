@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 from orthaug._base.registry import Registry
-from orthaug.fitting.criteria import Prediction, Simulation
+from orthaug.fitting.criteria import Auto, Prediction, Simulation
 from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
@@ -54,7 +54,7 @@ STRUCTURES = Registry(
     reserved=("kind", "measure"),
 )
 _BESIDE = ("solver", "focus", "restarts", "ensemble", "seed", "regularization")  # the other keys of [training]
-CRITERIA = Registry("criterion", {"prediction": Prediction, "simulation": Simulation}, reserved=_BESIDE)
+CRITERIA = Registry("criterion", {"auto": Auto, "prediction": Prediction, "simulation": Simulation}, reserved=_BESIDE)
 SOLVERS = Registry(
     "solver", {"levenberg-marquardt": LevenbergMarquardt, "adam-lbfgs": AdamLBFGS}, reserved=_BESIDE, beside=CRITERIA
 )

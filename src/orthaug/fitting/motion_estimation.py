@@ -73,6 +73,8 @@ def fit_motion(
     Raises:
         InputError: what a motion cannot be trained with.
     """
+    criterion = DEFAULT if criterion.automatic else criterion
+    criterion = criterion.on(problem.record)
     check_motion_choices(problem.motion, learner, structure, criterion, solver)
     validated = validation is not None
     conditions = {"linear": False, "validated": validated, "motion": True}
@@ -107,7 +109,7 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) ->
     slope = None if learned.scores is None else learned.scores.slope
     errors = learned.errors
     alone = np.asarray(learned.coefficients if task.physics is None else task.physics.end.flown.theta)
-    laid = (plan.flown.segment, plan.flown.washout, plan.segments.count)
+    laid = (plan.flown.steps, plan.flown.washout, plan.segments.count)
     trained = Trained(*laid, np.asarray(states), slope, alone)
     model = replace(_model(plan, structure, learned), trained=trained)
     reason = ALONE.get(learned.ending, "") if learned.bound is None or task.physics is None else ""

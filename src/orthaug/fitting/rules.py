@@ -58,7 +58,7 @@ def check_scored(criterion: Criterion, longest: int) -> None:
         rows = f"the {longest} usable rows of the longest experiment, or nothing is scored"
         raise KeyedError(text, "washout", f": found {flown.washout}; expected less than {rows}")
     rows = f"the longest experiment has {longest} usable rows"
-    raise KeyedError(text, "horizon", f": found {flown.segment}; {rows}")
+    raise KeyedError(text, "horizon", f": found {flown.steps}; {rows}")
 
 
 def check_solver(solver: Solver, criterion: Criterion, regularizations: Sequence[object]) -> None:

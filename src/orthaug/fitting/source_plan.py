@@ -54,7 +54,7 @@ class SourcePlan(FlightPlan):
         """
         problem, flown, sums = task.problem, criterion.flown, SegmentSums(task.engine)
         assert flown is not None and isinstance(problem, StreamedProblem)
-        if not flown.segment:
+        if not flown.steps:
             raise InputError(
                 "`segment` is 0, whole experiments, which need their rows in memory; give a number of steps, such as "
                 "512, or a Record."
@@ -65,7 +65,7 @@ class SourcePlan(FlightPlan):
         longest = max(found.rows) - dynamics.first_row
         check_scored(criterion, longest)
         made = (task.engine, source, found, dynamics, empty)
-        segments: Any = SourceSegments.cut(*made, flown.segment, washout)
+        segments: Any = SourceSegments.cut(*made, flown.steps, washout)
         whole: Any = segments
         colour: Any = None
         if criterion.simulates:
@@ -96,7 +96,7 @@ class SourcePlan(FlightPlan):
     def looked_at(self, objective: FreeRunObjective, end: Descent) -> Looked:
         """The segments of the witness; where that is all rows, with the states that were trained."""
         flown = self.flown
-        segments = lay_segments(self.record, self.dynamics, flown.segment, flown.washout)
+        segments = lay_segments(self.record, self.dynamics, flown.steps, flown.washout)
         initial = InitialStates(np.asarray(segments.start), objective.initial.free)
         p, start = end.flown.p, Start(initial.measured)
         seen = replace(objective, segments=segments, initial=initial, sums=None, colour=None)

@@ -13,7 +13,7 @@ import numpy as np
 from orthaug._base.checks import finite_or_none
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.jax import jax
-from orthaug._base.lines import counted, percent
+from orthaug._base.lines import counted
 from orthaug._base.parallel import Threads, one_blas_thread
 from orthaug._base.progress import LOG, Tell
 from orthaug.data.record import Record
@@ -119,7 +119,7 @@ def train(
     if held_out is not None:
         held_out = replace(held_out, chosen=best)
         flies = task.criterion.flown is not None and task.start_loss is not None
-        if choice.fallback and flies and held_out.ratio.code != "helps":
+        if choice.fallback and flies and not held_out.ratio.value < 1:
             told, best = [_fell_back(held_out)], -1
             LOG.info("no free run is better than physics alone where it was not fitted: physics alone is handed over")
     if best >= 0:
@@ -148,7 +148,11 @@ def train(
         *_stopped(stopped, len(runs), untried),
         *told,
     )
-    return replace(estimate, restarts=restarts, status=status, held_out=held_out, warnings=warnings)
+    kept = best >= 0 and task.bound is not None and not hasattr(task.problem, "source")  # no further pass over files
+    physics = _alone(conclude, task, structure) if kept else None
+    return replace(
+        estimate, restarts=restarts, status=status, held_out=held_out, physics_alone=physics, warnings=warnings
+    )
 
 
 def _restart(start: PlannedRun, run: Any, loss: float, error: float, score: float, *, chosen: bool) -> Restart:
@@ -289,23 +293,11 @@ def _errors(fit: Any, record: Record, unit: Any) -> Pieces:
 
 def _fell_back(held_out: HeldOut) -> Warning:
     model, alone = (math.sqrt(mean_square(p)) for p in (held_out.runs[held_out.chosen], held_out.alone))
-    ratio = held_out.ratio
     errors = f"its error is {model:.4g} deviations of the output, that of physics alone {alone:.4g}"
     if math.isinf(model):
         errors = "every one of its starts runs away there"
-    elif model < alone:
-        errors += f"; {ratio}"
-    where = held_out.where
-    if model < alone and ratio.high > 1:
-        text = (
-            f"it is undecided in {where} whether the learner is better than physics alone ({errors}), so the result is "
-            "physics alone, the simpler of the two; `fallback = false` keeps the learner, whose error there is "
-            f"{percent(1 - model / alone)} lower by the best guess. Test parts have no say in this choice."
-        )
-        return Warning("physics_alone", text)
-    surely = "surely " if model < alone else ""
     text = (
-        f"in {where} the learner is not {surely}better than physics alone ({errors}), so the result is "
+        f"in {held_out.where} the learner is not better than physics alone ({errors}), so the result is "
         "physics alone; `fallback = false` keeps the learner."
     )
     return Warning("physics_alone", text)

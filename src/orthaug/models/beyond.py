@@ -69,8 +69,10 @@ def pull_of(features: Callable[[Matrix], Matrix], points: Matrix) -> Matrix:
     slope, *_ = np.linalg.lstsq(known, np.where(finite, z, 0.0), rcond=None)
     missed = np.abs(z - known @ slope).max(axis=0)
     affine = finite & (missed <= _AFFINE * np.abs(np.where(finite, z, 0.0)).max(axis=0, initial=0.0))
+    moves = np.linalg.pinv(slope[:n, affine].T, rcond=1e-9)
+    moves[np.abs(moves) < 1e-9 * np.abs(moves).max(axis=0, initial=0.0)] = 0.0  # rounding
     pull = np.zeros((n, z.shape[1]))
-    pull[:, affine] = half[:, None] * np.linalg.pinv(slope[:n, affine].T, rcond=1e-9)
+    pull[:, affine] = half[:, None] * moves
     return pull
 
 

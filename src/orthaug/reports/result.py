@@ -239,6 +239,28 @@ class EquationResult(Content):
     latex: str
 
 
+class FocusCandidateResult(Content):
+    """A model whose free run was compared where nothing was fitted; `error` in standard deviations of the output."""
+
+    focus: str
+    learner: Flag
+    error: Number
+
+
+class FocusResult(Content):
+    """Whether the fit was trained one step ahead or on the free run, where that was left to the data, and why."""
+
+    chosen: str
+    text: str
+    candidates: list[FocusCandidateResult]
+
+
+class PhysicsAloneResult(Content):
+    """The physics without a learner that stands beside the model."""
+
+    scores: dict[str, PartScores]
+
+
 class FitResult(Headed):
     """What `orthaug fit` leaves."""
 
@@ -261,6 +283,8 @@ class FitResult(Headed):
     shared: SharedResult | None
     excitation: ExcitationResult
     scores: dict[str, PartScores]
+    focus: FocusResult | None = None
+    physics_alone: PhysicsAloneResult | None = None
     bias: list[SuspectResult] | None
     residuals: DiagnosisResult | None
     missing_lags: MissingLagsResult | None

@@ -36,7 +36,9 @@ def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
     """Parameters, scores on every part, what the residual says, whether the learner earns its place, warnings."""
     if not fit.status.ok:
         return ""
-    blocks = [list(fit.lines())]
+    blocks = [[w.text.capitalize() for w in result.warnings if w.code == "one_step_only"], list(fit.lines())]
+    if result.focus is not None and result.focus.candidates:
+        blocks.append([f"{result.focus.text[0].upper()}{result.focus.text[1:]}"])
     if result.physical_parameters:
         blocks.append(_physical_lines(result))
     blocks.append(_score_lines(fit, result))

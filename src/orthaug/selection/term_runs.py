@@ -136,7 +136,7 @@ class TermRuns:
         flown = criterion.flown
         assert flown is not None
         shape = None if like is None else like.laid
-        return replace(runs, laid=lay_segments(problem.record, menu, flown.segment, flown.washout, shape))
+        return replace(runs, laid=lay_segments(problem.record, menu, flown.steps, flown.washout, shape))
 
     @property
     def flown(self) -> Simulation:
