@@ -105,7 +105,7 @@ class MotionCourse(Course):
         finer = replace(self, dynamics=dynamics)
         if dynamics.motion.hold != "spline":  # otherwise steps read the input at the points of the substeps
             return finer
-        laid = Layout.of(self.record, dynamics, self.criterion, shares=self.shares)
+        laid = Layout.of(self.record, dynamics, self.criterion, self, self.shares)
         segments = laid.segments if self.flown == self.criterion.flown else finer.over(self.flown.steps).segments
         start = np.asarray(self.segments.start)
         return replace(finer, segments=segments._replace(start=start), whole=laid.whole, colour=laid.colour)
