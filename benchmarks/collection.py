@@ -192,18 +192,16 @@ inputs = ["x1", "x2"]
     "ball_and_beam": """
 [motion.states]
 x = { derivative = "v", start = "position" }
-v = { derivative = "g*(a - a0) - c*v", start = "derivative of position", learned = true }
-a = { derivative = "(drive - a)/lag", start = 0.8 }
+v = { derivative = "g*(drive - centre) - c*v", start = "derivative of position", learned = true }
 [motion.outputs]
 position = "x"
 [motion.parameters]
 g = { initial = 20.0, min = 0 }
-a0 = { initial = 0.8 }
+centre = { initial = 0.8 }
 c = { initial = 0.5, min = 0 }
-lag = { initial = 0.05, min = 0 }
 [learner]
 hidden = [8]
-inputs = ["x", "v", "a"]
+inputs = ["x", "v", "drive"]
 """,
     "servo": """
 [motion.states]
