@@ -133,7 +133,7 @@ def bouc_wen() -> Problem:
 def f1tenth() -> Problem:
     """Six runs train and six test, each cut to its first 650 rows."""
     folder, columns = data_folder() / "f1tenth", [1, 2, 3, 4, 5]
-    train = ("eight_0.55", "circle_0.6", "eight_0.75", "circle_0.8", "eight_0.95", "circle_1.0")
+    train = ("circle_0.6", "eight_0.55", "eight_0.75", "circle_0.8", "eight_0.95", "circle_1.0")
     test = ("eight_0.6", "circle_0.65", "eight_0.8", "circle_0.85", "eight_1.0", "circle_0.55")
     runs = [_csv(str(folder / "train" / f"{name}.csv"), columns, slice(650)) for name in train]
     tests = {n.replace(".", "_"): _csv(str(folder / "test" / f"{n}.csv"), columns, slice(650)) for n in test}
