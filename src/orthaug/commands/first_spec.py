@@ -90,12 +90,6 @@ def spec_text(
     document.add("learner", learner)
     training = tomlkit.table()
     training.add("restarts", 3)
-    if model.coupled:
-        training.add("focus", "simulation")
-        training["focus"].comment("one output's past tells of another: fits of one step may diverge in free run")
-    else:
-        told = 'focus = "simulation"  # trains on the free run: slower, better where noise is on the sensor'
-        training.add(tomlkit.comment(told))
     document.add("training", training)
     return tomlkit.dumps(document)
 

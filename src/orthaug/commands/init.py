@@ -208,8 +208,6 @@ def _account(found: Survey, roles: Roles, rows: int, missing: int, cut: int, mod
     for name, late, seen in zip(channel_names(roles.inputs), model.orders.nk, model.delays, strict=True):
         if seen is not None and seen != late:
             lines.append(f"the spec takes {name} from lag {late} on, which runs clearly better on rows held out")
-    if model.coupled:
-        lines.append('the past of one output tells of another: the spec trains on the free run (focus = "simulation")')
     size, errors = model.orders, ", ".join(percent(error, 3) for error in model.free_run)
     told = "one step ahead" if not roles.inputs else "in free run"
     lines.append(f"first physics: linear, {size}{', with a constant' if model.offset else ''}; {told} its error")
