@@ -255,8 +255,8 @@ def test_refused(tmp_path, options, message):
 def test_refused_files(tmp_path):
     with pytest.raises(InputError, match="absent.csv: no such file"):
         read(tmp_path / "absent.csv")
-    with pytest.raises(InputError, match="unknown file type '.txt'"):
-        read(put(tmp_path, name="run.txt"))
+    with pytest.raises(InputError, match="unknown file type '.log'"):
+        read(put(tmp_path, name="run.log"))
 
 
 def minutes(*instants: str) -> str:
