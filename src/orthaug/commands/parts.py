@@ -20,7 +20,7 @@ from orthaug.data.readers import DRIFT, read_record
 from orthaug.data.record import Record, same_step
 from orthaug.data.sources import Source, witness
 from orthaug.data.survey import told_clock
-from orthaug.data.tables import KNOWN
+from orthaug.data.tables import KNOWN, PLAIN_TEXT
 from orthaug.reports.result import FileResult
 
 
@@ -131,6 +131,8 @@ def expanded(path: Path, entries: Sequence[str], name: str) -> list[str]:
         if (path.parent / entry).is_dir():
             files = [f"{entry.rstrip('/')}/{file.name}" for file in (path.parent / entry).iterdir()]
             files = [file for file in files if Path(file).suffix.lower() in KNOWN]
+            plain = [file for file in files if Path(file).suffix.lower() not in PLAIN_TEXT]
+            files = plain or files  # beside tables, a .txt is a note
         elif any(mark in entry for mark in "*?[") and not (path.parent / entry).is_file():
             files = glob.glob(entry, root_dir=path.parent, recursive=True)
         else:

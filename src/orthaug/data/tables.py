@@ -21,6 +21,8 @@ from orthaug.data.layouts import Layout, as_number, layout, numbers_only, read_s
 from orthaug.data.variables import ENDINGS, foreign, read_variables, short, variable_names
 
 _SMALL = 4_000_000  # bytes of a text file that NumPy reads sooner than pandas is imported
+PLAIN_TEXT = (".txt", ".dat")
+"""Endings of text that need not be a table."""
 _NAMED = 30  # columns that a message lists
 
 
@@ -334,8 +336,7 @@ def _as_floats(array: np.ndarray, name: str, path: Path) -> Vector:
 _READERS: dict[str, Callable[..., Table]] = {
     ".csv": _read_text,
     ".tsv": _read_text,
-    ".txt": _read_text,
-    ".dat": _read_text,
+    **dict.fromkeys(PLAIN_TEXT, _read_text),
     ".parquet": _read_parquet,
     ".xlsx": _read_excel,
     **dict.fromkeys(ENDINGS, _read_variables),
