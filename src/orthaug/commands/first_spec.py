@@ -11,7 +11,8 @@ import tomlkit
 
 from orthaug._base.lines import counted
 from orthaug.commands.folder import relative
-from orthaug.data.survey import Column, Survey
+from orthaug.data.columns import Column
+from orthaug.data.survey import Survey
 from orthaug.selection.first_orders import FirstModel
 
 FILLED = 3

@@ -14,12 +14,12 @@ from orthaug._base.lines import counted
 from orthaug._base.memory import few_arenas
 from orthaug.commands.data_sections import PartSection
 from orthaug.commands.spec import Spec
+from orthaug.data.clock import told_clock
 from orthaug.data.parquet_source import open_parquet
 from orthaug.data.preparation import warnings_of
 from orthaug.data.readers import DRIFT, read_record
 from orthaug.data.record import Record, same_step
 from orthaug.data.sources import Source, witness
-from orthaug.data.survey import told_clock
 from orthaug.data.tables import KNOWN, PLAIN_TEXT
 from orthaug.reports.result import FileResult
 

@@ -136,8 +136,7 @@ def _from_mat(path: Path, names: Wanted) -> dict[str, Vector]:
     roots = {_ROOT.split(name.lstrip("/"))[0] for name in asked}
     held: dict[str, Held] = {}
     for name, variable in variables.items():
-        inside = not asked or name in roots or variable.what in ("a cell", "a struct")  # it may name signals
-        held |= _held(path, variable, deep=inside)
+        held |= _held(path, variable, deep=not roots or name in roots or not roots <= variables.keys())
     return _taken(path, names, _with_names(held))
 
 
@@ -233,9 +232,10 @@ def _with_names(held: Mapping[str, Held]) -> dict[str, Held]:
     for path, variable in held.items():
         parent, _, field = path.rpartition(".")
         label = held.get(f"{parent}.{_LABELS.get(field)}")
-        if variable.read and label and label.text and max(variable.shape, default=0) > 1:
-            if math.prod(label.shape) <= _LONGEST_NAME and label.text().strip():
-                named[path] = label.text().strip()
+        if not (variable.read and label and label.text and max(variable.shape, default=0) > 1):
+            continue
+        if math.prod(label.shape) <= _LONGEST_NAME and label.text().strip():
+            named[path] = label.text().strip()
     often, found = Counter(named.values()), {}
     for path, variable in held.items():
         name = named.get(path, "")
