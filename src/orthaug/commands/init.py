@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, MissingSampleError
 from orthaug._base.folders import whole_file
 from orthaug._base.lines import counted, percent
 from orthaug.commands.first_spec import FILLED, Roles, channel_names, lacking, spec_text, steps_of, time_of
@@ -65,6 +65,9 @@ def assign(
             raise InputError(f"{found.path}: column '{column.header}' is named twice among inputs and outputs.")
     if chosen[0] is None or chosen[1] is None:
         return None
+    if not found.same_lengths(both):
+        listing = ", ".join(f"'{c.header}' {c.filled}" for c in both)
+        raise InputError(f"{found.path}: the columns have unequal lengths: {listing} rows. Name those of one run.")
     return Roles(tuple(chosen[0]), tuple(chosen[1]), sampling_time)
 
 
@@ -168,7 +171,7 @@ def draft(found: Survey, roles: Roles, out: Path) -> Draft:
     rows, missing = _extent(roles)
     cut = round(TRAINED * rows)
     cut = cut if rows - cut >= _TESTED else rows
-    record = _record(found, roles, cut, missing)
+    record, lost = _record(found, roles, cut, missing)
     model = first_model(record)
     if model is None:
         raise InputError(
@@ -176,8 +179,10 @@ def draft(found: Survey, roles: Roles, out: Path) -> Draft:
             "are combinations of each other. Give more rows, or fewer inputs."
         )
     named = (channel_names(roles.inputs), channel_names(roles.outputs))
-    text = spec_text(found, roles, out, rows, cut, missing, named, model)
-    return Draft(text, _account(found, roles, rows, missing, cut, model))
+    wild = f"{counted(lost, 'training row')} in longer runs of wild samples {'is' if lost == 1 else 'are'} left out"
+    gaps = lacking(missing) if missing else wild if lost else ""
+    text = spec_text(found, roles, out, rows, cut, gaps, named, model)
+    return Draft(text, _account(found, roles, rows, missing, cut, model, wild if lost and not missing else ""))
 
 
 def write_spec(found: Draft, out: Path, *, force: bool = False) -> None:
@@ -206,17 +211,21 @@ def _extent(roles: Roles) -> tuple[int, int]:
     return rows, int((~there).sum())
 
 
-def _record(found: Survey, roles: Roles, cut: int, missing: int) -> Record:
-    """The training rows."""
+def _record(found: Survey, roles: Roles, cut: int, missing: int) -> tuple[Record, int]:
+    """The training rows, and how many are left out because a sample is missing."""
     inputs, outputs = ([Channel(c.name, c.unit, c.header) for c in group] for group in (roles.inputs, roles.outputs))
     options: dict[str, Any] = {"rows": (0, cut), "missing": "skip" if missing or not found.clock.even else "error"}
     options["prepare"] = [STEPS.declare(kind, keys) for kind, keys in steps_of(found, roles)]
     if not found.clock.even:
         options["time"] = time_of(found, roles)
-    return read_record(found.path, inputs=inputs, outputs=outputs, **options)
+    try:
+        record = read_record(found.path, inputs=inputs, outputs=outputs, **options)
+    except MissingSampleError:  # more samples in a row were wild than a gap is filled over
+        record = read_record(found.path, inputs=inputs, outputs=outputs, **{**options, "missing": "skip"})
+    return record, record.missing
 
 
-def _account(found: Survey, roles: Roles, rows: int, missing: int, cut: int, model: FirstModel) -> str:
+def _account(found: Survey, roles: Roles, rows: int, missing: int, cut: int, model: FirstModel, wild: str) -> str:
     """What was seen, a line each."""
     step = f"{roles.sampling_time:g} s, as given" if roles.sampling_time else str(found.clock)
     if roles.sampling_time is None and found.clock.step is None:
@@ -237,6 +246,7 @@ def _account(found: Survey, roles: Roles, rows: int, missing: int, cut: int, mod
         lines.append(f"{lacking(missing)} and will be left out, with all windows that touch them")
         if filled:
             lines[-1] = f"{lacking(missing)}: gaps of up to {FILLED} rows are filled, longer ones left out"
+    lines += [wild] if wild else []
     for name, late, seen in zip(channel_names(roles.inputs), model.orders.nk, model.delays, strict=True):
         if seen is not None and seen != late:
             lines.append(f"the spec takes {name} from lag {late} on, which runs clearly better on rows held out")

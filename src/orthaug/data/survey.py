@@ -16,6 +16,7 @@ from orthaug.data.columns import Column, channel_name
 from orthaug.data.headers import split_header
 from orthaug.data.layouts import numbers_only
 from orthaug.data.tables import column_names, read_table, reading_note
+from orthaug.data.variables import ENDINGS
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +44,10 @@ class Survey:
         """Return why a column is no channel."""
         refused = self.looks_like_time(column)
         return column.unusable or ("constant" if column.constant else refused.reason if refused else "not named")
+
+    def same_lengths(self, columns: Sequence[Column]) -> bool:
+        """Return whether columns belong to one run: those of a table do, arrays where they have as many rows."""
+        return self.path.suffix.lower() not in ENDINGS or len({len(column.values) for column in columns}) < 2
 
     def beside(self, channels: Sequence[Column]) -> Survey:
         """Return the survey with the clock of these channels, where the file has columns of several lengths."""
@@ -79,8 +84,10 @@ class Survey:
             return None  # a name says one thing and the values another
         if self.clock.column is not None and self.clock.column.kind and not self.clock.by_name:
             return None
-        if "output" not in kinds or "" in kinds:
+        if "output" not in kinds or "" in kinds or not self.same_lengths(self.signals):
             return None
+        if "input" not in kinds and any(not one.signal for one in self.clock.refused):
+            return None  # what is left out may be the input
         by = {kind: [c for c in self.signals if c.kind == kind] for kind in ("input", "output")}
         return by["input"], by["output"]
 
