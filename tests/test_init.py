@@ -318,6 +318,42 @@ def test_a_column_that_tells_another_step_is_a_warning(tmp_path, header, every, 
     assert len(warnings) == bool(told) and all(told in w.text for w in warnings)
 
 
+THINNED = [
+    ("time", 0.05, 5, 'Give sampling_time = 0.01, that of the file\'s rows, or time = "time" instead.'),
+    (
+        "aika",
+        0.05,
+        5,
+        "column 'aika' of a.csv tells 0.01 s from row to row, so rows of which one in 5 is kept are 0.05 s",
+    ),
+    ("Ts", 0.05, 5, "Give sampling_time = 0.01, that of the file's rows.\n"),
+    ("time", 0.01, 5, ""),
+    ("time", 0.05, 1, ""),
+    ("time", 0.03, 5, ""),
+    ("row", 0.05, 5, ""),
+]
+
+
+@pytest.mark.parametrize(("header", "given", "every", "told"), THINNED)
+def test_a_sampling_time_that_is_thinned_already_is_refused(tmp_path, header, given, every, told):
+    u, y = plant(300)
+    clock = {"Ts": np.full(300, 0.01), "row": np.arange(300)}.get(header, 0.01 * np.arange(300))
+    pd.DataFrame({"u": u, "y": y, "note": "warm", header: clock}).to_csv(tmp_path / "a.csv", index=False)
+    spec = f'[data]\nsampling_time = {given}\ninputs = ["u"]\noutputs = ["y"]\n'
+    spec += f'train = {{files = ["a.csv"], every = {every}}}\n'
+    spec += '[[baseline.terms]]\nparameter = "a"\nregressor = "y[k-1]"\n'
+    (tmp_path / "spec.toml").write_text(spec)
+    done = run("check", tmp_path / "spec.toml")
+    assert done.code == (2 if told else 0) and told in done.err, done.err
+    multiplied = (
+        f"data.train: every = {every} multiplies the sampling time {given:g} s to {every * given:g} s, but column"
+    )
+    assert (multiplied in done.err) == bool(told)
+    if not told and every > 1:
+        apart = f"without a filter, so that rows are {every * given:g} s apart instead of {given:g} s"
+        assert any(apart in warning.text for warning in kinds.open_job(tmp_path / "spec.toml").warnings)
+
+
 SINGLE = [
     ({"data": {"Ts": 2.0}}, 2.0),
     ({"Ts": 0.5}, 0.5),

@@ -13,11 +13,12 @@ from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
 from orthaug.data.columns import Column
 from orthaug.data.headers import in_seconds, is_time, split_header, step_of, unit_of_time
-from orthaug.data.readers import DRIFT, JITTER
 from orthaug.data.record import same_step
 from orthaug.data.tables import column_names, read_table
 from orthaug.data.variables import ENDINGS, scalars
 
+JITTER = 0.45  # largest deviation of a step from the usual one, relative: one lost sample is a deviation of 1 or ½
+DRIFT = 0.02  # largest change of the mean step over the record, relative; it must also displace half a sample
 DATES = "dates"
 """What a column of them is, no signal."""
 _JITTERS = 0.02  # largest deviation of a step that is not told, relative
@@ -183,15 +184,43 @@ def told_clock(path: Path, apart: Collection[str] = (), *, by_content: bool = Fa
         apart: columns that are channels, whatever they are called.
         by_content: look at columns of any name.
     """
-    columns = []
-    for header in column_names(path):
-        if header not in apart and (by_content or is_time(header) or step_of(header, 1.0)):
-            with suppress(InputError):
-                table = read_table(path, [header], header if is_time(header) else None, most=_HEAD)
-                dates = DATES if is_time(header) else ""  # these are in s, as dates are
-                columns.append(Column(header, header, "", table.columns[header], dates))
+    wanted = [name for name in column_names(path) if name not in apart]
+    wanted = [name for name in wanted if by_content or is_time(name) or step_of(name, 1.0)]
+    columns, values = [], {}
+    if by_content and wanted:
+        with suppress(InputError):  # one of them holds no numbers: each by itself
+            values = read_table(path, list(dict.fromkeys(wanted)), most=_HEAD).columns
+    for header in wanted:
+        with suppress(InputError):
+            named = header if is_time(header) else None  # it comes in s, as dates do
+            if named or header not in values:
+                values = {**values, header: read_table(path, [header], named, most=_HEAD).columns[header]}
+            columns.append(Column(header, header, "", values[header], DATES if named else ""))
     clock = find_clock(columns) if columns else Clock()
     return clock if clock.column else by_single_number(path)
+
+
+def thinned_twice(path: Path, sampling_time: float | None, every: int, apart: Collection[str]) -> str:
+    """Return what is wrong where a sampling time is that of the rows that are kept and not that of the file's rows.
+
+    Args:
+        sampling_time: as given, in s, to be multiplied by `every`.
+        apart: columns that are channels.
+    """
+    if every == 1 or sampling_time is None:
+        return ""
+    clock = told_clock(path, apart, by_content=True)
+    if clock.column is None or clock.step is None or same_step(clock.step, sampling_time):
+        return ""
+    if abs(clock.step * every - sampling_time) > DRIFT * sampling_time:
+        return ""
+    header, step = clock.column.header, clock.step
+    other = f', or time = "{header}" instead' if clock.instants else ""
+    return (
+        f"every = {every} multiplies the sampling time {sampling_time:g} s to {every * sampling_time:g} s, but column "
+        f"'{header}' of {path.name} tells {step:g} s from row to row, so rows of which one in {every} is kept are "
+        f"{every * step:g} s apart. Give sampling_time = {step:g}, that of the file's rows{other}."
+    )
 
 
 def by_single_number(path: Path) -> Clock:
