@@ -74,14 +74,13 @@ def read_record(
     path = _path(path)
     channels = [as_channels(inputs, "inputs"), as_channels(outputs, "outputs")]
     column_of = _columns(channels, columns)
-    _check_time(time, sampling_time, {name: column_of[name] for name in (c.name for c in channels[1])})
+    _check_time(time, sampling_time, {c.name: column_of[c.name] for c in channels[1]})
     check_choice(missing, ("error", "skip", "keep"), "`missing`")
     check_count(every, "every")
     wanted: list[str] = list(dict.fromkeys([*column_of.values(), *(name for name in (time, experiment) if name)]))
     if not column_of:
         raise InputError("no channels are asked for; name inputs, outputs or both.")
-    fault = thinned_twice(path, sampling_time, every, wanted)
-    if fault:
+    if fault := thinned_twice(path, sampling_time, every, wanted):
         raise InputError(f"{path}: {fault}")
     table = _trim(read_table(path, wanted, time or None), uneven=missing != "error")
     needed = wanted
@@ -112,11 +111,9 @@ def read_record(
     if time and not steps:
         raise InputError(f"{path}: no two rows without missing cells follow each other; the sampling time is unknown.")
     step = steps[0] if time else (1.0 if sampling_time is None else float(sampling_time))
-    for other in steps:
-        if not same_step(other, step):
-            raise InputError(
-                f"{path}: column '{time}' steps by {step:g} s in one row range and by {other:g} s in another."
-            )
+    if others := [other for other in steps if not same_step(other, step)]:
+        told = f"steps by {step:g} s in one row range and by {others[0]:g} s in another"
+        raise InputError(f"{path}: column '{time}' {told}.")
     left_out = recorded - sum(len(experiment) for experiment in experiments)
     step *= min(every, 10**15)  # what is longer is refused
     return Record(tuple(channels[0]), tuple(channels[1]), step, tuple(experiments), time, left_out)
