@@ -425,6 +425,7 @@ TIMES = {
     "a unit of time": ("Messung [ms]", 1e3 * EVEN, 0.02),
     "jitter of a clock": ("aika", EVEN + 0.004 * np.sin(np.arange(300)), 0.02),
     "rounded instants": ("aika", np.round(0.025 * np.arange(300), 2), 0.025),
+    "a cell that is missing": ("aika", np.where(np.arange(300) == 7, np.nan, EVEN), 0.02),
     "the last column": (None, EVEN, 0.02),
 }
 

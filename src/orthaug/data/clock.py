@@ -110,7 +110,7 @@ def find_clock(columns: Sequence[Column], near: str = "") -> Clock:
         elif fault is None and clock.column is None:
             clock = _ticking(column, column.values if dates else in_seconds(column.values, column.header))
         elif fault is None and not dates:
-            refused.append(Refused(column, f"rises as a time does, beside '{clock.column.header}'", False))
+            refused.append(Refused(column, "rises as a time does, and another column is the time", False))
     for column in columns:
         if column.unusable or column is clock.column or is_time(column.header):
             continue
@@ -131,7 +131,8 @@ def _parent(path: str) -> str:
 
 
 def _mean_step(column: Column) -> float:
-    return float(np.diff(column.finite).mean())
+    rows = np.flatnonzero(np.isfinite(column.values))
+    return float((column.finite[-1] - column.finite[0]) / (rows[-1] - rows[0]))
 
 
 def _fault(column: Column, rows: int) -> Refused | None:
@@ -157,12 +158,13 @@ def _resemblance(column: Column) -> Refused | bool | None:
 
     A column that rises and is not the time for another reason comes with the reason.
     """
-    steps = np.diff(column.values[: column.filled])
+    rows, values = np.flatnonzero(np.isfinite(column.values)), column.finite
+    steps = np.diff(values) / np.diff(rows)
     if len(steps) < _FEWEST - 1 or not (steps > 0).all():
         return False
     header, usual = column.header, float(np.median(steps))
-    line = np.linspace(column.values[0], column.values[column.filled - 1], column.filled)
-    on_line = bool(np.abs(column.values[: column.filled] - line).max() < 0.5 * steps.mean())
+    line = np.interp(rows, rows[[0, -1]], values[[0, -1]])
+    on_line = bool(np.abs(values - line).max() < 0.5 * steps.mean())
     thirds = [float(np.median(part)) for part in np.array_split(steps, 3)]
     alike = (np.abs(steps - usual) <= JITTER * usual).mean() >= _MOSTLY and max(thirds) - min(thirds) <= DRIFT * usual
     if not (on_line or alike):
@@ -172,7 +174,7 @@ def _resemblance(column: Column) -> Refused | bool | None:
     if unit is None:
         reason = f"rises evenly, but its unit {split_header(header)[1]} is none of time, so it is taken for a signal"
         return Refused(column, reason, True)
-    if (steps == 1).all() and column.values[0] in _COUNTING and not split_header(header)[1]:
+    if (steps == 1).all() and values[0] in _COUNTING and not split_header(header)[1]:
         return Refused(column, "counts the rows", False)
     return None
 
