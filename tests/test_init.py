@@ -567,6 +567,24 @@ def test_signals_of_dspace_are_known_by_their_names(tmp_path):
     ]  # fmt: skip
 
 
+MEASURED = [
+    ("f16/f-16.txt", "x1 x2", "x3", 1.0),
+    ("ball_and_beam/run.mat", "In2", "In1 In7", 0.001),
+    ("servo/Training_Set.mat", "Training_set.Clock.PW_adj", "Training_set.Clock.motor_rpm", 1.0),
+    ("mr_damper/damper.mat", "X", "y", 1.0),
+]
+
+
+@pytest.mark.parametrize(("file", "inputs", "outputs", "step"), MEASURED)
+def test_measured_files_are_begun_with(data_folder, tmp_path, file, inputs, outputs, step):
+    if not (data_folder / file).is_file():
+        pytest.skip(f"no {file}; set ORTHAUG_DATA to the folder of the data sets")
+    options = ["--inputs", *inputs.split(), "--outputs", *outputs.split(), "--out", tmp_path / "spec.toml"]
+    done = run("init", data_folder / file, *options)
+    assert done.code == 0, done.err
+    assert kinds.open_job(tmp_path / "spec.toml").train.record.sampling_time == pytest.approx(step, rel=1e-4)
+
+
 def test_runs_of_unequal_length_have_their_own_time(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.StringIO())
     (u, y), (v, z) = plant(300), plant(200)

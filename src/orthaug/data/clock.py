@@ -73,13 +73,14 @@ class Clock:
     def __str__(self) -> str:
         if self.column is None or self.step is None:
             return "no column tells it"
+        header, known = self.column.header, ""
+        if not self.by_name:
+            known = ", which rises as time does"
+            known += "" if split_header(header)[1] else " and whose header names no unit, so s is taken"
         if not self.even:
-            text = f"{self.step:g} s is usual in column '{self.column.header}', but the steps are uneven"
+            text = f"{self.step:g} s is usual in column '{header}'{known}, but the steps are uneven"
         else:
-            text = f"{self.step:g} s, from column '{self.column.header}'"
-        if self.instants and not (is_time(self.column.header) or self.column.unusable):
-            text += ", which rises as time does"
-            text += "" if split_header(self.column.header)[1] else "; its header names no unit, so s is taken"
+            text = f"{self.step:g} s, from column '{header}'{known}"
         steps = np.diff(self.seconds[np.isfinite(self.seconds)]) if self.seconds is not None else np.zeros(0)
         if len(steps) and np.abs(steps - self.step).max() > _JITTERS * self.step:
             text += f"; single steps are {steps.min():.3g} to {steps.max():.3g} s"

@@ -58,7 +58,11 @@ class Layout(NamedTuple):
         """What to know of the encoding and of the names; mostly nothing."""
         notes = ["no UTF-8, so read as Windows-1252"] if self.encoding == _FALLBACK else []
         if not self.headed:
-            notes.append(f"no header, so the columns are called {_first_and_last(self.names)}")
+            named = [name for name in self.names if name]
+            called = (
+                f"columns are called {named[0]} to {named[-1]}" if len(named) > 1 else f"column is called {named[0]}"
+            )
+            notes.append(f"no header, so the {called}")
         return "; ".join(notes)
 
     @property
@@ -73,11 +77,6 @@ class Layout(NamedTuple):
             return False
         with path.open(encoding=self.encoding, newline="") as file:
             return pattern.search("".join(islice(file, self.header_line, None))) is not None
-
-
-def _first_and_last(names: Sequence[str]) -> str:
-    named = [name for name in names if name]
-    return named[0] if len(named) == 1 else f"{named[0]} to {named[-1]}"
 
 
 def layout(path: Path, columns: Sequence[str] = ()) -> Layout:
