@@ -14,8 +14,7 @@ from orthaug._base.checks import Matrix, Vector, as_signal, check_count
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, jnp
 from orthaug._base.views import Shown
-from orthaug.data.prepared import Prepared
-from orthaug.data.record import Channel, Experiment, Record
+from orthaug.data.record import Channel, Experiment, Prepared, Record
 from orthaug.models.dynamics import Dynamics, Numbers, Parts
 from orthaug.models.filters import LaggedFilter
 from orthaug.models.lagged import Lagged

@@ -13,8 +13,7 @@ import numpy as np
 
 from orthaug._base.errors import InputError
 from orthaug._base.registry import frozen
-from orthaug.data.prepared import Prepared
-from orthaug.data.record import Channel
+from orthaug.data.record import Channel, Prepared
 from orthaug.models.dynamics import Numbers
 from orthaug.models.kinds import LEARNERS
 from orthaug.models.learners import Bound, Learner

@@ -11,8 +11,7 @@ from jaxtyping import Bool
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError, shown
 from orthaug.data.preparation import steps_again
-from orthaug.data.prepared import Prepared
-from orthaug.data.record import Channel, Experiment, Record, same_step
+from orthaug.data.record import Channel, Experiment, Prepared, Record, same_step
 from orthaug.models.dynamics import Dynamics, Numbers, Parts
 from orthaug.models.learners import Scaling
 from orthaug.models.response import Trajectory
