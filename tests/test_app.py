@@ -162,6 +162,16 @@ def test_a_file_whose_name_looks_like_a_pattern_is_found(tmp_path):
     assert expanded(tmp_path / "spec.toml", ["run [1].csv"], "train") == ["run [1].csv"]
 
 
+def test_a_text_beside_tables_is_a_note(tmp_path):
+    for name in ("a.csv", "b.csv", "notes.txt", "c.dat", "plot.png"):
+        (tmp_path / name).touch()
+    (tmp_path / "plain").mkdir()
+    for name in ("a.txt", "b.dat"):
+        (tmp_path / "plain" / name).touch()
+    assert expanded(tmp_path / "spec.toml", ["."], "train") == ["./a.csv", "./b.csv"]
+    assert expanded(tmp_path / "spec.toml", ["plain"], "train") == ["plain/a.txt", "plain/b.dat"]
+
+
 def test_a_curve_is_thinned_to_what_is_seen():
     x = np.arange(100_000.0)
     y = np.sin(x / 1e4)

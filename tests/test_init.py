@@ -234,7 +234,7 @@ NOTHING = [
      'such as --inputs "a,c" --outputs "b" (--inputs "" for none)'),
     ("a,b,c\n1,2,4\n2,1,7\n", ("--inputs", "c"), '--inputs "c" --outputs "b"; columns'),
     ("a,b,c\n1,2,4\n2,1,7\n", ("--inputs", "A"), "no column 'A', did you mean 'a'?"),
-    ("-1.5,2\n1,2\n2,3\n", (), "the first line holds numbers; a header with names is expected there"),
+    ("-1.5,2\n1,2\n2,3\n", (), 'from outputs: x1, x2. Say both, separated by commas, such as --inputs "x1"'),
     ("bench 3, May\nu\nnone\n", (), "expected one for each signal, under a header. The names that were found are "
      "'bench 3, May'; a line above the header must begin with #"),
 ]  # fmt: skip
@@ -318,6 +318,42 @@ def test_a_column_that_tells_another_step_is_a_warning(tmp_path, header, every, 
     assert len(warnings) == bool(told) and all(told in w.text for w in warnings)
 
 
+THINNED = [
+    ("time", 0.05, 5, 'Give sampling_time = 0.01, that of the file\'s rows, or time = "time" instead.'),
+    (
+        "aika",
+        0.05,
+        5,
+        "column 'aika' of a.csv tells 0.01 s from row to row, so rows of which one in 5 is kept are 0.05 s",
+    ),
+    ("Ts", 0.05, 5, "Give sampling_time = 0.01, that of the file's rows.\n"),
+    ("time", 0.01, 5, ""),
+    ("time", 0.05, 1, ""),
+    ("time", 0.03, 5, ""),
+    ("row", 0.05, 5, ""),
+]
+
+
+@pytest.mark.parametrize(("header", "given", "every", "told"), THINNED)
+def test_a_sampling_time_that_is_thinned_already_is_refused(tmp_path, header, given, every, told):
+    u, y = plant(300)
+    clock = {"Ts": np.full(300, 0.01), "row": np.arange(300)}.get(header, 0.01 * np.arange(300))
+    pd.DataFrame({"u": u, "y": y, "note": "warm", header: clock}).to_csv(tmp_path / "a.csv", index=False)
+    spec = f'[data]\nsampling_time = {given}\ninputs = ["u"]\noutputs = ["y"]\n'
+    spec += f'train = {{files = ["a.csv"], every = {every}}}\n'
+    spec += '[[baseline.terms]]\nparameter = "a"\nregressor = "y[k-1]"\n'
+    (tmp_path / "spec.toml").write_text(spec)
+    done = run("check", tmp_path / "spec.toml")
+    assert done.code == (2 if told else 0) and told in done.err, done.err
+    multiplied = (
+        f"data.train: every = {every} multiplies the sampling time {given:g} s to {every * given:g} s, but column"
+    )
+    assert (multiplied in done.err) == bool(told)
+    if not told and every > 1:
+        apart = f"without a filter, so that rows are {every * given:g} s apart instead of {given:g} s"
+        assert any(apart in warning.text for warning in kinds.open_job(tmp_path / "spec.toml").warnings)
+
+
 SINGLE = [
     ({"data": {"Ts": 2.0}}, 2.0),
     ({"Ts": 0.5}, 0.5),
@@ -374,3 +410,199 @@ def test_a_long_file_is_looked_at_in_windows_and_says_so(tmp_path, monkeypatch):
     done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
     assert done.code == 0 and "reading a.csv" in done.err and "looking at signals" in done.err
     assert "delays and orders are found on 500 of these rows" in done.out and "nk 3;" in done.out
+
+
+def frame_with(**columns) -> pd.DataFrame:
+    """The plant's signals behind other columns."""
+    u, y = plant(300)
+    return pd.DataFrame({**columns, "u": u, "y": y})
+
+
+EVEN = 0.02 * np.arange(300)
+TIMES = {
+    "another language": ("aika", EVEN, 0.02),
+    "no name of time": ("X.Data", EVEN + 7.0, 0.02),
+    "a unit of time": ("Messung [ms]", 1e3 * EVEN, 0.02),
+    "jitter of a clock": ("aika", EVEN + 0.004 * np.sin(np.arange(300)), 0.02),
+    "rounded instants": ("aika", np.round(0.025 * np.arange(300), 2), 0.025),
+    "a cell that is missing": ("aika", np.where(np.arange(300) == 7, np.nan, EVEN), 0.02),
+    "the last column": (None, EVEN, 0.02),
+}
+
+
+@pytest.mark.parametrize(("header", "instants", "step"), TIMES.values(), ids=TIMES.keys())
+def test_the_time_is_known_by_rising_evenly_and_is_no_channel(tmp_path, header, instants, step):
+    frame = frame_with(**{header or "aika": instants})
+    frame = frame[["u", "y", "aika"]] if header is None else frame
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
+    assert done.code == 0, done.err
+    data = tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
+    assert (data["inputs"], data["outputs"]) == (["u"], ["y"])
+    assert f"from column '{header or 'aika'}', which rises as time does" in done.out
+    assert kinds.open_job(tmp_path / "spec.toml").train.record.sampling_time == pytest.approx(step, rel=1e-3)
+    done = run("init", tmp_path / "a.csv", "--inputs", "u", "--outputs", "y", header or "aika", "--out", tmp_path / "b")
+    assert done.code == 2 and "in each row, as time does; it is no output" in done.err
+
+
+NO_TIMES = {
+    "a quantity that rises": (
+        "energy",
+        np.arange(300.0) ** 1.5,
+        "rises, but in steps of 1 to 25.9, so it is taken for a signal",
+    ),
+    "another unit": ("pos [mm]", EVEN, "rises evenly, but its unit mm is none of time, so it is taken for a signal"),
+    "a time that begins anew": ("time", EVEN % 4.0, "falls from 3.98 to 0 in row 200, so it is not the time"),
+    "instants that repeat": ("time", np.floor(EVEN * 10), "stands still at 0 in row 1, so it is not the time"),
+    "a temperature": ("t", np.cos(EVEN), "falls in many rows, so it is taken for a signal"),
+    "a counter": ("row", np.arange(300), "counts the rows"),
+}
+
+
+@pytest.mark.parametrize(("header", "values", "reason"), NO_TIMES.values(), ids=NO_TIMES.keys())
+def test_why_a_column_is_not_the_time_is_said(tmp_path, header, values, reason):
+    frame_with(**{header: values}).to_csv(tmp_path / "a.csv", index=False)
+    done = run("init", tmp_path / "a.csv", "--inputs", "u", "--outputs", "y", "--out", tmp_path / "spec.toml")
+    assert done.code == 0 and "sampling time: no column tells it" in done.out, done.err
+    assert any(header in line and reason in line for line in done.out.splitlines()), done.out
+    signals = [column.header for column in survey(tmp_path / "a.csv").signals]
+    assert signals == (["u", "y"] if "signal" not in reason else [header, "u", "y"])
+
+
+def test_a_second_time_is_no_signal_either(tmp_path):
+    frame_with(n=np.arange(300), time=EVEN, aika=EVEN + 3.0).to_csv(tmp_path / "a.csv", index=False)
+    done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
+    assert "0.02 s, from column 'time'" in done.out and "left out: n (counts the rows)" in done.out, done.err
+    assert "left out: aika (rises by 0.02 in each row, as a time does)" in done.out
+
+
+def test_a_ramp_may_be_an_input_where_the_time_is_known(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    frame = frame_with()
+    frame["u"] = 0.5 * np.arange(300) + 1.0
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    out = tmp_path / "spec.toml"
+    done = run("init", tmp_path / "a.csv", "--out", out)  # its name says input, its values time
+    assert done.code == 2 and "the names of the columns do not tell inputs from outputs: y" in done.err
+    done = run("init", tmp_path / "a.csv", "--inputs", "u", "--outputs", "y", "--out", out)
+    assert done.code == 2 and "column 'u' rises by 0.5 s in each row, as time does; if it is an input, give" in done.err
+    done = run("init", tmp_path / "a.csv", "--inputs", "u", "--outputs", "y", "--sampling-time", "0.1", "--out", out)
+    assert done.code == 0 and "sampling time: 0.1 s, as given" in done.out, done.err
+    assert tomllib.loads(out.read_text())["data"]["sampling_time"] == 0.1
+
+
+LISTS = [
+    "a.csv --inputs u v --outputs y",
+    "a.csv --inputs u,v --outputs y",
+    "a.csv --inputs u --inputs v --outputs y",
+    "a.csv --inputs=u v --outputs y",
+    "--inputs u v a.csv --outputs y",
+    "--outputs y --inputs u v a.csv",
+    "--outputs y a.csv --inputs u, v",
+]
+
+
+@pytest.mark.parametrize("line", LISTS)
+def test_columns_are_listed_by_spaces_commas_or_repetition(tmp_path, monkeypatch, line):
+    frame_with(v=np.random.default_rng(1).normal(size=300)).to_csv(tmp_path / "a.csv", index=False)
+    monkeypatch.chdir(tmp_path)
+    done = run("init", *line.split(), "--sampling-time", "0.1")
+    assert done.code == 0, done.err
+    assert tomllib.loads((tmp_path / "spec.toml").read_text())["data"]["inputs"] == ["u", "v"]
+
+
+def test_a_column_may_have_a_comma_in_its_name(tmp_path):
+    frame_with().rename(columns={"u": "Kraft, N"}).to_csv(tmp_path / "a.csv", index=False)
+    done = run("init", tmp_path / "a.csv", "--inputs", "Kraft, N", "--outputs", "y", "--out", tmp_path / "spec.toml")
+    assert done.code == 0, done.err
+    assert tomllib.loads((tmp_path / "spec.toml").read_text())["data"]["channels"] == {
+        "Kraft_N": {"column": "Kraft, N"}
+    }
+
+
+@pytest.mark.parametrize(("ending", "separator", "comma"), [("txt", " ", "."), ("dat", ";", ","), ("csv", "\t", ",")])
+def test_a_file_without_a_header_is_begun_with_and_runs(tmp_path, ending, separator, comma):
+    frame_with(t=EVEN).to_csv(tmp_path / f"a.{ending}", index=False, header=False, sep=separator, decimal=comma)
+    out = tmp_path / "spec.toml"
+    done = run("init", tmp_path / f"a.{ending}", "--inputs", "x2", "--outputs", "x3", "--out", out)
+    assert done.code == 0 and "no header, so the columns are called x1 to x3" in done.out, done.err
+    data = tomllib.loads(out.read_text())["data"]
+    assert data["time"] == "x1" and "nk 3;" in done.out
+    out.write_text(out.read_text().replace("restarts = 3", "restarts = 1").replace('kind = "mlp"', 'kind = "none"')
+                   .replace("hidden = [8]", ""))  # fmt: skip
+    assert run("fit", out, "--out", tmp_path / "result").code == 0
+    done = run("simulate", tmp_path / "result", tmp_path / f"a.{ending}", "--column", "x2=x2")
+    assert done.code == 0 and len(done.out.splitlines()) > 250, done.err
+
+
+def put_dspace(path, *, names=("Force", "Position"), rows=300):
+    """A measurement as ControlDesk exports it in v7.3: X holds the time, Y an array of structs by references."""
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(path, "w") as file:
+        refs, run_ = file.create_group("#refs#"), file.create_group("run")
+        for group in (run_, run_.create_group("X"), run_.create_group("Y")):
+            group.attrs["MATLAB_class"] = np.bytes_("struct")
+        run_["X"].create_dataset("Data", data=EVEN[:rows, None])
+        for field, values in (("Name", names), ("Data", plant(rows))):
+            held = []
+            for i, value in enumerate(values):
+                text = isinstance(value, str)
+                data = np.array([[ord(c)] for c in value], "u2") if text else np.asarray(value)[:, None]
+                made = refs.create_dataset(f"{field}{i}", data=data)
+                made.attrs["MATLAB_class"] = np.bytes_("char" if text else "double")
+                held.append([made.ref])
+            run_["Y"].create_dataset(field, data=np.array(held, dtype=h5py.ref_dtype), dtype=h5py.ref_dtype)
+    return path
+
+
+def test_signals_of_dspace_are_known_by_their_names(tmp_path):
+    path, out = put_dspace(tmp_path / "run.mat"), tmp_path / "spec.toml"
+    assert column_names(path) == ["run.X.Data", "Force", "Position"]
+    done = run("init", path, "--inputs", "Force", "--outputs", "Position", "--out", out)
+    assert done.code == 0 and "0.02 s, from column 'run.X.Data', which rises as time does" in done.out, done.err
+    assert tomllib.loads(out.read_text())["data"]["time"] == "run.X.Data" and "nk 3;" in done.out
+    assert run("check", out).code == 0
+    assert column_names(put_dspace(tmp_path / "b.mat", names=("In", "In"))) == [
+        "run.X.Data", "run.Y[0].Data", "run.Y[1].Data"
+    ]  # fmt: skip
+
+
+MEASURED = [
+    ("f16/f-16.txt", "x1 x2", "x3", 1.0),
+    ("ball_and_beam/run.mat", "In2", "In1 In7", 0.001),
+    ("servo/Training_Set.mat", "Training_set.Clock.PW_adj", "Training_set.Clock.motor_rpm", 1.0),
+    ("mr_damper/damper.mat", "X", "y", 1.0),
+]
+
+
+@pytest.mark.parametrize(("file", "inputs", "outputs", "step"), MEASURED)
+def test_measured_files_are_begun_with(data_folder, tmp_path, file, inputs, outputs, step):
+    if not (data_folder / file).is_file():
+        pytest.skip(f"no {file}; set ORTHAUG_DATA to the folder of the data sets")
+    options = ["--inputs", *inputs.split(), "--outputs", *outputs.split(), "--out", tmp_path / "spec.toml"]
+    done = run("init", data_folder / file, *options)
+    assert done.code == 0, done.err
+    assert kinds.open_job(tmp_path / "spec.toml").train.record.sampling_time == pytest.approx(step, rel=1e-4)
+
+
+def test_runs_of_unequal_length_have_their_own_time(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    (u, y), (v, z) = plant(300), plant(200)
+    runs = {"a": {"tid": EVEN, "u": u, "y": y}, "b": {"tid": 0.05 * np.arange(200), "u": v, "y": z}}
+    scipy.io.savemat(tmp_path / "a.mat", runs)
+    out = tmp_path / "spec.toml"
+    assert run("init", tmp_path / "a.mat", "--out", out).code == 2  # u and y of two runs
+    done = run("init", tmp_path / "a.mat", "--inputs", "a.u", "--outputs", "b.y", "--out", out)
+    assert done.code == 2 and "the columns have unequal lengths: 'a.u' 300, 'b.y' 200 rows" in done.err
+    done = run("init", tmp_path / "a.mat", "--inputs", "b.u", "--outputs", "b.y", "--out", out)
+    assert done.code == 0 and "0.05 s, from column 'b.tid'" in done.out, done.err
+
+
+def test_wild_samples_in_long_runs_are_left_out(tmp_path):
+    u, y = plant(1200)
+    y[100:104] = [60.0, -70.0, 80.0, -90.0]  # more than the step `fill` reconstructs
+    pd.DataFrame({"u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
+    done = run("init", tmp_path / "a.csv", "--sampling-time", "0.1", "--out", tmp_path / "spec.toml")
+    assert done.code == 0 and "4 training rows in longer runs of wild samples are left out" in done.out, done.err
+    assert tomllib.loads((tmp_path / "spec.toml").read_text())["data"]["missing"] == "skip"
+    assert run("check", tmp_path / "spec.toml").code == 0

@@ -13,7 +13,7 @@ from test_cli import make_project, run
 import orthaug as oa
 from orthaug._base.errors import InputError
 from orthaug.data.preparation import steps_again, warnings_of
-from orthaug.data.record import Prepared
+from orthaug.data.prepared import Prepared
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 

@@ -255,8 +255,20 @@ def test_refused(tmp_path, options, message):
 def test_refused_files(tmp_path):
     with pytest.raises(InputError, match="absent.csv: no such file"):
         read(tmp_path / "absent.csv")
-    with pytest.raises(InputError, match="unknown file type '.txt'"):
-        read(put(tmp_path, name="run.txt"))
+    with pytest.raises(InputError, match="unknown file type '.log'"):
+        read(put(tmp_path, name="run.log"))
+
+
+def test_a_sampling_time_that_every_thins_twice(tmp_path):
+    path = tmp_path / "run.txt"
+    np.savetxt(path, np.column_stack([0.01 * np.arange(60), np.ones(60), np.arange(60) % 7]))
+    options = {"inputs": ["x2"], "outputs": ["x3"], "every": 5}
+    with pytest.raises(
+        InputError, match=r"run.txt: every = 5 multiplies the sampling time 0.05 s to 0.25 s, but col.* 'x1'"
+    ):
+        read_record(path, sampling_time=0.05, **options)
+    assert read_record(path, sampling_time=0.01, **options).sampling_time == pytest.approx(0.05)
+    assert read_record(path, time="x1", **options).sampling_time == pytest.approx(0.05)
 
 
 def minutes(*instants: str) -> str:

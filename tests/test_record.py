@@ -58,6 +58,51 @@ def test_rows_and_split():
     assert timed.experiments[0].start_time == pytest.approx(0.4)
 
 
+def test_slices():
+    record = Record.from_arrays(u=-STEPS, y=STEPS, sampling_time=0.1, source="run.csv")
+    for part, rows in (
+        (record[2:5], [2, 3, 4]),
+        (record[:2], [0, 1]),
+        (record[-2:], [4, 5]),
+        (record[1:99], STEPS[1:]),
+    ):
+        np.testing.assert_array_equal(part.experiments[0].outputs[:, 0], rows)
+        np.testing.assert_array_equal(part.experiments[0].inputs[:, 0], -np.asarray(rows))
+        assert part.experiments[0].where(0) == f"run.csv: row {rows[0]:g}"
+        assert part.experiments[0].start_time == pytest.approx(0.1 * rows[0])
+    assert record[np.int64(1) : -1 : 1][1:].experiments[0].first_row == 2
+    assert len(record[:]) == 6
+
+
+def test_a_slice_of_several_experiments_keeps_them_apart():
+    joined = Record.join(Record.from_arrays(y=np.arange(n), source=str(n)) for n in (10, 20, 5))
+    for part, lengths in ((joined[5:32], [5, 20, 2]), (joined[10:30], [20]), (joined[-7:], [2, 5]), (joined[:3], [3])):
+        assert [len(e) for e in part.experiments] == lengths
+    assert joined[5:32].experiments[0].first_row == 5 and joined[-7:].experiments[0].where(0) == "20: row 18"
+
+
+NO_SLICES = [
+    (slice(None, None, 5), r"record\[start:stop:5\]: a step would leave out rows .* with `every`, or take `prepare"),
+    (slice(None, None, -1), "a step would leave out rows"),
+    (slice(4, 2), r"record\[4:2\] holds no row; the record has 6"),
+    (slice(6, None), r"record\[6:\] holds no row; the record has 6"),
+    (slice(0.5, 2), "`the range of rows` must be record.start:stop. with whole numbers"),
+    (3, r"cut by a range of rows, such as record\[100:500\]; got record\[3\]"),
+    ("y", r"cut by a range of rows, such as record\[100:500\]; got record\['y'\]"),
+]
+
+
+@pytest.mark.parametrize(("rows", "message"), NO_SLICES, ids=range(len(NO_SLICES)))
+def test_what_is_no_slice(rows, message):
+    with pytest.raises(InputError, match=message):
+        Record.from_arrays(y=STEPS)[rows]
+
+
+def test_a_record_is_not_iterated_by_rows():
+    with pytest.raises(TypeError, match="not iterable"):
+        list(Record.from_arrays(y=STEPS))  # type: ignore[arg-type]
+
+
 def test_several_experiments_are_split_each_or_as_a_whole():
     joined = Record.join(Record.from_arrays(y=np.arange(n), source=str(n)) for n in (10, 20, 5))
     first, rest = joined.split(0.8)

@@ -157,6 +157,72 @@ def test_the_ending_may_be_upper_case(tmp_path):
     assert values(put(tmp_path, "RUN.CSV", "u\n1\n"), "u") == [[1.0]]
 
 
+SEPARATED = {
+    "commas": "1.5,2\n-3,4e1\n",
+    "commas and spaces": " 1.5, 2\n  -3, 40\n",
+    "semicolons and decimal commas": "1,5;2\n-3;40,0\n",
+    "tabs": "1.5\t2\n-3\t40\n",
+    "tabs and decimal commas": "1,5\t2\n-3,0\t40\n",
+    "spaces": "1.5 2\n-3 40\n",
+    "columns of spaces": "  1.5000e+00    2.0000e+00\n -3.0000e+00    4.0000e+01  \n",
+    "spaces and decimal commas": "1,5 2,0\n-3 40\n",
+    "spaces and tabs": "1.5 \t2\n-3  40\n",
+    "blank lines at the end": "1.5 2\n-3 40\n\n\n",
+    "trailing separators": "1.5,2,\n-3,40,\n",
+    "Windows": "1,5;2\r\n-3;40\r\n",
+}
+
+
+@pytest.mark.parametrize("ending", ["csv", "txt", "dat"])
+@pytest.mark.parametrize("headed", [True, False], ids=["header", "no header"])
+@pytest.mark.parametrize("kind", SEPARATED)
+def test_separators_are_known_by_the_content(tmp_path, kind, headed, ending, monkeypatch):
+    content, names, expected = SEPARATED[kind], ["x1", "x2"], [[1.5, -3.0], [2.0, 40.0]]
+    if headed:
+        commas = "decimal commas" in kind
+        separator = next(mark for mark in (";", "\t", " " if commas else ",", " ") if mark in content.split("\n")[0])
+        names, content = ["Weg [mm]", "F"], f"Weg [mm]{separator}F\n{content}"
+    path = put(tmp_path, f"run.{ending}", content)
+    assert column_names(path) == names
+    assert values(path, *names) == expected
+    monkeypatch.setattr(tables, "_SMALL", 0)
+    assert values(path, *names) == expected
+
+
+UNNAMED = [
+    ("# bench 3, 4 May\n% of u and y\n1,2\n3,4\n", ["x1", "x2"], [[1, 3], [2, 4]]),
+    ("# t u y\n0 1 2\n1 3 4\n", ["t", "u", "y"], [[0, 1], [1, 3], [2, 4]]),  # as numpy.savetxt writes it
+    ("0\n1\n3\n", ["x1"], [[0, 1, 3]]),
+    ("0,1\n0.5,7\n1,2\n", ["x1", "x2"], [[0, 0.5, 1], [1, 7, 2]]),  # time goes on from the first line
+    ("0,1\n3.5,7\n2,2\n", ["0", "1"], [[3.5, 2], [7, 2]]),  # columns that pandas counted
+    ("nan,1\n0.5,\n1,2\n", ["x1", "x2"], [[np.nan, 0.5, 1], [1, np.nan, 2]]),
+    (".5 -.25\n1 2\n", ["x1", "x2"], [[0.5, 1], [-0.25, 2]]),
+    ("time [s] force [N]\n0 1\n1 3\n", ["time [s]", "force [N]"], [[0, 1], [1, 3]]),
+    ("level 1,5 bar;y\n1;2\n", ["level 1,5 bar", "y"], [[1], [2]]),
+    ("2024-03-01 12:00:00;1,5\n2024-03-01 12:00:01;2,5\n", ["x1", "x2"], None),
+]
+
+
+@pytest.mark.parametrize(("content", "names", "expected"), UNNAMED, ids=range(len(UNNAMED)))
+def test_columns_without_names_are_numbered(tmp_path, content, names, expected):
+    path = put(tmp_path, "run.dat", content)
+    assert column_names(path) == names
+    if expected is None:
+        assert read_table(path, ["x1", "x2"], "x1").columns["x1"].tolist() == [0.0, 1.0]
+        return
+    table = read_table(path, names)
+    np.testing.assert_array_equal([table.columns[name] for name in names], expected)
+
+
+def test_a_row_of_a_file_without_header_is_named_by_its_line(tmp_path):
+    path = put(tmp_path, "run.txt", "# only a remark\n1 2\n3 x\n")
+    table = read_table(path, ["x1", "x2"])
+    assert (table.where(1), table.cell("x2", 1), table.first_line) == ("line 3 (row 1)", "x", 2)
+    assert layout(path).note == "no header, so the columns are called x1 to x2"
+    with pytest.raises(InputError, match="line 3 has 3 cells and line 1 has 2; is a separator or a decimal comma wr"):
+        read_table(put(tmp_path, "run.dat", "1 2\n3 4\n5 6 7\n"), ["x1"])
+
+
 def test_numbers_are_read_to_the_last_digit(tmp_path):
     rng = np.random.default_rng(0)
     numbers = (rng.normal(size=500) * 10.0 ** rng.integers(-12, 12, 500)).tolist()
@@ -210,7 +276,7 @@ def test_has_column(tmp_path):
         ("run.csv", "", "0 bytes"),
         ("run.csv", "y,y\n1,2\n", "the column 'y' stands 2 times; names must differ"),
         ("run.npz", "y", "cannot be read as .npz"),
-        ("run.txt", "y\n1\n", "unknown file type '.txt'"),
+        ("run.log", "y\n1\n", "unknown file type '.log'"),
     ],
 )
 def test_has_column_of_a_file_that_cannot_be_read(tmp_path, name, content, message):
@@ -230,7 +296,7 @@ REFUSED_TEXT = [
     ("run.csv", "u,y\n1,2\n".encode("utf-16-le"), "not a text table; expected UTF-8"),  # no mark says so
     ("run.csv", b"u,y,\xfc\x01\n1,2,3\n", "not a text table; expected UTF-8"),
     ("run.csv", b"\xef\xbb\xbfu,y,\xfc\n1,2,3\n", "not a text table; expected UTF-8"),
-    ("run.csv", "1.5,2\n1,2\n", "no column 'u': the first line holds numbers; a header with names is expected"),
+    ("run.csv", "1.5,2\n1,2\n", "no column 'u': the file has no header, so its columns are called x1, x2"),
     ("run.csv", "u,y\n1,2\n3,4,5\n", "line 3.*3 cells.*2"),
     ("run.csv", 'u,y\n1,2\n3,"4\n5,6\n', "not a readable table.*row 2"),
     ("run.csv", "force,position\n1,2\n", "no column 'u'; the file has 'force', 'position'"),
@@ -238,8 +304,9 @@ REFUSED_TEXT = [
     ("run.csv", "u (N),y\n1,2\n", r"no column 'u', did you mean 'u \(N\)'\?"),
     ("run.csv", ",,\n1,2,3\n", "no column 'u'; the file has no column names"),
     ("run.csv", "u,y,y\n1,2,3\n", "column 'y' stands 2 times; names must differ"),
+    ("run.txt", "1 2\n3 4\n5 6 7\n", "no column 'u': the file has no header"),
     ("run.tsv", "u,y\n1,2\n", "no column 'u'.*the file has 'u,y'"),
-    ("run.xml", "<a/>", r"unknown file type '.xml'; known are .csv, .tsv, .parquet"),
+    ("run.xml", "<a/>", r"unknown file type '.xml'; known are .csv, .tsv, .txt, .dat, .parquet"),
     ("run", "u,y\n1,2\n", "unknown file type ''; known are .csv"),
     ("run.npz", b"not a zip", "cannot be read as .npz .*cut or corrupt"),
     ("run.npz", b"PK\x03\x04 cut", "cannot be read as .npz .*cut or corrupt"),

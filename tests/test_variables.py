@@ -13,7 +13,7 @@ import scipy.sparse
 from test_cli import run, signals
 
 from orthaug._base.errors import InputError
-from orthaug.data.tables import has_column
+from orthaug.data.tables import column_names, has_column
 from orthaug.data.variables import read_variables
 
 h5py = pytest.importorskip("h5py")
@@ -394,6 +394,53 @@ def test_paths_with_points_or_slashes(tmp_path):
         for name in ("run.deep.u", "run/deep/u", "/run/deep/u"):
             np.testing.assert_array_equal(read_variables(file, (name,))[name], np.ravel(U))
     np.testing.assert_array_equal(read_variables(matlab, ("run.cell[1]",))["run.cell[1]"], np.ravel(Y))
+
+
+def put_references(file, name: str, held: list, *, cell: bool) -> None:
+    """Elements behind references, in a cell or in a field of an array of structs."""
+    made = [file.require_group("#refs#").create_dataset(f"{name[-1]}{i}", data=np.atleast_2d(v).T).ref
+            for i, v in enumerate(held)]  # fmt: skip
+    data = file.create_dataset(name, data=np.array([made], dtype=h5py.ref_dtype), dtype=h5py.ref_dtype)
+    if cell:
+        data.attrs["MATLAB_class"] = np.bytes_("cell")
+
+
+def test_cells_and_arrays_of_structs_of_v73(tmp_path):
+    u, path = np.arange(6.0), tmp_path / "run.mat"
+    with h5py.File(path, "w") as file:
+        put_references(file, "c", [u, 3 * u], cell=True)
+        put_references(file, "runs/u", [u, 5 * u], cell=False)
+        put_references(file, "runs/w", [2 * u, np.zeros((0, 0))], cell=False)
+        struct = file["#refs#"].create_group("struct")
+        struct.create_dataset("y", data=7 * u[:, None])
+        reference = np.array([[struct.ref, file["c"].ref]], dtype=h5py.ref_dtype)
+        file.create_dataset("deep", data=reference, dtype=h5py.ref_dtype).attrs["MATLAB_class"] = np.bytes_("cell")
+    wanted = {"c[0]": 1, "c[1]": 3, "runs[0].u": 1, "runs[1].u": 5, "runs[0].w": 2, "deep[0].y": 7, "deep[1][1]": 3}
+    for name, values in read_variables(path, tuple(wanted)).items():
+        np.testing.assert_array_equal(values, wanted[name] * u, err_msg=name)
+    with pytest.raises(InputError, match="'c' is a cell, no numbers"):
+        read_variables(path, ("c",))
+
+
+def test_cells_that_hold_themselves_end(tmp_path):
+    path = tmp_path / "run.mat"
+    with h5py.File(path, "w") as file:
+        data = file.create_dataset("c", shape=(1, 50), dtype=h5py.ref_dtype)
+        data[:] = np.array([[data.ref] * 49 + [h5py.Reference()]], dtype=h5py.ref_dtype)
+        data.attrs["MATLAB_class"] = np.bytes_("cell")
+        file.create_dataset("y", data=np.ones((9, 1)))
+    np.testing.assert_array_equal(read_variables(path, ("y",))["y"], np.ones(9))
+
+
+def test_signals_that_a_file_names(tmp_path):
+    u = np.arange(6.0)
+    signals_ = np.array([("Force", u), ("", 2 * u)], dtype=[("Name", object), ("Data", object)])
+    scope = {"time": u, "signals": {"label": "Speed", "values": 3 * u}}
+    scipy.io.savemat(tmp_path / "run.mat", {"run": {"Y": signals_}, "scope": scope})
+    assert column_names(tmp_path / "run.mat") == ["Force", "run.Y[1].Data", "scope.time", "Speed"]
+    wanted = {"Force": 1, "run.Y[0].Data": 1, "run.Y[1].Data": 2, "Speed": 3, "scope.signals.values": 3}
+    for name, factor in wanted.items():
+        np.testing.assert_array_equal(read_variables(tmp_path / "run.mat", (name,))[name], factor * u)
 
 
 def test_a_group_of_hdf5(tmp_path):

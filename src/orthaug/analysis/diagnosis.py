@@ -22,9 +22,9 @@ from orthaug.analysis.motion_diagnosis import diagnose_motion
 from orthaug.analysis.predictability import predictable
 from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, errors_of, rms_errors
 from orthaug.analysis.verdict_text import SHARE, Diagnosis, Finding, words
+from orthaug.data.columns import quantum_of
 from orthaug.data.record import Experiment
 from orthaug.data.regressors import Lags
-from orthaug.data.survey import quantum_of
 from orthaug.fitting.criteria import Simulation
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import estimate

@@ -21,6 +21,7 @@ from orthaug.commands.program import (
     Force,
     OutFolder,
     SpecPath,
+    TakesLists,
     app,
     arguments,
     main,
@@ -190,12 +191,14 @@ def select(spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force
     tell(selected.result, selection_text(selected.result), as_json, place)
 
 
-@app.command()
+@app.command(cls=TakesLists)
 def init(
     data: Annotated[Path, typer.Argument(metavar="DATA", help="Data file.")],
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The spec to write.")] = Path("spec.toml"),
-    inputs: Annotated[str | None, typer.Option("--inputs", metavar="A,B", help="Columns of the inputs.")] = None,
-    outputs: Annotated[str | None, typer.Option("--outputs", metavar="Y", help="Columns of the outputs.")] = None,
+    inputs: Annotated[
+        list[str] | None, typer.Option("--inputs", metavar="A B", help="Columns of the inputs; A,B as well.")
+    ] = None,
+    outputs: Annotated[list[str] | None, typer.Option("--outputs", metavar="Y", help="Columns of the outputs.")] = None,
     sampling_time: Annotated[float | None, typer.Option("--sampling-time", metavar="S", help="Between rows.")] = None,
     force: Force = False,
 ) -> None:
@@ -222,9 +225,10 @@ def init(
             raise InputError(asked)
         streams.say("columns: " + ", ".join(column.header for column in found.signals))
         if inputs is None:
-            inputs = _asked("inputs, separated by commas (none: press enter)", partial(assign, found, outputs=outputs))
+            check = partial(assign, found, outputs=outputs, sampling_time=sampling_time)
+            inputs = [_asked("inputs, separated by commas (none: press enter)", check)]
         if outputs is None:
-            outputs = _asked("outputs", partial(assign, found, inputs), default=None)
+            outputs = [_asked("outputs", partial(assign, found, inputs), default=None)]
         roles = assign(found, inputs, outputs, sampling_time)
     if roles is not None and sampling_time is None and found.clock.step is None and sys.stdin.isatty():
         roles = replace(roles, sampling_time=check_step(typer.prompt("seconds between rows", type=float, default=1.0)))

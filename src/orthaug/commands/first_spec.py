@@ -11,7 +11,8 @@ import tomlkit
 
 from orthaug._base.lines import counted
 from orthaug.commands.folder import relative
-from orthaug.data.survey import Column, Survey
+from orthaug.data.columns import Column
+from orthaug.data.survey import Survey
 from orthaug.selection.first_orders import FirstModel
 
 FILLED = 3
@@ -67,15 +68,15 @@ def spec_text(
     out: Path,
     rows: int,
     cut: int,
-    missing: int,
+    gaps: str,
     named: tuple[list[str], list[str]],
     model: FirstModel,
 ) -> str:
-    """The spec with comments."""
+    """The spec with comments; `gaps` says which rows will be left out, "" for none."""
     document = tomlkit.document()
     document.add(tomlkit.comment(f"Written by orthaug init from {found.path.name}. Run: orthaug fit {out.name}"))
     document.add(tomlkit.comment("Every key: orthaug schema keys. What is written here is a start, not a verdict."))
-    document.add("data", _data(found, roles, out, rows, cut, missing, named))
+    document.add("data", _data(found, roles, out, rows, cut, gaps, named))
     document.add(tomlkit.nl())
     document.add(
         tomlkit.comment(
@@ -95,7 +96,7 @@ def spec_text(
 
 
 def _data(
-    found: Survey, roles: Roles, out: Path, rows: int, cut: int, missing: int, named: tuple[list[str], list[str]]
+    found: Survey, roles: Roles, out: Path, rows: int, cut: int, gaps: str, named: tuple[list[str], list[str]]
 ) -> Any:
     file, clock = relative(found.path, out.resolve().parent), found.clock
     data = tomlkit.table()
@@ -110,9 +111,9 @@ def _data(
     for key, names in zip(("inputs", "outputs"), named, strict=True):
         data.add(key, names)
     uneven = time is not None and not clock.even
-    if missing or uneven:
+    if gaps or uneven:
         data.add("missing", "skip")
-        data["missing"].comment(lacking(missing) if missing else "nothing is interpolated across gaps")
+        data["missing"].comment(gaps or "nothing is interpolated across gaps")
     for name, part in (("train", [0, cut]), ("tests", [cut, rows])):
         if part[0] == part[1]:
             continue

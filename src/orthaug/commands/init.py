@@ -9,16 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, MissingSampleError
 from orthaug._base.folders import whole_file
 from orthaug._base.lines import counted, percent
 from orthaug.commands.first_spec import FILLED, Roles, channel_names, lacking, spec_text, steps_of, time_of
+from orthaug.data.columns import Column
+from orthaug.data.headers import is_time
 from orthaug.data.preparation import STEPS
 from orthaug.data.readers import read_record
 from orthaug.data.record import Channel, Record
-from orthaug.data.survey import Column, Survey, survey
+from orthaug.data.survey import Survey, survey
 from orthaug.selection.first_orders import LOOKED_AT, FirstModel, first_model
 
+Names = str | Sequence[str]  # columns, several in a text separated by commas
 TRAINED = 0.75  # share of the rows; the rest is a test
 _TESTED = 30  # rows of a test at least
 _LISTED = 12  # columns in a message
@@ -41,8 +44,10 @@ def look(path: Path) -> Survey:
     return survey(path)
 
 
-def assign(found: Survey, inputs: str | None, outputs: str | None, sampling_time: float | None = None) -> Roles | None:
-    """Columns by names separated by commas; where nothing is given by what the names say; None if that is open.
+def assign(
+    found: Survey, inputs: Names | None, outputs: Names | None, sampling_time: float | None = None
+) -> Roles | None:
+    """Columns by their names; where nothing is given by what the names say; None if that is open.
 
     Raises:
         InputError: columns that are not there, twice, constant or the time.
@@ -50,7 +55,8 @@ def assign(found: Survey, inputs: str | None, outputs: str | None, sampling_time
     if inputs is None and outputs is None:
         known = found.roles()
         return None if known is None else Roles(tuple(known[0]), tuple(known[1]), sampling_time)
-    chosen = [None if text is None else columns_of(found, text) for text in (inputs, outputs)]
+    named = {"input": inputs, "output": outputs}
+    chosen = [None if n is None else columns_of(found, n, kind, sampling_time) for kind, n in named.items()]
     if outputs is not None and not chosen[1]:
         raise InputError(f"{found.path}: no output is named; give --outputs, a column or several separated by commas.")
     both = [column for group in chosen for column in group or ()]
@@ -59,36 +65,62 @@ def assign(found: Survey, inputs: str | None, outputs: str | None, sampling_time
             raise InputError(f"{found.path}: column '{column.header}' is named twice among inputs and outputs.")
     if chosen[0] is None or chosen[1] is None:
         return None
+    if not found.same_lengths(both):
+        listing = ", ".join(f"'{c.header}' {c.filled}" for c in both)
+        raise InputError(f"{found.path}: the columns have unequal lengths: {listing} rows. Name those of one run.")
     return Roles(tuple(chosen[0]), tuple(chosen[1]), sampling_time)
 
 
-def columns_of(found: Survey, text: str) -> list[Column]:
-    """The columns that a text names, separated by commas.
+def columns_of(found: Survey, names: Names, kind: str, sampling_time: float | None = None) -> list[Column]:
+    """Return the columns of these names; a text may hold several, separated by commas.
+
+    Args:
+        kind: "input" or "output", what they are to be.
+        sampling_time: in s, where a person gave it.
 
     Raises:
         InputError: a column that is not there, has no numbers that vary, or is the time.
     """
-    columns = [found.find(name) for name in (part.strip() for part in text.split(",")) if name]
+    headers = {column.header for column in found.columns}
+    columns = []
+    for text in (names,) if isinstance(names, str) else names:
+        parts = (part.strip() for part in ((text,) if text.strip() in headers else text.split(",")))
+        columns += [found.find(name) for name in parts if name]
     for column in columns:
-        if column is found.clock.column:
-            raise InputError(f"{found.path}: column '{column.header}' is the time; it is no channel.")
+        _check_no_time(found, column, kind, sampling_time)
     return columns
 
 
-def question(found: Survey, inputs: str | None = None, outputs: str | None = None) -> str:
+def _check_no_time(found: Survey, column: Column, kind: str, sampling_time: float | None) -> None:
+    """Raise InputError for the time as a channel; an input may rise as evenly where the time is known otherwise."""
+    place, refused = f"{found.path}: column '{column.header}'", found.looks_like_time(column)
+    if column is found.clock.column and found.clock.by_name:
+        raise InputError(f"{place} is the time; it is no channel.")
+    if column is found.clock.column and (kind == "output" or sampling_time is None):
+        remedy = "it is no output" if kind == "output" else "if it is an input, give --sampling-time, the step in s"
+        raise InputError(f"{place} rises by {found.clock.step:g} s in each row, as time does; {remedy}.")
+    if refused is not None and (kind == "output" or is_time(column.header)):
+        raise InputError(f"{place} {refused.reason}; it is no {'channel' if is_time(column.header) else 'output'}.")
+
+
+def question(found: Survey, inputs: Names | None = None, outputs: Names | None = None) -> str:
     """What to give where the columns do not say what they are; `inputs` and `outputs` are what was given.
 
     Raises:
         InputError: no column could be a channel, or none is left for an output.
     """
-    given = {id(c) for text in (inputs, outputs) for c in columns_of(found, text or "")}
-    free = [c.header for c in found.signals if id(c) not in given]
+    kinds = {"input": inputs, "output": outputs}
+    given = {id(c): c for kind, names in kinds.items() for c in columns_of(found, names or "", kind)}
+    free = [c for c in found.signals if id(c) not in given]
     if not found.signals or (outputs is None and not free):
-        raise InputError(f"{found.path}: {_nothing_left(found, inputs)}")
+        raise InputError(f"{found.path}: {_nothing_left(found, _joined(inputs))}")
     some = _listed([c.header for c in found.signals])
-    output = free.pop() if outputs is None else outputs
-    named = ",".join(free[:_LISTED]) if outputs is not None else free[0] if free else ""
-    proposed = f'--inputs "{named if inputs is None else inputs}" --outputs "{output}"'
+    output = free.pop() if outputs is None else None
+    rows = next((c.filled for c in (output, *given.values()) if c is not None), 0)
+    alike = [c.header for c in free if c.filled == rows] or [c.header for c in free]
+    named = ",".join(alike[:_LISTED]) if outputs is not None else alike[0] if alike else ""
+    into = named if inputs is None else _joined(inputs)
+    proposed = f'--inputs "{into}" --outputs "{_joined(outputs) if output is None else output.header}"'
     said = "the names of the columns do not tell inputs from outputs"
     if inputs is not None or outputs is not None:
         said = f"only {'inputs' if outputs is None else 'outputs'} are named"
@@ -98,6 +130,11 @@ def question(found: Survey, inputs: str | None = None, outputs: str | None = Non
         f"{found.path}: {said}: {some}. Say both, separated by commas, such as {proposed}{none}; columns that are not "
         f"named are left out." + (f" No channels: {others}." if others else "")
     )
+
+
+def _joined(names: Names | None) -> str | None:
+    """Names as a person would write them."""
+    return names if names is None or isinstance(names, str) else ",".join(names)
 
 
 def _nothing_left(found: Survey, inputs: str | None) -> str:
@@ -116,17 +153,12 @@ def _nothing_left(found: Survey, inputs: str | None) -> str:
 def left_out(found: Survey, used: Sequence[Column]) -> str:
     """The columns that are not used, and why, in a list; the time is none of them."""
     apart = {id(c) for c in (*used, found.clock.column)}
-    return _listed([f"{c.header} ({why_not(c)})" for c in found.columns if id(c) not in apart])
+    return _listed([f"{c.header} ({found.why_not(c)})" for c in found.columns if id(c) not in apart])
 
 
 def _listed(columns: Sequence[str]) -> str:
     more = f" and {len(columns) - _LISTED} more" if len(columns) > _LISTED else ""
     return ", ".join(columns[:_LISTED]) + more
-
-
-def why_not(column: Column) -> str:
-    """Why a column is no channel."""
-    return column.unusable or ("constant" if column.constant else "not named")
 
 
 def draft(found: Survey, roles: Roles, out: Path) -> Draft:
@@ -135,10 +167,11 @@ def draft(found: Survey, roles: Roles, out: Path) -> Draft:
     Raises:
         InputError: too few rows, or channels without a row where all have a value.
     """
+    found = found.beside([*roles.inputs, *roles.outputs])
     rows, missing = _extent(roles)
     cut = round(TRAINED * rows)
     cut = cut if rows - cut >= _TESTED else rows
-    record = _record(found, roles, cut, missing)
+    record, lost = _record(found, roles, cut, missing)
     model = first_model(record)
     if model is None:
         raise InputError(
@@ -146,8 +179,10 @@ def draft(found: Survey, roles: Roles, out: Path) -> Draft:
             "are combinations of each other. Give more rows, or fewer inputs."
         )
     named = (channel_names(roles.inputs), channel_names(roles.outputs))
-    text = spec_text(found, roles, out, rows, cut, missing, named, model)
-    return Draft(text, _account(found, roles, rows, missing, cut, model))
+    wild = f"{counted(lost, 'training row')} in longer runs of wild samples {'is' if lost == 1 else 'are'} left out"
+    gaps = lacking(missing) if missing else wild if lost else ""
+    text = spec_text(found, roles, out, rows, cut, gaps, named, model)
+    return Draft(text, _account(found, roles, rows, missing, cut, model, wild if lost and not missing else ""))
 
 
 def write_spec(found: Draft, out: Path, *, force: bool = False) -> None:
@@ -176,17 +211,21 @@ def _extent(roles: Roles) -> tuple[int, int]:
     return rows, int((~there).sum())
 
 
-def _record(found: Survey, roles: Roles, cut: int, missing: int) -> Record:
-    """The training rows."""
+def _record(found: Survey, roles: Roles, cut: int, missing: int) -> tuple[Record, int]:
+    """The training rows, and how many are left out because a sample is missing."""
     inputs, outputs = ([Channel(c.name, c.unit, c.header) for c in group] for group in (roles.inputs, roles.outputs))
     options: dict[str, Any] = {"rows": (0, cut), "missing": "skip" if missing or not found.clock.even else "error"}
     options["prepare"] = [STEPS.declare(kind, keys) for kind, keys in steps_of(found, roles)]
     if not found.clock.even:
         options["time"] = time_of(found, roles)
-    return read_record(found.path, inputs=inputs, outputs=outputs, **options)
+    try:
+        record = read_record(found.path, inputs=inputs, outputs=outputs, **options)
+    except MissingSampleError:  # more samples in a row were wild than a gap is filled over
+        record = read_record(found.path, inputs=inputs, outputs=outputs, **{**options, "missing": "skip"})
+    return record, record.missing
 
 
-def _account(found: Survey, roles: Roles, rows: int, missing: int, cut: int, model: FirstModel) -> str:
+def _account(found: Survey, roles: Roles, rows: int, missing: int, cut: int, model: FirstModel, wild: str) -> str:
     """What was seen, a line each."""
     step = f"{roles.sampling_time:g} s, as given" if roles.sampling_time else str(found.clock)
     if roles.sampling_time is None and found.clock.step is None:
@@ -196,8 +235,10 @@ def _account(found: Survey, roles: Roles, rows: int, missing: int, cut: int, mod
     for kind, columns in (("input", roles.inputs), ("output", roles.outputs)):
         lines += [f"{kind:<7}{as_seen(column, spikes=kind == 'output')}" for column in columns]
     used = {id(c) for c in (*roles.inputs, *roles.outputs, found.clock.column)}
+    doubtful = [one for one in found.clock.refused if one.signal or id(one.column) in used]
+    lines[2:2] = [f"not the time: column '{one.column.header}' {one.reason}" for one in doubtful]
     for column in (c for c in found.columns if id(c) not in used):
-        lines.append(f"left out: {column.header} ({why_not(column)})")
+        lines.append(f"left out: {column.header} ({found.why_not(column)})")
     for column, delay, order in zip(roles.inputs, model.delays, model.persistence, strict=True):
         lines.append(f"{column.name} excites {_order(order)}; {_delay(delay)}")
     if missing:
@@ -205,6 +246,7 @@ def _account(found: Survey, roles: Roles, rows: int, missing: int, cut: int, mod
         lines.append(f"{lacking(missing)} and will be left out, with all windows that touch them")
         if filled:
             lines[-1] = f"{lacking(missing)}: gaps of up to {FILLED} rows are filled, longer ones left out"
+    lines += [wild] if wild else []
     for name, late, seen in zip(channel_names(roles.inputs), model.orders.nk, model.delays, strict=True):
         if seen is not None and seen != late:
             lines.append(f"the spec takes {name} from lag {late} on, which runs clearly better on rows held out")

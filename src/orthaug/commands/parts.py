@@ -14,13 +14,13 @@ from orthaug._base.lines import counted
 from orthaug._base.memory import few_arenas
 from orthaug.commands.data_sections import PartSection
 from orthaug.commands.spec import Spec
+from orthaug.data.clock import DRIFT, thinned_twice, told_clock
 from orthaug.data.parquet_source import open_parquet
 from orthaug.data.preparation import warnings_of
-from orthaug.data.readers import DRIFT, read_record
+from orthaug.data.readers import read_record
 from orthaug.data.record import Record, same_step
 from orthaug.data.sources import Source, witness
-from orthaug.data.survey import told_clock
-from orthaug.data.tables import KNOWN
+from orthaug.data.tables import KNOWN, PLAIN_TEXT
 from orthaug.reports.result import FileResult
 
 
@@ -131,6 +131,8 @@ def expanded(path: Path, entries: Sequence[str], name: str) -> list[str]:
         if (path.parent / entry).is_dir():
             files = [f"{entry.rstrip('/')}/{file.name}" for file in (path.parent / entry).iterdir()]
             files = [file for file in files if Path(file).suffix.lower() in KNOWN]
+            plain = [file for file in files if Path(file).suffix.lower() not in PLAIN_TEXT]
+            files = plain or files  # beside tables, a .txt is a note
         elif any(mark in entry for mark in "*?[") and not (path.parent / entry).is_file():
             files = glob.glob(entry, root_dir=path.parent, recursive=True)
         else:
@@ -157,7 +159,11 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
     if stays and all(Path(file).suffix.lower() == ".parquet" for file in files):
         return _left(path, spec, part, name, files)
     records, results = [], []
+    used = _used_columns(spec, part.columns)
     for file in files:
+        fault = thinned_twice(path.parent / file, spec.data.sampling_time, part.every, used)
+        if fault:
+            raise InputError(f"{path}: data.{name}: {fault}")
         record = read_record(
             path.parent / file,
             **_options(spec, part),
@@ -173,7 +179,9 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
     record = replace(record, experiments=told)
     warnings = ()
     if part.every > 1:
-        kept = f"{name}: one row in {part.every} is kept without a filter"
+        given = spec.data.sampling_time
+        apart = f", so that rows are {part.every * given:g} s apart instead of {given:g} s" if given else ""
+        kept = f"{name}: one row in {part.every} is kept without a filter{apart}"
         warnings = (Warning("thinned", f"{kept}; content above the new Nyquist frequency folds back."),)
     if spec.data.time is None:
         warnings += _other_step(path, spec, files, name, part.columns)
@@ -224,12 +232,17 @@ def _options(spec: Spec, part: PartSection) -> dict[str, Any]:
     return named | channels | {"columns": part.columns}
 
 
+def _used_columns(spec: Spec, columns: Mapping[str, str]) -> set[str]:
+    """The columns of a part's files that are channels, or tell experiments apart."""
+    channels = [*spec.channels(spec.data.inputs), *spec.channels(spec.data.outputs)]
+    return {columns.get(c.name, c.file_column) for c in channels} | {spec.data.experiment or ""}
+
+
 def _other_step(
     path: Path, spec: Spec, files: Sequence[str], name: str, columns: Mapping[str, str]
 ) -> tuple[Warning, ...]:
     """A warning where a file tells another sampling time than the spec does."""
-    channels = [*spec.channels(spec.data.inputs), *spec.channels(spec.data.outputs)]
-    used = {columns.get(c.name, c.file_column) for c in channels} | {spec.data.experiment or ""}
+    used = _used_columns(spec, columns)
     step, given = spec.data.sampling_time or 1.0, spec.data.sampling_time is not None
     for file in files:
         clock = told_clock(path.parent / file, used)

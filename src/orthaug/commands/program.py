@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import sys
+from collections.abc import Sequence, Set
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -39,6 +40,46 @@ class _Group(typer.core.TyperGroup):
             if error.errno in _NO_READER and error.filename is None:
                 raise Unread from None
             raise
+
+
+class TakesLists(typer.core.TyperCommand):
+    """A command each of whose repeatable options takes several values too: `--inputs a b`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        valued = {name: option for option in self.params for name in option.opts if name.startswith("-")}
+        valued = {name: option for name, option in valued.items() if not getattr(option, "is_flag", False)}
+        lists = {name for name, option in valued.items() if getattr(option, "multiple", False)}
+        return super().parse_args(ctx, _repeated(args, lists, set(valued)))
+
+
+def _repeated(args: Sequence[str], lists: Set[str], valued: Set[str]) -> list[str]:
+    """Return arguments where an option of a list stands before each of its values.
+
+    One value is left to be the argument of the command where there would be none: a file that exists, or the last.
+
+    Examples:
+        >>> _repeated(["run.csv", "--inputs", "a", "b", "--out", "c"], {"--inputs"}, {"--inputs", "--out"})
+        ['run.csv', '--inputs', 'a', '--inputs', 'b', '--out', 'c']
+    """
+    found: list[list[str]] = []
+    option, further = "", []
+    arguments = list(args)
+    while arguments:
+        word = arguments.pop(0)
+        name = word.partition("=")[0]
+        if word.startswith("-") and len(word) > 1:
+            found.append([word] if "=" in word or word not in valued else [word, *arguments[:1]])
+            arguments = arguments[len(found[-1]) - 1 :]
+            option = name if name in lists else ""
+        elif option:
+            further.append(len(found))
+            found.append([option, word])
+        else:
+            found.append([word])
+    if further and all(part[0].startswith("-") for part in found):
+        at = next((i for i in further if Path(found[i][1]).is_file()), further[-1])
+        found[at] = found[at][1:]
+    return [word for part in found for word in part]
 
 
 app = typer.Typer(

@@ -7,6 +7,7 @@ import csv
 import functools
 import re
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Sequence
 from itertools import islice
 from pathlib import Path
@@ -19,7 +20,18 @@ from orthaug._base.errors import InputError, shown
 from orthaug._base.memory import check_memory
 
 _REMARK = ("#", "%")  # lines above the header that begin so
-_NUMBER = re.compile(r'[\s"]*[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?[\s"]*')
+_NUMBER = re.compile(r'[\s"]*[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?[\s"]*')
+_COMMA = re.compile(r"(\d*),(\d+)")
+_DATE = re.compile(r"\d[\d.:/+ T-]*[.:/-][\d.:/+ T-]*\dZ?")
+_MISSING = ("", "nan", "na", "n/a", "null", "none")
+_BLANK = " "  # the separator that stands for any run of spaces and tabs
+_SEPARATORS = ("\t", ";", ",", _BLANK)
+_WITH_UNIT = re.compile(r'"[^"]*"|[^\s"]+(?:\s+(?:\[[^\]]*\]|\([^)]*\)))?')
+_DECIMAL_COMMA = {
+    ";": re.compile(r'(?:^|;)[ \t]*"?[ \t]*[+-]?(?:\d[\d.]*)?,\d+', re.MULTILINE),
+    "\t": re.compile(r'(?:^|\t) *"?[+-]?\d*,\d+(?:[eE][+-]?\d+)?"? *(?=[\t\r\n]|$)', re.MULTILINE),
+    _BLANK: re.compile(r"(?:^|[ \t])[+-]?\d*,\d+(?:[eE][+-]?\d+)?(?=\s|$)", re.MULTILINE),
+}
 _AHEAD = 50  # lines in which the header is looked for
 _MARKS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0e-\x19\x1b-\x1f]")  # what no text holds
@@ -30,28 +42,55 @@ _PROLOGUE = 4096  # bytes of a part in which a document type would stand
 
 
 class Layout(NamedTuple):
-    """Column names, the number of lines up to and with the header, the separator, and the encoding."""
+    """Column names, the number of lines above the first row, the separator, the encoding, and whether names were read.
+
+    The separator `" "` stands for any run of spaces and tabs. Columns without names are `x1`, `x2`, …
+    """
 
     names: list[str]
     header_line: int
     separator: str
     encoding: str
+    headed: bool = True
 
     @property
     def note(self) -> str:
-        """What to know of the encoding; mostly nothing."""
-        return "no UTF-8, so read as Windows-1252" if self.encoding == _FALLBACK else ""
+        """What to know of the encoding and of the names; mostly nothing."""
+        notes = ["no UTF-8, so read as Windows-1252"] if self.encoding == _FALLBACK else []
+        if not self.headed:
+            named = [name for name in self.names if name]
+            called = (
+                f"columns are called {named[0]} to {named[-1]}" if len(named) > 1 else f"column is called {named[0]}"
+            )
+            notes.append(f"no header, so the {called}")
+        return "; ".join(notes)
+
+    @property
+    def splits(self) -> str:
+        """The separator as pandas takes it."""
+        return r"\s+" if self.separator == _BLANK else self.separator
+
+    def has_decimal_commas(self, path: Path) -> bool:
+        """Return whether a cell of the file is a number with a decimal comma."""
+        pattern = _DECIMAL_COMMA.get(self.separator)
+        if pattern is None:
+            return False
+        with path.open(encoding=self.encoding, newline="") as file:
+            return pattern.search("".join(islice(file, self.header_line, None))) is not None
 
 
-def layout(path: Path) -> Layout:
-    """Of a text table; remarks above its header are skipped.
+def layout(path: Path, columns: Sequence[str] = ()) -> Layout:
+    """Return the layout of a text table; remarks above its header are skipped.
+
+    Args:
+        columns: names that are asked for. A first line of numbers is a header only where it holds all of them.
 
     Raises:
         InputError: what is no text, or only blank lines.
     """
     try:
         encoding = _encoding(path)
-        return _layout(path, encoding)
+        return _layout(path, encoding, columns)
     except (UnicodeError, csv.Error):
         raise InputError(f"{path}: not a text table; expected UTF-8 text with a header row.") from None
 
@@ -89,41 +128,92 @@ def _check_text(path: Path, encoding: str, *, strict: bool = False) -> None:
     decoder.decode(b"", final=True)
 
 
-def _layout(path: Path, encoding: str) -> Layout:
+def _layout(path: Path, encoding: str, columns: Sequence[str]) -> Layout:
     with path.open(encoding=encoding, newline="") as file:
         line, number = _next_line(file, 0)
         if not line:
             raise InputError(f"{path}: the file holds only blank lines.")
+        ahead = [(line, number)]
         while line.lstrip().startswith(_REMARK):
             after, further = _next_line(file, number)
-            if not after or any(map(_NUMBER.fullmatch, re.split(r"[,;\t]", after))):
-                break  # the names themselves stand behind the sign, right above the numbers
+            if not after or _has_numbers(after):  # the names themselves stand behind the sign, right above the numbers
+                ahead += [(after, further)] if after else []
+                break
             line, number = after, further
-        ahead = [(line, number)]
+            ahead = [(line, number)]
+        number = ahead[-1][1]
         for text in islice(file, _AHEAD):
             number += 1
             if text.strip():
                 ahead.append((text, number))
-    tab = path.suffix.lower() == ".tsv"
-    line, number = _below_remarks(ahead, tab=tab)
-    separator = _separator(line, tab=tab)
-    return Layout([name.strip() for name in _cells(line, separator)], number, separator, encoding)
+    separator = "\t" if path.suffix.lower() == ".tsv" else _separator([text for text, _ in ahead])
+    rows = [(_cells(text, separator), number) for text, number in ahead]
+    first = _first_unnamed(rows, separator, ahead[0][0])
+    if first is not None and not (columns and set(columns) <= {cell.strip() for cell in rows[first][0]}):
+        return Layout(_unnamed([cells for cells, _ in rows[first:]]), rows[first][1] - 1, separator, encoding, False)
+    names, number = _below_remarks(rows, separator)
+    return Layout([name.strip() for name in names], number, separator, encoding)
 
 
-def _below_remarks(lines: list[tuple[str, int]], *, tab: bool) -> tuple[str, int]:
+def _has_numbers(line: str) -> bool:
+    """Whether a line is one of a table and no remark: a cell between separators is a number, or each between spaces."""
+    if line.lstrip().startswith(_REMARK):
+        return False
+    return any(map(_NUMBER.fullmatch, re.split(r"[,;\t]", line))) or all(map(_NUMBER.fullmatch, line.split()))
+
+
+def _first_unnamed(rows: list[tuple[list[str], int]], separator: str, line: str) -> int | None:
+    """Index of the first row of a table without a header, None where it has one.
+
+    Args:
+        line: the first of the lines as it stands, which may be a remark.
+    """
+    cells = rows[0][0]
+    if _is_row(cells, separator):
+        return None if _counts_columns(rows, separator) else 0
+    if not line.lstrip().startswith(_REMARK) or len(rows) < 2 or not _is_row(rows[1][0], separator):
+        return None
+    return None if len(cells) == len(rows[1][0]) else 1
+
+
+def _is_row(cells: list[str], separator: str) -> bool:
+    """Whether cells hold numbers, dates or nothing, and at least one of the former."""
+    found = [_is_number(cell, separator) or _DATE.fullmatch(cell.strip()) is not None for cell in cells]
+    return any(found) and all(good or cell.strip().lower() in _MISSING for good, cell in zip(found, cells, strict=True))
+
+
+def _counts_columns(rows: list[tuple[list[str], int]], separator: str) -> bool:
+    """Whether the first line, 0, 1, 2, …, stands for columns without names, as pandas writes it.
+
+    It does not where the table has one column, or where the first column goes on evenly from it, as time does.
+    """
+    names = [cell.strip() for cell in rows[0][0] if cell.strip()]
+    if len(names) < 2 or names != [str(i) for i in range(len(names))]:
+        return False
+    begin = [text_number(cells[0].strip().replace(",", "." if separator != "," else ",")) for cells, _ in rows[:4]]
+    steps = np.diff(begin)
+    return not (len(steps) > 1 and steps[0] > 0 and np.allclose(steps, steps[0], rtol=1e-6))
+
+
+def _unnamed(rows: list[list[str]]) -> list[str]:
+    """Names x1, x2, … for the columns of rows; none for those behind the last that holds anything."""
+    count = len(rows[0])
+    used = max((i + 1 for cells in rows for i, cell in enumerate(cells[:count]) if cell.strip()), default=count)
+    return [f"x{i + 1}" if i < used else "" for i in range(count)]
+
+
+def _below_remarks(rows: list[tuple[list[str], int]], separator: str) -> tuple[list[str], int]:
     """The first line with as many cells as the rows below, or simply the first."""
-    for at, (row, _) in enumerate(lines[1:], start=1):
-        separator = ";" if ";" in row and not tab else _separator(row, tab=tab)  # decimals may be commas
-        row_cells = _cells(row, separator)
-        if len(row_cells) > 1 and any(_is_number(cell, separator) for cell in row_cells):
-            count = len(row_cells)
-            above = [one for one in lines[1:at] if _count(_cells(one[0], separator)) == count]
-            return above[0] if above and len(_cells(lines[0][0], separator)) != count else lines[0]
-    return lines[0]
+    for at, (cells, _) in enumerate(rows[1:], start=1):
+        if len(cells) > 1 and any(_is_number(cell, separator) for cell in cells):
+            count = len(cells)
+            above = [one for one in rows[1:at] if _count(one[0]) == count]
+            return above[0] if above and len(rows[0][0]) != count else rows[0]
+    return rows[0]
 
 
 def _is_number(cell: str, separator: str) -> bool:
-    return _NUMBER.fullmatch(cell.replace(",", ".", 1) if separator == ";" else cell) is not None
+    return _NUMBER.fullmatch(_COMMA.sub(r"\1.\2", cell, count=1) if separator != "," else cell) is not None
 
 
 def _count(cells: list[str]) -> int:
@@ -134,15 +224,33 @@ def _count(cells: list[str]) -> int:
     return len(cells) if all(named) and not any(map(_NUMBER.fullmatch, named)) else 0
 
 
-def _separator(line: str, *, tab: bool) -> str:
-    bare = re.sub(r'"[^"]*"', "", line)  # separators inside quotes do not count
-    if tab:
-        return "\t"
-    return ";" if ";" in bare and "," not in bare else ","
+def _separator(lines: list[str]) -> str:
+    """Return what separates the cells: of what splits most rows alike, what fits the header and leaves most numbers."""
+    best, found = (False, 0.0), ""
+    for separator in _SEPARATORS:
+        split = [_cells(line, separator) for line in lines]
+        rows = [cells for cells in split if any(_is_number(cell, separator) for cell in cells)]
+        count = Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
+        if count < 2:
+            continue
+        begin = split.index(next(row for row in rows if len(row) == count))
+        alike = [row for row in split[begin:] if len(row) == count]
+        cells = [cell for row in alike for cell in row if cell.strip()]
+        fits = len(split[0]) == count or any(_count(one) == count for one in split[:begin])
+        numbers = sum(_is_number(cell, separator) for cell in cells) / max(len(cells), 1)
+        rank = (fits, numbers * len(alike) / len(split[begin:]))
+        if rank > best:
+            best, found = rank, separator
+    bare = re.sub(r'"[^"]*"', "", lines[0])  # separators inside quotes do not count
+    return found or next((mark for mark in ("\t", ";") if mark in bare and "," not in bare), ",")
 
 
 def _cells(line: str, separator: str) -> list[str]:
-    return next(csv.reader([line], delimiter=separator))
+    if separator != _BLANK:
+        return next(csv.reader([line], delimiter=separator))
+    bare = line.strip()
+    found = [cell.strip('"') for cell in _WITH_UNIT.findall(bare.lstrip("".join(_REMARK)))]
+    return found or [""]
 
 
 def _next_line(file: TextIO, number: int) -> tuple[str, int]:

@@ -15,7 +15,7 @@ from orthaug._base.memory import check_memory
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _INT32, _UINT32, _MATRIX, _COMPRESSED = 5, 6, 14, 15
 _CELL, _STRUCT, _OBJECT = 1, 2, 3
-_MOST_ELEMENTS = 1000  # of an array of structs or a cell that is looked into
+MOST_ELEMENTS = 1000  # of an array of structs or a cell that is looked into
 _NO_NUMBERS = {_CELL: "a cell", _STRUCT: "a struct", _OBJECT: "an object", 4: "text", 5: "a sparse matrix",
                16: "a function", 17: "an opaque object"}  # fmt: skip
 _COMPLEX_FLAG = 0x0800
@@ -43,6 +43,12 @@ class Variable:
             values = values + 1j * self._values(kind, data)
         return values
 
+    def text(self) -> str:
+        """Return the characters of a text."""
+        kind, data, _ = _element(self._body(), self._begin, self._order)
+        utf_16 = "utf-16-le" if self._order == "<" else "utf-16-be"
+        return bytes(data).decode({4: utf_16, 17: utf_16, 16: "utf-8"}.get(kind, "latin-1"))
+
     def _values(self, kind: int, data: memoryview) -> np.ndarray:
         values = np.frombuffer(data, self._order + _NUMBERS[kind])
         if len(values) != math.prod(self.shape):
@@ -55,7 +61,7 @@ class Variable:
         Elements of arrays are counted from 0: `runs[1].u`, `c[0]`. The only element of a cell has the cell's own name.
         """
         kind, count = self._flags & 0xFF, math.prod(self.shape)
-        if kind not in (_CELL, _STRUCT, _OBJECT) or not 0 < count <= _MOST_ELEMENTS:
+        if kind not in (_CELL, _STRUCT, _OBJECT) or not 0 < count <= MOST_ELEMENTS:
             return
         body, at, names = self._body(), self._begin, [""]
         if kind == _OBJECT:

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from orthaug._base.errors import InputError
+from orthaug.data.clock import DRIFT, JITTER
 from orthaug.data.headers import in_seconds
-from orthaug.data.readers import DRIFT, JITTER
 from orthaug.data.record import Channel, Experiment, as_channels, check_channels, check_step, same_step
 from orthaug.data.sources import joined, stretches
 from orthaug.data.tables import check_present, check_readable, parquet_file

@@ -12,7 +12,8 @@ from orthaug._base.checks import check_type
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.registry import Registry
 from orthaug.data.filters import Decimate, Highpass, Lowpass
-from orthaug.data.record import Experiment, Prepared, Record, same_step, unbroken
+from orthaug.data.prepared import Prepared
+from orthaug.data.record import Experiment, Record, same_step, unbroken
 from orthaug.data.steps import Detrend, Fill, Outliers, Resample, Run, Shift, Step
 
 STEPS = Registry(

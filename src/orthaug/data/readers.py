@@ -16,6 +16,7 @@ import numpy as np
 from orthaug._base.checks import Vector, check_choice, check_count, check_type
 from orthaug._base.errors import InputError, MissingSampleError, shown
 from orthaug._base.lines import counted
+from orthaug.data.clock import DRIFT, JITTER, thinned_twice
 from orthaug.data.layouts import text_number
 from orthaug.data.preparation import check_steps, prepared_experiments
 from orthaug.data.record import Channel, Experiment, Record, as_channels, check_step, same_step, unbroken
@@ -23,8 +24,6 @@ from orthaug.data.steps import Fill, Outliers, Resample, Run
 from orthaug.data.tables import Table, check_readable, has_column, read_table
 
 RowRange = tuple[int, int] | list[int]
-JITTER = 0.45  # largest deviation of a step from the usual one, relative: one lost sample is a deviation of 1 or ½
-DRIFT = 0.02  # largest change of the mean step over the record, relative; it must also displace half a sample
 _RESOLUTION = 1e-6  # what rounding of the instants may change the mean step by, relative
 _LATEST = 1e11  # s; later than the year 5000
 _MISSING = ("", "nan", "na", "n/a", "#n/a", "null", "none")  # how files write a sample that is not there
@@ -47,12 +46,12 @@ def read_record(
     r"""Read one file; several row ranges are experiments of their own.
 
     Args:
-        path: of a file that ends in .csv, .tsv, .parquet, .xlsx, .npz, .mat or .h5.
+        path: of a file that ends in .csv, .tsv, .txt, .dat, .parquet, .xlsx, .npz, .mat or .h5.
         inputs, outputs: channel names, or `Channel`s with column, unit, scale and offset.
         sampling_time: seconds between rows; or `time`, the column that holds the instants: numbers in the unit of its
             header (`t [ms]`; s without one), or dates, which count from the first row of the file.
         rows: half-open range `(start, stop)` of data rows, or several; None for all.
-        every: keep each n-th row (no filter); the sampling time is multiplied.
+        every: keep each n-th row (no filter); the sampling time is multiplied, so it is that of the file's rows.
         columns: this file's column for a channel, `{"position": "yVal"}`.
         missing: "error", or "skip" to leave out rows with empty or NaN cells. Each stretch between them is then an
             experiment of its own, so that no lag reaches across a gap. "keep" does so where inputs are missing, and
@@ -75,12 +74,14 @@ def read_record(
     path = _path(path)
     channels = [as_channels(inputs, "inputs"), as_channels(outputs, "outputs")]
     column_of = _columns(channels, columns)
-    _check_time(time, sampling_time, {name: column_of[name] for name in (c.name for c in channels[1])})
+    _check_time(time, sampling_time, {c.name: column_of[c.name] for c in channels[1]})
     check_choice(missing, ("error", "skip", "keep"), "`missing`")
     check_count(every, "every")
     wanted: list[str] = list(dict.fromkeys([*column_of.values(), *(name for name in (time, experiment) if name)]))
     if not column_of:
         raise InputError("no channels are asked for; name inputs, outputs or both.")
+    if fault := thinned_twice(path, sampling_time, every, wanted):
+        raise InputError(f"{path}: {fault}")
     table = _trim(read_table(path, wanted, time or None), uneven=missing != "error")
     needed = wanted
     if missing == "keep":
@@ -110,11 +111,9 @@ def read_record(
     if time and not steps:
         raise InputError(f"{path}: no two rows without missing cells follow each other; the sampling time is unknown.")
     step = steps[0] if time else (1.0 if sampling_time is None else float(sampling_time))
-    for other in steps:
-        if not same_step(other, step):
-            raise InputError(
-                f"{path}: column '{time}' steps by {step:g} s in one row range and by {other:g} s in another."
-            )
+    if others := [other for other in steps if not same_step(other, step)]:
+        told = f"steps by {step:g} s in one row range and by {others[0]:g} s in another"
+        raise InputError(f"{path}: column '{time}' {told}.")
     left_out = recorded - sum(len(experiment) for experiment in experiments)
     step *= min(every, 10**15)  # what is longer is refused
     return Record(tuple(channels[0]), tuple(channels[1]), step, tuple(experiments), time, left_out)

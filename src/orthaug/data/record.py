@@ -12,6 +12,7 @@ from orthaug._base.checks import Matrix, as_signal, check_choice, check_label, c
 from orthaug._base.errors import LONGEST, InputError, shown, visible
 from orthaug._base.views import Shown
 from orthaug.data.expressions import RESERVED, is_name
+from orthaug.data.prepared import Prepared, added_up
 
 LONGEST_STEP = 1e12  # s; a longer one overflows somewhere in a time axis
 _DERIVED = ("model", "baseline", "learner", "model_low", "model_high")  # columns of result tables
@@ -151,32 +152,6 @@ class Experiment:
         return replace(self, inputs=self.inputs[start:stop], outputs=self.outputs[start:stop], first_row=first)
 
 
-@dataclass(frozen=True)
-class Prepared:
-    """A step that data went through: its kind, its options, and how many samples it marked as missing or filled."""
-
-    step: str
-    options: dict[str, Any]
-    samples: int = 0
-
-    @property
-    def named(self) -> str:
-        """The step with its options in words."""
-        values = {name: " ".join(v) if isinstance(v, list) else v for name, v in self.options.items()}
-        return f"{self.step} ({', '.join(f'{name} {value}' for name, value in values.items())})"
-
-    @property
-    def text(self) -> str:
-        """The same with what it found."""
-        done = {"outliers": "marked as missing", "fill": "reconstructed"}.get(self.step)
-        samples = "1 sample" if self.samples == 1 else f"{self.samples} samples"
-        return f"{self.named}: {samples} {done}" if done else self.named
-
-    def with_samples(self, samples: int) -> Prepared:
-        """The same step of more samples."""
-        return replace(self, samples=samples)
-
-
 @dataclass(frozen=True, eq=False)
 class Record(Shown):
     """Experiments that share channels and sampling time; lags never reach across experiments.
@@ -191,6 +166,8 @@ class Record(Shown):
         Record(1 experiment, 5 samples, Ts = 0.1 s, inputs: force; outputs: y)
         >>> [len(part) for part in record.split(0.6)]
         [3, 2]
+        >>> record[-2:]
+        Record(1 experiment, 2 samples, Ts = 0.1 s, inputs: force; outputs: y)
     """
 
     inputs: tuple[Channel, ...]
@@ -286,10 +263,32 @@ class Record(Shown):
                 )
         experiments = tuple(e for record in records for e in record.experiments)
         missing = sum(record.missing for record in records)
-        return replace(first, experiments=experiments, missing=missing, prepared=_added([r.prepared for r in records]))
+        return replace(
+            first, experiments=experiments, missing=missing, prepared=added_up([r.prepared for r in records])
+        )
 
     def __len__(self) -> int:
         return sum(len(experiment) for experiment in self.experiments)
+
+    __iter__ = None  # rows of several experiments would follow each other without a sign
+
+    def __getitem__(self, rows: slice) -> Record:
+        """The half-open range of rows `record[start:stop]`; negative ones count from the end.
+
+        Rows count over all experiments, one behind the other, as `len(record)` does. Experiments stay apart: the range
+        cuts the first and the last of them, and those outside are left out.
+
+        Raises:
+            InputError: a row, a step, places that are no whole numbers, or a range without rows.
+        """
+        start, stop = _range_of(rows, len(self))
+        kept, before = [], 0
+        for experiment in self.experiments:
+            first, last = max(start - before, 0), min(stop - before, len(experiment))
+            if first < last:
+                kept.append(self._piece(experiment, first, last))
+            before += len(experiment)
+        return replace(self, experiments=tuple(kept))
 
     def __repr__(self) -> str:
         count = len(self.experiments)
@@ -367,16 +366,22 @@ class Record(Shown):
         return replace(experiment.rows(start, stop), start_time=experiment.start_time + first * self.sampling_time)
 
 
-def _added(prepared: Sequence[tuple[Prepared, ...]]) -> tuple[Prepared, ...]:
-    """What was done to records that are joined, their samples added up; all went through the same steps.
-
-    Raises:
-        InputError: they did not.
-    """
-    kinds = {tuple((done.step, repr(done.options)) for done in one) for one in prepared}
-    if len(kinds) > 1:
-        raise InputError("records that went through different preparation cannot be joined; prepare all alike.")
-    return tuple(done[0].with_samples(sum(one.samples for one in done)) for done in zip(*prepared, strict=True))
+def _range_of(rows: Any, count: int) -> tuple[int, int]:
+    """Return start and stop of a slice of `count` rows."""
+    if not isinstance(rows, slice):
+        raise InputError(f"a record is cut by a range of rows, such as record[100:500]; got record[{shown(rows)}].")
+    for place in (rows.start, rows.stop, rows.step):
+        check_type(place, int | np.integer | None, "the range of rows", "record[start:stop] with whole numbers")
+    if rows.step not in (None, 1):
+        raise InputError(
+            f"record[start:stop:{rows.step}]: a step would leave out rows without a filter, and change the sampling "
+            "time. Read the file with `every`, or take `prepare(record, Decimate(factor))`."
+        )
+    start, stop, _ = rows.indices(count)
+    if start >= stop:
+        ends = [":".join("" if place is None else str(place) for place in (rows.start, rows.stop))]
+        raise InputError(f"record[{ends[0]}] holds no row; the record has {count}.")
+    return start, stop
 
 
 def _channels(given: Sequence[str | Channel] | None, default: str, count: int) -> tuple[Channel, ...]:

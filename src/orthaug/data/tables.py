@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,8 +21,9 @@ from orthaug.data.layouts import Layout, as_number, layout, numbers_only, read_s
 from orthaug.data.variables import ENDINGS, foreign, read_variables, short, variable_names
 
 _SMALL = 4_000_000  # bytes of a text file that NumPy reads sooner than pandas is imported
+PLAIN_TEXT = (".txt", ".dat")
+"""Endings of text that need not be a table."""
 _NAMED = 30  # columns that a message lists
-_DECIMAL_COMMA = re.compile(r'(?:^|;)[ \t]*"?[ \t]*[+-]?(?:\d[\d.]*)?,\d+', re.MULTILINE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,20 +130,24 @@ def check_readable(path: Path) -> None:
 
 
 def _read_text(path: Path, columns: Sequence[str], time: str | None, most: int | None = None) -> Table:
-    """CSV and TSV as they occur: byte-order mark, trailing separators, units in headers, decimal commas."""
-    found = layout(path)
+    """Text tables as they occur: byte-order mark, trailing separators, units in headers, decimal commas, no header."""
+    found = layout(path, columns)
     header, header_line = found.names, found.header_line
     if found.note:
         LOG.info("%s: %s", path, found.note)
-    place = {name: str(index) for name, index in zip(columns, places(path, columns, header), strict=True)}
-    commas = found.separator == ";" and _DECIMAL_COMMA.search(path.read_text(encoding=found.encoding)) is not None
+    place = {
+        name: str(index)
+        for name, index in zip(columns, places(path, columns, header, headed=found.headed), strict=True)
+    }
+    commas = found.has_decimal_commas(path)
     beyond = str(len(header))  # a column that must stay empty: cells behind the last header
     apart = place[time] if time else None
     numbers, texts, held = _cells(path, found, [*place.values(), beyond], commas, apart, most)
     extra = np.flatnonzero(np.asarray(held[beyond]))
     if extra.size:
+        under = f"under {len(header)} headers" if found.headed else f"and line {header_line + 1} has {len(header)}"
         raise InputError(
-            f"{path}: line {header_line + 1 + extra[0]} has {len(header) + 1} cells under {len(header)} headers; "
+            f"{path}: line {header_line + 1 + extra[0]} has {len(header) + 1} cells {under}; "
             "is a separator or a decimal comma wrong?"
         )
     values = {name: np.asarray(numbers[place[name]], dtype=float) for name in columns}
@@ -179,7 +183,7 @@ def _cells(
     def read(**options: Any) -> pd.DataFrame:
         frame = pd.read_csv(
             path,
-            sep=found.separator,
+            sep=found.splits,
             header=None,
             names=[str(i) for i in range(len(found.names) + 1)],
             index_col=False,
@@ -230,7 +234,11 @@ def _plain_numbers(path: Path, found: Layout) -> Matrix | None:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # as where all lines are blank
-            options: dict[str, Any] = {"delimiter": found.separator, "skiprows": skipped, "comments": None}
+            options: dict[str, Any] = {
+                "delimiter": found.separator.strip(" ") or None,
+                "skiprows": skipped,
+                "comments": None,
+            }
             numbers = np.loadtxt(path, **options, encoding=found.encoding, ndmin=2)
     except (ValueError, UserWarning):
         return None
@@ -328,6 +336,7 @@ def _as_floats(array: np.ndarray, name: str, path: Path) -> Vector:
 _READERS: dict[str, Callable[..., Table]] = {
     ".csv": _read_text,
     ".tsv": _read_text,
+    **dict.fromkeys(PLAIN_TEXT, _read_text),
     ".parquet": _read_parquet,
     ".xlsx": _read_excel,
     **dict.fromkeys(ENDINGS, _read_variables),
@@ -336,10 +345,17 @@ KNOWN = tuple(_READERS)
 """Endings of the files that can be read."""
 
 
-def check_present(path: Path, columns: Sequence[str], header: Sequence[str], *, named_apart: bool = False) -> None:
+def check_present(
+    path: Path, columns: Sequence[str], header: Sequence[str], *, named_apart: bool = False, headed: bool = True
+) -> None:
     """Raise InputError for a column that is not there, or stands twice."""
     for name in columns:
         if name not in header:
+            if not headed:
+                called = ", ".join(h for h in list(header)[:_NAMED] if h)
+                raise MissingColumnError(
+                    f"{path}: no column '{name}': the file has no header, so its columns are called {called}."
+                )
             if numbers_only(list(header)):
                 raise MissingColumnError(
                     f"{path}: no column '{name}': the first line holds numbers; a header with names is expected."
@@ -353,14 +369,14 @@ def check_present(path: Path, columns: Sequence[str], header: Sequence[str], *, 
             raise InputError(f"{path}: {twice}{apart}.")
 
 
-def places(path: Path, columns: Sequence[str], header: Sequence[str]) -> list[int]:
+def places(path: Path, columns: Sequence[str], header: Sequence[str], *, headed: bool = True) -> list[int]:
     """Where the columns stand in a header; columns of one name are `name.0`, `name.1`, ... from the left.
 
     Raises:
         InputError: a column that is not there, or a name that stands twice.
     """
     apart = told_apart(header)
-    check_present(path, [name for name in columns if name not in apart], header, named_apart=True)
+    check_present(path, [name for name in columns if name not in apart], header, named_apart=True, headed=headed)
     return [apart.index(name) for name in columns]
 
 

@@ -6,9 +6,10 @@ import math
 import re
 import warnings
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,23 +18,31 @@ import numpy as np
 from orthaug._base.checks import Vector, nearest
 from orthaug._base.errors import InputError, MissingColumnError
 from orthaug._base.memory import check_memory, in_words
-from orthaug.data.matlab import Variable, read_mat5
+from orthaug.data.matlab import MOST_ELEMENTS, Variable, read_mat5
 
 _NAMED = 30  # variables that a message lists
 _HDF5, _USERBLOCK = b"\x89HDF\r\n", 4096  # how such a file begins, and before which byte it does
 _DIGITS = 10  # of an index at most
 Wanted = Sequence[str] | Callable[[str], bool] | None  # names, a choice of single numbers, or all names
+_MOST_HELD, _DEEPEST = 10_000, 8  # variables that are noted, and references one behind the other
+_LABELS = {"Data": "Name", "values": "label"}  # fields of dSPACE and of Simulink: a signal, and what it is called
+_LONGEST_NAME = 200  # characters of such a name at most
 _ROOT = re.compile(r"[./\[]")  # what follows the name of a variable in a path
 _ELEMENT = re.compile(r"[({]\s*(?::\s*,\s*)?([1-9]\d{0,8})\s*(,\s*:\s*)?[)}]")  # as MATLAB writes it
 
 
 @dataclass(frozen=True)
 class Held:
-    """A variable of a file: what it is, in words, and how to read it (None where it holds no numbers)."""
+    """A variable of a file: what it is, in words, and how to read it (None where it holds no numbers).
+
+    `text` reads a text. `named` is the name that the file itself gives to the signal, beside its path.
+    """
 
     what: str
     read: Callable[[], np.ndarray] | None
     shape: tuple[int, ...] = ()
+    text: Callable[[], str] | None = None
+    named: str = ""
 
 
 def read_variables(path: Path, names: Sequence[str]) -> dict[str, Vector]:
@@ -127,15 +136,16 @@ def _from_mat(path: Path, names: Wanted) -> dict[str, Vector]:
     roots = {_ROOT.split(name.lstrip("/"))[0] for name in asked}
     held: dict[str, Held] = {}
     for name, variable in variables.items():
-        held |= _held(path, variable, deep=not asked or name in roots)
-    return _taken(path, names, held)
+        held |= _held(path, variable, deep=not roots or name in roots or not roots <= variables.keys())
+    return _taken(path, names, _with_names(held))
 
 
 def _held(path: Path, variable: Variable, *, deep: bool) -> dict[str, Held]:
     """A variable, with what is in it if wanted, by their paths."""
     if not variable.what:
         return {variable.name: _lazy(path, variable.shape, 8, variable.numbers)}
-    held = {variable.name: Held(variable.what, None)}
+    text = variable.text if variable.what == "text" else None
+    held = {variable.name: Held(variable.what, None, variable.shape, text)}
     for part in variable.parts() if deep else ():
         held |= _held(path, part, deep=True)
     return held
@@ -147,37 +157,93 @@ def _from_hdf5(path: Path, names: Wanted) -> dict[str, Vector]:
         import h5py
     except ImportError:
         raise InputError(f"{path}: reading HDF5 needs h5py; install orthaug[hdf5].") from None
-    matlab = path.suffix.lower() == ".mat"
-    held: dict[str, Held] = {}
-
-    def note(name: str, item: Any) -> None:
-        key = name.replace("/", ".") if matlab else name
-        if isinstance(item, h5py.Group):
-            if not name.startswith("#"):
-                sparse = "MATLAB_sparse" in item.attrs
-                held[key] = Held("a sparse matrix" if sparse else "a struct" if matlab else "a group", None)
-        elif not name.startswith("#") and "MATLAB_sparse" not in item.parent.attrs:
-            kind = item.attrs.get("MATLAB_class", b"")
-            if kind in (b"cell", "cell") and item.shape is not None and math.prod(item.shape) == 1:
-                note(name, file[item[()].flat[0]])
-            elif kind in (b"char", b"cell", "char", "cell"):
-                held[key] = Held("text" if kind in (b"char", "char") else "a cell", None)
-            elif item.shape is None:
-                held[key] = Held("empty", None)
-            elif item.dtype.kind not in "fiubc" and item.dtype.names is None:
-                held[key] = Held(f"{item.dtype} values", None)
-            elif item.dtype.kind in "fiu" and item.id.get_type() != h5py.h5t.py_create(item.dtype):
-                held[key] = Held("numbers in a format of their own", None)
-            else:
-                shape = item.shape[::-1] if matlab else item.shape
-                held[key] = _lazy(path, shape, item.dtype.itemsize, lambda: item[()].T if matlab else item[()])
-
     with h5py.File(path, "r") as file:
         _ = [
             name in file for name in (() if names is None or callable(names) else names)
         ]  # complains of broken tables on which a visit never ends
-        file.visititems(note)
-        return _taken(path, names, held)
+        found = _Datasets(path, file, path.suffix.lower() == ".mat", {})
+        file.visititems(found.add)
+        return _taken(path, names, _with_names(found.held) if found.matlab else found.held)
+
+
+@dataclass(frozen=True, eq=False)
+class _Datasets:
+    """What an HDF5 file holds, by path. MATLAB keeps cells and arrays of structs as references to `#refs#`."""
+
+    path: Path
+    file: Any
+    matlab: bool
+    held: dict[str, Held]
+
+    def add(self, name: str, item: Any) -> None:
+        """Note what stands at a path of groups; `#refs#` is reached by its references only."""
+        if not name.startswith("#"):
+            self._note(name, item, 0)
+
+    def _note(self, name: str, item: Any, depth: int) -> None:
+        import h5py
+
+        key = name.replace("/", ".") if self.matlab else name
+        kind = _word(item.attrs.get("MATLAB_class", b""))
+        if isinstance(item, h5py.Group):
+            sparse = "MATLAB_sparse" in item.attrs
+            self.held[key] = Held("a sparse matrix" if sparse else "a struct" if self.matlab else "a group", None)
+            for child in item if depth else ():  # of what a reference points at; others are visited
+                self._note(f"{name}/{child}", item[child], depth + 1)
+        elif "MATLAB_sparse" in item.parent.attrs:
+            pass
+        elif item.shape is None or "MATLAB_empty" in item.attrs:
+            self.held[key] = Held("empty", None)
+        elif self.matlab and (kind == "cell" or h5py.check_ref_dtype(item.dtype) is h5py.Reference):
+            self._note_elements(name, item, kind == "cell", depth)
+        elif kind == "char":
+            text = lambda: "".join(map(chr, item[()].ravel().tolist()))  # noqa: E731
+            self.held[key] = Held("text", None, item.shape[::-1], text)
+        elif item.dtype.kind not in "fiubc" and item.dtype.names is None:
+            self.held[key] = Held(f"{item.dtype} values", None)
+        elif item.dtype.kind in "fiu" and item.id.get_type() != h5py.h5t.py_create(item.dtype):
+            self.held[key] = Held("numbers in a format of their own", None)
+        else:
+            shape = item.shape[::-1] if self.matlab else item.shape
+            load = lambda: item[()].T if self.matlab else item[()]  # noqa: E731
+            self.held[key] = _lazy(self.path, shape, item.dtype.itemsize, load)
+
+    def _note_elements(self, name: str, item: Any, cell: bool, depth: int) -> None:
+        """Note what the elements of a cell, or of a field of an array of structs, point at: `c[0]`, `runs[0].u`."""
+        count = math.prod(item.shape)
+        parent, _, field = name.rpartition("/")
+        if cell:
+            self.held[name.replace("/", ".")] = Held("a cell", None)
+        if not 0 < count <= MOST_ELEMENTS or depth >= _DEEPEST:
+            return
+        for i, reference in enumerate(item[()].flat):
+            place = f"{name}[{i}]" if cell else f"{parent}[{i}]/{field}"
+            if reference and len(self.held) < _MOST_HELD:
+                self._note(name if cell and count == 1 else place, self.file[reference], depth + 1)
+
+
+def _word(text: Any) -> str:
+    return text.decode("latin-1") if isinstance(text, bytes) else str(text)
+
+
+def _with_names(held: Mapping[str, Held]) -> dict[str, Held]:
+    """Add the signals that a file names in a field beside their values, each under its name where no other has it."""
+    named: dict[str, str] = {}
+    for path, variable in held.items():
+        parent, _, field = path.rpartition(".")
+        label = held.get(f"{parent}.{_LABELS.get(field)}")
+        if not (variable.read and label and label.text and max(variable.shape, default=0) > 1):
+            continue
+        if math.prod(label.shape) <= _LONGEST_NAME and label.text().strip():
+            named[path] = label.text().strip()
+    often, found = Counter(named.values()), {}
+    for path, variable in held.items():
+        name = named.get(path, "")
+        if name and often[name] == 1 and name not in held:
+            found[name] = variable
+            variable = replace(variable, named=name)
+        found[path] = variable
+    return found
 
 
 _FORMATS: dict[str, Callable[[Path, Wanted], dict[str, Vector]]] = {
@@ -215,7 +281,7 @@ def _taken(path: Path, names: Wanted, held: Mapping[str, Held]) -> dict[str, Vec
         return {name: _pick(path, name, held) for name in names}
     lines = {}
     for name, variable in held.items():
-        sides = [n for n in variable.shape if n != 1]
+        sides = [n for n in variable.shape if n != 1] if variable.read and not variable.named else []
         if len(variable.shape) <= 2 and len(sides) == 1:
             lines[name] = np.empty(0)
         elif len(sides) == len(variable.shape) == 2 and min(sides) <= _NAMED:

@@ -51,7 +51,7 @@ _SUMMARIES = {
 _FIRST = {"factor": 2, "samples": 1}  # what a step begins with where it has no default
 _LABELS = {"cutoff": "cutoff in Hz", "sampling_time": "step in s", "most": "rows at most", "window": "rows each side"}
 _CUTOFF = 0.1  # the first cutoff, as a share of the sampling frequency
-_KNOWN = "CSV, TSV, Parquet, Excel, MATLAB, NumPy or HDF5; it stays on this machine"
+_KNOWN = "CSV, TSV, TXT, DAT, Parquet, Excel, MATLAB, NumPy or HDF5; it stays on this machine"
 _DROP = """
 <label class="drop" id="drop">
   <input type="file" id="dropped" class="unseen" accept="{endings}">

@@ -22,8 +22,9 @@ from orthaug._base.errors import InputError
 from orthaug.commands import init as starting
 from orthaug.commands.job import Job
 from orthaug.commands.kinds import kind_of, open_job
+from orthaug.data.columns import Column
 from orthaug.data.record import Channel, check_step
-from orthaug.data.survey import Column, Survey
+from orthaug.data.survey import Survey
 from orthaug.physics.baseline import derived_units
 
 MOST = 3000
@@ -119,7 +120,7 @@ def _timed(found: Survey) -> str:
 
 def _column(found: Survey, column: Column) -> dict[str, Any]:
     usable = column in found.signals
-    told = starting.as_seen(column, spikes=column.kind != "input") if usable else column.unusable or "constant"
+    told = starting.as_seen(column, spikes=column.kind != "input") if usable else found.why_not(column)
     head = column.name + (f" = column '{column.header}'" if column.header != column.name else "")
     own = {"header": column.header, "kind": column.kind, "usable": usable, "timed": column is found.clock.column}
     return own | {"told": told.removeprefix(f"{head}: ")}

@@ -1,0 +1,148 @@
+"""A column of a data file: its values, the channel that it would be, and what is odd about it."""
+
+from __future__ import annotations
+
+import keyword
+import re
+import unicodedata
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from orthaug._base.checks import Vector
+from orthaug._base.errors import LONGEST
+from orthaug.data.expressions import SAMPLING_TIME, is_name
+from orthaug.data.headers import last_part, split_header
+from orthaug.data.steps import Outliers
+
+_INPUT = re.compile(r"^(u|u_?\d+|in|input|input_?\d+)$", re.IGNORECASE)
+_OUTPUT = re.compile(r"^(y|y_?\d+|out|output|output_?\d+)$", re.IGNORECASE)
+_HELD = 6  # rows at the largest or smallest value from which on it is suspected to be a limit
+_OFTEN = 5.0  # times the rows that a value usually has
+_LONGER = 3.0  # times the rows for which other values are usually held
+_LEVELS = 20  # of a signal at least, for one with fewer stands at its extremes anyway
+_FINEST = 1e5  # steps within the range from which on rounding of the numbers could make them
+_COARSE = 0.02  # steps of a signal over its standard deviation that are told
+SPIKE = 15.0
+"""Deviations from its neighbours that a sample is a spike from on."""
+_LOWER = (SPIKE, 10.0, 7.0, 5.0, 4.0)  # tried where a sample stands far outside the range of all others
+_BEYOND = 0.5  # of that range
+_OUTSIDE = 2.5  # interquartile ranges from the middle
+_FEW = 0.01  # share of samples that spikes are at most
+_SAME = 1e-6  # relative
+
+
+@dataclass(frozen=True, eq=False)
+class Column:
+    """A column of a file: its values as floats, and the channel it would be."""
+
+    header: str
+    name: str
+    unit: str
+    values: Vector
+    unusable: str = ""
+    """Why it can be no channel, in words."""
+
+    @property
+    def finite(self) -> Vector:
+        """The values that are there."""
+        return self.values[np.isfinite(self.values)]
+
+    @property
+    def filled(self) -> int:
+        """Rows up to the last value."""
+        there = np.flatnonzero(np.isfinite(self.values))
+        return int(there[-1]) + 1 if len(there) else 0
+
+    @property
+    def missing(self) -> int:
+        """Cells without a number before the last value."""
+        return self.filled - len(self.finite)
+
+    @property
+    def constant(self) -> bool:
+        """Whether all values are the same."""
+        return len(self.finite) > 0 and bool(np.ptp(self.finite) == 0)
+
+    @property
+    def limits(self) -> tuple[tuple[float, int], ...]:
+        """Extreme values where the signal stands much more often than elsewhere, with the rows; perhaps saturated."""
+        levels, counts = np.unique(self.finite, return_counts=True)
+        if len(levels) < _LEVELS:
+            return ()
+        x = self.finite
+        edges = np.concatenate([[0], np.flatnonzero(np.diff(x)) + 1, [len(x)]])
+        held = np.diff(edges)
+        held = held[(held > 1) & ~np.isin(x[edges[:-1]], levels[[0, -1]])]  # as inputs are, between their steps
+        least = max(_HELD, _OFTEN * float(np.median(counts)), _LONGER * float(np.median(held)) if len(held) else 0.0)
+        return tuple((float(levels[i]), int(counts[i])) for i in (0, -1) if counts[i] >= least)
+
+    @property
+    def spikes(self) -> int:
+        """Samples far from all their neighbours and from what the signal usually is, where they are few."""
+        return self._spiky[1]
+
+    @property
+    def threshold(self) -> float:
+        """The step `outliers` takes the spikes away with it: `SPIKE`, lower where they need it."""
+        return self._spiky[0]
+
+    @cached_property
+    def _spiky(self) -> tuple[float, int]:
+        x = self.values[: self.filled]
+        distance, deviation = Outliers().distances(x)
+        usual = np.quantile(self.finite, [0.25, 0.75])
+        far = np.abs(x - usual.mean()) > _OUTSIDE * np.ptp(usual)
+        wild = {}
+        for threshold in _LOWER:
+            wild[threshold] = (distance > threshold * deviation) & far
+        rest = x[np.isfinite(x) & ~wild[_LOWER[-1]]]
+        beyond = _BEYOND * np.ptp(rest)
+        alone = wild[_LOWER[-1]] & ((x > rest.max() + beyond) | (x < rest.min() - beyond))
+        threshold = next(threshold for threshold in _LOWER if not (alone & ~wild[threshold]).any())
+        count = int(wild[threshold].sum())
+        return (threshold, count) if count <= max(1.0, _FEW * len(x)) else (SPIKE, 0)
+
+    @property
+    def quantum(self) -> float | None:
+        """The step of which all values are multiples, where it is coarse beside deviation or movement of a sample."""
+        step = quantum_of(self.finite)
+        if step is None or step <= min(_COARSE * float(self.finite.std()), self.movement):
+            return None
+        return step if len(np.unique(self.finite)) < len(self.finite) / 2 else None
+
+    @property
+    def movement(self) -> float:
+        """By how much the signal moves between two rows, on the average."""
+        return float(np.abs(np.diff(self.finite)).mean()) if len(self.finite) > 1 else 0.0
+
+    @property
+    def kind(self) -> str:
+        """'input' or 'output' where the name says so, otherwise ''."""
+        name = channel_name(last_part(split_header(self.header)[0]))
+        return "input" if _INPUT.match(name) else "output" if _OUTPUT.match(name) else ""
+
+
+def quantum_of(values: Vector) -> float | None:
+    """The step of which all differences between values are multiples, up to rounding; None where there is none."""
+    levels = np.unique(values)
+    if len(levels) < 3 or not np.isfinite(levels[[0, -1]]).all():
+        return None
+    step = float(np.diff(levels).min())
+    multiples = (levels - levels[0]) / step
+    even = np.abs(multiples - np.round(multiples)).max() < _SAME * max(float(multiples.max()), 1e3)
+    return step if even and multiples.max() < _FINEST else None
+
+
+def channel_name(text: str, taken: Iterable[str] = ()) -> str:
+    """An identifier for a column: other letters become underscores; a name that is taken gets a number."""
+    name = re.sub(r"\W+", "_", unicodedata.normalize("NFKC", text)).strip("_")[: LONGEST - 4] or "channel"
+    name = f"x{name}" if name[0].isdigit() else name
+    if not is_name(name) or keyword.iskeyword(name) or name in (SAMPLING_TIME, "time"):
+        name += "_"
+    taken, unique, number = set(taken), name, 2
+    while unique in taken:
+        unique, number = f"{name}_{number}", number + 1
+    return unique
