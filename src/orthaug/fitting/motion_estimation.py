@@ -24,6 +24,7 @@ from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import ALONE, Ending, Status
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.fitting.training import Choice, planned, train
+from orthaug.fitting.unfinished import ending_in_words, not_converged, unfinished, withheld
 from orthaug.inference.motion_split import MotionSplit
 from orthaug.models.learners import Learner, Scaling
 from orthaug.models.motion_model import MotionModel, Trained
@@ -104,7 +105,10 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) ->
     assert learned.coefficients is not None and learned.errors is not None
     states = plan.segments.start if learned.scores is None else learned.scores.states
     slope = None if learned.scores is None else learned.scores.slope
+    unsettled = (not_converged(learned),) if unfinished(learned) else ()
+    learned = withheld(learned) if unsettled else learned
     errors = learned.errors
+    assert errors is not None
     alone = np.asarray(learned.coefficients if task.physics is None else task.physics.end.flown.theta)
     laid = (plan.flown.segment, plan.flown.washout, plan.segments.count)
     trained = Trained(*laid, np.asarray(states), slope, alone)
@@ -112,6 +116,7 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) ->
     reason = ALONE.get(learned.ending, "") if learned.bound is None or task.physics is None else ""
     if reason and not learned.ending.usable and (where := task.problem.without_value(np.any)):
         reason = f"{where}; mend it, or bound what it reads"
+    reason = reason or ending_in_words(learned.ending, learned.tail)
     fit = MotionEstimate(
         model=model,
         status=Status(learned.ending, learned.iterations, learned.seconds, errors.mean_square, reason=reason),
@@ -128,7 +133,7 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) ->
         slope=slope,
         alone=alone,
         scores=learned.scores,
-        warnings=tuple(without_loss(errors.mean_square)),
+        warnings=(*without_loss(errors.mean_square), *unsettled),
     )
     return fit.split(structure.measure, getattr(structure, "shared", "auto")) if learned.ending.usable else fit
 
