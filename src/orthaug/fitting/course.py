@@ -163,7 +163,8 @@ class Course:
             )
             path = (*end.path, *again.path)
             spent = {"iterations": done + again.iterations, "seconds": end.seconds + again.seconds}
-            end = again._replace(path=path, **spent)
+            tail = again.tail and again.tail._replace(done=spent["iterations"], limit=solver.iterations)
+            end = again._replace(path=path, tail=tail, **spent)
         mean_square = self.mean_square(end.flown.c, end.flown.w)
         return Flight(objective, end, mean_square, end.iterations, end.seconds)
 

@@ -190,8 +190,8 @@ def descend(
     began = training_clock()
     limits = tuple(np.full(len(p), side) for side in (-np.inf, np.inf))
     if bounds is not None:
-        for limit, side in zip(limits, bounds, strict=True):
-            limit[: objective.physics] = side
+        for whole, side in zip(limits, bounds, strict=True):
+            whole[: objective.physics] = side
     paused = None if kept is None else kept.state()
     if paused is not None:
         iterate, (done, taken, begun, first_loss, mark), ending = _resumed(objective, paused)
