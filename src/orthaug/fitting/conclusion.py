@@ -20,6 +20,7 @@ from orthaug.fitting.estimates import NOT_UNIQUE, Estimate
 from orthaug.fitting.laid_rows import Share
 from orthaug.fitting.learned import ErrorStatistics, Learned
 from orthaug.fitting.one_step import OneStepTask
+from orthaug.fitting.silence import learner_silent
 from orthaug.fitting.status import ALONE, Ending, Status
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.fitting.unfinished import (
@@ -72,6 +73,7 @@ def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estim
     noise = errors.noise if ending.usable else None
     identified = structure.projects or (learned.bound is None and structure.identifies)
     known = noise is not None and identified and not learned.elsewhere
+    told += [] if learned.elsewhere else learner_silent(learned)
     told += _warnings(problem, structure, learned, identified, noise, fixed)
     if any(warning.code == NOT_CONVERGED for warning in told):
         pass

@@ -42,6 +42,11 @@ class Flight(NamedTuple):
     def ending(self) -> Ending:
         return self.end.ending
 
+    @property
+    def effective(self) -> float:
+        """Effective number of weights."""
+        return self.end.effective
+
 
 class Looked(NamedTuple):
     """A trial whose segments are in memory, to be looked at, and how its states follow (c, w)."""

@@ -280,17 +280,26 @@ def _trial(
 
 
 def _next_ridge(objective: SquaredResiduals, iterate: _Iterate) -> float:
-    """MacKay's fixed point `α = γσ²/(κ‖w‖²)`, κ the share of the residuals that is independent.
+    effective = effective_weights(iterate.linear.hessian, iterate.ridge, objective.physics)
+    return evidence_ridge(objective, iterate.flown, effective, coloured=iterate.coloured)
+
+
+def evidence_ridge(objective: SquaredResiduals, flown: Any, effective: float, *, coloured: bool = True) -> float:
+    """Return MacKay's fixed point `α = γσ²/(κ‖w‖²)`, κ the share of the residuals that is independent.
 
     Residuals of a free run are coloured: N of them say as much as κN independent ones. So the data weigh less against
     the prior.
+
+    Args:
+        objective: that the weights minimise.
+        flown: the trial at the weights.
+        effective: number γ of effective weights there.
+        coloured: whether the colour of the residuals counts.
     """
-    flown, physics = iterate.flown, objective.physics
     count, share = objective.samples(flown)
-    share = share if iterate.coloured else 1.0
-    effective = effective_weights(iterate.linear.hessian, iterate.ridge, physics)
+    share = share if coloured else 1.0
     variance = flown.loss / max(count - effective / share, 1.0)
-    size = float(np.sum(flown.p[physics:] ** 2))
+    size = float(np.sum(flown.p[objective.physics :] ** 2))
     return float(np.clip(effective * variance / (share * max(size, 1e-300)), 1e-12, 1e12))
 
 
