@@ -84,8 +84,8 @@ def tell_retries(
     effective = max(run.effective for run in runs[:planned])
     text = (
         f"evidence left {counted_weights(effective)} of the learner, no more than a constant, so training was tried "
-        f"again with {' and '.join(_name(choice) for choice in choices[1:])}. Errors in {held_out.where}, in deviations of "
-        f"the output: {found}, physics alone {_error(np.sqrt(mean_square(held_out.alone)))}. Kept is {kept}."
+        f"again with {' and '.join(_name(choice) for choice in choices[1:])}. Errors in {held_out.where}, in deviations "
+        f"of the output: {found}, physics alone {_error(np.sqrt(mean_square(held_out.alone)))}. Kept is {kept}."
     )
     return [Warning("evidence_retried", text)]
 

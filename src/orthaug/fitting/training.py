@@ -106,8 +106,7 @@ def train(
     with one_blas_thread():
         task = task.prepared(solver, structure, partial(progress, 0))
     LOG.info("training: %d runs of %s, %s", len(starts), type(solver).__name__, structure.name)
-    planned = len(starts)
-    starts, runs = _run_all(task, starts, structure, solver, choice, progress, runner)
+    planned, (starts, runs) = len(starts), _run_all(task, starts, structure, solver, choice, progress, runner)
     losses = [task.loss(run) for run in runs]
     concluded = cache(lambda i: _concluded(conclude, task, structure, task.learned(runs[i])))
     stopped = sum(run.ending is Ending.STOPPED for run in runs)
