@@ -111,7 +111,7 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) ->
     unsettled = (not_converged(learned),) if unfinished(learned) else ()
     learned = withheld(learned) if unsettled else learned
     errors = learned.errors
-    assert errors is not None
+    assert errors is not None and learned.coefficients is not None
     alone = np.asarray(learned.coefficients if task.physics is None else task.physics.end.flown.theta)
     laid = (plan.flown.segment, plan.flown.washout, plan.segments.count)
     trained = Trained(*laid, np.asarray(states), slope, alone)
@@ -147,6 +147,7 @@ def _learner_values(plan: MotionCourse, learned: Learned) -> Matrix | None:
     bound = plan.bound
     if bound is None or learned.scores is None or not silenced(learned.effective, bound.ny):
         return None
+    assert learned.coefficients is not None
     x, u = plan.trajectory(learned.coefficients, learned.weights, learned.scores.states)
     with np.errstate(all="ignore"):
         features = plan.scaling(np.asarray(plan.dynamics.seen(x.T, u.T, np)).T)

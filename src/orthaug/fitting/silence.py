@@ -82,9 +82,10 @@ def tell_retries(
     found = ", ".join(f"{_name(choice)} {_error(error)}" for choice, error in errors.items())
     kept = "physics alone" if best < 0 else _name(starts[best].regularization)
     effective = max(run.effective for run in runs[:planned])
+    tried = " and ".join(_name(choice) for choice in choices[1:])
     text = (
         f"evidence left {counted_weights(effective)} of the learner, no more than a constant, so training was tried "
-        f"again with {' and '.join(_name(choice) for choice in choices[1:])}. Errors in {held_out.where}, in deviations "
+        f"again with {tried}. Errors in {held_out.where}, in deviations "
         f"of the output: {found}, physics alone {_error(np.sqrt(mean_square(held_out.alone)))}. Kept is {kept}."
     )
     return [Warning("evidence_retried", text)]
