@@ -216,7 +216,7 @@ def test_a_run_goes_on_past_its_limit_while_the_loss_falls():
     )
     assert (short.iterations, long.iterations) == (8, 40) and long.tail.prolonged and not short.tail.prolonged
     np.testing.assert_array_equal(long.w, longest.w)
-    assert short.tail.noticeable and short.tail.fall > 0 and short.tail.window == 2
+    assert short.tail.noticeable and short.tail.fall > 0 and short.tail.window == 5
     once = minimise(given, solver=LevenbergMarquardt(8, 0.0, longest=40), noticeable=1e6)
     assert once.iterations == 8 and not once.tail.noticeable
 

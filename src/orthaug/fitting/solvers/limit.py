@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 _HALF_AN_ERROR = 0.25  # of χ²: (½ standard error)²
+_FEWEST = 5  # steps of a window: one alone may be a trial that was rejected
 _PROLONGED = 10  # times the limit, at most
 
 
@@ -30,7 +31,7 @@ class Limit(NamedTuple):
     @property
     def window(self) -> int:
         """Return the number of last steps over which the fall of the loss is judged."""
-        return max(self.iterations // 4, 1)
+        return max(self.iterations // 4, min(_FEWEST, self.iterations), 1)
 
     def reached(self, done: int, before: float, loss: float) -> bool:
         """Return whether a run ends after `done` steps.
