@@ -480,10 +480,10 @@ def test_evidence_that_silences_dry_friction_is_tried_again():
     assert low < 95.1 < high
 
 
-def tanks(rows: int = 160) -> oa.Record:
+def tanks(rows: int = 300) -> oa.Record:
     """Two tanks of which the upper one runs over; K = 0.05, a1 = 0.05, a2 = 0.04, and both levels are measured."""
     rng, state, levels = np.random.default_rng(5), np.array([3.0, 3.0]), []
-    pump = np.interp(np.arange(rows), np.arange(0, rows + 15, 15), rng.uniform(0.3, 6.5, rows // 15 + 1))
+    pump = np.interp(np.arange(rows), np.arange(0, rows + 1, 15), rng.uniform(0.3, 6.5, rows // 15 + 1))
 
     def rates(x, u):
         down, over = 0.05 * np.sqrt(max(x[0], 0.0)), 3 * max(x[0] - 10, 0.0)
