@@ -188,15 +188,15 @@ def _kinds(fits: Mapping[str, Any], like: Sequence[_Tried] | None = None) -> lis
     if like is not None:
         return [replace(tried, estimate=_without(fits[tried.focus], tried.learner)) for tried in like]
     learns = fits[ONE_STEP].model.form.bound is not None
-    return [
-        _Tried(focus, own, _without(one, own)) for focus, one in fits.items() for own in ([0, 1] if learns else [0])
-    ]
+    kinds = (False, True) if learns else (False,)
+    return [_Tried(focus, own, _without(one, own)) for focus, one in fits.items() for own in kinds]
 
 
 def _without(estimate: Any, learner: bool) -> Any:
     """Return an estimate, or that of physics alone beside it."""
-    alone = not learner and estimate is not None and estimate.physics_alone is not None
-    return estimate.physics_alone if alone else estimate
+    if learner or estimate is None or estimate.physics_alone is None:
+        return estimate
+    return estimate.physics_alone
 
 
 def _best(problem: Any, tried: Sequence[_Tried], reason: str, *, keeps_learner: bool) -> Any:
