@@ -32,6 +32,7 @@ _PATIENCE = 5  # additions that did not improve the score by `_BETTER` each, aft
 _BETTER = 0.005
 _FOLD_ITERATIONS = 10
 _ANEW = 5  # times that the terms are picked anew about the choice
+_SURE, _HALF = 3.0, 0.5  # standard errors, and of the error of physics alone: what is better by both is confirmed
 _HALVES = 50  # random halves of the data over which terms are chosen again
 _PARTS = 10  # of the training data, that halves are made of
 _SEED = 20_261_122
@@ -236,7 +237,10 @@ def climb(
         confirmed = True
 
         def judged(point: Point, change: Sequence[str], began: float) -> Rung:
-            held, _ = next(folds.judge([point]))
+            known = (rung.held for rung in rungs if rung.point.chosen == point.chosen)  # ways that begin alike
+            held = next(known, None)
+            if held is None:
+                held, _ = next(folds.judge([point]))
             lags = frozenset[Lag]().union(*(runs.lags[i] for i in point.chosen))
             rung = Rung(point, tuple(change), held, time.monotonic() - began, len(point.chosen), len(lags))
             rungs.append(rung)
@@ -333,7 +337,18 @@ def _confirmed(folds: Blocks, size: int, able: Able) -> bool:
         count = min(_added_to(before), size - before) if rungs else 0
         points, held = folds.along(points, count, able)
         rungs.append(Rung(Point((), held, held), (), held, 0.0, before + count))
+        if _beyond_doubt(rungs[0].held, held):
+            return True
     return bool(size) and not judge_all(rungs)[0].within
+
+
+def _beyond_doubt(alone: Vector, held: Vector) -> bool:
+    """Whether physics alone is so much worse than a model that larger models need not be asked."""
+    worse = alone - held
+    if not np.isfinite(held).all() or not np.isfinite(alone).all():
+        return False
+    error = float(worse.std(ddof=1)) / np.sqrt(len(held))
+    return bool(worse.mean() > _SURE * error and np.mean(held) < _HALF**2 * np.mean(alone))
 
 
 def _backward(path: TermPath, judged: Any) -> None:
