@@ -266,9 +266,9 @@ def _layout(outputs: Sequence[str], inputs: Sequence[str], orders: Orders) -> tu
 
 def _beside(orders: OrderSearch, record: Record, baseline: Baseline) -> list[str]:
     """Return the linear lags of the choice, and its constant, that the physics does not have."""
-    names = ([channel.name for channel in group] for group in (record.outputs, record.inputs))
+    outputs, inputs = ([channel.name for channel in group] for group in (record.outputs, record.inputs))
     own = {term.regressor for term in baseline.terms}
-    linear = [str(lag) for lag in _layout(*names, orders.chosen)]
+    linear = [str(lag) for lag in _layout(outputs, inputs, orders.chosen)]
     return [text for text in [*linear, *([CONSTANT] * orders.constant)] if text not in own]
 
 

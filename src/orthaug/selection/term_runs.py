@@ -35,6 +35,7 @@ _PLACES = 32  # for terms in a compiled program; choices that need more take a m
 _NARROW = (8, 16)  # places of programs that are worth being compiled besides, from so many rows on:
 _MANY_ROWS = 20_000  # compiling takes 1 s, and a pass over 65,000 rows 0.012 s with 8 places and 0.04 s with 32
 _CHUNK = 4096  # rows
+_SETTLED = 0.1  # of the loss: a step that lowers it by more may change the sensitivities
 _TOLERANCE = 1e-4  # relative change of the loss: models are compared, not published
 
 
@@ -303,8 +304,9 @@ class TermRuns:
 def _descended(objective: FreeRunObjective, p: Vector, start: Start, iterations: int) -> Flown:
     """Minimise the misfit by Gauss-Newton steps, and by Levenberg-Marquardt from where one of them does not descend.
 
-    About a fitted model the misfit is nearly quadratic. A step that lowers it by what was expected leaves nothing to
-    gain, so no trial is linearised only to confirm that: a linearisation costs ten to thirty trials.
+    About a fitted model the misfit is nearly quadratic. A small step that lowers it by what was expected leaves nothing
+    to gain, so no trial is linearised only to confirm that: a linearisation costs ten to thirty trials. After a large
+    step the sensitivities are others: those of past outputs are zero where the model does nothing yet.
     """
     flown = objective.fly(p, start)
     for done in range(iterations if np.isfinite(flown.misfit) else 0):
@@ -321,7 +323,7 @@ def _descended(objective: FreeRunObjective, p: Vector, start: Start, iterations:
             solver, start = LevenbergMarquardt(iterations - done, _TOLERANCE), Start(flown.states)
             return solver.descend(objective, flown.p, start, damping=MARQUARDT).flown
         before, flown = flown, tried
-        if abs(expected - gained) <= _TOLERANCE * before.misfit:
+        if gained <= _SETTLED * before.misfit and abs(expected - gained) <= _TOLERANCE * before.misfit:
             break
     return flown
 
