@@ -4,9 +4,9 @@ import json
 
 import numpy as np
 import pytest
+from test_cli import run
 
 import orthaug as oa
-from orthaug.commands.cli import main
 
 
 def plant(rows=600, amplitude=1.0, seed=0, noise=0.0) -> oa.Record:
@@ -58,15 +58,15 @@ def test_a_correction_that_fades_leaves_the_physics_alone():
 @pytest.mark.parametrize("beyond", ["hold", "fade"])
 def test_within_its_training_nothing_is_changed(beyond):
     held, free = fitted(beyond=beyond), fitted(beyond="free")
-    for run in ("predict", "simulate"):
-        found, expected = (getattr(model, run)(plant()).trajectories[0].model for model in (held, free))
+    for what in ("predict", "simulate"):
+        found, expected = (getattr(model, what)(plant()).trajectories[0].model for model in (held, free))
         np.testing.assert_allclose(found[2:], expected[2:], rtol=1e-12, atol=1e-13)
 
 
 def test_a_free_run_far_beyond_its_training_stays_bounded():
     """The physics is stable, so that a bounded correction keeps the run bounded whatever the input is."""
-    run = fitted().simulate(louder(300.0)).trajectories[0]
-    assert run.diverged is None and np.abs(run.model[2:]).max() < 3e3
+    found = fitted().simulate(louder(300.0)).trajectories[0]
+    assert found.diverged is None and np.abs(found.model[2:]).max() < 3e3
 
 
 def test_a_learner_of_a_difference_is_held_in_the_difference():
@@ -97,8 +97,8 @@ def test_a_saved_model_holds_as_well(tmp_path):
     model = fitted()
     oa.save(model, tmp_path / "model")
     record = louder(50.0)
-    for run in ("predict", "simulate"):
-        found, expected = (getattr(m, run)(record).trajectories[0].model for m in (oa.load(tmp_path / "model"), model))
+    for what in ("predict", "simulate"):
+        found, expected = (getattr(m, what)(record).trajectories[0].model for m in (oa.load(tmp_path / "model"), model))
         np.testing.assert_array_equal(found, expected)
 
 
@@ -134,13 +134,14 @@ hidden = [2]
 beyond = "WHAT"
 [training]
 iterations = 20
+focus = "prediction"
 [validation]
 blocks = 0
 """
     (tmp_path / "wrong.toml").write_text(text.replace("WHAT", "clip"))
-    assert main(["fit", "wrong.toml"]) == 2
+    assert run("fit", "wrong.toml").code == 2
     (tmp_path / "spec.toml").write_text(text.replace("WHAT", "free"))
-    assert main(["fit", "spec.toml", "--out", "out"]) == 0
+    assert run("fit", "spec.toml", "--out", "out").code == 0
     assert json.loads((tmp_path / "out/model/model.json").read_text())["learner"]["beyond"] == "free"
     assert oa.load(tmp_path / "out").numbers.limits is None
 
