@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,8 @@ from orthaug.fitting.held_out import Candidate, Focus, Pieces, blocked, mean_squ
 from orthaug.fitting.training import FOLD_ITERATIONS
 
 ONE_STEP, FREE_RUN = "prediction", "simulation"
-HALVES = 2  # blocks that are held out in turn: long runs show the drift that short ones hide
+BLOCKS = 4  # blocks that are held out in turn where that is not said
+HALVES = 2  # the later one is run over by a fit to the other
 _SLACK = 1.02  # errors closer than this are the same: then the simpler candidate stays
 _LAGS = 20  # of the residual's autocorrelation
 _COLOURED = 0.1  # autocorrelation from which a residual is no noise of the equation, where it is significant, too
@@ -31,26 +33,8 @@ _SIGNIFICANT = 4.0  # standard deviations of the autocorrelation of white noise:
 
 Fit = Callable[..., Any]
 """Fits a problem: `fit(problem, learner=…, criterion=…, …)`."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Tried:
-    """A candidate with its estimate, and the squared errors of its free runs where nothing was fitted."""
-
-    focus: str
-    learner: bool
-    estimate: Any
-    pieces: Pieces = ()
-
-    @property
-    def error(self) -> float:
-        """RMS in standard deviations of the training output."""
-        return math.sqrt(mean_square(self.pieces)) if self.pieces else math.nan
-
-    @property
-    def candidate(self) -> Candidate:
-        """What is reported of it."""
-        return Candidate(self.focus, self.learner, self.error)
+Key = tuple[str, bool]
+"""How a candidate was trained, and whether it has a learner."""
 
 
 def choose_focus(problem: Any, fit: Fit, options: Mapping[str, Any], criterion: Any) -> Any:
@@ -70,12 +54,12 @@ def choose_focus(problem: Any, fit: Fit, options: Mapping[str, Any], criterion: 
         text = "one step ahead is enough: the free run holds where nothing was fitted, and the residual is white."
         return replace(first, focus=Focus(ONE_STEP, text))
     LOG.info("auto: %s; the free run is trained, too", reason)
+    flown = _free_run(criterion, problem)
     try:
-        tried = _candidates(problem, first, fit, options, criterion)
+        return _best(_Choosing(problem, first, fit, options, flown), reason)
     except InputError as error:  # too few rows for a free run
         text = f"{reason}, but the free run cannot be trained: {error}"
         return replace(first, focus=Focus(ONE_STEP, text))
-    return _best(problem, tried, reason, keeps_learner=not options["fallback"])
 
 
 def _why_not(problem: Any, first: Any, fit: Fit, options: Mapping[str, Any]) -> str | None:
@@ -148,27 +132,6 @@ def _coloured(fit: Any) -> bool:
     return False
 
 
-def _candidates(problem: Any, first: Any, fit: Fit, options: Mapping[str, Any], criterion: Any) -> list[_Tried]:
-    """Return what is compared, the simplest first, with errors where nothing was fitted."""
-    flown = _free_run(criterion, problem)
-    other = fit(problem, criterion=flown, **{**options, "fallback": False, "blocks": 0})
-    fits = _kinds({ONE_STEP: first, FREE_RUN: other})
-    validation = options["validation"]
-    if validation is not None:
-        return [replace(tried, pieces=_errors(tried.estimate, validation, problem)) for tried in fits]
-    try:
-        folds = blocked(problem.record, HALVES, problem.first_row)
-    except InputError:  # too few rows to leave some out: the training data have to do
-        return [replace(tried, pieces=_errors(tried.estimate, problem.record, problem)) for tried in fits]
-    pieces: list[list[Any]] = [[] for _ in fits]
-    for training, held in folds:
-        own = _kinds({ONE_STEP: _made(problem, training, fit, Prediction(), options),
-                      FREE_RUN: _made(problem, training, fit, flown, options)}, fits)  # fmt: skip
-        for found, tried in zip(pieces, own, strict=True):
-            found += _errors(tried.estimate, held, problem)
-    return [replace(tried, pieces=found) for tried, found in zip(fits, pieces, strict=True)]
-
-
 def _free_run(criterion: Any, problem: Any) -> Any:
     """Return the free run that is trained, with a washout that leaves most of a short record to be scored."""
     usable = max(map(len, problem.record.experiments)) - problem.first_row
@@ -176,20 +139,70 @@ def _free_run(criterion: Any, problem: Any) -> Any:
     return replace(declared, washout=min(declared.washout, usable // 4)).on(problem.record, problem.first_row)
 
 
-def _made(problem: Any, training: Record, fit: Fit, criterion: Any, options: Mapping[str, Any]) -> Any:
-    try:
-        return fit(problem.on(training), criterion=criterion, **_quick(options))
-    except InputError:  # the block took away what the physics needs
-        return None
+@dataclass(frozen=True, eq=False)
+class _Choosing:
+    """A problem with its fit one step ahead, and how others are made of it."""
 
+    problem: Any
+    first: Any
+    fit: Fit
+    options: Mapping[str, Any]
+    flown: Any
 
-def _kinds(fits: Mapping[str, Any], like: Sequence[_Tried] | None = None) -> list[_Tried]:
-    """Return every estimate with and without its learner; of fits that failed in the places of others."""
-    if like is not None:
-        return [replace(tried, estimate=_without(fits[tried.focus], tried.learner)) for tried in like]
-    learns = fits[ONE_STEP].model.form.bound is not None
-    kinds = (False, True) if learns else (False,)
-    return [_Tried(focus, own, _without(one, own)) for focus, one in fits.items() for own in kinds]
+    @property
+    def learns(self) -> bool:
+        """Whether there is a learner to be with or without."""
+        return self.options["learner"] is not None
+
+    @cached_property
+    def free(self) -> Any:
+        """The fit on the free run, from one start: all of them begin at physics alone with a silent learner."""
+        chosen = {**self.options, "fallback": False, "blocks": 0, "restarts": 1}
+        return self.fit(self.problem, criterion=self.flown, **chosen)
+
+    @cached_property
+    def free_physics(self) -> Any:
+        """Physics alone on the free run."""
+        if "free" in vars(self) and self.free.physics_alone is not None:
+            return self.free.physics_alone
+        chosen = {**self.options, "learner": None, "fallback": False, "blocks": 0, "restarts": 1}
+        return self.fit(self.problem, criterion=self.flown, **chosen)
+
+    def estimate(self, key: Key) -> Any:
+        """Return the estimate of a candidate from all rows."""
+        focus, learner = key
+        if focus == ONE_STEP:
+            return _without(self.first, learner)
+        return self.free if learner else self.free_physics
+
+    @cached_property
+    def errors(self) -> dict[Key, float]:
+        """RMS errors of the free runs of all candidates where nothing was fitted, the simplest first."""
+        keys = [(focus, own) for focus in (ONE_STEP, FREE_RUN) for own in ((False, True) if self.learns else (False,))]
+        validation = self.options["validation"]
+        records = [(self.problem.record, validation)] if validation is not None else self._folds()
+        pieces: dict[Key, list[Any]] = {key: [] for key in keys}
+        for training, held in records:
+            whole = training is self.problem.record
+            made = {} if whole else {ONE_STEP: self._made(training, Prediction()),
+                                     FREE_RUN: self._made(training, self.flown)}  # fmt: skip
+            for key, found in pieces.items():
+                one = self.estimate(key) if whole else _without(made[key[0]], key[1])
+                found += _errors(one, held, self.problem)
+        return {key: math.sqrt(mean_square(found)) for key, found in pieces.items()}
+
+    def _folds(self) -> list[tuple[Record, Record]]:
+        """What blocks are left out of, and these; of few rows the training data themselves."""
+        try:
+            return blocked(self.problem.record, self.options["blocks"] or BLOCKS, self.problem.first_row)
+        except InputError:
+            return [(self.problem.record, self.problem.record)]
+
+    def _made(self, training: Record, criterion: Any) -> Any:
+        try:
+            return self.fit(self.problem.on(training), criterion=criterion, **_quick(self.options))
+        except InputError:  # the block took away what the physics needs
+            return None
 
 
 def _without(estimate: Any, learner: bool) -> Any:
@@ -199,35 +212,47 @@ def _without(estimate: Any, learner: bool) -> Any:
     return estimate.physics_alone
 
 
-def _best(problem: Any, tried: Sequence[_Tried], reason: str, *, keeps_learner: bool) -> Any:
+def _best(choosing: _Choosing, reason: str) -> Any:
     """Return the estimate of the candidate with the least error, of those whose free run over all rows is sound."""
-    own = {id(one): mean_square(_errors(one.estimate, problem.record, problem)) for one in tried}
-    alone = {one.focus: own[id(one)] for one in tried if not one.learner}
-    usable = [one for one in tried if math.isfinite(own[id(one)]) and math.isfinite(one.error)]
-    usable = [one for one in usable if not one.learner or own[id(one)] <= _SLACK**2 * alone[one.focus]] or usable
-    if keeps_learner:
-        usable = [one for one in usable if one.learner] or usable
-    least = min((one.error for one in usable), default=math.inf)
-    chosen = next((one for one in usable if one.error <= _SLACK * least), tried[0])
-    compared = tuple(one.candidate for one in tried)
+    errors = choosing.errors
+    ranked = _ranked(errors, with_learner=choosing.learns and not choosing.options["fallback"])
+    chosen = next((key for key in ranked if _sound(choosing, key)), None)
+    lost = chosen is None
+    key = (ONE_STEP, False) if chosen is None else chosen
+    best, compared = choosing.estimate(key), tuple(Candidate(*one, error) for one, error in errors.items())
+    named = {(one.focus, one.learner): one for one in compared}
     text = (
         f"one step ahead is not enough: {reason}. So the free run was trained, too. Errors of free runs where nothing "
         f"was fitted, in standard deviations of the output: {'; '.join(one.described for one in compared)}. "
-        f"The result is {chosen.candidate}."
+        f"The result is {named[key]}."
     )
-    best, learns = chosen.estimate, any(one.learner for one in tried)
     warnings = list(best.warnings)
-    if learns and not chosen.learner:
-        rival = min((one for one in tried if one.learner), key=lambda one: one.error)
-        told = f"no learner is better in free run where nothing was fitted ({rival.candidate.described}), so the result"
-        warnings.append(Warning("physics_alone", f"{told} is {chosen.candidate.described}."))
-    if not usable:
-        text_lost = "every free run diverges over the training data, so the result is for one-step prediction only."
-        warnings.append(Warning("one_step_only", text_lost))
-    physics = min((one for one in tried if not one.learner), key=lambda one: one.error)
-    return replace(
-        best,
-        focus=Focus(chosen.focus, text, compared),
-        physics_alone=physics.estimate if chosen.learner else None,
-        warnings=tuple(warnings),
-    )
+    if choosing.learns and not key[1]:
+        rival = min((one for one in compared if one.learner), key=lambda one: one.error)
+        told = f"no learner is better in free run where nothing was fitted ({rival.described}), so the result is"
+        warnings.append(Warning("physics_alone", f"{told} {named[key].described}."))
+    if lost:
+        told = "every free run diverges over the training data, so the result is for one-step prediction only."
+        warnings.append(Warning("one_step_only", told))
+    physics = min((one for one in errors if not one[1]), key=lambda one: errors[one])
+    kept = choosing.estimate(physics) if key[1] else None
+    return replace(best, focus=Focus(key[0], text, compared), physics_alone=kept, warnings=tuple(warnings))
+
+
+def _ranked(errors: Mapping[Key, float], *, with_learner: bool) -> list[Key]:
+    """Return the candidates, the least error first and of alike ones the simplest; with a learner if it is wanted."""
+    among = [key for key in errors if key[1] or not with_learner]
+    least = min(errors[key] for key in among)
+    alike = [key for key in among if errors[key] <= _SLACK * least]
+    return alike + sorted((key for key in among if key not in alike), key=lambda key: errors[key])
+
+
+def _sound(choosing: _Choosing, key: Key) -> bool:
+    """Return whether a candidate runs over all training data, with a learner no worse than physics alone does."""
+    if not math.isfinite(choosing.errors[key]):
+        return False
+    problem = choosing.problem
+    own = mean_square(_errors(choosing.estimate(key), problem.record, problem))
+    if not key[1] or not math.isfinite(own):
+        return math.isfinite(own)
+    return own <= _SLACK**2 * mean_square(_errors(choosing.estimate((key[0], False)), problem.record, problem))
