@@ -173,7 +173,7 @@ def told_of(job: Job, fit: Any) -> Fitted:
     content = told | {
         "spec": job.declaration,
         "data": job.data,
-        "status": fit.status,
+        "status": _status(fit, warnings),
         "restarts": fit.restarts,
         "structure": fit.model.structure,
         "measure": fit.model.measure if fit.model.structure == "orthogonal" else None,
@@ -190,6 +190,12 @@ def told_of(job: Job, fit: Any) -> Fitted:
         written = {writing: equation(fit.model, writing) for writing in ("text", "latex")}
         content |= {"terms": terms, "equation": written}
     return Fitted(job, fit, FitResult.model_validate(content), responses)
+
+
+def _status(fit: Any, warnings: Sequence[Any]) -> Any:
+    """How training ended; of a model that does not run freely its message begins with that."""
+    first = next((warning.text for warning in warnings if warning.code == "one_step_only"), "")
+    return replace(fit.status, reason=f"{first} {fit.status.message}".strip()) if first else fit.status
 
 
 def _one_step_only(

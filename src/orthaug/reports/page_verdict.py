@@ -58,7 +58,9 @@ def fit_verdict(result: FitResult) -> PageVerdict:
     }[level]
     shown = "" if error is None else f": {_told_error(error, part)}"
     because = f"{', but ' if level == 'care' else '; '}{_joined(doubts[:_MOST_DOUBTS])}" if doubts else ""
-    return PageVerdict(level, f"{opening}{shown}{because}.", _use(result, level), _then(result))
+    first = next((f"{w.text.split(':')[0][0].upper()}{w.text.split(':')[0][1:]}. " for w in result.warnings
+                  if w.code == "one_step_only"), "")  # fmt: skip
+    return PageVerdict(level, f"{first}{opening}{shown}{because}.", _use(result, level), _then(result))
 
 
 def compare_verdict(result: CompareResult) -> PageVerdict:
