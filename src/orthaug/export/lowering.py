@@ -87,24 +87,7 @@ def _lagged(model: Model, name: str, digest: str) -> Program:
     features = [written(entry) for entry in form.features.entries]
     held = Held.of(form, numbers, features, [lags[lag] for lag in form.layout]) if limited else None
     constants.symbols |= {} if held is None else held.symbols
-    values = np.asarray(model.theta if limited else model.theta - model.theta_aux).tolist()
-    effective = dict(zip(form.baseline.names, values, strict=True))
-    moved = dict(zip(form.baseline.names, np.asarray(model.theta_aux).tolist(), strict=True))
-    sums: list[list[Node]] = [[] for _ in form.outputs]
-    corrections: list[list[Node]] = [[] for _ in form.outputs]
-    units = {parameter.name: parameter.unit for parameter in form.baseline.parameters}
-    for term, expression in zip(form.baseline.terms, form.baseline.expressions, strict=True):
-        value = (term.initial or 0.0) if term.fixed else effective[term.parameter]
-        unit = term.unit or units.get(term.parameter, "")
-        what = "known" if term.fixed else "theta" if limited else "theta - theta_aux"
-        named = f"{term.parameter}{f' [{unit}]' if unit else ''}"
-        factor = constants.node("p", term.parameter, value, f"{named}, {what}")
-        row = form.outputs.index(term.output) if term.output is not None else 0
-        sums[row].append(apply("mul", factor, written(expression)))
-        if held is not None and not term.fixed and moved[term.parameter]:
-            aux = constants.node("p", f"{term.parameter}_aux", moved[term.parameter], f"{named}, theta_aux")
-            inside = dict(zip(form.layout, held.inside, strict=True))
-            corrections[row].append(apply("neg", apply("mul", aux, written(expression, inside))))
+    sums, corrections = _weighted_terms(model, constants, written, held)
     network = None
     if form.bound is not None:
         seen = features if held is None else held.features
@@ -132,14 +115,36 @@ def _lagged(model: Model, name: str, digest: str) -> Program:
     )
 
 
-def _motion(model: MotionModel, name: str, digest: str) -> Program:
+def _weighted_terms(
+    model: Model, constants: _Constants, written: Callable[..., Node], held: Held | None
+) -> tuple[list[list[Node]], list[list[Node]]]:
+    """Of each output the terms of the physics, and those that the learner's correction takes back where it is held."""
+    form = model.form
+    values = np.asarray(model.theta if held is not None else model.theta - model.theta_aux).tolist()
+    effective = dict(zip(form.baseline.names, values, strict=True))
+    moved = dict(zip(form.baseline.names, np.asarray(model.theta_aux).tolist(), strict=True))
+    sums: list[list[Node]] = [[] for _ in form.outputs]
+    corrections: list[list[Node]] = [[] for _ in form.outputs]
+    units = {parameter.name: parameter.unit for parameter in form.baseline.parameters}
+    for term, expression in zip(form.baseline.terms, form.baseline.expressions, strict=True):
+        value = (term.initial or 0.0) if term.fixed else effective[term.parameter]
+        unit = term.unit or units.get(term.parameter, "")
+        what = "known" if term.fixed else "theta" if held is not None else "theta - theta_aux"
+        named = f"{term.parameter}{f' [{unit}]' if unit else ''}"
+        factor = constants.node("p", term.parameter, value, f"{named}, {what}")
+        row = form.outputs.index(term.output) if term.output is not None else 0
+        sums[row].append(apply("mul", factor, written(expression)))
+        if held is not None and not term.fixed and moved[term.parameter]:
+            aux = constants.node("p", f"{term.parameter}_aux", moved[term.parameter], f"{named}, theta_aux")
+            inside = dict(zip(form.layout, held.inside, strict=True))
+            corrections[row].append(apply("neg", apply("mul", aux, written(expression, inside))))
+    return sums, corrections
+
+
+def _motion_names(model: MotionModel, constants: _Constants) -> dict[str, Node]:
+    """What the names of constants, parameters, states and inputs stand for."""
     form, numbers, motion = model.form, model.numbers, model.form.motion
-    if motion.functions is not None:
-        raise InputError(f"the motion {_OWN_FUNCTION}.")
-    step_inputs = model.step_inputs
-    units = {channel.name: channel.unit for channel in model.inputs}
     values = np.asarray(motion.coordinates.physical(np.asarray(numbers.theta) - np.asarray(numbers.theta_aux)))
-    constants = _Constants()
     names: dict[str, Node] = {
         key: constants.node("c", key, value, f"constant {key}") for key, value in motion.constants
     }
@@ -149,6 +154,33 @@ def _motion(model: MotionModel, name: str, digest: str) -> Program:
         names[parameter.name] = constants.node("p", parameter.name, value, f"{parameter.name}{unit}{beside}")
     names |= {state.name: Entry("x", i) for i, state in enumerate(motion.states)}
     names |= {channel: Entry("u", i) for i, channel in enumerate(motion.inputs)}
+    return names
+
+
+def _with_correction(correction: Node, physics: Node, held: Held | None, rows: Sequence[Node]) -> Node:
+    """A learned equation with what is added to it; `rows` are its physics at p̂, and where it is held at c and at p̂."""
+    if rows:
+        physics, own, split = rows
+        correction = apply("add", correction, apply("sub", own, split))
+    return apply("add", physics, correction if held is None else held.faded(correction))
+
+
+def _split_parameters(model: MotionModel, constants: _Constants) -> dict[str, Node]:
+    """The estimated parameters, with which the physics goes on beyond the data."""
+    motion = model.form.motion
+    values = np.asarray(motion.coordinates.physical(np.asarray(model.numbers.theta))).tolist()
+    return {
+        parameter.name: constants.node("p", f"{parameter.name}_split", value, f"{parameter.name}, as estimated")
+        for parameter, value in zip(motion.parameters, values, strict=True)
+    }
+
+
+def _motion(model: MotionModel, name: str, digest: str) -> Program:
+    form, numbers, motion = model.form, model.numbers, model.form.motion
+    if motion.functions is not None:
+        raise InputError(f"the motion {_OWN_FUNCTION}.")
+    constants = _Constants()
+    names = _motion_names(model, constants)
     numeric = dict(motion.constants)
     defined: dict[str, Node] = {}
 
@@ -170,18 +202,14 @@ def _motion(model: MotionModel, name: str, digest: str) -> Program:
     learned_states, learned_outputs = motion.learned
     equations = {"rate": [*motion.equations.values()], "output": [*motion.observations]}
     results = {kind: list(map(written, expressions)) for kind, expressions in equations.items()}
-    held, changed = None, [names] * 3
+    held, changed = None, list[dict[str, Node]]()
     if numbers.limits is not None:
         points: list[Node] = [*(Entry("x", i) for i in range(form.states)), *(names[key] for key in motion.inputs)]
         held = Held.of(form, numbers, features, points)
         defined |= dict(held.locals)
         constants.symbols |= held.symbols
         if np.any(numbers.theta_aux):  # the physics itself extrapolates with the parameters that were split off
-            at_split = np.asarray(motion.coordinates.physical(np.asarray(numbers.theta))).tolist()
-            split = {
-                parameter.name: constants.node("p", f"{parameter.name}_split", value, f"{parameter.name}, as estimated")
-                for parameter, value in zip(motion.parameters, at_split, strict=True)
-            }
+            split = _split_parameters(model, constants)
             inside = dict(zip((*motion.names_of_states, *motion.inputs), held.inside, strict=True))
             bare = {key: node for key, node in names.items() if key not in dict(motion.definitions)}
             changed = [define(bare | split, "_s"), define(bare | inside, "_h"), define(bare | inside | split, "_hs")]
@@ -192,14 +220,18 @@ def _motion(model: MotionModel, name: str, digest: str) -> Program:
             seen = features if held is None else held.features
             network = _network(form.bound, numbers, seen, first + np.arange(len(learned)))
             for i, place in enumerate(learned):
-                correction, physics = Entry("g", i), results[kind][place]
-                if held is not None and np.any(numbers.theta_aux):
-                    physics, own, split = (written(equations[kind][place], there) for there in changed)
-                    correction = apply("add", correction, apply("sub", own, split))
-                correction = correction if held is None else held.faded(correction)
-                results[kind][place] = apply("add", physics, correction)
+                rows = [written(equations[kind][place], there) for there in changed]
+                results[kind][place] = _with_correction(Entry("g", i), results[kind][place], held, rows)
         seen = list(network.features) if network is not None else []
         blocks[kind] = Block(kind, _needed(defined, [*results[kind], *seen]), network, tuple(results[kind]))
+    return _moving_program(model, blocks, constants, name, digest)
+
+
+def _moving_program(
+    model: MotionModel, blocks: Mapping[str, Block], constants: _Constants, name: str, digest: str
+) -> Program:
+    motion, step_inputs = model.form.motion, model.step_inputs
+    units = {channel.name: channel.unit for channel in model.inputs}
     return Program(
         name=name,
         states=tuple(Signal(state.name, identifier(state.name), state.unit) for state in motion.states),

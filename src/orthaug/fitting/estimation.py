@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, TypedDict, Unpack, overload
 
 import numpy as np
@@ -204,15 +205,12 @@ def fit(
     _check_types(learner=learner, structure=structure, criterion=criterion, solver=solver)
     _check_types(initial=initial, validation=validation)
     _check_splittable(structure, problem.baseline, learner)
-    if criterion.automatic:
-        if _undecided(problem, solver, structure, warm=initial is not None, ensemble=ensemble):
-            options: dict[str, Any] = {"learner": learner, "structure": structure, "solver": solver, "seed": seed}
-            options |= {"regularization": regularization, "restarts": restarts, "blocks": blocks, "fallback": fallback}
-            options |= {"validation": validation, "progress": progress, "engine": engine, "checkpoints": checkpoints}
-            return choose_focus(problem, fit, options, criterion)
-        criterion = Prediction()
-    streamed = isinstance(problem, StreamedProblem)
-    criterion = criterion.on(problem.record, problem.first_row) if not streamed else criterion.streamed
+    if criterion.automatic and _undecided(problem, solver, structure, warm=initial is not None, ensemble=ensemble):
+        options: dict[str, Any] = {"learner": learner, "structure": structure, "solver": solver, "seed": seed}
+        options |= {"regularization": regularization, "restarts": restarts, "blocks": blocks, "fallback": fallback}
+        options |= {"validation": validation, "progress": progress, "engine": engine, "checkpoints": checkpoints}
+        return choose_focus(problem, fit, options, criterion)
+    criterion = _settled(criterion, problem)
     blocks = _check_blocks(blocks)
     conditions = {"linear": problem.baseline.linear, "validated": validation is not None}
     choices = tried(regularization, solver, criterion, structure, learner=learner, **conditions)
@@ -244,19 +242,29 @@ def fit(
     if problem.weight.choice != "covariance" or problem.weight.kind == "covariance" or not solved:
         return estimate
 
-    def again(problem: Problem, last: Estimate) -> Estimate:
-        chosen = next((r.regularization for r in last.restarts if r.chosen), "none")
-        start = None if task.bound is None else last.model
-        more: dict[str, Any] = {"learner": learner, "initial": start, "regularization": chosen, "engine": engine}
-        return fit(problem, structure=structure, criterion=criterion, solver=solver, progress=progress, **more)
+    more = {"learner": learner, "structure": structure, "criterion": criterion, "solver": solver, "engine": engine}
+    return reweighted(estimate, partial(_again, **more, progress=progress))
 
-    return reweighted(estimate, again)
+
+def _again(problem: Problem, last: Estimate, **options: Any) -> Estimate:
+    """The fit to other weights of the outputs, from where the last one ended."""
+    chosen = next((r.regularization for r in last.restarts if r.chosen), "none")
+    start = None if last.model.form.bound is None else last.model
+    return fit(problem, initial=start, regularization=chosen, **options)
 
 
 def _undecided(problem: Problem, solver: Solver, structure: Structure, *, warm: bool, ensemble: bool) -> bool:
     """Whether the data may decide for the free run: not where nothing but one step ahead can be trained."""
     able = solver.gauss_newton and problem.baseline.linear and not isinstance(problem, StreamedProblem)
     return able and not (warm or ensemble or structure.from_initial)
+
+
+def _settled(criterion: Criterion, problem: Problem) -> Criterion:
+    """The criterion with what it left to the record; one step ahead where nothing else can be trained."""
+    criterion = Prediction() if criterion.automatic else criterion
+    if isinstance(problem, StreamedProblem):
+        return criterion.streamed
+    return criterion.on(problem.record, problem.first_row)
 
 
 def _for_runs(engine: Engine, problem: Problem, runs: int) -> Engine:

@@ -47,7 +47,7 @@ def choose_focus(problem: Any, fit: Fit, options: Mapping[str, Any], criterion: 
         criterion: the `Auto` that was asked for.
     """
     first = fit(problem, criterion=Prediction(), **options)
-    if not first.status.ok:
+    if not first.status.ok or any(warning.code == "stopped" for warning in first.warnings):
         return first
     reason = _why_not(problem, first, fit, options)
     if reason is None:

@@ -121,12 +121,11 @@ def train(
     told = []
     if held_out is not None:
         held_out = replace(held_out, chosen=best)
-        flies = task.criterion.flown is not None and task.start_loss is not None
-        if choice.fallback and flies and not held_out.ratio.value < 1:
+        runs_freely = task.criterion.flown is not None and task.start_loss is not None
+        if choice.fallback and runs_freely and not held_out.ratio.value < 1:
             told, best = [_fell_back(held_out)], -1
             LOG.info("no free run is better than physics alone where it was not fitted: physics alone is handed over")
-    if best >= 0:
-        LOG.info("run %d is chosen of %d", best + 1, len(runs))
+    LOG.info("run %d is chosen of %d; 0 is physics alone", best + 1, len(runs))
     alike = _members(starts, ranking, best) if choice.scored else _alike(starts, best)
     shown = alike if choice.scored and held_out is None else list(range(len(starts)))
     members = [best]
@@ -141,9 +140,8 @@ def train(
     scores = [_cross_validation(task, run) if scored else math.nan for run in runs]
     told_of = list(zip(starts, runs, losses, errors, scores, strict=True))
     restarts = tuple(_restart(*told_of[i], chosen=i in members) for i in shown)
-    status = replace(
-        estimate.status, seconds=task.seconds + sum(run.seconds for run in runs), start_loss=task.start_loss
-    )
+    seconds = task.seconds + sum(run.seconds for run in runs)
+    status = replace(estimate.status, seconds=seconds, start_loss=task.start_loss)
     warnings = (
         *estimate.warnings,
         *task.warnings,
@@ -152,11 +150,15 @@ def train(
         *told,
         *tell_retries(planned, starts, runs, held_out, best),
     )
-    kept = best >= 0 and task.bound is not None and not hasattr(task.problem, "source")  # no further pass over files
-    physics = _alone(conclude, task, structure) if kept else None
-    return replace(
-        estimate, restarts=restarts, status=status, held_out=held_out, physics_alone=physics, warnings=warnings
-    )
+    beside = _beside(conclude, task, structure) if best >= 0 else None
+    found = {"restarts": restarts, "status": status, "held_out": held_out, "physics_alone": beside}
+    return replace(estimate, **found, warnings=warnings)
+
+
+def _beside(conclude: Concluding, task: Task, structure: Structure) -> Any:
+    """The estimate of physics alone that a learner stands beside; None without one, and where it costs a pass."""
+    streamed = hasattr(task.problem, "source")
+    return None if task.bound is None or streamed else _alone(conclude, task, structure)
 
 
 def _restart(start: PlannedRun, run: Any, loss: float, error: float, score: float, *, chosen: bool) -> Restart:
