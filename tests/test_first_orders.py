@@ -35,18 +35,6 @@ def test_lag_0_is_taken_where_it_is_clearly_better():
     assert model is not None and model.delays == (0,) and model.orders.nk == (0,)
 
 
-def test_outputs_that_tell_of_each_other_are_seen():
-    """A position and its difference, beside two signals that have nothing to do with each other."""
-    rng = np.random.default_rng(0)
-    u = rng.normal(size=(500, 2))
-    position = lfilter([0, 0.1], [1, -1.6, 0.8], u[:, 0]) + 1e-4 * rng.normal(size=500)
-    apart = lfilter([0, 0.5], [1, -0.7], u[:, 1]) + 0.01 * rng.normal(size=500)
-    model = first_model(Record.from_arrays(u, np.stack([position, np.gradient(position)], axis=1)))
-    assert model is not None and model.coupled
-    model = first_model(Record.from_arrays(u, np.stack([position, apart], axis=1)))
-    assert model is not None and not model.coupled
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_the_level_of_an_output_is_no_delay(seed):
     rng = np.random.default_rng(seed)

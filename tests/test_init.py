@@ -387,16 +387,11 @@ def test_a_lag_that_is_a_guess_is_told_in_the_spec(tmp_path):
     assert "# no lag of it is significant, so this is a guess" in (tmp_path / "spec.toml").read_text()
 
 
-def test_coupled_outputs_are_trained_on_the_free_run(tmp_path):
+def test_the_focus_is_left_to_the_data(tmp_path):
     u, y = plant(400)
-    frame = pd.DataFrame({"u": u, "y1": y, "y2": np.gradient(y)})
-    frame.to_csv(tmp_path / "a.csv", index=False)
-    done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
-    assert done.code == 0 and "the past of one output tells of another" in done.out, done.err
-    assert tomllib.loads((tmp_path / "spec.toml").read_text())["training"]["focus"] == "simulation"
-    frame.drop(columns="y2").to_csv(tmp_path / "a.csv", index=False)
-    assert run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml", "--force").code == 0
-    assert "focus" not in tomllib.loads((tmp_path / "spec.toml").read_text())["training"]
+    pd.DataFrame({"u": u, "y1": y, "y2": np.gradient(y)}).to_csv(tmp_path / "a.csv", index=False)
+    assert run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml").code == 0
+    assert "focus" not in (tmp_path / "spec.toml").read_text()
 
 
 def test_a_long_file_is_looked_at_in_windows_and_says_so(tmp_path, monkeypatch):

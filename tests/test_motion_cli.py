@@ -613,7 +613,7 @@ def test_what_a_motion_is_trained_with_unless_asked(folder):
     spec = put(folder).with_name("plain.toml")
     spec.write_text(SPEC.replace("segment = 150\n", "").replace('[learner]\nhidden = [3]\ninputs = ["v"]\n', ""))
     criterion = open_job(spec).spec.declared_criterion()
-    assert (criterion, open_job(spec).spec.declared_learner()) == (oa.Simulation(512, 0), oa.MLP())
+    assert (criterion, open_job(spec).spec.declared_learner()) == (oa.Simulation("auto", 0), oa.MLP())
     spec.write_text(spec.read_text().replace(", learned = true", ""))
     job = open_job(spec)
     assert job.spec.declared_learner() is None and job.compared == ("physics alone",)

@@ -228,7 +228,7 @@ REFUSED = [
         SOLVERS,
         "segmented",
         Segmented,
-        "the solver 'segmented' and the criterion 'simulation' declare the key 'segment'",
+        "the solver 'segmented' and the criterion 'auto' declare the key 'segment'",
     ),
     (CRITERIA, "seeded", Seeded, "the criterion 'seeded' has a key 'seed', which its section has already"),
     (MEASURES, "uniform", Enlarged, "the measure 'uniform' is registered already"),

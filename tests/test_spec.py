@@ -145,9 +145,9 @@ def test_defaults(tmp_path):
     assert (spec.lag_orders(), spec.learner_inputs()) == (None, None)
     assert (learner.kind, learner.hidden, learner.activation) == ("mlp", [16], "tanh")
     assert (spec.structure.kind, spec.structure.measure.kind, spec.structure.weight) == ("orthogonal", "training", 1.0)
-    assert (training.solver, training.focus, training.iterations) == ("levenberg-marquardt", "prediction", 300)
+    assert (training.solver, training.focus, training.iterations) == ("levenberg-marquardt", "auto", 300)
     assert (training.restarts, training.seed, training.regularization) == (1, 0, "auto")
-    assert (training.segment, training.washout) == (512, 40)
+    assert (training.segment, training.washout) == ("auto", 40)
 
 
 def test_without_inputs_with_a_time_column_and_without_a_learner(tmp_path):

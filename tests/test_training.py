@@ -13,10 +13,9 @@ from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Record
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.free_run import FreeRunTask
-from orthaug.fitting.held_out import HeldOut, Ratio, mean_square
+from orthaug.fitting.held_out import Ratio, mean_square
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
-from orthaug.fitting.training import _fell_back
 from orthaug.models.learners import MLP, Bound, EquinoxModule, Function
 from orthaug.physics.baseline import Baseline, Term
 
@@ -62,16 +61,6 @@ def test_where_no_learner_is_better_the_result_is_physics_alone(seed):
     np.testing.assert_allclose(found.theta, alone.theta, rtol=1e-9)
     np.testing.assert_allclose(found.std, alone.std, rtol=1e-6)
     assert found.status.loss == found.status.start_loss and not any(run.chosen for run in found.restarts)
-
-
-def test_a_fallback_that_is_undecided_says_so():
-    many, few = np.full(180, 2.0), np.full(20, 1.0)
-    held = HeldOut("blocks", ("block 1",), [np.concatenate([np.full(20, 30.0), np.ones(180)])],
-                   ([np.concatenate([few, many])],))  # fmt: skip
-    assert held.ratio.low < held.ratio.value < 1 < held.ratio.high
-    told = _fell_back(held).text
-    assert told.startswith("it is undecided in blocks whether") and "`fallback = false` keeps the learner" in told
-    assert f"{100 * (1 - held.ratio.value):.2g} % lower" in told and "Test parts have no say" in told
 
 
 def test_the_fallback_can_be_declined():

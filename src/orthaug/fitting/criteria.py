@@ -184,7 +184,14 @@ class Auto:
 
     A fit one step ahead stays where its free run is finite and no worse than that of physics alone where nothing was
     fitted, and where its residual is noise of the equation. Otherwise physics and learner are trained on the free run
-    as well, and the best of all in free run is handed over (`Estimate.focus`). The arguments are those of `Simulation`.
+    as well, and the best of all in free run is the result (`Estimate.focus`).
+
+    Args:
+        segment, washout, start_iterations: of the free run, as in `Simulation`.
+
+    Examples:
+        >>> Auto(washout=10).simulation.washout
+        10
     """
 
     one_step = True

@@ -85,7 +85,8 @@ class MotionField:
             self.motion.coordinates.physical(q, jnp) for q in (numbers.theta, numbers.theta - numbers.theta_aux)
         )
         held = self.learned_rows(own, x_in, u_in) - self.learned_rows(split, x_in, u_in) + self._values(numbers, inside)
-        return self.learned_rows(split, x, u) - self.learned_rows(own, x, u) + share * held
+        beyond = self.learned_rows(split, x, u) - self.learned_rows(own, x, u) + share * held
+        return jnp.where(jnp.all(inside == z), self._values(numbers, inside), beyond)
 
     def learned_rows(self, p: Any, x: Any, u: Any) -> Any:
         """The physics (nl,) of the learned equations, then of the learned outputs, with the parameters p."""

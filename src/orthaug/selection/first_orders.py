@@ -18,7 +18,6 @@ LOOKED_AT = 40_000
 _FITTED = 0.7  # share of the rows that a candidate is fitted to
 _AS_GOOD = 1.05  # free-run error over the best, up to which fewer lags are taken
 _BETTER = 1.2  # free-run error over that from another first lag, up to which the lag that a test found is kept
-_TELLS = 0.5  # error one step ahead with the other outputs' past over that without
 _RANK = 1e-9  # singular value over the largest
 PERSISTENCE = 20  # the highest order of excitation that is looked for
 _EXCITED = 1e-6  # singular value over the largest
@@ -40,8 +39,6 @@ class FirstModel:
     """Up to which order each input excites; `PERSISTENCE` stands for that or more."""
     free_run: tuple[float, ...]
     """Error of the free run on rows held out over the output's standard deviation, for each output."""
-    coupled: bool = False
-    """Whether the past of one output tells much of another, beside that one's own past and the inputs."""
 
 
 def first_model(record: Record) -> FirstModel | None:
@@ -64,7 +61,7 @@ def first_model(record: Record) -> FirstModel | None:
             chosen = found
     if chosen is None:
         return None
-    return FirstModel(chosen[1], offset, delays, excited, chosen[2], _coupled(record, chosen[1]))
+    return FirstModel(chosen[1], offset, delays, excited, chosen[2])
 
 
 def _smallest(
@@ -83,24 +80,6 @@ def _smallest(
     near = [one for one in tried if one[0] <= _AS_GOOD * least]
     _, _, orders, errors = min(near, key=lambda one: (one[1], one[0]))
     return least, orders, errors
-
-
-def _coupled(record: Record, orders: Orders) -> bool:
-    """Whether the others' past lowers an output's error one step ahead to less than `_TELLS` of it."""
-    first = max([orders.na, *(nb + nk - 1 for nb, nk in zip(orders.nb, orders.nk, strict=True))])
-    usable = [e for e in record.experiments if len(e) > first]
-    names = range(len(record.outputs))
-    own = [np.concatenate([_rows(e, j, orders, first) for e in usable]) for j in names]
-    for j in names if len(own) > 1 and orders.na else ():
-        y = np.concatenate([e.outputs[first:, j] for e in usable])
-        both = np.hstack([own[j], *(own[i][:, : orders.na] for i in names if i != j)])
-        left = []
-        for phi in (own[j], both):
-            scaled = phi / np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
-            left.append(np.linalg.norm(y - scaled @ np.linalg.lstsq(scaled, y, rcond=_RANK)[0]))
-        if len(y) > 2 * both.shape[1] and left[1] < _TELLS * left[0]:
-            return True
-    return False
 
 
 def _spread(record: Record) -> Record:
