@@ -41,6 +41,7 @@ class HeldOutRows:
     held: Record
     skips: Any
     where: str
+    which: str
 
     @classmethod
     def of(cls, job: Job) -> HeldOutRows:
@@ -50,9 +51,9 @@ class HeldOutRows:
             InputError: too few rows.
         """
         if job.validation is not None:
-            return cls(job.train.record, job.validation.record, job.validation.skips, "the validation part")
+            return cls(job.train.record, job.validation.record, job.validation.skips, "the validation part", "")
         training, held = blocked(job.train.record, _PIECES, job.first_row)[-1]
-        return cls(training, held, 0, "rows held out (the last third of the training data)")
+        return cls(training, held, 0, "rows held out", " (the last third of the training data)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,9 +172,8 @@ def _concluded(
         for one in better
     ]
     worse = [one for one in tried if one not in better]
-    text = f"{counted(len(tried), 'change')} of the spec {'was' if len(tried) == 1 else 'were'} tried by a refit, "
-    text += f"{'physics and learner' if learns else 'physics'}, and a free run over {rows.where}: "
-    text += f"{len(better) or 'none'} betters it." if len(better) < 2 else f"{len(better)} better it."
+    text = f"Tried by a refit of {'physics and learner' if learns else 'the physics'} and a free run over {rows.where}"
+    text += f"{rows.which}: {counted(len(tried), 'change')} of the spec, {_which(len(better), len(tried))}."
     if worse:
         named = "; ".join(f"{one.proposal.words} ({_after(one)})" for one in worse[:_LISTED])
         more = f" and {len(worse) - _LISTED} more" if len(worse) > _LISTED else ""
@@ -181,6 +181,12 @@ def _concluded(
     if left:
         text += f" {counted(left, 'change')} {'was' if left == 1 else 'were'} not tried, to spare time."
     return advice, AdviceTrialsResult(text=text, tried=len(tried), not_tried=left)
+
+
+def _which(better: int, tried: int) -> str:
+    if tried == 1:
+        return "which betters it" if better else "which does not better it"
+    return f"of which {'none betters' if not better else 'one betters' if better == 1 else f'{better} better'} it"
 
 
 def _ratio(pieces: Pieces, base: Pieces) -> Ratio:

@@ -199,9 +199,7 @@ def _learner(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
     widths = getattr(bound.learner, "hidden", None)
     if not hidden and widths and not wild:
         wider = [_WIDER * width for width in widths]
-        yield Proposal(
-            f"a learner of {' and '.join(map(str, wider))} neurons", {"learner.hidden": wider}, learns=True
-        )
+        yield Proposal(f"a learner of {' and '.join(map(str, wider))} neurons", {"learner.hidden": wider}, learns=True)
 
 
 def _learner_for_equation(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
