@@ -324,7 +324,7 @@ def _warning(
         return Warning(
             "biased",
             f"what the learner found{there} looks most like {name} ({percent(share)} of it{beside}), which would move "
-            f"{listed}, and the standard errors do not cover that{other}{f': if it is that term, {cure}' if cure else ''}.",
+            f"{listed}, and the standard errors do not cover that{other}{f': if it is that, {cure}' if cure else ''}.",
         )
     return Warning(
         "biased",

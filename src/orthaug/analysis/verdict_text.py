@@ -24,12 +24,12 @@ _TOO_FAST = 0.05  # noise variance / smallest variance among the lagged outputs
 _BIASED = Warning(
     "sensor_noise",
     "noise on the measured output biases the one-step θ, and its intervals do not cover that bias: "
-    'training on the free run (focus = "simulation") is free of it.',
+    'training on the free run (focus = "simulation") has none.',
 )
 _INCONSISTENT = Warning(
     "coloured_residual",
     "the one-step residual is coloured: what disturbs one row is in the lagged outputs of the next, which biases the "
-    'one-step θ, and its intervals do not cover that bias. Training on the free run (focus = "simulation") is free of it.',
+    'one-step θ, and its intervals do not cover that bias. Training on the free run (focus = "simulation") has none.',
 )
 _COLOUR = 0.1  # of the residual's variance that its own past tells: from there on that bias may matter
 

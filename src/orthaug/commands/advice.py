@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _PIECES = 3  # of the training rows, the last of which is held out where there is no validation part
 _MOST = 5  # changes that are tried
-_LEAST_SECONDS = 3.0  # that trials may take, however short the fit was: programs are compiled for each
+_LEAST_SECONDS = 1.0  # that trials may take, however short the fit was: programs are compiled for each
 _LISTED = 3  # changes without gain that the text names
 
 
@@ -79,6 +79,8 @@ class Trials:
     variant: Variant
     unit: Any
     seconds: float
+    substeps: int | None = None
+    """Of a motion that is integrated."""
     spent: float = 0.0
     longest: float = field(default=0.0)
 
@@ -86,6 +88,15 @@ class Trials:
     def exhausted(self) -> bool:
         """Whether another trial would take longer than is left."""
         return self.spent + self.longest > self.seconds
+
+    def changed(self, change: dict[str, Any]) -> Job:
+        """Return the job of a changed spec, with the substeps of the fit: looking for them costs most of a motion's fit.
+
+        Raises:
+            InputError: the change is not possible; ValueError likewise.
+        """
+        fixed = {} if self.substeps is None else {"motion.substeps": self.substeps}
+        return self.job.changed(spec_model().model_validate(changed(self.job.declaration, change | fixed)))
 
     def run(self, job: Job, variant: Variant, accepts: Callable[[Any], bool] = lambda fit: True) -> Pieces | None:
         """Squared errors of the free run of a job's model; None where there is none, or it is not accepted."""
@@ -105,7 +116,7 @@ class Trials:
     def of(self, proposal: Proposal, *, physics_only: bool) -> Tried:
         """The trial of a proposal."""
         try:
-            job = self.job.changed(spec_model().model_validate(changed(self.job.declaration, proposal.change)))
+            job = self.changed(proposal.change)
         except (InputError, ValueError) as error:
             LOG.info("%s was not tried: %s", proposal.words, error)
             return Tried(proposal, None)
@@ -147,16 +158,18 @@ def advise(fitted: Fitted, seconds: float) -> tuple[list[AdviceResult], AdviceTr
         return None
     learns = fit.model.form.bound is not None
     variant = Variant(None if learns else ALONE, criterion=fit.criterion)
-    trials = Trials(job, rows, variant, fit.problem.deviation, max(seconds, _LEAST_SECONDS))
-    base = trials.run(job, variant)
+    motion = fitted.result.motion
+    substeps = None if motion is None or motion.integrator == "discrete" else motion.substeps
+    trials = Trials(job, rows, variant, fit.problem.deviation, max(seconds, _LEAST_SECONDS), substeps)
+    base = trials.run(trials.changed({}), variant)
     if base is None:
         return None
     physics_only = learns and trials.spent * (1 + min(len(found), _MOST)) > trials.seconds
     tried: list[Tried] = []
     for proposal in found[:_MOST]:
         only = physics_only and not proposal.learns
-        if tried and trials.exhausted and not only:
-            continue
+        if tried and trials.exhausted:
+            break
         tried.append(trials.of(proposal, physics_only=only))
     return _concluded(base, tried, rows, len(found) - len(tried), learns)
 

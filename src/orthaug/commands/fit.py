@@ -70,8 +70,9 @@ class Fitted:
 def fit_job(job: Job, progress: Progress = SILENT) -> Fitted:
     """Train as the spec says, score every part, ask whether the learner earns its place, and try what may better it."""
     began = time.monotonic()
-    fitted = judged(fit_variant(job, AS_DECLARED, progress))
-    return advised(fitted, time.monotonic() - began)
+    fitted = fit_variant(job, AS_DECLARED, progress)
+    seconds = time.monotonic() - began
+    return advised(judged(fitted), seconds)
 
 
 def advised(fitted: Fitted, seconds: float) -> Fitted:

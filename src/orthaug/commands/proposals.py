@@ -166,10 +166,13 @@ def _predicted_changes(job: Job, result: FitResult, fit: Any) -> Iterator[Propos
             yield from _term(job, change.what, change.output, None, _lag_words(change))
         elif change.kind == "learner":
             yield from _learner(job, result, fit)
-        elif change.kind == "criterion" and (result.focus is None or not result.focus.candidates):
-            if change.what in CRITERIA and change.what != CRITERIA.kind_of(fit.criterion):
-                words = f'focus = "{change.what}"'
-                yield Proposal(words, {"training.focus": change.what}, refocuses=True)
+        elif change.kind == "criterion" and not _compared(result) and change.what != CRITERIA.kind_of(fit.criterion):
+            yield Proposal(f'focus = "{change.what}"', {"training.focus": change.what}, refocuses=True)
+
+
+def _compared(result: FitResult) -> bool:
+    """Whether both criteria were tried by the fit itself."""
+    return result.focus is not None and bool(result.focus.candidates)
 
 
 def _lag_words(change: ChangeResult) -> str:
