@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from orthaug._base.errors import InputError
 from orthaug._base.lines import counted
@@ -23,9 +23,7 @@ from orthaug.commands.spec import spec_model
 from orthaug.data.record import Record
 from orthaug.fitting.held_out import Pieces, Ratio, blocked, mean_square, squared_errors
 from orthaug.reports.findings import AdviceResult, AdviceTrialsResult
-
-if TYPE_CHECKING:
-    from orthaug.commands.fit import Fitted
+from orthaug.reports.result import FitResult
 
 _PIECES = 3  # of the training rows, the last of which is held out where there is no validation part
 _MOST = 5  # changes that are tried
@@ -90,7 +88,7 @@ class Trials:
         return self.spent + self.longest > self.seconds
 
     def changed(self, change: dict[str, Any]) -> Job:
-        """Return the job of a changed spec, with the substeps of the fit: looking for them costs most of a motion's fit.
+        """Return the job of a changed spec, with the substeps of the fit: looking for them would cost most.
 
         Raises:
             InputError: the change is not possible; ValueError likewise.
@@ -140,7 +138,9 @@ def changed(declaration: dict[str, Any], change: dict[str, Any]) -> dict[str, An
     return found
 
 
-def advise(fitted: Fitted, seconds: float) -> tuple[list[AdviceResult], AdviceTrialsResult] | None:
+def advise(
+    job: Job, fit: Any, result: FitResult, seconds: float
+) -> tuple[list[AdviceResult], AdviceTrialsResult] | None:
     """Return the changes that better the free run where nothing was fitted, and an account of all trials.
 
     None where nothing is proposed, or nothing can be tried.
@@ -148,8 +148,7 @@ def advise(fitted: Fitted, seconds: float) -> tuple[list[AdviceResult], AdviceTr
     Args:
         seconds: that training took: trials take no longer.
     """
-    job, fit = fitted.job, fitted.fit
-    found = proposals(job, fitted.result, fit)
+    found = proposals(job, result, fit)
     if not found or job.train.source is not None or job.spec.engine.kind not in ("auto", "memory"):
         return None
     try:
@@ -158,7 +157,7 @@ def advise(fitted: Fitted, seconds: float) -> tuple[list[AdviceResult], AdviceTr
         return None
     learns = fit.model.form.bound is not None
     variant = Variant(None if learns else ALONE, criterion=fit.criterion)
-    motion = fitted.result.motion
+    motion = result.motion
     substeps = None if motion is None or motion.integrator == "discrete" else motion.substeps
     trials = Trials(job, rows, variant, fit.problem.deviation, max(seconds, _LEAST_SECONDS), substeps)
     base = trials.run(trials.changed({}), variant)

@@ -82,7 +82,7 @@ def advised(fitted: Fitted, seconds: float) -> Fitted:
     if not fitted.fit.status.ok or _stopped(fitted.fit):
         return fitted
     failed: list[Any] = []
-    found = attempt("the trial of advice", lambda: advise(fitted, seconds), failed, None)
+    found = attempt("the trial of advice", lambda: advise(fitted.job, fitted.fit, fitted.result, seconds), failed, None)
     warnings = [*fitted.result.warnings, *(WarningResult.model_validate(warning) for warning in failed)]
     told = {"warnings": warnings} if found is None else {"advice": found[0], "advice_trials": found[1]}
     return replace(fitted, result=FitResult.model_validate({**dict(fitted.result), **told}))

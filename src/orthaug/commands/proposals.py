@@ -9,7 +9,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from orthaug.analysis.suspects import Suspect
 from orthaug.commands.job import Job
+from orthaug.data.expressions import SAMPLING_TIME
 from orthaug.fitting.kinds import CRITERIA
 from orthaug.physics.motion import HOLDS
 from orthaug.reports.findings import ChangeResult, SuspectResult
@@ -17,6 +21,9 @@ from orthaug.reports.result import FitResult
 
 _SHAPES = {"linear": "{}", "jump": "sign({})", "absolute": "abs({})", "square": "{}**2", "cube": "{}**3"}
 _TERMS = 3  # suspected terms that are proposed
+_LITTLE = 0.05  # of what was learned or left: what explains less is not proposed
+_ROWS = 20_000  # of the residual that are looked at
+_SPANNED = 1e-9  # of a term's squares: what is left of it beside the physics where it is physics
 _WIDER = 2  # times the neurons
 _ZONE = "dead_zone"
 
@@ -43,16 +50,15 @@ class Proposal:
 def proposals(job: Job, result: FitResult, fit: Any) -> list[Proposal]:
     """Return what the findings of a fit suggest, the likeliest first, each once."""
     if result.residuals is not None and result.residuals.verdict == "white" and not result.residuals.changes:
-        suspected = [] if not _biased(result) else list(_suspected_terms(job, result))
-        return _once(suspected)
+        return _once(list(_suspected_terms(job, result, fit)) if _biased(result) else [])
     found = [
         *_missing_terms(job, result),
-        *_suspected_terms(job, result),
+        *_suspected_terms(job, result, fit),
         *_predicted_changes(job, result, fit),
         *_learner_for_equation(job, result, fit),
         *_holds(job, result),
     ]
-    return _once(found)
+    return _once(sorted(found, key=lambda proposal: proposal.learns))  # a learner takes longest
 
 
 def _once(found: list[Proposal]) -> list[Proposal]:
@@ -74,21 +80,51 @@ def _missing_terms(job: Job, result: FitResult) -> Iterator[Proposal]:
         yield from _term(job, text, term.equation, term.coefficient, words)
 
 
-def _suspected_terms(job: Job, result: FitResult) -> Iterator[Proposal]:
-    """Terms that explain most of what the learner found, or of what the free run leaves; then those of the spec."""
-    entries = sorted(result.bias or (), key=_explained, reverse=True)
-    for entry in entries[:_TERMS]:
-        size = entry.coefficient_found if entry.residual is None else entry.residual.coefficient
-        expression, positive = entry.expression, entry.name.startswith(_ZONE)
-        if positive and (size or 0.0) < 0:  # a slope that falls beyond the width is no dead zone
-            continue
+def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
+    """The suspects that explain most of what the learner found, or of what the physics leaves."""
+    left = _residual_columns(fit) if job.spec.motion is None and fit.model.form.bound is None else None
+    found = []
+    for entry in result.bias or ():
+        share, size = entry.explained, entry.coefficient_found
+        if entry.residual is not None:
+            share, size = entry.residual.share, entry.residual.coefficient
+        elif left is not None:
+            share, size = _residual_share(fit, entry, *left)
+        positive = entry.name.startswith(_ZONE)
+        if (share or 0.0) > _LITTLE and not (positive and (size or 0.0) < 0):  # that would be no dead zone
+            found.append((share or 0.0, entry, size, positive))
+    for _, entry, size, positive in sorted(found, key=lambda one: -one[0])[:_TERMS]:
         where = entry.output if job.spec.motion is None else entry.equation
-        yield from _term(job, expression, where, size or entry.coefficient, "", positive=positive)
+        yield from _term(job, entry.expression, where, size or entry.coefficient, "", positive=positive)
 
 
-def _explained(entry: SuspectResult) -> float:
-    told = entry.residual.share if entry.residual is not None else None
-    return max(entry.explained or 0.0, told or 0.0)
+def _residual_columns(fit: Any) -> tuple[np.ndarray, np.ndarray]:
+    """An orthonormal basis of the physics (N ny, nθ) and the one-step residual beside it (N ny,), in deviations."""
+    problem = fit.problem
+    x, unit = problem.rows.x[:: _every(fit)], problem.deviation
+    phi = np.asarray(problem.baseline.phi(x, problem.layout, problem.outputs, np)) / unit[:, None]
+    basis = np.linalg.qr(phi.reshape(-1, phi.shape[2]))[0]
+    runs = fit.model.predict(problem.record).trajectories
+    error = np.concatenate([(run.measured - run.model)[problem.rows.start :] for run in runs])[:: _every(fit)] / unit
+    return basis, error.ravel() - basis @ (basis.T @ error.ravel())
+
+
+def _every(fit: Any) -> int:
+    """Of so many rows one is looked at."""
+    return 1 + len(fit.problem.rows.x) // _ROWS
+
+
+def _residual_share(fit: Any, entry: SuspectResult, basis: np.ndarray, error: np.ndarray) -> tuple[float, float]:
+    """The share of the one-step residual that a suspect explains beside the physics, and its coefficient."""
+    problem = fit.problem
+    constants = {SAMPLING_TIME: problem.record.sampling_time} | dict(problem.baseline.constants)
+    suspect = Suspect(entry.name, entry.expression, entry.output, constants=constants)
+    column = suspect.values(problem.rows.x[:: _every(fit)], problem.layout, problem.outputs) / problem.deviation
+    rest = column.ravel() - basis @ (basis.T @ column.ravel())
+    along, size = float(rest @ error), float(rest @ rest)
+    if not size > _SPANNED * float(column.ravel() @ column.ravel()):
+        return 0.0, 0.0
+    return along**2 / size / max(float(error @ error), np.finfo(float).tiny), along / size
 
 
 def _term(
