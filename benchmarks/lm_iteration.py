@@ -43,7 +43,7 @@ def main() -> None:
 
         def train(n: int, posed: OneStepTask = posed, start: object = start) -> None:
             with one_blas_thread():  # as `estimate` trains
-                run = posed.run(LevenbergMarquardt(n, tolerance=0.0), start)
+                run = posed.run(LevenbergMarquardt(n, tolerance=0.0, longest=n), start)
             assert run.iterations == n, "training ended early"
 
         # in blocks, not in turn: the threads of BLAS and of XLA wait actively for a while after a call

@@ -43,7 +43,7 @@ def noisy(data_set: int, draws: int) -> np.ndarray:
 def noiseless(data_set: int, iterations: int) -> np.ndarray:
     """Errors (initialisations, 2) without noise or regularisation."""
     example = oa.synthetic.static(data_set)
-    solver = oa.LevenbergMarquardt(iterations)
+    solver = oa.LevenbergMarquardt(iterations, longest=iterations)
     return np.array(
         [
             errors(

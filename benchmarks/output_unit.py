@@ -27,7 +27,7 @@ def test_rmse(example: synthetic.Example, unit: float, seed: int, regularization
     problem = pose(example.train, example.baseline)
     usual = OneStepTask.of(problem, oa.MLP())
     task = OneStepTask.of(problem, oa.MLP(), usual.scaling, usual.unit * unit / OUTPUT_UNIT)
-    solver = oa.LevenbergMarquardt(iterations)
+    solver = oa.LevenbergMarquardt(iterations, longest=iterations)
     run = task.run(solver, task.bound.init(jax.random.key(seed)), regularization=regularization)
     c = problem.projection.solve((problem.target - task.values(run.w)) / problem.deviation)
     test = pose(example.test, example.baseline)

@@ -3,7 +3,8 @@
 Sparse NARX systems and linear ones with known structure, equation noise and sensor noise; the level and power of the
 test for anything nonlinear; coverage of intervals of terms that one half of the data chose and the other fitted; time
 against rows. SysIdentPy's FROLS gets the same data where that package is installed.
-Run: python benchmarks/selection.py [silverbox | terms | orders | level | power | coverage | time] [systems or draws]
+Run: python benchmarks/selection.py [silverbox | terms | orders | level | power | coverage | collinear | time]
+[systems or draws]
 """
 
 from __future__ import annotations
@@ -237,6 +238,40 @@ def coverage(draws: int = 200) -> dict[str, float]:
     return {name: 100 * float(np.mean(rows)) for name, rows in held.items()}
 
 
+HEAT = oa.Baseline.from_terms([oa.Term("a1", "y[k-1]"), oa.Term("b1", "u[k-1]"), oa.Term("b0", "1")])
+
+
+def exchanger(seed: int, noise: float, mean: float, rows: int = 1500) -> oa.Record:
+    """A slow plant with a persistent input: a saturating gain, a wall that stores heat, a drift."""
+    rng = np.random.default_rng(seed)
+    u = 0.4 + 0.2 * np.tanh(scipy.signal.lfilter([1], [1, -0.97], rng.normal(size=rows + 300))[300:] / 4)
+    drift = scipy.signal.lfilter([0.02], [1, -0.995], rng.normal(size=rows))
+    y, wall = np.zeros(rows), 0.0
+    for k in range(1, rows):
+        v = np.tanh(2.5 * (u[k - 1] - 0.4))
+        wall += 0.05 * (v - wall)
+        y[k] = y[k - 1] + 0.1 * (-8 * v * (1 + 0.3 * v) - 4 * wall + drift[k - 1] - y[k - 1])
+    return oa.Record.from_arrays(u=u, y=mean + y + noise * rng.normal(size=rows))
+
+
+def collinear(seeds: int = 4) -> dict[str, list[float]]:
+    """By the limit: how much terms widen a standard error of θ (median, worst), error on blocks over physics alone."""
+    found = {}
+    for limit in (0.0, 0.005, 0.02, 0.05, 0.1):
+        rows = []
+        for seed in range(seeds):
+            for noise, mean in ((0.02, 97.0), (0.1, 97.0), (0.02, 5.0)):
+                record = exchanger(seed, noise, mean)
+                one = oa.select(record, HEAT, criterion=oa.Prediction(), most=40, collinear=limit)
+                assert one.physics is not None and one.terms is not None
+                widened = max(s.after_std / s.before_std for s in one.physics.shifts if s.after_std and s.before_std)
+                rows.append((widened, one.terms.chosen.score / one.terms.rungs[0].score))
+        widened, better = np.array(rows).T
+        scale = float(np.exp(np.mean(np.log(better))))
+        found[f"{limit:g}"] = [float(np.median(widened)), float(widened.max()), scale]
+    return found
+
+
 def seconds() -> dict[int, float]:
     """Seconds of a search of 80 terms against the rows; the slope of logarithms is in the last entry."""
     one, found = systems(1)[0], {}
@@ -300,6 +335,7 @@ STUDIES = {
     "level": level,
     "power": power,
     "coverage": coverage,
+    "collinear": collinear,
     "time": seconds,
 }
 

@@ -26,13 +26,13 @@ CASES = (
 def iterations_to(task: OneStepTask, w: object, loss: float) -> int | None:
     """The fewest Levenberg-Marquardt iterations that end at or below a loss."""
     low, high = 0, 1
-    while task.run(LevenbergMarquardt(high, tolerance=0.0), w).normal.loss > loss:
+    while task.run(LevenbergMarquardt(high, tolerance=0.0, longest=high), w).normal.loss > loss:
         low, high = high, 2 * high
         if high > 4096:
             return None
     while high - low > 1:
         middle = (low + high) // 2
-        if task.run(LevenbergMarquardt(middle, tolerance=0.0), w).normal.loss > loss:
+        if task.run(LevenbergMarquardt(middle, tolerance=0.0, longest=middle), w).normal.loss > loss:
             low = middle
         else:
             high = middle
@@ -61,7 +61,7 @@ def table() -> None:
                 continue
             slow, fast = alternate(
                 lambda t=task, w=w, p=pipeline: t.run(p, w, Orthogonal()),
-                lambda t=task, w=w, n=count: t.run(LevenbergMarquardt(n, tolerance=0.0), w),
+                lambda t=task, w=w, n=count: t.run(LevenbergMarquardt(n, tolerance=0.0, longest=n), w),
                 3,
             )
             ratios.append(slow / fast)

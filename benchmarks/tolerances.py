@@ -34,7 +34,7 @@ def median_run(name: str, regularization: str, tolerance: float) -> tuple[float,
     """Medians over starts of the test RMSE and of the iterations."""
     given, runs = example(name), []
     for seed in SEEDS:
-        solver = oa.LevenbergMarquardt(300, tolerance)
+        solver = oa.LevenbergMarquardt(300, tolerance, longest=300)
         fit = oa.estimate(given.train, given.baseline, solver=solver, regularization=regularization, seed=seed)
         runs.append((fit.model.predict(given.test).scores().rmse[0], fit.status.iterations))
     rmse, iterations = np.median(runs, axis=0)

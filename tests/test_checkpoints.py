@@ -66,6 +66,21 @@ def test_a_run_that_was_ended_goes_on_bit_by_bit(tmp_path, engine, step):
     assert steps[0] > 1 or step == 1
 
 
+@pytest.mark.parametrize("step", [7, 11, 14])
+@pytest.mark.parametrize("engine", [Streaming(), InMemory()], ids=["stream", "memory"])
+def test_a_run_that_was_ended_past_its_limit_goes_on_bit_by_bit(tmp_path, engine, step):
+    chosen = options(engine) | {"solver": LevenbergMarquardt(8, tolerance=1e-13, longest=20)}
+    whole = fit(posed(1), **chosen)
+    assert whole.status.iterations > 8 and "past its limit of 8 iterations" in whole.status.message
+    kept = Checkpoints(tmp_path / "kept", "this fit", every=0.0)
+    with pytest.raises(Killed):
+        fit(posed(1), **chosen, checkpoints=kept.opened(resume=False), progress=dies_at(step))
+    again = Checkpoints(tmp_path / "kept", "this fit", every=0.0).opened(resume=True)
+    found = fit(posed(1), **chosen, checkpoints=again)
+    np.testing.assert_array_equal(found.model.numbers.weights, whole.model.numbers.weights)
+    assert found.status.iterations == whole.status.iterations and found.status.message == whole.status.message
+
+
 @pytest.mark.parametrize("engine", [Stream(), InMemory()], ids=["stream", "memory"])
 def test_a_free_run_goes_on_bit_by_bit(folder, tmp_path, engine):  # noqa: F811
     """Killed once in the run of physics alone, once in that of the learner."""

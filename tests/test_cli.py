@@ -216,6 +216,7 @@ def test_demo_leaves_a_complete_result(demo):
     result = finite_json((out / "result.json").read_text(encoding="utf-8"))
     assert result["structure"] == "orthogonal"
     assert result["orthogonality_defect"] <= 1e-12
+    assert result["status"]["code"] == "converged" and result["status"]["message"] == ""
     expected = [0.471697779, -0.471758489, 4.76104182e-5]
     np.testing.assert_allclose([p["value"] for p in result["parameters"]], expected, rtol=2e-9)
     assert result["scores"]["tests.uniform"]["prediction"]["rmse"][0] <= 2.0e-5

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers import unfolded
 
+import orthaug as oa
 from orthaug._base.errors import InputError, RankError
 from orthaug._base.jax import jax, jnp
 from orthaug._base.progress import Enough
@@ -346,6 +347,31 @@ def test_iteration_limit(short):
     assert (short.status.code, short.status.iterations) == ("iteration_limit", 6)
     assert short.status.ok and "more iterations may improve it" in short.status.message
     assert short.status.message in unfolded(short.summary())
+
+
+def test_theta_keeps_its_intervals_where_training_does_not_move_it(short):
+    """F1: under the training measure θ̂ = Φ⁺Y after every iteration; under another one it follows the weights."""
+    assert short.std is not None and "not_converged" not in {warning.code for warning in short.warnings}
+    solver = LevenbergMarquardt(iterations=6)
+    moved = Orthogonal(measure=oa.Symmetrized())
+    record, options = record_of(), {"learner": NETWORK, "solver": solver, "regularization": "none"}
+    found = estimate(record, PHYSICS, structure=moved, **options)
+    told = {warning.code: warning.text for warning in found.warnings}
+    assert found.status.code == "iteration_limit" and found.std is None
+    assert "no intervals: training ended after 6 iterations while the loss still fell" in told["not_converged"]
+    assert "without the key training goes on by itself" in told["not_converged"]
+    flown = estimate(record, PHYSICS, criterion=oa.Simulation(30, 0), **options | {"blocks": 0})
+    assert flown.std is None and "not_converged" in {warning.code for warning in flown.warnings}
+
+
+def test_a_learner_that_was_regularised_to_nothing_says_so():
+    options = {"learner": NETWORK, "solver": LevenbergMarquardt(20)}
+    silent = estimate(record_of(), PHYSICS, regularization=1e9, **options)
+    told = {warning.code: warning.text for warning in silent.warnings}
+    assert silent.effective_weights < 0.5
+    assert re.search(r"the learner is silent: the fit is that of physics alone .*compare", told["learner_silent"])
+    heard = estimate(record_of(), PHYSICS, regularization="none", **options)
+    assert "learner_silent" not in {warning.code for warning in heard.warnings}
 
 
 @pytest.mark.parametrize("solver", [LevenbergMarquardt(iterations=60), AdamLBFGS(40, 40)], ids=["lm", "paper"])

@@ -45,3 +45,20 @@ def test_outputs_that_tell_of_each_other_are_seen():
     assert model is not None and model.coupled
     model = first_model(Record.from_arrays(u, np.stack([position, apart], axis=1)))
     assert model is not None and not model.coupled
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_level_of_an_output_is_no_delay(seed):
+    rng = np.random.default_rng(seed)
+    u = rng.normal(size=600)
+    y = 5 + lfilter([0, 0, 0, 1.0], [1, -0.8], u) + 0.05 * rng.normal(size=600)
+    model = first_model(Record.from_arrays(u, y))
+    assert model is not None and model.offset and (model.orders.na, model.orders.nb, model.orders.nk) == (1, (1,), (3,))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_delay_of_an_input_that_acts_by_its_square_is_found(seed):
+    rng = np.random.default_rng(seed)
+    u = rng.normal(size=600)
+    model = first_model(Record.from_arrays(u, lfilter([0, 0, 1.0], [1, -0.8], u**2) + 0.05 * rng.normal(size=600)))
+    assert model is not None and model.delays == (2,) and model.orders.nk == (2,)

@@ -207,6 +207,27 @@ def test_iteration_limit():
     assert (run.ending, run.iterations) == (Ending.RUNNING, 4)
 
 
+def test_a_run_goes_on_past_its_limit_while_the_loss_falls():
+    """By the same steps as under a longer limit, and for no longer than it falls noticeably."""
+    given = regression(MLP(hidden=(5,)))
+    short, long, longest = (
+        minimise(given, solver=LevenbergMarquardt(*limits, longest=last))
+        for limits, last in (((8, 0.0), 8), ((8, 0.0), 40), ((40, 0.0), 40))
+    )
+    assert (short.iterations, long.iterations) == (8, 40) and long.tail.prolonged and not short.tail.prolonged
+    np.testing.assert_array_equal(long.w, longest.w)
+    assert short.tail.noticeable and short.tail.fall > 0 and short.tail.window == 5
+    once = minimise(given, solver=LevenbergMarquardt(8, 0.0, longest=40), noticeable=1e6)
+    assert once.iterations == 8 and not once.tail.noticeable
+
+
+def test_only_the_default_limit_is_passed():
+    assert LevenbergMarquardt().limit()[:2] == (300, 3000)
+    assert LevenbergMarquardt(200).limit()[:2] == LevenbergMarquardt().at_most(200).limit()[:2] == (200, 200)
+    assert LevenbergMarquardt().within_limit.limit()[:2] == (300, 300)
+    assert LevenbergMarquardt().after(120).limit()[:2] == (180, 2880)
+
+
 def test_loss_and_overlap_belong_to_the_weights():
     given = regression(MLP(hidden=(5,)))
     run = minimise(given, solver=LevenbergMarquardt(iterations=15))
@@ -240,7 +261,7 @@ def test_pauses_change_nothing(monkeypatch, seconds):
         Ending(int(whole.code)),
     )
     assert told[-1] == (run.iterations, float(run.normal.loss))
-    assert len(told) == (run.iterations if seconds == 0 else 4)
+    assert len(told) == (run.iterations if seconds == 0 else 5)  # one where the last window begins
 
 
 def test_the_training_clock_stands_still_while_programs_are_made():

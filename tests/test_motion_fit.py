@@ -429,3 +429,92 @@ def test_what_stands_at_a_bound_is_a_constant_to_the_others() -> None:
     assert one.at_bound == ("k",) and one.unidentified == () and np.isnan(one.std[2])
     np.testing.assert_allclose(one.values[:2], other.values, rtol=1e-4)
     np.testing.assert_allclose(one.std[:2], other.std, rtol=1e-2)
+
+
+# training to its end, and learners that evidence silenced
+
+
+def axis(rows: int = 300, friction: float = 20.4) -> oa.Record:
+    """A positioning axis like the EMPS benchmark: M = 95.1 kg, dry and viscous friction, an offset, a noisy encoder."""
+    rng, steps, state, drive, position = np.random.default_rng(0), 20, np.zeros(2), [], []
+    target = 0.4 * np.cos(2 * np.pi * 0.25 * 0.02 * np.arange(rows))
+    reference = np.cumsum(target) * 0.02
+    for goal, speed in zip(reference, target, strict=True):
+        position.append(state[0] + 1e-3 * rng.normal())
+        drive.append(float(np.clip(160 * (goal - state[0]) + 24 * (speed - state[1]), -10, 10)))
+
+        def rates(x, force=35.15 * drive[-1]):
+            return np.array([x[1], (force - 203.5 * x[1] - friction * np.tanh(x[1] / 1e-3) + 3.2) / 95.1])
+
+        for _ in range(steps):
+            half = state + 0.01 / steps * rates(state)
+            state = state + 0.02 / steps * rates(half)
+    names = {"inputs": ["drive"], "outputs": ["q"]}
+    return oa.Record.from_arrays(u=np.array(drive), y=np.array(position), sampling_time=0.02, **names)
+
+
+AXIS = oa.Motion.from_equations(
+    states=[
+        oa.State("x", "v", start="q"),
+        oa.State("v", "(35.15*drive - Fv*v)/M", start="derivative of q", learned=True),
+    ],
+    outputs=[oa.Output("q", "x")],
+    inputs=["drive"],
+    parameters=positive(M=100.0, Fv=200.0),
+)
+SPEED = oa.MLP(hidden=(8,), inputs=("v",))
+
+
+def test_evidence_that_silences_dry_friction_is_tried_again():
+    record = axis()
+    by_hand = oa.estimate(record, AXIS, learner=SPEED, regularization="evidence", blocks=0)
+    told = {warning.code: warning.text for warning in by_hand.warnings}
+    assert by_hand.effective_weights < 1.5 and "has learned nothing but a constant" in told["learner_silent"]
+    assert abs(by_hand.values[0] - 95.1) > 3 * by_hand.std[0]
+    found = oa.estimate(record, AXIS, learner=SPEED)
+    told = {warning.code: warning.text for warning in found.warnings}
+    assert found.effective_weights > 4 and "learner_silent" not in told
+    assert "so training was tried again with no regularization and a ridge of" in told["evidence_retried"]
+    assert [r.regularization for r in found.restarts][:2] == ["evidence", "none"]
+    (low, high), _ = found.interval
+    assert low < 95.1 < high
+
+
+def tanks(rows: int = 300) -> oa.Record:
+    """Two tanks of which the upper one runs over; K = 0.05, a1 = 0.05, a2 = 0.04, and both levels are measured."""
+    rng, state, levels = np.random.default_rng(5), np.array([3.0, 3.0]), []
+    pump = np.interp(np.arange(rows), np.arange(0, rows + 1, 15), rng.uniform(0.3, 6.5, rows // 15 + 1))
+
+    def rates(x, u):
+        down, over = 0.05 * np.sqrt(max(x[0], 0.0)), 3 * max(x[0] - 10, 0.0)
+        return np.array([0.05 * u - down - over, down - 0.04 * np.sqrt(max(x[1], 0.0)) + 0.6 * over])
+
+    for u in pump:
+        levels.append(state)
+        for _ in range(20):
+            half = state + 0.1 * rates(state, u)
+            state = state + 0.2 * rates(half, u)
+    y = np.array(levels) + 0.01 * rng.normal(size=(rows, 2))
+    return oa.Record.from_arrays(u=pump, y=y, sampling_time=4.0, inputs=["pump"], outputs=["upper", "lower"])
+
+
+def test_a_motion_whose_training_has_not_ended_has_no_intervals():
+    motion = oa.Motion.from_equations(
+        states=[
+            oa.State("x1", "K*pump - a1*sqrt(max(x1, 0.01))", start="upper", learned=True),
+            oa.State("x2", "a1*sqrt(max(x1, 0.01)) - a2*sqrt(max(x2, 0.01))", start="lower", learned=True),
+        ],
+        outputs=[oa.Output("upper", "x1"), oa.Output("lower", "x2")],
+        inputs=["pump"],
+        parameters=positive(K=0.04, a1=0.04, a2=0.05),
+    )
+    options = {"learner": oa.MLP(hidden=(6,), inputs=("x1",)), "blocks": 0, "fallback": False}
+    short = oa.estimate(tanks(), motion, solver=oa.LevenbergMarquardt(60), **options)
+    told = {warning.code: warning.text for warning in short.warnings}
+    assert short.status.code == "iteration_limit" and short.std is None and short.interval is None
+    assert short.parameters["std"].isna().all() and short.split(oa.Uniform()).std is None
+    assert "while the loss still fell" in told["not_converged"] and "`iterations`" in told["not_converged"]
+    whole = oa.estimate(tanks(), motion, **options)
+    assert whole.status.iterations > 300 and "went on past its limit of 300 iterations" in whole.status.message
+    assert (whole.std is None) == ("not_converged" in {warning.code for warning in whole.warnings})
+    assert whole.status.loss < short.status.loss

@@ -197,6 +197,7 @@ def test_a_term_that_is_not_finite_is_left_out():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
+        ({"collinear": -0.1}, "`collinear` must be a number, 0 or more"),
         ({"blocks": 1}, "`blocks` must be a whole number, 2 or more"),
         ({"learner": oa.Terms(degree=2, exclude=("u[k-9]",))}, "`exclude` names the term 'u\\[k-9\\]'"),
         ({"learner": oa.Terms(("u[k-1]",))}, "the physics expresses all candidate terms already"),
@@ -243,6 +244,89 @@ def test_a_term_of_a_slow_signal_is_of_the_lag_that_the_physics_reads(term):
     y += 0.1 * y.std() * rng.normal(size=800)
     one = oa.select(oa.Record.from_arrays(u=u[:300], y=y[:300], sampling_time=0.1), PHYSICS, most=2)
     assert one.learner.terms == (term,) and one.shares[term] > 0.5
+
+
+HEAT = oa.Baseline.from_terms([oa.Term("a1", "y[k-1]"), oa.Term("b1", "u[k-1]"), oa.Term("b0", "1")])
+
+
+def exchanger(seed: int, rows: int = 1000, noise: float = 0.02) -> oa.Record:
+    """A temperature near 97, its flow slow and persistent: a saturating gain, a wall that stores heat, a drift."""
+    rng = np.random.default_rng(seed)
+    u = 0.4 + 0.2 * np.tanh(scipy.signal.lfilter([1], [1, -0.97], rng.normal(size=rows + 300))[300:] / 4)
+    drift = scipy.signal.lfilter([0.02], [1, -0.995], rng.normal(size=rows))
+    y, wall = np.zeros(rows), 0.0
+    for k in range(1, rows):
+        v = np.tanh(2.5 * (u[k - 1] - 0.4))
+        wall += 0.05 * (v - wall)
+        y[k] = y[k - 1] + 0.1 * (-8 * v * (1 + 0.3 * v) - 4 * wall + drift[k - 1] - y[k - 1])
+    return oa.Record.from_arrays(u=u, y=97 + y + noise * rng.normal(size=rows))
+
+
+def test_no_term_within_the_span_of_the_physics_is_taken():
+    """All terms allowed, y[k-2] is taken, of which 0.1 % is left: it makes the interval of a1 27 times as wide."""
+    loose, kept = (
+        oa.select(exchanger(5), HEAT, criterion=oa.Prediction(), most=12, collinear=collinear).physics
+        for collinear in (0.0, 0.05)
+    )
+    widened = [max(s.after_std / s.before_std for s in one.shifts) for one in (loose, kept)]
+    assert min(loose.left.values()) < 0.01 and widened[0] > 20 > widened[1]
+    assert all(left > 0.03 for left in kept.left.values()) and kept.condition < loose.condition / 10
+    assert kept.excluded > 10 and loose.excluded == 0
+    text = {note.code: note.text for note in kept.notes}["terms_within_span"]
+    assert text.startswith(f"{kept.excluded} of 217 candidate terms lie within the span")
+    assert f"condition number is {kept.condition:.3g}" in text
+
+
+def test_parameters_that_the_terms_move_are_shown_before_and_after():
+    one = oa.select(exchanger(1), HEAT, criterion=oa.Prediction(), most=4)
+    alone = oa.estimate(exchanger(1), HEAT, criterion=oa.Prediction(), blocks=0).parameters
+    fitted = one.estimate(blocks=0).parameters
+    for shift in one.physics.shifts:
+        assert shift.before == pytest.approx(alone["value"][shift.parameter], rel=0.02)
+        assert shift.after == pytest.approx(fitted["value"][shift.parameter], rel=0.02)
+        assert shift.after_std == pytest.approx(fitted["std"][shift.parameter], rel=0.05)
+    b1 = next(shift for shift in one.physics.shifts if shift.parameter == "b1")
+    assert b1.moved and b1.times > 3
+    text = {note.code: note.text for note in one.notes}["physics_moved"]
+    assert f"b1 from {b1.before:.4g} ± {b1.before_std:.2g} to {b1.after:.4g} ± {b1.after_std:.2g}" in text
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("of", ["input", "output"])
+def test_the_level_of_a_signal_is_no_delay(seed, of):
+    rng = np.random.default_rng(seed)
+    u = rng.normal(size=600)
+    y = scipy.signal.lfilter([0, 0, 0, 1.0], [1, -0.8], u) + 0.05 * rng.normal(size=600)
+    record = oa.Record.from_arrays(u=u + 5 * (of == "input"), y=y + 5 * (of == "output"))
+    one = oa.select(record, learner=None, lags=oa.Lags(3, 5, 0), criterion=FLOWN)
+    assert (one.orders.chosen.na, one.orders.chosen.nb, one.orders.chosen.nk) == (1, (1,), (3,))
+    assert one.delays[0].fitted == 3 and one.learner.terms == ("y[k-1]", "u[k-3]", "1")
+
+
+@pytest.mark.parametrize("seed", [1, 2, 5])
+def test_an_input_that_acts_by_its_square_stays_a_candidate(seed):
+    """No linear lag of it helps, so that the orders keep none; its functions are looked at all the same."""
+    rng = np.random.default_rng(seed)
+    u = rng.normal(size=600)
+    y = scipy.signal.lfilter([0, 1.0], [1, -0.8], u**2)
+    record = oa.Record.from_arrays(u=u, y=y + 0.05 * y.std() * rng.normal(size=600))
+    one = oa.select(record, learner=oa.Terms(degree=2), criterion=FLOWN, most=4)
+    assert one.nonlinearity.found and "u[k-1]" in one.nonlinearity.matter
+    assert set(one.learner.terms) == {"u[k-1]**2", "y[k-1]"}
+    assert one.delays[0].correlation is None and one.delays[0].square == 1
+    assert one.delays[0].fitted is None and one.lags.nb[0] > 0
+
+
+def test_lags_of_the_chosen_orders_reach_the_terms():
+    """Beside first-order physics, the terms of a second-order plant took y[k-3] for y[k-2], and six instead of four."""
+    rng = np.random.default_rng(1)
+    u = rng.normal(size=600)
+    y = scipy.signal.lfilter([0, 1, 0.5], [1, -1.2, 0.6], u + 0.2 * u**2) + 0.02 * rng.normal(size=600)
+    record, learner = oa.Record.from_arrays(u=u, y=y), oa.Terms(degree=2)
+    one = oa.select(record, PHYSICS, lags=oa.Lags(3, 3, 1), learner=learner, criterion=FLOWN, most=6)
+    assert set(one.learner.terms) == {"y[k-2]", "u[k-2]", "u[k-1]**2", "u[k-2]**2"}
+    begun = [rung.change for rung in one.terms.rungs if rung.change[:1] == ("physics alone",)]
+    assert "+ u[k-2]" in begun[0]
 
 
 def test_a_network_is_as_wide_as_it_pays():
@@ -304,6 +388,9 @@ def test_select_from_the_shell_leaves_a_spec_that_runs(project, tmp_path, withou
     assert done.code == 0, done.err
     result = finite_json(done.out)
     assert set(result["learner"]["terms"]) == TRUE and result["focus"] == "simulation" and not result["stopped"]
+    shifts = {shift["parameter"]: shift for shift in result["physics"]}
+    assert set(shifts) == {"a", "b"} and shifts["b"]["before_std"] > 0 and result["condition"] > 1
+    assert all(0 < term["left"] <= 1 for term in result["terms"])
     assert result["orders"] == {"na": 1, "nb": [1], "nk": [1]} or result["orders"]["na"] >= 1
     files = {str(p.relative_to(tmp_path / "out")) for p in (tmp_path / "out").rglob("*") if p.is_file()}
     assert files == {"result.json", "spec.toml", "table.csv", "figures/selection.png", "manifest.json"}
@@ -324,12 +411,14 @@ def test_select_of_halves_fits_the_other_rows(project, tmp_path):
     done = run("select", project, "--out", tmp_path / "out")
     assert done.code == 0, done.err
     assert "rows = [305, 600]" in (tmp_path / "out" / "spec.toml").read_text()
+    assert "physics alone" in done.out and "condition number of physics and terms together" in done.out
     assert "orders" in done.out and "→" in done.out and "next: orthaug fit" in done.out
 
 
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
+        ("terms = 4", "collinear = 1.5", "'selection.collinear': found 1.5"),
         ("terms = 4", "terms = -1", "'selection.terms': found -1"),
         ("terms = 4", "term = 4", "unknown key 'selection.term', did you mean 'terms'?"),
         (
@@ -364,3 +453,35 @@ def test_a_path_is_the_same_twice():
     paths = [climb(TermRuns.of(problem, library, oa.Prediction()), 4, 3) for _ in range(2)]
     assert [rung.point.chosen for rung in paths[0].rungs] == [rung.point.chosen for rung in paths[1].rungs]
     assert [rung.score for rung in paths[0].rungs] == [rung.score for rung in paths[1].rungs]
+
+
+def test_a_fit_says_where_terms_leave_little_of_the_physics(tmp_path):
+    """No name says that y[k-2] could imitate y[k-1]; on the rows of a slow plant it nearly does."""
+    record = exchanger(5).experiments[0]
+    table = np.column_stack([record.inputs, record.outputs])
+    np.savetxt(tmp_path / "run.csv", table, delimiter=",", header="u,y", comments="", fmt="%.17g")
+    spec = """
+[data]
+inputs = ["u"]
+outputs = ["y"]
+train = { files = ["run.csv"] }
+[baseline]
+terms = [
+    { parameter = "a1", regressor = "y[k-1]" },
+    { parameter = "b1", regressor = "u[k-1]" },
+    { parameter = "b0", regressor = "1" },
+]
+[training]
+focus = "prediction"
+[learner]
+kind = "terms"
+terms = ["TERM"]
+"""
+    texts = []
+    for name, term in (("near", "y[k-2]"), ("far", "u[k-1]**3")):
+        (tmp_path / f"{name}.toml").write_text(spec.replace("TERM", term))
+        done = run("check", tmp_path / f"{name}.toml", "--json")
+        assert done.code == 0, done.err
+        texts.append(finite_json(done.out)["shared"]["text"])
+    assert "the fit determines every parameter beside it" in texts[0] and "the terms leave" in texts[0]
+    assert "% of what physics alone has to determine a1" in texts[0] and "the terms leave" not in texts[1]

@@ -22,6 +22,7 @@ from orthaug.physics.shared import Shared, shared_directions
 
 _STILL = 1e-8  # change of a physical parameter along a shared direction, relative: rounding
 _ALTERNATIVES = 8
+_NEARLY = 0.05  # of a regressor's norm: what widens a standard error twenty times, as in `orthaug select`
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,8 @@ class Imitation:
     """Whether the learner can be linear combinations of its inputs only."""
     held: tuple[str, ...] = ()
     """Parameters at a bound: known terms, along which nothing is split off."""
+    weakest: tuple[str, float] | None = None
+    """The determined parameter that a learner of terms comes nearest to, and what it leaves of its regressor."""
 
     @classmethod
     def of(cls, inputs: Sequence[str], shared: Shared, *others: Any) -> Self:
@@ -76,14 +79,25 @@ class Imitation:
         if not self.directions:
             rest = " other" if self.held else ""
             told = f"{sees} and could imitate nothing of the{rest} physics"
-            return f"{told}: the fit determines every{rest} parameter beside it."
+            return f"{told}: the fit determines every{rest} parameter beside it.{self._nearly}"
         could = _listed([_combination(direction) for direction in self.directions])
         told = [f"{sees} and could imitate {could}: there, and only there, θ is split off."]
         if self.determined:
             told.append(f"The fit determines {_listed(self.determined)} beside any learner of these inputs.")
         if self.physical:
             told.append(f"Of the physical parameters it determines {_listed(self.physical)} so.")
-        return " ".join(told)
+        return " ".join(told) + self._nearly
+
+    @property
+    def _nearly(self) -> str:
+        """A sentence where the terms leave so little of a regressor that its parameter rests on next to nothing."""
+        if self.weakest is None or self.weakest[1] >= _NEARLY:
+            return ""
+        name, left = self.weakest
+        return (
+            f" On these rows, however, the terms leave {100 * left:.2g} % of what physics alone has to determine "
+            f"{name}: its value rests on that part, and the terms may have taken over the rest."
+        )
 
 
 class MotionImitation(Imitation):
@@ -123,7 +137,24 @@ def imitation(
             alternatives.append(Alternative.of(other, shared, _untouched(shared, slopes)))
     shown, terms = tuple(alternatives[:_ALTERNATIVES]), problem.features.linear
     found = Imitation.of(inputs, own, _untouched(own, slopes), shown, terms, tuple(held))
-    return replace(found, determined=tuple(name for name in found.determined if name not in held))
+    determined = tuple(name for name in found.determined if name not in held)
+    return replace(found, determined=determined, weakest=_weakest(problem, determined) if terms else None)
+
+
+def _weakest(problem: Problem, determined: Collection[str]) -> tuple[str, float] | None:
+    """Return the parameter whose regressor the others leave least of, relative to what they do without the terms."""
+    if len(problem.outputs) > 1 or not determined or not problem.count:
+        return None
+    physics, terms = problem.projection.phi[:, 0], problem.feature_rows()
+    left = []
+    for columns in (np.concatenate([physics, terms], axis=1), physics):
+        size = np.linalg.norm(columns, axis=0)
+        r = np.linalg.qr(columns / np.where(size > 0, size, 1.0), mode="r")
+        inverse = np.linalg.pinv(r, rcond=1e-12)
+        left.append(1 / np.maximum(np.linalg.norm(inverse[: physics.shape[1]], axis=1), 1.0))
+    share = dict(zip(problem.baseline.names, np.minimum(left[0] / left[1], 1.0).tolist(), strict=True))
+    name = min(determined, key=lambda one: share[one])
+    return name, share[name]
 
 
 def _slopes(problem: Problem, physics: PhysicsMap | None) -> dict[str, np.ndarray] | None:

@@ -73,7 +73,7 @@ def diagnose_motion(fit: MotionEstimate, free_run: Response) -> Diagnosis | None
 
 def _late(fit: MotionEstimate) -> tuple[DeadTime, ...]:
     """Inputs that act later, by physics alone, as it was trained in front of the learner: by the same programs."""
-    solver, bound = LevenbergMarquardt(), fit.model.form.bound
+    solver, bound = LevenbergMarquardt().within_limit, fit.model.form.bound
     posed, learner = (fit.problem, bound.learner) if bound else (without_learner(fit.problem), None)
     return dead_times(on_longest(posed, fit.criterion, solver, Orthogonal(), learner), solver)
 

@@ -19,7 +19,7 @@ from orthaug.fitting.structures import Additive
 from orthaug.studies.synthetic import Example, mass_spring_damper
 
 RESTARTS = 3
-ITERATIONS = 100
+ITERATIONS = LevenbergMarquardt().iterations  # those on which a progress bar counts
 
 SPEC = f"""# The paper's mass-spring-damper (Sect. 5.2): linear physics, unmodelled Stribeck friction.
 [data]
@@ -54,7 +54,6 @@ hidden = [16]
 kind = "orthogonal"
 
 [training]
-iterations = {ITERATIONS}
 restarts = {RESTARTS}
 regularization = "none"
 """
@@ -81,7 +80,6 @@ def _additive(example: Example, seed: int, progress: Progress) -> Estimate:
         example.train,
         example.baseline,
         structure=Additive(),
-        solver=LevenbergMarquardt(ITERATIONS),
         regularization="none",
         seed=seed,
         progress=progress.after(runs=RESTARTS + seed),

@@ -25,6 +25,7 @@ from orthaug.models.terms import Terms
 from orthaug.reports.selection import SelectResult
 
 if TYPE_CHECKING:
+    from orthaug.selection.kept_physics import Shift
     from orthaug.selection.selecting import Selection, Told
 
 _DEGREE = 3  # of the terms that a spec without [learner] is searched with
@@ -81,6 +82,7 @@ def select_for(job: LaggedJob, spec: Spec, folder: Path, told: Told) -> Selected
         "most": MOST if section.terms is None else section.terms,
         "blocks": section.blocks,
         "halves": section.halves,
+        "collinear": section.collinear,
     }
     if section.halves and len(job.train.record.experiments) != 1:
         raise InputError(f"{job.path}: 'selection.halves' needs training data of one experiment, to be cut in two.")
@@ -145,7 +147,7 @@ def _criterion(spec: Spec) -> Criterion:
 
 def _result(job: LaggedJob, selection: Selection, seconds: float) -> SelectResult:
     orders, test, learner = selection.orders.chosen, selection.nonlinearity, selection.learner
-    shares = selection.shares
+    shares, physics = selection.shares, selection.physics
     terms = learner.terms if isinstance(learner, Terms) else ()
     content = {
         "data": job.data,
@@ -156,13 +158,26 @@ def _result(job: LaggedJob, selection: Selection, seconds: float) -> SelectResul
         else {"p": test.p, "regressors": test.regressors, "matter": list(test.matter), "text": str(test)},
         "learner": _declared(learner),
         "focus": CRITERIA.kind_of(selection.criterion),
-        "terms": [{"term": term, "chosen": shares.get(term)} for term in terms] or None,
+        "terms": [{"term": t, "chosen": shares.get(t), "left": physics and physics.left.get(t)} for t in terms] or None,
+        "physics": physics and [_moved(shift) for shift in physics.shifts],
+        "condition": physics and physics.condition,
         "models": selection.table.to_dict("records"),
         "seconds": seconds,
         "stopped": selection.stopped,
         "warnings": list(selection.notes),
     }
     return SelectResult.model_validate(content)
+
+
+def _moved(shift: Shift) -> dict[str, Any]:
+    own = {"parameter": shift.parameter, "unit": shift.unit, "left": shift.left, "moved": shift.moved}
+    values = {
+        "before": shift.before,
+        "before_std": shift.before_std,
+        "after": shift.after,
+        "after_std": shift.after_std,
+    }
+    return own | values
 
 
 def _declared(learner: Learner | None) -> dict[str, Any] | None:
@@ -186,7 +201,7 @@ def _new_spec(job: LaggedJob, folder: Path, selection: Selection, *, halved: boo
         first = int(rows[0])
         cut = first + every * (len(job.train.record) - len(selection.record))
         train["rows"] = [cut, first + every * len(job.train.record)]
-    learner, orders = _declared(selection.learner), selection.orders.chosen
+    learner, orders = _declared(selection.learner), selection.reach or selection.orders.chosen
     document["lags"] = tomlkit.item({"na": orders.na, "nb": list(orders.nb), "nk": list(orders.nk)})
     document["learner"] = tomlkit.item(learner or {"kind": "none"})
     if learner is not None and "terms" in learner:

@@ -182,6 +182,7 @@ class SelectionSection(Section):
     hidden: Annotated[list[Positive], Field(min_length=1)] | None = None
     blocks: Annotated[int, Field(ge=2, strict=True)] = 5
     halves: bool = False
+    collinear: Annotated[float, Field(ge=0, lt=1)] = 0.05
 
 
 class ValidationSection(Section):

@@ -27,7 +27,7 @@ from orthaug.models.rows import Overlap
 EVERY = 10.0  # s
 _ABOUT = "training.json"
 _ONE: Any = 0
-_LEAVES = State(_ONE, Normal(_ONE, _ONE, _ONE, Overlap(_ONE, _ONE)), _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE)
+_LEAVES = State(_ONE, Normal(_ONE, _ONE, _ONE, Overlap(_ONE, _ONE)), _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE)
 
 OF_DESCENT = Pause((_ONE,) * 5, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE)
 """The form of what a descent keeps."""

@@ -20,8 +20,17 @@ from orthaug.fitting.estimates import NOT_UNIQUE, Estimate
 from orthaug.fitting.laid_rows import Share
 from orthaug.fitting.learned import ErrorStatistics, Learned
 from orthaug.fitting.one_step import OneStepTask
+from orthaug.fitting.silence import learner_silent
 from orthaug.fitting.status import ALONE, Ending, Status
 from orthaug.fitting.structures import Orthogonal, Structure
+from orthaug.fitting.unfinished import (
+    NOT_CONVERGED,
+    ending_in_words,
+    follows_training,
+    not_converged,
+    unfinished,
+    withheld,
+)
 from orthaug.inference.covariance import degrees_of_freedom, noise_covariance, theta_covariance
 from orthaug.models.beyond import limits_of, pull_of
 from orthaug.models.dynamics import Numbers
@@ -47,6 +56,10 @@ def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estim
         learned: of these rows, or of a free run on the same problem.
     """
     problem = task.problem
+    told: list[Warning] = []
+    if unfinished(learned) and follows_training(structure, problem, learned):
+        learned = withheld(learned)
+        told.append(not_converged(learned))
     share = task.share(learned)
     finite = bool(np.isfinite(share.square) and np.isfinite(share.coordinates).all())
     ending = learned.ending if finite else Ending.NON_FINITE
@@ -61,13 +74,17 @@ def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estim
     noise = errors.noise if ending.usable else None
     identified = structure.projects or (learned.bound is None and structure.identifies)
     known = noise is not None and identified and not learned.elsewhere
-    told = _warnings(problem, structure, learned, identified, noise, fixed)
-    if known and errors.covariance is None and learned.errors is None:
+    told += [] if learned.elsewhere else learner_silent(learned)
+    told += _warnings(problem, structure, learned, identified, noise, fixed)
+    if any(warning.code == NOT_CONVERGED for warning in told):
+        pass
+    elif known and errors.covariance is None and learned.errors is None:
         text = "no standard errors: beside a learner that sees only some features, an ensemble leaves none."
         told.append(Warning("no_standard_errors", text))
     elif known and errors.covariance is not None and np.isnan(np.diag(errors.covariance)).sum() > len(fixed):
         told.append(Warning("no_standard_errors", _UNDETERMINED))
     reason = ALONE.get(ending, "") if learned.bound is None else ""
+    reason = reason or ending_in_words(ending, learned.tail)
     return Estimate(
         model=_model(problem, structure, learned, ThetaSplit(theta, theta_aux, fixed), errors, noise),
         status=Status(ending, learned.iterations, learned.seconds, errors.mean_square, reason=reason),

@@ -19,6 +19,7 @@ from orthaug.fitting.segment_sums import SegmentSums
 from orthaug.fitting.segments import Segments, lay_segments
 from orthaug.fitting.solvers.descent import MARQUARDT, Descent
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.solvers.limit import noticeable_in
 from orthaug.fitting.status import Ending
 from orthaug.inference.covariance import noise_covariance, whitening
 from orthaug.models.dynamics import Dynamics, Numbers
@@ -40,6 +41,11 @@ class Flight(NamedTuple):
     @property
     def ending(self) -> Ending:
         return self.end.ending
+
+    @property
+    def effective(self) -> float:
+        """Effective number of weights."""
+        return self.end.effective
 
 
 class Looked(NamedTuple):
@@ -139,7 +145,7 @@ class Course:
             options: of `descent.descend`.
         """
         ny = len(self.dynamics.outputs)
-        options |= {"bounds": objective.bounds, "damping": MARQUARDT}
+        options |= {"bounds": objective.bounds, "damping": MARQUARDT, "noticeable": noticeable_in(self.residuals)}
         two_legs = ny > 1 and self.output_weights in ("auto", "covariance")
         first = solver.at_most(solver.iterations // 2) if two_legs else solver
         start = Start(objective.initial.measured if states is None else states)
@@ -152,7 +158,7 @@ class Course:
             objective = replace(objective, weight=np.sqrt(size) * white)
             done = end.iterations
             begun, options = Start(end.flown.states), options | {"ridge": end.ridge, "ceiling": np.inf}
-            again = solver.at_most(solver.iterations - done).descend(
+            again = solver.after(done).descend(
                 objective,
                 end.flown.p,
                 begun,
@@ -162,7 +168,8 @@ class Course:
             )
             path = (*end.path, *again.path)
             spent = {"iterations": done + again.iterations, "seconds": end.seconds + again.seconds}
-            end = again._replace(path=path, **spent)
+            tail = again.tail and again.tail._replace(done=spent["iterations"], limit=solver.iterations)
+            end = again._replace(path=path, tail=tail, **spent)
         mean_square = self.mean_square(end.flown.c, end.flown.w)
         return Flight(objective, end, mean_square, end.iterations, end.seconds)
 

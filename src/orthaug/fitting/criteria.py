@@ -62,9 +62,9 @@ class Criterion(Protocol):
 
 
 Steps = Annotated[int, Ge(0)] | Literal["auto"]
-LONG, SHORT = 4096, 512
-"""Steps: experiments of up to so many are one segment of a free run; longer ones are cut, but no shorter than that."""
+SHORT = 512  # steps of a segment at least, where its length is left to the record
 _MEMORIES = 20  # times that the outputs remember themselves: a segment shows their slowest mode
+_LOOKED_AT = 2**17  # samples of which the autocorrelation is taken
 
 
 @dataclass(frozen=True)
@@ -117,8 +117,8 @@ class Simulation:
     unknowns too (`InitialStates`). Segments without a washout start exactly from what was measured.
 
     Args:
-        segment: steps of a segment; 0 for whole experiments; "auto" for whole experiments of up to 4096 steps and, of
-            longer ones, 20 times as many steps as the outputs remember themselves, 512 or more.
+        segment: steps of a segment; 0 for whole experiments; "auto" for 20 times as many steps as the outputs remember
+            themselves, 512 or more, and whole experiments where these are not twice as long.
         washout: leading steps of a segment that are not scored, until its start is forgotten.
         start_iterations: one-step iterations that training starts from.
         exact_start: whether a segment starts exactly from what was measured; None for the rule above.
@@ -231,9 +231,7 @@ def segment_for(record: Record, first_row: int, washout: int) -> int:
     """
     longest = max(record.experiments, key=len)
     steps = len(longest) - first_row
-    if steps <= LONG:
-        return 0
-    outputs = longest.outputs[: 2 * LONG * _MEMORIES]
+    outputs = longest.outputs[:_LOOKED_AT]
     centred = np.nan_to_num(outputs - np.nanmean(outputs, axis=0))
     size = 2 ** int(np.ceil(np.log2(2 * len(centred))))
     spectrum = np.abs(np.fft.rfft(centred, size, axis=0)) ** 2

@@ -167,7 +167,7 @@ class FlightTask(ABC):
         options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "evidence_settled": True}
         flight = plan.descend(objective, best.p, solver, tell, best.states, ceiling=ceiling, **options)
         if evidence and not _learned(flight, best.loss):
-            free = plan.descend(objective, best.p, solver, tell, best.states, ceiling=ceiling)
+            free = plan.descend(objective, best.p, solver.within_limit, tell, best.states, ceiling=ceiling)
             if _learned(free, best.loss):
                 flown, options = free.end.flown, options | {"evidence_settled": False}
                 again = plan.descend(objective, flown.p, solver, tell, flown.states, ceiling=ceiling, **options)
@@ -225,6 +225,7 @@ class FlightTask(ABC):
             coefficients=end.flown.c,
             errors=self._errors(run),
             scores=self._scores(run),
+            tail=end.tail,
         )
 
     def _errors(self, run: Flight) -> ErrorStatistics:

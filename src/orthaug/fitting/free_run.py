@@ -68,7 +68,7 @@ def _lengthening(
     """The end over the plan's own segments, reached over shorter ones, from the first start that flies over them."""
     p, segment, shortest = None, _SHORTEST, plan.over(_SHORTEST)
     for start in starts:
-        end = shortest.descend(shortest.objective(structure), start, solver)
+        end = shortest.descend(shortest.objective(structure), start, solver.within_limit)
         if end.ending.usable:
             p = end.end.flown.p
             break
@@ -76,7 +76,7 @@ def _lengthening(
         for longer in _LONGER:
             steps = min(int(np.ceil(longer * segment)), plan.segments.steps)
             course = plan if steps == plan.segments.steps else plan.over(steps)
-            end = course.descend(course.objective(structure), p, solver)
+            end = course.descend(course.objective(structure), p, solver if course is plan else solver.within_limit)
             if end.ending.usable:
                 break
         else:
@@ -111,7 +111,7 @@ def _over_whole(
     own = plan.descend(objective, end.end.flown.p, solver.at_most(0))  # its statistics are those of the plan's segments
     if not own.ending.usable:
         return []
-    own = own._replace(end=own.end._replace(ending=end.ending))
+    own = own._replace(end=own.end._replace(ending=end.ending, tail=end.end.tail))
     return [own._replace(iterations=end.iterations, seconds=end.seconds)]
 
 
@@ -220,7 +220,8 @@ class FreeRunTask(FlightTask):
         elif not places:
             add(objective.begin(w))
         if self.bound is not None and plan.flown.start_iterations and self.warm is None:
-            short = LevenbergMarquardt(plan.flown.start_iterations, solver.tolerance)
+            steps = plan.flown.start_iterations
+            short = LevenbergMarquardt(steps, solver.tolerance, longest=steps)
             begun = objective.begin(np.asarray(plan.task.run(short, w, structure, regularization).w))
             if self._flies_better(objective, begun):
                 add(begun)

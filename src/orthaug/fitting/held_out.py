@@ -20,8 +20,6 @@ from orthaug._base.errors import InputError
 from orthaug.data.record import Experiment, Record
 from orthaug.models.response import Response
 
-ONE_STEP = "prediction"
-"""The focus of training one step ahead, as a spec names it."""
 WORTH = 0.02  # of the error: less than this is neither help nor harm
 _FEWEST = 20  # usable rows of a block
 _STRETCHES = 20  # pieces of a free run that the bootstrap draws from: longer than its errors remember
@@ -100,26 +98,24 @@ def _stretches(model: Vector, other: Vector, rows: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One of the models that were compared: how it was trained, and the error of its free run.
+    """One of the models that were compared: how it was trained, `prediction` or `simulation`, and its free run's error.
 
     `error` is the RMS error where nothing was fitted, in standard deviations of the training output; infinite where
-    the run diverges, None where it was not tried.
+    the run diverges, NaN where it was not tried.
     """
 
     focus: str
     learner: bool
-    error: float | None
+    error: float
 
     def __str__(self) -> str:
-        how = "one step ahead" if self.focus == ONE_STEP else "on the free run"
+        how = "one step ahead" if self.focus == "prediction" else "on the free run"
         return f"{'physics and learner' if self.learner else 'physics alone'} trained {how}"
 
     @property
-    def told(self) -> str:
+    def described(self) -> str:
         """The candidate with its error."""
-        if self.error is None:
-            return str(self)
-        return f"{self} {'diverges' if math.isinf(self.error) else f'{self.error:.3g}'}"
+        return f"{self}: {f'{self.error:.3g}' if math.isfinite(self.error) else 'diverges'}"
 
 
 @dataclass(frozen=True)

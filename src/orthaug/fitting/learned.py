@@ -13,6 +13,7 @@ from orthaug.data.record import Record
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.elimination import Fixed
+from orthaug.fitting.solvers.limit import Tail
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Structure
 from orthaug.models.learners import Bound, Scaling
@@ -59,6 +60,8 @@ class Learned:
     """Of a free run; None where they are those of the one-step residual."""
     tilt: Matrix | None = None
     """(members, nθ) of an ensemble, whose weights are (members, nw)."""
+    tail: Tail | None = None
+    """The last steps of its run; None for what was solved."""
     elsewhere: bool = False
     """Whether it is a function from another toolbox."""
 

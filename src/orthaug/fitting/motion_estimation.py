@@ -9,6 +9,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, check_type
 from orthaug._base.errors import InputError
+from orthaug._base.jax import jax, jnp
 from orthaug._base.progress import SILENT, Tell
 from orthaug.data.record import Record
 from orthaug.fitting.checkpoints import Checkpoints
@@ -20,10 +21,12 @@ from orthaug.fitting.motion_course import MotionCourse
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.rules import check_motion_choices, check_solver, checked_starts, tried
+from orthaug.fitting.silence import learner_silent, silenced
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import ALONE, Ending, Status
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.fitting.training import Choice, planned, train
+from orthaug.fitting.unfinished import ending_in_words, not_converged, unfinished, withheld
 from orthaug.inference.motion_split import MotionSplit
 from orthaug.models.beyond import limits_of, pull_of
 from orthaug.models.learners import Learner, Scaling
@@ -85,7 +88,8 @@ def fit_motion(
     kept = None if isinstance(engine, Tasks) else checkpoints
     task = MotionTask.of(problem, learner, criterion, engine).keeping(kept)
     starts = planned(task.bound, range(seed, seed + restarts), choices)
-    chosen = Choice(validation, blocks, fallback)
+    retry = isinstance(regularization, str) and regularization == "auto"
+    chosen = Choice(validation, blocks, fallback, retry=retry)
     return train(task, starts, structure, solver, chosen, progress, conclude_motion, runner=engine)
 
 
@@ -107,7 +111,10 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) ->
     assert learned.coefficients is not None and learned.errors is not None
     states = plan.segments.start if learned.scores is None else learned.scores.states
     slope = None if learned.scores is None else learned.scores.slope
+    unsettled = (not_converged(learned),) if unfinished(learned) else ()
+    learned = withheld(learned) if unsettled else learned
     errors = learned.errors
+    assert errors is not None and learned.coefficients is not None
     alone = np.asarray(learned.coefficients if task.physics is None else task.physics.end.flown.theta)
     laid = (plan.flown.steps, plan.flown.washout, plan.segments.count)
     trained = Trained(*laid, np.asarray(states), slope, alone)
@@ -115,6 +122,8 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) ->
     reason = ALONE.get(learned.ending, "") if learned.bound is None or task.physics is None else ""
     if reason and not learned.ending.usable and (where := task.problem.without_value(np.any)):
         reason = f"{where}; mend it, or bound what it reads"
+    silent = learner_silent(learned, _learner_values(plan, learned))
+    reason = reason or ending_in_words(learned.ending, learned.tail)
     fit = MotionEstimate(
         model=model,
         status=Status(learned.ending, learned.iterations, learned.seconds, errors.mean_square, reason=reason),
@@ -131,9 +140,22 @@ def conclude_motion(task: MotionTask, structure: Structure, learned: Learned) ->
         slope=slope,
         alone=alone,
         scores=learned.scores,
-        warnings=tuple(without_loss(errors.mean_square)),
+        warnings=(*without_loss(errors.mean_square), *unsettled, *silent),
     )
     return fit.split(structure.measure, getattr(structure, "shared", "auto")) if learned.ending.usable else fit
+
+
+def _learner_values(plan: MotionCourse, learned: Learned) -> Matrix | None:
+    """Return the values (N, nl) of a learner with few effective weights along the training runs; None of others."""
+    bound = plan.bound
+    if bound is None or learned.scores is None or not silenced(learned.effective, bound.ny):
+        return None
+    assert learned.coefficients is not None
+    x, u = plan.trajectory(learned.coefficients, learned.weights, learned.scores.states)
+    with np.errstate(all="ignore"):
+        features = plan.scaling(np.asarray(plan.dynamics.seen(x.T, u.T, np)).T)
+    values = np.asarray(jax.vmap(lambda z: bound.values(jnp.asarray(learned.weights), z))(features))
+    return values if np.isfinite(values).all() else None
 
 
 def _model(plan: MotionCourse, structure: Structure, learned: Learned) -> MotionModel:

@@ -25,7 +25,9 @@ from orthaug.fitting.paper_criterion import JointOneStep, PaperCriterion, Physic
 from orthaug.fitting.rules import check_joint, ridge_of
 from orthaug.fitting.solvers import compiled
 from orthaug.fitting.solvers.adam_lbfgs import GradientRun
+from orthaug.fitting.solvers.limit import noticeable_in
 from orthaug.fitting.structures import Additive, Orthogonal, Structure
+from orthaug.fitting.unfinished import noticeable_fall
 from orthaug.models.learners import Bound, Learner, Scaling
 from orthaug.models.rows import Engine, InMemory, Overlap
 from orthaug.models.terms import scaling_of
@@ -215,6 +217,7 @@ class OneStepTask(LaidRows):
         ridge, evidence = ridge_of(regularization)
         if solver.gauss_newton and not structure.from_initial:
             options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "progress": progress}
+            options["noticeable"] = noticeable_fall(structure, elimination.decoupled, self.problem.samples)
             if regularization == "ard":
                 options["groups"] = self.bound.groups()
             if self.checkpoints is not None:
@@ -242,6 +245,7 @@ class OneStepTask(LaidRows):
         nothing = Overlap(np.zeros((nt, nt + self.bound.size)), np.zeros(nt))
         unknowns = np.concatenate([np.zeros(nt), w])
         options: dict[str, Any] = {"samples": self.problem.samples, "progress": progress}
+        options["noticeable"] = noticeable_in(self.problem.samples)
         end = solver.minimise(JointOneStep(self.bound), unknowns, (self.rows, physics), nothing, **options)
         return GradientRun(end.w[:nt], end.w[nt:], end.iterations, end.ending, end.seconds)
 
@@ -275,6 +279,7 @@ class OneStepTask(LaidRows):
             middle=lambda noise: self.middle(run.w, noise),
             coefficients=run.coefficients,
             fixed=None if run.coefficients is not None else run.fixed,
+            tail=run.tail,
         )
 
     def physics_learned(self) -> Learned:

@@ -23,6 +23,7 @@ from orthaug.fitting.held_out import HeldOut, Pieces, blocked, mean_square, squa
 from orthaug.fitting.kinds import Solver
 from orthaug.fitting.learned import Learned, Task
 from orthaug.fitting.one_step import OneStepTask
+from orthaug.fitting.silence import add_retries, tell_retries
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Structure
 from orthaug.models.learners import Bound
@@ -65,6 +66,8 @@ class Choice:
     fallback: bool = True
     ensemble: bool = False
     scored: bool = False
+    retry: bool = False
+    """Whether runs that evidence silenced are made again with weaker regularizations, if held-out rows can choose."""
 
     def compares(self, task: Task, starts: Sequence[PlannedRun]) -> bool:
         """Whether there is something to choose by held-out errors: runs that fly, or several regularizations."""
@@ -103,7 +106,7 @@ def train(
     with one_blas_thread():
         task = task.prepared(solver, structure, partial(progress, 0))
     LOG.info("training: %d runs of %s, %s", len(starts), type(solver).__name__, structure.name)
-    starts, runs = _run(task, starts, structure, solver, progress, runner)
+    planned, (starts, runs) = len(starts), _run_all(task, starts, structure, solver, choice, progress, runner)
     losses = [task.loss(run) for run in runs]
     concluded = cache(lambda i: _concluded(conclude, task, structure, task.learned(runs[i])))
     stopped = sum(run.ending is Ending.STOPPED for run in runs)
@@ -147,6 +150,7 @@ def train(
         *_replaced(starts, runs),
         *_stopped(stopped, len(runs), untried),
         *told,
+        *tell_retries(planned, starts, runs, held_out, best),
     )
     kept = best >= 0 and task.bound is not None and not hasattr(task.problem, "source")  # no further pass over files
     physics = _alone(conclude, task, structure) if kept else None
@@ -186,6 +190,26 @@ def _members(starts: Sequence[PlannedRun], ranking: np.ndarray, best: int) -> li
     ranking = np.where(np.isfinite(ranking), ranking, np.inf)
     own = {seed: [i for i, start in enumerate(starts) if start.seed == seed] for seed in seeds}
     return [best if best in runs else min(runs, key=lambda i: ranking[i]) for runs in own.values()]
+
+
+def _run_all(
+    task: Task,
+    starts: Sequence[PlannedRun],
+    structure: Structure,
+    solver: Solver,
+    choice: Choice,
+    progress: Tell,
+    runner: Any,
+) -> tuple[list[PlannedRun], list[Any]]:
+    """Make every planned run, and more where evidence silenced the learner and held-out rows can choose."""
+    begun, runs = _run(task, starts, structure, solver, progress, runner)
+    if task.bound is None or not choice.retry or (choice.validation is None and not choice.blocks):
+        return begun, runs
+
+    def again(planned: list[PlannedRun]) -> tuple[list[PlannedRun], list[Any]]:
+        return _run(task, planned, structure, solver, lambda i, *at: progress(len(begun) + i, *at), runner)
+
+    return add_retries(begun, runs, task.bound.ny, again)
 
 
 def _run(

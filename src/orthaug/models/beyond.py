@@ -1,11 +1,12 @@
 """What a learned correction does beyond the range of its training: it is held, fades, or goes on as it is.
 
-A model predicts `φ(x)θ̂ + δ(x)` with the correction `δ = f − φθ_aux`. Within the range of the training rows nothing is
-changed. Beyond it the features z are moved onto that range, z̄, and the regressor with them as little as that takes, x̄:
+A model predicts `φ(x)θ̂ + δ(x)` with the correction `δ = f − φθ_aux`. Within the limits, the range of the training rows
+and half a half-width more on each side, nothing is changed. Beyond them the features z are moved onto the limits, z̄,
+and the regressor with them as little as that takes, x̄:
 
     φ(x)θ̂ + a δ(x̄),    a = 1 where it is held,    a = exp(−(d/¼)²) where it fades,
 
-d the distance ‖z − z̄‖ in half-widths of the range. The physics with its θ̂ goes on alone. A held correction is bounded,
+d the distance ‖z − z̄‖ in half-widths of the limits. The physics with its θ̂ goes on alone. A held correction is bounded,
 so that the free run is, too, wherever that of the physics is stable from input to state.
 """
 
@@ -21,7 +22,8 @@ from orthaug._base.jax import jnp
 
 BEYOND = ("auto", "hold", "fade", "free")
 """What `learner.beyond` may be; `auto` is hold for lagged physics, fade for motions, free for terms."""
-FADED = 0.25  # half-widths beyond the range at which a fading correction is down to 1/e: benchmarks/defaults.py
+FADED = 0.25  # half-widths beyond the limits at which a fading correction is down to 1/e: benchmarks/defaults.py
+MARGIN = 0.5  # half-widths that a correction goes on as it is beyond the range of training: benchmarks/defaults.py
 _WIDER = 1e-9  # of the range: rounding moves no training row
 _AFFINE = 1e-9  # of a feature's size over the probes
 _PROBES = 8  # more than the coefficients of an affine function
@@ -39,12 +41,12 @@ def beyond_of(learner: Any, usual: str) -> str:
 
 
 def limits_of(features: Matrix) -> Matrix | None:
-    """Return the least and the largest value (2, nz) of the features (N, nz) of training; None without a finite row."""
+    """Return the limits (2, nz) of the features (N, nz) of training, `MARGIN` wide; None without a finite row."""
     finite = features[np.isfinite(features).all(axis=1)]
     if not finite.size:
         return None
     low, high = finite.min(axis=0), finite.max(axis=0)
-    wider = _WIDER * np.maximum(high - low, np.maximum(np.abs(low), np.abs(high)))
+    wider = np.maximum(MARGIN * (high - low) / 2, _WIDER * np.maximum(np.abs(low), np.abs(high)))
     return np.stack([low - wider, high + wider])
 
 

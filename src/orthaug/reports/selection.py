@@ -20,11 +20,12 @@ class OrdersResult(Content):
 
 
 class DelayResult(Content):
-    """The delay of an input, by its cross-correlation with the output and by the fit, in samples."""
+    """The delay of an input in samples: by its cross-correlation with the output, by the fit, by that of its square."""
 
     input: str
     correlation: int | None
-    fitted: Whole
+    fitted: int | None
+    square: int | None = None
 
 
 class NonlinearityResult(Content):
@@ -37,10 +38,24 @@ class NonlinearityResult(Content):
 
 
 class TermShareResult(Content):
-    """A chosen term, and how often it is chosen over random halves of the data."""
+    """A chosen term, how often it is chosen over random halves of the data, and what the other columns leave of it."""
 
     term: str
     chosen: Number
+    left: Number = None
+
+
+class ShiftResult(Content):
+    """A parameter of physics alone and with the chosen terms, and what these leave of its regressor."""
+
+    parameter: str
+    unit: str | None
+    before: Number
+    before_std: Number
+    after: Number
+    after_std: Number
+    left: Number
+    moved: Flag
 
 
 class JudgedResult(Content):
@@ -66,6 +81,8 @@ class SelectResult(Headed):
     learner: dict[str, Any] | None
     focus: str
     terms: list[TermShareResult] | None
+    physics: list[ShiftResult] | None = None
+    condition: Number = None
     models: list[JudgedResult]
     seconds: Number
     stopped: Flag
@@ -78,19 +95,45 @@ def selection_text(result: SelectResult) -> str:
 
     orders = Orders(result.orders.na, tuple(result.orders.nb), tuple(result.orders.nk))
     lines = [f"orders       {orders}"]
-    lines += [f"delay        {Delay(delay.input, delay.correlation, delay.fitted)}" for delay in result.delays]
+    lines += [
+        f"delay        {Delay(delay.input, delay.correlation, delay.fitted, delay.square)}" for delay in result.delays
+    ]
     if result.nonlinearity is not None:
         lines.append(f"nonlinear    {result.nonlinearity.text}")
     lines.append(f"learner      {_learner(result)}")
     if result.terms:
         width = max(len(term.term) for term in result.terms)
-        lines += ["", f"{'term':<{width}}  chosen over random halves of the data"]
-        lines += [f"{t.term:<{width}}  {'–' if t.chosen is None else f'{100 * t.chosen:.0f} %'}" for t in result.terms]
+        lines += ["", f"{'term':<{width}}  chosen over random halves of the data, left beside physics and other terms"]
+        lines += [f"{t.term:<{width}}  {_percent(t.chosen):>5}  {_percent(t.left):>6}" for t in result.terms]
+        lines += _physics(result)
     for stage in dict.fromkeys(row.stage for row in result.models):
         lines += ["", *_table(stage, [row for row in result.models if row.stage == stage])]
     for warning in result.warnings:
         lines += ["", f"note: {warning.text}"]
     return "\n".join(fold(lines))
+
+
+def _percent(share: float | None) -> str:
+    return "–" if share is None else f"{100 * share:.2g} %"
+
+
+def _physics(result: SelectResult) -> list[str]:
+    """Return the table of parameters, of physics alone and with the terms."""
+    if not result.physics:
+        return []
+    width = max(9, *(len(shift.parameter) for shift in result.physics))
+    lines = ["", f"{'parameter':<{width}}  {'physics alone':>22}  {'with the terms':>22}  {'left':>6}"]
+    for shift in result.physics:
+        before, after = _figure(shift.before, shift.before_std), _figure(shift.after, shift.after_std)
+        mark = "  moves by more than its standard errors allow" if shift.moved else ""
+        lines.append(f"{shift.parameter:<{width}}  {before:>22}  {after:>22}  {_percent(shift.left):>6}{mark}")
+    condition = "infinite" if result.condition is None else f"{result.condition:.3g}"
+    return [*lines, f"condition number of physics and terms together: {condition}"]
+
+
+def _figure(value: float | None, std: float | None) -> str:
+    shown = "–" if value is None else f"{value:.4g}"
+    return shown if std is None else f"{shown} ± {std:.2g}"
 
 
 def _learner(result: SelectResult) -> str:

@@ -48,7 +48,8 @@ def first_model(record: Record) -> FirstModel | None:
     """Delays, excitation and orders for a record; None where it has too few rows for any model.
 
     The orders are the smallest whose free run is within 5 % of the best of up to 4 lags a channel. The first lags are
-    the significant ones, unless from 1 or 0 on the best free run is clearly better.
+    the significant ones, unless from 1 or 0 on the best free run is clearly better. Every model that is tried has a
+    constant: without one, lags that are not there stand in for the level of the signals.
     """
     record = _spread(record)
     signals = np.concatenate([np.hstack([e.outputs, e.inputs]) for e in record.experiments])
@@ -58,22 +59,22 @@ def first_model(record: Record) -> FirstModel | None:
     usual = [tuple(late if delay is None else delay for delay in delays) for late in (1, 0)]
     chosen: tuple[float, Orders, tuple[float, ...]] | None = None
     for nk in dict.fromkeys([*usual, *((late,) * len(delays) for late in (1, 0))]):  # a test may miss the first lags
-        found = _smallest(record, excited, nk, offset)
+        found = _smallest(record, excited, nk)
         if found is not None and (chosen is None or found[0] * _BETTER < chosen[0]):
             chosen = found
     if chosen is None:
         return None
-    return FirstModel(chosen[1], offset, delays, excited, chosen[2], _coupled(record, chosen[1], offset))
+    return FirstModel(chosen[1], offset, delays, excited, chosen[2], _coupled(record, chosen[1]))
 
 
 def _smallest(
-    record: Record, excited: tuple[int, ...], nk: tuple[int, ...], offset: bool
+    record: Record, excited: tuple[int, ...], nk: tuple[int, ...]
 ) -> tuple[float, Orders, tuple[float, ...]] | None:
     """From these first lags on: the least error of all orders, and the smallest that come near it with theirs."""
     tried: list[tuple[float, int, Orders, tuple[float, ...]]] = []
     for na, n in product(range(_MOST + 1), range(1, _MOST + 1) if record.inputs else [0]):
         orders = Orders(na, tuple(max(1, min(n, order)) for order in excited), nk)
-        errors = _errors(record, orders, offset)
+        errors = _errors(record, orders)
         if errors is not None and orders.size:
             tried.append((float(np.mean(errors)), orders.size, orders, errors))
     if not tried:
@@ -84,12 +85,12 @@ def _smallest(
     return least, orders, errors
 
 
-def _coupled(record: Record, orders: Orders, offset: bool) -> bool:
+def _coupled(record: Record, orders: Orders) -> bool:
     """Whether the others' past lowers an output's error one step ahead to less than `_TELLS` of it."""
     first = max([orders.na, *(nb + nk - 1 for nb, nk in zip(orders.nb, orders.nk, strict=True))])
     usable = [e for e in record.experiments if len(e) > first]
     names = range(len(record.outputs))
-    own = [np.concatenate([_rows(e, j, orders, first, offset) for e in usable]) for j in names]
+    own = [np.concatenate([_rows(e, j, orders, first) for e in usable]) for j in names]
     for j in names if len(own) > 1 and orders.na else ():
         y = np.concatenate([e.outputs[first:, j] for e in usable])
         both = np.hstack([own[j], *(own[i][:, : orders.na] for i in names if i != j)])
@@ -112,7 +113,8 @@ def _spread(record: Record) -> Record:
 def _delay(record: Record, number: int) -> int | None:
     """The first lag at which an input acts on any output, beside the output's past and all other lags of the inputs.
 
-    Where rows or excitation do not allow that, by the cross-correlation with the input made white.
+    Where rows or excitation do not allow that, by the cross-correlation with the input made white; where none is
+    significant, by that of the input's square.
     """
     found = []
     long = tuple(e for e in record.experiments if len(e) > 2 * _DELAY)
@@ -121,6 +123,8 @@ def _delay(record: Record, number: int) -> int | None:
         own = replace(record, outputs=(output,), experiments=one)
         tested = _tested_delay(own, number)
         found.append(correlated_delay(own, number, _DELAY) if tested is None else tested)
+        if found[-1] is None:  # an even function of an input has no linear correlation with it
+            found[-1] = correlated_delay(own, number, _DELAY, squared=True)
     seen = [lag for lag in found if lag is not None]
     return min(seen) if seen else None
 
@@ -128,7 +132,7 @@ def _delay(record: Record, number: int) -> int | None:
 def _tested_delay(record: Record, number: int) -> int | None:
     """By t-tests, at 5 % for all lags together; None where none is significant or the lags cannot be told apart."""
     orders = Orders(_MOST, (_DELAY + 1,) * len(record.inputs), (0,) * len(record.inputs))
-    phi = np.concatenate([_rows(e, 0, orders, _DELAY, True) for e in record.experiments])
+    phi = np.concatenate([_rows(e, 0, orders, _DELAY) for e in record.experiments])
     y = np.concatenate([e.outputs[_DELAY:, 0] for e in record.experiments])
     q, r = np.linalg.qr(phi / np.maximum(np.linalg.norm(phi, axis=0), 1e-300))
     if len(y) < 2 * orders.size or np.linalg.cond(r) > 1 / _RANK:
@@ -153,17 +157,17 @@ def _persistence(record: Record, number: int) -> int:
     return int((values > _EXCITED * values[0]).sum()) if values[0] > 0 else 0
 
 
-def _errors(record: Record, orders: Orders, offset: bool) -> tuple[float, ...] | None:
+def _errors(record: Record, orders: Orders) -> tuple[float, ...] | None:
     """Error of the free run on the last rows for each output; None where it cannot be fitted, or runs away."""
     first = max([orders.na, *(nb + nk - 1 for nb, nk in zip(orders.nb, orders.nk, strict=True))])
     usable = [e for e in record.experiments if len(e) > first + 1]
     rows = sum(len(e) - first for e in usable)
     cut, found = int(_FITTED * rows), []
     for j in range(len(record.outputs)):
-        columns = orders.size + offset
-        if not columns or cut < 2 * columns or rows - cut < 2:
+        columns = orders.size + 1
+        if cut < 2 * columns or rows - cut < 2:
             return None
-        phi = np.concatenate([_rows(e, j, orders, first, offset) for e in usable])
+        phi = np.concatenate([_rows(e, j, orders, first) for e in usable])
         y = np.concatenate([e.outputs[first:, j] for e in usable])
         scale = np.maximum(np.linalg.norm(phi[:cut], axis=0), 1e-300)
         theta, _, rank, _ = np.linalg.lstsq(phi[:cut] / scale, y[:cut], rcond=_RANK)
@@ -171,7 +175,7 @@ def _errors(record: Record, orders: Orders, offset: bool) -> tuple[float, ...] |
             return None
         theta = theta / scale
         if record.inputs:
-            flown = np.concatenate([_free_run(e, j, theta, orders, first, offset) for e in usable])
+            flown = np.concatenate([_free_run(e, j, theta, orders, first) for e in usable])
         else:
             flown = phi @ theta
         with np.errstate(all="ignore"):  # one that is not stable overflows
@@ -182,20 +186,20 @@ def _errors(record: Record, orders: Orders, offset: bool) -> tuple[float, ...] |
     return tuple(found)
 
 
-def _rows(e: Experiment, j: int, orders: Orders, first: int, offset: bool) -> Matrix:
+def _rows(e: Experiment, j: int, orders: Orders, first: int) -> Matrix:
     """Own past, inputs from their delays on, and 1."""
     count = len(e) - first
     columns = [e.outputs[first - i : first - i + count, j] for i in range(1, orders.na + 1)]
     for i, (nb, nk) in enumerate(zip(orders.nb, orders.nk, strict=True)):
         columns += [e.inputs[first - lag : first - lag + count, i] for lag in range(nk, nk + nb)]
-    return np.stack([*columns, *([np.ones(count)] if offset else [])], axis=1)
+    return np.stack([*columns, np.ones(count)], axis=1)
 
 
-def _free_run(e: Experiment, j: int, theta: np.ndarray, orders: Orders, first: int, offset: bool) -> np.ndarray:
+def _free_run(e: Experiment, j: int, theta: np.ndarray, orders: Orders, first: int) -> np.ndarray:
     """The output from its first measured rows on."""
     from scipy.signal import lfilter, lfiltic
 
-    driven = _rows(e, j, orders, first, offset)[:, orders.na :] @ theta[orders.na :]
+    driven = _rows(e, j, orders, first)[:, orders.na :] @ theta[orders.na :]
     taps = np.concatenate([[1.0], -theta[: orders.na]])
     with np.errstate(all="ignore"):
         start = lfiltic([1.0], taps, e.outputs[first - 1 :: -1, j][: orders.na] if first else np.empty(0))

@@ -60,23 +60,38 @@ class Orders:
 class Delay:
     """The delay of an input: by its cross-correlation with the output, both filtered until the input is white.
 
-    `correlation` is None where no lag is significant; `fitted` is the first lag that the choice of orders kept.
+    `correlation` is None where no lag is significant; `fitted` is the first lag that the choice of orders kept, None
+    where it kept none. `square` is that of the cross-correlation of the input's square, which is looked at where the
+    input itself does not correlate: an even nonlinearity has no linear correlation.
     """
 
     input: str
     correlation: int | None
-    fitted: int
+    fitted: int | None
+    square: int | None = None
 
     def __str__(self) -> str:
-        seen = "none is significant" if self.correlation is None else f"{self.correlation}"
-        return f"{self.input}: {seen} by cross-correlation, {self.fitted} by the fit"
+        seen = "no lag is significant" if self.correlation is None else f"{self.correlation}"
+        fitted = "the orders keep no lag" if self.fitted is None else f"{self.fitted} by the fit"
+        squared = "" if self.square is None else f"; {self.square} by cross-correlation of its square"
+        return f"{self.input}: {seen} by cross-correlation, {fitted}{squared}"
+
+    @classmethod
+    def of(cls, record: Record, number: int, most: int, orders: Orders) -> Delay:
+        """Return the delay of an input by both ways."""
+        linear = correlated_delay(record, number, most)
+        square = correlated_delay(record, number, most, squared=True) if linear is None else None
+        fitted = orders.nk[number] if orders.nb[number] else None
+        return cls(record.inputs[number].name, linear, fitted, square)
 
 
 @dataclass(frozen=True, eq=False)
 class OrderSearch(Search):
-    """Models of linear lags."""
+    """Models of linear lags and a constant."""
 
     orders: tuple[Orders, ...]
+    constant: bool = False
+    """Whether the choice needs a constant that the physics does not have."""
 
     @property
     def chosen(self) -> Orders:
@@ -95,6 +110,8 @@ def search_orders(
 ) -> OrderSearch:
     """Judge orders from `largest` down, never below `least`, what the physics reads already.
 
+    Every model has a constant: without one, lags that are not there stand in for the level of the signals.
+
     Raises:
         InputError: too few rows for so many blocks.
     """
@@ -105,17 +122,18 @@ def search_orders(
         for i in range(nk, nk + nb):
             place[name, i] = len(lags)
             lags.append(f"{name}[k-{i}]" if i else f"{name}[k]")
-    runs = TermRuns.of(problem, TermLibrary(tuple(lags), tuple((i,) for i in range(len(lags)))), criterion)
+    runs = TermRuns.of(problem, TermLibrary(tuple(lags), (*((i,) for i in range(len(lags))), ())), criterion)
+    level = [len(lags)] if runs.constant == len(problem.baseline.names) + len(lags) else []
     known = {str(lag) for term in problem.baseline.terms for lag in [term.regressor]}
     found: dict[Orders, Rung] = {}
     with one_blas_thread():
         folds = Blocks(runs, blocks, runner)
 
-        def chosen(orders: Orders) -> list[int]:
+        def chosen(orders: Orders, level: list[int] = level) -> list[int]:
             numbers = [place[output, i] for i in range(1, orders.na + 1)]
             for name, nb, nk in zip(inputs, orders.nb, orders.nk, strict=True):
                 numbers += [place[name, i] for i in range(nk, nk + nb)]
-            return [i for i in numbers if lags[i] not in known]
+            return [i for i in numbers if lags[i] not in known] + level
 
         def judge(several: Iterable[Orders]) -> None:
             new = [orders for orders in dict.fromkeys(several) if orders not in found]
@@ -134,7 +152,13 @@ def search_orders(
         except KeyboardInterrupt:
             if not found:
                 raise
-    return OrderSearch(tuple(found.values()), tuple(found))
+        search = OrderSearch(tuple(found.values()), tuple(found))
+        if not level:
+            return search
+        point, held, seconds = next(folds.fitted([chosen(search.chosen, [])]))
+        without = Rung(point, (), held, seconds, search.chosen.size)
+        needed = not judge_all((without, replace(search.rungs[search.place], size=without.size + 1)))[0].within
+        return replace(search, constant=needed)
 
 
 def _shrink(found: dict[Orders, Rung], judge: Callable[[Iterable[Orders]], None], least: Orders) -> None:
@@ -150,7 +174,7 @@ def _shrink(found: dict[Orders, Rung], judge: Callable[[Iterable[Orders]], None]
         current = min(able, key=lambda orders: found[orders].score)
 
 
-def correlated_delay(record: Record, number: int, most: int) -> int | None:
+def correlated_delay(record: Record, number: int, most: int, *, squared: bool = False) -> int | None:
     """The first lag at which an input, made white, acts on the output; None where none is significant.
 
     Both signals go through the filter that makes the input white (Box and Jenkins); a lag counts from 1.96/√N on, for
@@ -159,12 +183,14 @@ def correlated_delay(record: Record, number: int, most: int) -> int | None:
     Args:
         number: of the input.
         most: the largest lag that is looked at.
+        squared: of the input's square about its mean.
     """
     total, rows = np.zeros(most + 1), 0
     for experiment in record.experiments:
         u, y = experiment.inputs[:, number], experiment.outputs[:, 0]
         n = min(_WHITENING, len(u) // 10)
         u, y = u - u.mean(), y - y.mean()
+        u = u**2 - np.mean(u**2) if squared else u
         past = np.column_stack([u[n - i : len(u) - i] for i in range(1, n + 1)]) if n else np.zeros((len(u), 0))
         filtered = np.linalg.lstsq(past, u[n:], rcond=1e-8)[0] if n else np.zeros(0)
         taps = np.concatenate([[1.0], -filtered])

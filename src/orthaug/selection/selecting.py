@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
-from orthaug._base.checks import check_count, check_type
+from orthaug._base.checks import check_count, check_number, check_type
 from orthaug._base.errors import InputError, Warning
+from orthaug.data.expressions import Lag
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags, in_order
+from orthaug.data.terms import CONSTANT
 from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.estimation import estimate
 from orthaug.models.learners import MLP, Learner
@@ -20,9 +22,11 @@ from orthaug.models.terms import Terms
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.problem import Problem, pose, regressor_of
 from orthaug.selection.candidates import candidates
+from orthaug.selection.forward import COLLINEAR
+from orthaug.selection.kept_physics import KeptPhysics, kept_physics
 from orthaug.selection.learner_search import LearnerSearch, search_learners
 from orthaug.selection.nonlinearity import Nonlinearity, nonlinearity
-from orthaug.selection.orders import Delay, Orders, OrderSearch, correlated_delay, search_orders
+from orthaug.selection.orders import Delay, Orders, OrderSearch, search_orders
 from orthaug.selection.term_path import Judged, TermPath, climb
 from orthaug.selection.term_runs import TermRuns
 
@@ -65,11 +69,15 @@ class Selection:
     notes: tuple[Warning, ...]
     stopped: bool = False
     """Whether the search was stopped before its end; what it had found by then was chosen from."""
+    physics: KeptPhysics | None = None
+    """θ of physics alone beside θ with the chosen terms; None where no terms were searched, or there is no physics."""
+    reach: Orders | None = None
+    """The orders that were chosen, with lags of inputs that act by a nonlinear function alone; None for no such."""
 
     @property
     def lags(self) -> Lags:
-        """The orders that were chosen."""
-        chosen = self.orders.chosen
+        """The orders that were chosen, and lags of inputs that have no linear effect but a nonlinear one."""
+        chosen = self.reach or self.orders.chosen
         return Lags(chosen.na, chosen.nb, chosen.nk)
 
     @cached_property
@@ -80,13 +88,8 @@ class Selection:
         if self.terms is not None:
             chosen, texts = self.terms.chosen.point.chosen, self.terms.runs.library.texts
             return Terms(tuple(texts[i] for i in chosen)) if chosen else None
-        linear = [text for text in self._linear if text not in {t.regressor for t in self.baseline.terms}]
+        linear = _beside(self.orders, self.record, self.baseline)
         return Terms(tuple(linear)) if linear else None
-
-    @property
-    def _linear(self) -> list[str]:
-        names = tuple(c.name for c in self.record.outputs), tuple(c.name for c in self.record.inputs)
-        return [str(lag) for lag in self.lags.layout(*names)]
 
     @cached_property
     def shares(self) -> dict[str, float]:
@@ -146,6 +149,7 @@ class Selection:
         if self.nonlinearity is not None:
             lines.append(f"nonlinear   {self.nonlinearity}")
         lines.append(f"learner     {self.learner or 'none: nothing helps on the blocks that were held out'}")
+        lines += [f"physics     {shift}" for shift in self.physics.shifts] if self.physics and self.shares else []
         if self.shares:
             width = max(len(term) for term in self.shares)
             lines += ["", f"{'term':<{width}}  chosen over halves of the data"]
@@ -166,6 +170,7 @@ def select(
     halves: bool = False,
     progress: Told = _unheard,
     engine: Engine | None = None,
+    collinear: float = COLLINEAR,
 ) -> Selection:
     """Choose orders and delay, and terms or a network, by free runs on blocks of the data that are held out.
 
@@ -188,6 +193,8 @@ def select(
             intervals are then not conditional on the choice.
         progress: called with the stage and each model that was judged.
         engine: `Dask(client)` has the workers of a cluster judge the models; None for this machine's cores.
+        collinear: share of a term's deviation that physics and the terms before it must leave: a term of which less is
+            left lies within their span and is not taken, for it would take over a part of the physics. 0 takes all.
 
     Raises:
         InputError: several outputs, too few rows, terms that are none.
@@ -195,6 +202,7 @@ def select(
     check_type(record, Record, "record", "a Record")
     check_type(learner, Terms | MLP | None, "learner", "Terms(…), MLP(…) or None")
     most, blocks = check_count(most, "most", least=0), check_count(blocks, "blocks", least=2)
+    collinear = check_number(collinear, "collinear")
     if len(record.outputs) != 1:
         raise InputError(f"structure is chosen for one output; the record has {len(record.outputs)}: choose for each.")
     baseline = Baseline(()) if baseline is None else baseline
@@ -206,29 +214,33 @@ def select(
     largest, least = _reach(problem, lags)
     orders = search_orders(problem, criterion, largest, least, blocks, heard.of("orders"), runner)
     names = [channel.name for channel in record.inputs]
-    delays = tuple(
-        Delay(name, correlated_delay(record, i, largest.nk[i] + largest.nb[i]), orders.chosen.nk[i])
-        for i, name in enumerate(names)
-    )
-    chosen = Lags(orders.chosen.na, orders.chosen.nb, orders.chosen.nk)
-    linear = [str(lag) for lag in chosen.layout(problem.outputs, names)]
-    tested = nonlinearity(problem, linear) if linear else None
-    path = found = None
+    delays = tuple(Delay.of(record, i, largest.nk[i] + largest.nb[i], orders.chosen) for i in range(len(names)))
+    layout = partial(_layout, problem.outputs, names)
+    asked = _with_every_input(orders.chosen, largest)
+    tested = nonlinearity(problem, [str(lag) for lag in layout(asked)]) if layout(asked) else None
+    reach = _reached(orders.chosen, asked, tested, names)
+    path = found = physics = None
     notes: list[Warning] = []
     if isinstance(learner, Terms) and not heard.stopped:
-        runs, notes = _terms(problem, learner, largest, criterion)
-        near = [baseline.lags, chosen.layout(problem.outputs, names)]
-        path = climb(runs, blocks, min(most, len(problem.rows) // 10), heard.of("terms"), runner, near)
+        runs, notes = _terms(problem, learner, largest, criterion, collinear)
+        near, linear = [baseline.lags, layout(reach)], _beside(orders, record, baseline)
+        at_most = min(most, len(problem.rows) // 10)
+        path = climb(runs, blocks, at_most, heard.of("terms"), runner, near, linear)
         if not path.chosen.point.chosen:
             notes.append(Warning("nothing_helps", "no term lowers the error on blocks without which it was picked."))
+        physics = kept_physics(runs, path.rungs[0].point, path.chosen.point) if baseline.names else None
+        notes += physics.notes if physics else []
     elif isinstance(learner, MLP) and not heard.stopped:
         told = heard.of("learner")
-        found = search_learners(problem, chosen, tested, learner, widths, criterion, blocks, told, runner)
+        lags = Lags(reach.na, reach.nb, reach.nk)
+        found = search_learners(problem, lags, tested, learner, widths, criterion, blocks, told, runner)
     if heard.stopped:
         notes.append(Warning("stopped", "the search was stopped; the choice is among the models judged by then."))
     if not halves:
         notes.append(Warning("conditional_on_selection", _CONDITIONAL))
-    return Selection(kept, baseline, criterion, delays, orders, tested, path, found, tuple(notes), heard.stopped)
+    return Selection(
+        kept, baseline, criterion, delays, orders, tested, path, found, tuple(notes), heard.stopped, physics, reach
+    )
 
 
 class _Listener:
@@ -248,7 +260,44 @@ class _Listener:
         return told
 
 
-def _terms(problem: Problem, learner: Terms, largest: Orders, criterion: Criterion) -> tuple[TermRuns, list[Warning]]:
+def _layout(outputs: Sequence[str], inputs: Sequence[str], orders: Orders) -> tuple[Lag, ...]:
+    return Lags(orders.na, orders.nb, orders.nk).layout(outputs, inputs)
+
+
+def _beside(orders: OrderSearch, record: Record, baseline: Baseline) -> list[str]:
+    """Return the linear lags of the choice, and its constant, that the physics does not have."""
+    outputs, inputs = ([channel.name for channel in group] for group in (record.outputs, record.inputs))
+    own = {term.regressor for term in baseline.terms}
+    linear = [str(lag) for lag in _layout(outputs, inputs, orders.chosen)]
+    return [text for text in [*linear, *([CONSTANT] * orders.constant)] if text not in own]
+
+
+def _with_every_input(chosen: Orders, largest: Orders) -> Orders:
+    """Return the chosen orders, and of inputs that they keep no lag of all that are allowed.
+
+    An even function of an input has no linear correlation with it, so no linear lag of the input helps.
+    """
+    nb = tuple(n or most for n, most in zip(chosen.nb, largest.nb, strict=True))
+    nk = tuple(k if n else first for n, k, first in zip(chosen.nb, chosen.nk, largest.nk, strict=True))
+    return replace(chosen, nb=nb, nk=nk)
+
+
+def _reached(chosen: Orders, asked: Orders, tested: Nonlinearity | None, names: Sequence[str]) -> Orders:
+    """Return the chosen orders with the inputs whose functions matter although no linear lag of them does."""
+    nb, nk = list(chosen.nb), list(chosen.nk)
+    for i, name in enumerate(names):
+        if chosen.nb[i] or tested is None or not tested.found:
+            continue
+        own = [k for k in range(asked.nk[i], asked.nk[i] + asked.nb[i]) if str(Lag(name, k)) in tested.matter]
+        if own or not tested.matter:
+            nk[i] = min(own, default=asked.nk[i])
+            nb[i] = max(own) - nk[i] + 1 if own else asked.nb[i]
+    return replace(chosen, nb=tuple(nb), nk=tuple(nk))
+
+
+def _terms(
+    problem: Problem, learner: Terms, largest: Orders, criterion: Criterion, collinear: float
+) -> tuple[TermRuns, list[Warning]]:
     """The library of terms laid out, and what is to be told of it."""
     outputs, inputs = problem.outputs, tuple(channel.name for channel in problem.record.inputs)
     lags = Lags(largest.na, largest.nb, largest.nk).layout(outputs, inputs)
@@ -260,7 +309,7 @@ def _terms(problem: Problem, learner: Terms, largest: Orders, criterion: Criteri
     if len(library) > rows:
         text = f"there are {len(library)} candidate terms and {rows} rows; at most a tenth as many terms are chosen."
         notes.append(Warning("more_terms_than_rows", text))
-    return TermRuns.of(problem, able.library, criterion), notes
+    return TermRuns.of(problem, able.library, criterion, None, collinear), notes
 
 
 def _reach(problem: Problem, lags: Lags | None) -> tuple[Orders, Orders]:

@@ -32,6 +32,7 @@ _PATIENCE = 5  # additions that did not improve the score by `_BETTER` each, aft
 _BETTER = 0.005
 _FOLD_ITERATIONS = 10
 _ANEW = 5  # times that the terms are picked anew about the choice
+_SURE, _HALF = 3.0, 0.5  # standard errors, and of the error of physics alone: what is better by both is confirmed
 _HALVES = 50  # random halves of the data over which terms are chosen again
 _PARTS = 10  # of the training data, that halves are made of
 _SEED = 20_261_122
@@ -150,9 +151,15 @@ _Given = tuple[TermRuns, list[tuple[TermRuns, Segments]]]
 
 
 def _on_all(given: _Given, chosen: Sequence[int], tell: Callable[..., None]) -> tuple[Point, float]:
-    """Chosen terms beside the physics, fitted from physics alone; and what it took [s]."""
+    """Chosen terms beside the physics, fitted from physics alone and from one step ahead; and what it took [s]."""
     runs, began = given[0], time.monotonic()
-    return runs.fit(runs.start(), chosen), time.monotonic() - began
+    point = runs.fit(runs.start(), chosen)
+    if runs.laid is not None and chosen:  # from physics alone a free run may end in a local minimum
+        nt = len(point.c)
+        p = runs.step_equations.of([*range(nt), *(nt + i for i in chosen)]).solve()
+        other = runs.fit(runs.start()._replace(chosen=tuple(chosen), c=p[:nt], w=p[nt:]), chosen)
+        point = min(point, other, key=lambda one: one.loss)
+    return point, time.monotonic() - began
 
 
 def _on_fold(given: _Given, item: tuple[Point, int], tell: Callable[..., None]) -> tuple[float, float]:
@@ -203,14 +210,14 @@ class TermPath(Search):
         As many terms are picked as the choice has, by the equations about the chosen model.
         """
         runs, rung = self.runs, self.chosen
-        parts, nt, most = _parts(runs, rung.point, self.way), len(rung.point.c), rung.size
+        parts, most = runs.parts(rung.point, _PARTS, self.way), rung.size
         if not most or len(parts) < 4:
             return {}
         rng, count = np.random.default_rng(_SEED), np.zeros(len(runs.library))
         for _ in range(_HALVES):
             half = rng.permutation(len(parts))[: len(parts) // 2]
-            picks = forward(Equations.sum_of(parts[i] for i in half), range(nt), most)
-            count[[pick.column - nt for pick in picks]] += 1
+            picks = _picked(runs, Equations.sum_of(parts[i] for i in half), (), most)
+            count[picks] += 1
         texts = runs.library.texts
         return {texts[i]: float(count[i] / _HALVES) for i in rung.point.chosen}
 
@@ -222,11 +229,14 @@ def climb(
     told: Told = lambda rung: None,
     runner: Any = Threads(),  # noqa: B008  (it holds nothing)
     near: Sequence[Collection[Lag]] = (),
+    linear: Sequence[str] = (),
 ) -> TermPath:
     """The path of up to `most` terms forward, and from the best model on backward.
 
     Args:
         near: lags whose terms have a way forward of their own, before the one that has all.
+        linear: terms that the last of these ways begins with, the linear lags that the choice of orders has beside the
+            physics.
 
     Raises:
         InputError: too few rows for so many blocks.
@@ -236,7 +246,10 @@ def climb(
         confirmed = True
 
         def judged(point: Point, change: Sequence[str], began: float) -> Rung:
-            held, _ = next(folds.judge([point]))
+            known = (rung.held for rung in rungs if rung.point.chosen == point.chosen)  # ways that begin alike
+            held = next(known, None)
+            if held is None:
+                held, _ = next(folds.judge([point]))
             lags = frozenset[Lag]().union(*(runs.lags[i] for i in point.chosen))
             rung = Rung(point, tuple(change), held, time.monotonic() - began, len(point.chosen), len(lags))
             rungs.append(rung)
@@ -249,8 +262,14 @@ def climb(
         try:
             began = time.monotonic()
             alone = judged(runs.fit(runs.start(), ()), (), began)
+            given = _given(runs, alone.point, linear[:most])
             for able in (*ways, None):
-                _forward(runs, alone, most, able, judged, again=len(rungs) > 1)
+                begin = alone
+                if given and (able is None or able == ways[-1]) and set(given) <= set(able or given):
+                    began, given_now, given = time.monotonic(), given, ()
+                    point = runs.fit(alone.point, given_now)
+                    begin = judged(point, ["physics alone", *(f"+ {runs.library.texts[i]}" for i in given_now)], began)
+                _forward(runs, begin, most, able, judged, again=len(rungs) > 1)
             _anew(path, judged)
             confirmed = _confirmed(folds, path().chosen.size, path().way)
             _backward(path(), judged)
@@ -266,6 +285,13 @@ def _ways(runs: TermRuns, near: Sequence[Collection[Lag]]) -> tuple[tuple[int, .
     return tuple(able for able in dict.fromkeys(own) if 0 < len(able) < len(runs.library))
 
 
+def _given(runs: TermRuns, alone: Point, linear: Sequence[str]) -> tuple[int, ...]:
+    """Return those of some terms, by number, that are candidates outside the span of physics and one another."""
+    texts = {text: i for i, text in enumerate(runs.library.texts)}
+    numbers = [texts[text] for text in linear if text in texts]
+    return tuple(_picked(runs, runs.equations(alone, numbers), (), len(numbers))) if numbers else ()
+
+
 def steps(most: int) -> int:
     """How many models are judged at most before terms go: physics alone, three ways forward, the choice picked anew."""
     count, size = 0, 0
@@ -279,8 +305,8 @@ def _added_to(size: int) -> int:
     return 1 if size < _ONE_BY_ONE else max(1, size // 8)
 
 
-def _forward(runs: TermRuns, alone: Rung, most: int, able: Able, judged: Any, *, again: bool) -> None:
-    texts, point, best, waited = runs.library.texts, alone.point, alone.score, 0
+def _forward(runs: TermRuns, begin: Rung, most: int, able: Able, judged: Any, *, again: bool) -> None:
+    texts, point, best, waited = runs.library.texts, begin.point, begin.score, 0
     while len(point.chosen) < most and waited < _PATIENCE and np.isfinite(point.loss):
         began = time.monotonic()
         count = min(_added_to(len(point.chosen)), most - len(point.chosen))
@@ -296,10 +322,18 @@ def _forward(runs: TermRuns, alone: Rung, most: int, able: Able, judged: Any, *,
 
 def _grown(runs: TermRuns, point: Point, count: int, able: Able) -> Point:
     """With the terms more that lower the error most; the point itself where none does."""
-    nt = len(point.c)
-    known = [*range(nt), *(nt + i for i in point.chosen)]
-    new = [pick.column - nt for pick in forward(runs.equations(point, able), known, count, least=_LEAST)]
+    new = _picked(runs, runs.equations(point, able), point.chosen, count, least=_LEAST)
     return runs.fit(point, (*point.chosen, *new)) if new else point
+
+
+def _picked(
+    runs: TermRuns, equations: Equations, chosen: Sequence[int], count: int, *, least: float = 0.0
+) -> list[int]:
+    """Return up to `count` further terms by number, each of them outside the span of physics and terms before it."""
+    nt = equations.hessian.shape[0] - len(runs.library)
+    known = [*range(nt), *(nt + i for i in chosen)]
+    picks = forward(equations, known, count, least=least, within=runs.collinear, constant=runs.constant)
+    return [pick.column - nt for pick in picks]
 
 
 def _anew(path: Callable[[], TermPath], judged: Any) -> None:
@@ -308,9 +342,9 @@ def _anew(path: Callable[[], TermPath], judged: Any) -> None:
         began, rung, runs = time.monotonic(), path().chosen, path().runs
         if not rung.size:
             return
-        nt, texts, before = len(rung.point.c), runs.library.texts, set(rung.point.chosen)
+        texts, before = runs.library.texts, set(rung.point.chosen)
         equations = runs.equations(rung.point, path().way)
-        new = tuple(pick.column - nt for pick in forward(equations, range(nt), rung.size))
+        new = tuple(_picked(runs, equations, (), rung.size))
         if any({*new} == set(other.point.chosen) for other in path().rungs):
             return
         change = [f"+ {texts[i]}" for i in new if i not in before] + [f"− {texts[i]}" for i in sorted(before - {*new})]
@@ -333,7 +367,18 @@ def _confirmed(folds: Blocks, size: int, able: Able) -> bool:
         count = min(_added_to(before), size - before) if rungs else 0
         points, held = folds.along(points, count, able)
         rungs.append(Rung(Point((), held, held), (), held, 0.0, before + count))
+        if _beyond_doubt(rungs[0].held, held):
+            return True
     return bool(size) and not judge_all(rungs)[0].within
+
+
+def _beyond_doubt(alone: Vector, held: Vector) -> bool:
+    """Whether physics alone is so much worse than a model that larger models need not be asked."""
+    worse = alone - held
+    if not np.isfinite(held).all() or not np.isfinite(alone).all():
+        return False
+    error = float(worse.std(ddof=1)) / np.sqrt(len(held))
+    return bool(worse.mean() > _SURE * error and np.mean(held) < _HALF**2 * np.mean(alone))
 
 
 def _backward(path: TermPath, judged: Any) -> None:
@@ -351,15 +396,3 @@ def _backward(path: TermPath, judged: Any) -> None:
         point = _refitted(runs, point, equations, left)  # the others take over what it did
         rung = judged(point, [f"− {texts[gone]}"], began)
         path = replace(path, rungs=(*path.rungs, rung))
-
-
-def _parts(runs: TermRuns, point: Point, able: Able) -> list[Equations]:
-    """The equations about a point over parts of the data, one after another."""
-    if runs.laid is None:
-        chunks = len(runs.step_blocks)
-        edges = np.linspace(0, chunks, min(_PARTS, chunks) + 1).astype(int)
-        return [runs.equations(point, able, slice(a, b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
-    scored = np.asarray(runs.laid.scored)
-    order = np.cumsum(np.moveaxis(scored, 1, -1).reshape(-1)).reshape(*scored.shape[::2], scored.shape[1])
-    place = np.moveaxis((order - 1) * _PARTS // max(int(scored.sum()), 1), -1, 1)
-    return [runs.equations(point, able, scored & (place == part)) for part in range(_PARTS)]

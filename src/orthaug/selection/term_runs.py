@@ -19,7 +19,7 @@ from orthaug._base.jax import jax, jnp
 from orthaug.data.expressions import Lag, parse
 from orthaug.data.record import Record
 from orthaug.data.regressors import Features, in_order
-from orthaug.data.terms import TermLibrary, products_of
+from orthaug.data.terms import CONSTANT, TermLibrary, products_of
 from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.initial_states import InitialStates, Start
 from orthaug.fitting.objective import RUNAWAY, Flown, FreeRunObjective, LinearisedFreeRun, errors_of
@@ -29,10 +29,13 @@ from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.models.dynamics import Numbers, Parts
 from orthaug.models.lagged import Lagged
 from orthaug.physics.problem import Problem
-from orthaug.selection.forward import Equations
+from orthaug.selection.forward import COLLINEAR, Equations
 
 _PLACES = 32  # for terms in a compiled program; choices that need more take a multiple
+_NARROW = (8, 16)  # places of programs that are worth being compiled besides, from so many rows on:
+_MANY_ROWS = 20_000  # compiling takes 1 s, and a pass over 65,000 rows 0.012 s with 8 places and 0.04 s with 32
 _CHUNK = 4096  # rows
+_SETTLED = 0.1  # of the loss: a step that lowers it by more may change the sensitivities
 _TOLERANCE = 1e-4  # relative change of the loss: models are compared, not published
 
 
@@ -115,16 +118,26 @@ class TermRuns:
     menu: Menu
     sizes: Vector
     laid: Segments | None
+    collinear: float = COLLINEAR
+    """Share of a term's deviation that physics and the terms before it must leave, so that it is taken."""
 
     @classmethod
-    def of(cls, problem: Problem, library: TermLibrary, criterion: Criterion, like: TermRuns | None = None) -> TermRuns:
+    def of(
+        cls,
+        problem: Problem,
+        library: TermLibrary,
+        criterion: Criterion,
+        like: TermRuns | None = None,
+        collinear: float = COLLINEAR,
+    ) -> TermRuns:
         """Lay a problem out; its segments padded to the shapes of another's."""
         factors = Features(tuple(parse(text) for text in library.factors)).sampled(problem.record.sampling_time)
         names = tuple(c.name for c in problem.record.outputs), tuple(c.name for c in problem.record.inputs)
         layout = in_order((*problem.baseline.lags, *factors.lags), *names)
         menu = Menu(problem.baseline, factors, layout, names[0], None, width=_PLACES, order=max(library.order, 1))
         sizes = like.sizes if like is not None else None
-        runs = cls(problem, library, criterion, menu, np.ones(len(library.factors)) if sizes is None else sizes, None)
+        first = np.ones(len(library.factors)) if sizes is None else sizes
+        runs = cls(problem, library, criterion, menu, first, None, collinear)
         if sizes is None:
             with np.errstate(all="ignore"):
                 largest = np.abs(np.concatenate([runs.factors(e) for e in problem.record.experiments], axis=1)).max(
@@ -148,6 +161,11 @@ class TermRuns:
         """Of what least squares leaves one step ahead, in the output's unit."""
         return max(float(np.sqrt(np.mean(self.problem.unexplained**2))), 1e-10) * float(self.problem.deviation[0])
 
+    def places(self, count: int) -> int:
+        """Return the number of places of the compiled program that so many terms run in."""
+        narrow = _NARROW if self.problem.count >= _MANY_ROWS else ()
+        return next((n for n in narrow if count <= n), _PLACES * max(1, -(-count // _PLACES)))
+
     def factors(self, experiment: Any) -> Float[np.ndarray, "nf T"]:
         """The factors along an experiment, over their sizes."""
         x = self.menu.regressors(experiment, self.problem.record)
@@ -165,13 +183,23 @@ class TermRuns:
 
     def on(self, record: Record) -> TermRuns:
         """The same on another record."""
-        return TermRuns.of(self.problem.on(record), self.library, self.criterion, like=self)
+        return TermRuns.of(self.problem.on(record), self.library, self.criterion, self, self.collinear)
 
     @cached_property
     def lags(self) -> tuple[frozenset[Lag], ...]:
         """Those that each term reads."""
         own = [parse(text).lags for text in self.library.factors]
         return tuple(frozenset(lag for i in product for lag in own[i]) for product in self.library.products)
+
+    @cached_property
+    def constant(self) -> int | None:
+        """The column of a constant among those of physics and terms; None where neither has one."""
+        physics, texts = self.problem.baseline, self.library.texts
+        several = [term.parameter for term in physics.terms]
+        for term, expression in zip(physics.terms, physics.expressions, strict=True):
+            if not expression.lags and not term.fixed and several.count(term.parameter) == 1:
+                return physics.names.index(term.parameter)
+        return len(physics.names) + texts.index(CONSTANT) if CONSTANT in texts else None
 
     def start(self) -> Point:
         """Physics alone, one step ahead."""
@@ -191,10 +219,18 @@ class TermRuns:
         objective = _Chosen.of(self, chosen)
         p = np.concatenate([point.c, w, np.zeros(objective.dynamics.unknowns - len(point.c) - len(w))])
         states = point.states if point.states is not None else np.asarray(self.laid.start)
-        end = LevenbergMarquardt(iterations, _TOLERANCE).descend(objective, p, Start(states), damping=MARQUARDT)
-        flown = end.flown
+        flown = _descended(objective, p, Start(states), iterations)
         loss = flown.misfit * self.rms**2 / self.laid.count if np.isfinite(flown.misfit) else np.inf
         return Point(chosen, flown.c, flown.w[: len(chosen)], flown.states, loss)
+
+    def independent_share(self, point: Point) -> float:
+        """Return the share of a model's errors that is independent; one step ahead all of them count."""
+        if self.laid is None:
+            return 1.0
+        objective = _Chosen.of(self, point.chosen)
+        p = np.zeros(objective.physics + objective.dynamics.width)  # type: ignore[attr-defined]
+        p[: len(point.c)], p[len(point.c) : len(point.c) + len(point.w)] = point.c, point.w
+        return objective.samples(objective.fly(p, Start(point.states)))[1]
 
     def equations(self, point: Point, able: Able = None, scored: Any = None) -> Equations:
         """The normal equations of physics and all terms about a point, for p itself: its chosen terms are in the error.
@@ -222,6 +258,17 @@ class TermRuns:
         square = flown.misfit + 2 * p @ right + p @ bent
         own = Equations(hessian, right + bent, float(square), objective.segments.count)
         return own.among(columns, nt + terms)
+
+    def parts(self, point: Point, count: int, able: Able = None) -> list[Equations]:
+        """Return the equations about a point over up to `count` parts of the data, one after another."""
+        if self.laid is None:
+            chunks = len(self.step_blocks)
+            edges = np.linspace(0, chunks, min(count, chunks) + 1).astype(int)
+            return [self.equations(point, able, slice(a, b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        scored = np.asarray(self.laid.scored)
+        order = np.cumsum(np.moveaxis(scored, 1, -1).reshape(-1)).reshape(*scored.shape[::2], scored.shape[1])
+        place = np.moveaxis((order - 1) * count // max(int(scored.sum()), 1), -1, 1)
+        return [self.equations(point, able, scored & (place == part)) for part in range(count)]
 
     @cached_property
     def step_blocks(self) -> tuple[Equations, ...]:
@@ -254,6 +301,33 @@ class TermRuns:
         return mean if mean < RUNAWAY * float(self.problem.deviation[0]) ** 2 else np.inf
 
 
+def _descended(objective: FreeRunObjective, p: Vector, start: Start, iterations: int) -> Flown:
+    """Minimise the misfit by Gauss-Newton steps, and by Levenberg-Marquardt from where one of them does not descend.
+
+    About a fitted model the misfit is nearly quadratic. A small step that lowers it by what was expected leaves nothing
+    to gain, so no trial is linearised only to confirm that: a linearisation costs ten to thirty trials. After a large
+    step the sensitivities are others: those of past outputs are zero where the model does nothing yet.
+    """
+    flown = objective.fly(p, start)
+    for done in range(iterations if np.isfinite(flown.misfit) else 0):
+        linear = objective.linearise(flown)
+        if not np.isfinite(linear.hessian).all():
+            break
+        step = Equations(linear.hessian, linear.gradient, flown.misfit, objective.segments.count).solve()
+        expected = float(2 * step @ linear.gradient - step @ linear.hessian @ step)
+        if expected <= _TOLERANCE**2 * flown.misfit:
+            break
+        tried = objective.fly(flown.p + step, linear.start)
+        gained = flown.misfit - tried.misfit
+        if not gained > 0:
+            solver, start = LevenbergMarquardt(iterations - done, _TOLERANCE), Start(flown.states)
+            return solver.descend(objective, flown.p, start, damping=MARQUARDT).flown
+        before, flown = flown, tried
+        if gained <= _SETTLED * before.misfit and abs(expected - gained) <= _TOLERANCE * before.misfit:
+            break
+    return flown
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Chosen(FreeRunObjective):
     """The free run of some terms, in a program with more places: those that are not taken stay zero."""
@@ -262,7 +336,7 @@ class _Chosen(FreeRunObjective):
 
     @classmethod
     def of(cls, runs: TermRuns, chosen: tuple[int, ...], *, exactly: bool = False) -> _Chosen:
-        places = len(chosen) if exactly else _PLACES * max(1, -(-len(chosen) // _PLACES))
+        places = len(chosen) if exactly else runs.places(len(chosen))
         menu, laid = replace(runs.menu, width=places), runs.laid
         products = np.full((places, runs.menu.order), len(runs.library.factors))
         products[: len(chosen)] = runs.library.numbers[list(chosen)]

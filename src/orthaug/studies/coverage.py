@@ -30,7 +30,7 @@ _MARKERS = {"training": "o", "paper": "s", "uniform": "^"}
 @lru_cache
 def _noiseless(data_set: int) -> Estimate:
     example = static(data_set)
-    return estimate(example.train, example.baseline, solver=LevenbergMarquardt(300), regularization="none")
+    return estimate(example.train, example.baseline, solver=LevenbergMarquardt(300).within_limit, regularization="none")
 
 
 def one(data_set: int, draw: int) -> dict[str, Any]:

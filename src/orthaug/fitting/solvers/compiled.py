@@ -20,6 +20,7 @@ from orthaug._base.jax import Array, jax, jnp, training_clock
 from orthaug._base.progress import Enough, RunTell, quiet
 from orthaug.fitting.normal_equations import Normal, linearise, one_pass
 from orthaug.fitting.solvers.descent import IDENTITY
+from orthaug.fitting.solvers.limit import Limit, Tail
 from orthaug.fitting.status import Ending
 from orthaug.models.rows import Overlap
 
@@ -40,6 +41,8 @@ class State(NamedTuple):
     accepted: Int[Array, ""]
     small: Int[Array, ""]
     code: Int[Array, ""]
+    mark: Float[Array | np.ndarray, ""]
+    """The loss where the last window of the limit began."""
 
 
 @runtime_checkable
@@ -82,6 +85,8 @@ class TrainingRun(NamedTuple):
     """Whether a penalty or a bound held the learner, so that `normal` has its rows too."""
     fixed: dict[int, float] | None = None
     """Entries of θ that stood at a bound, with its value."""
+    tail: Tail | None = None
+    """The last steps; None where nobody looked at them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +94,8 @@ class Settings:
     """What a run is made with.
 
     Args:
-        iterations, tolerance: as of `LevenbergMarquardt`.
+        limit: of the iterations.
+        tolerance: as of `LevenbergMarquardt`.
         samples: residuals less the physics' own parameters, for the noise variance.
         ridge: α in normalised units; with `evidence` where it starts.
         evidence: choose α by MacKay's re-estimation after every accepted step.
@@ -98,7 +104,7 @@ class Settings:
         kept: where states are kept; a run goes on from the last one.
     """
 
-    iterations: int
+    limit: Limit
     tolerance: float
     samples: int
     ridge: float = 0.0
@@ -119,7 +125,14 @@ class Settings:
 
     def runs(self, state: State) -> bool:
         """Whether there is a step to take."""
-        return int(state.code) == Ending.RUNNING and int(state.iteration) < self.iterations
+        if int(state.code) != Ending.RUNNING:
+            return False
+        return not self.limit.reached(int(state.iteration), float(state.mark), float(state.normal.loss))
+
+    def marked(self, state: State) -> State:
+        """Return the state, with its loss noted where a window of the limit begins."""
+        begins = self.limit.begins_window(int(state.iteration))
+        return state._replace(mark=np.asarray(state.normal.loss)) if begins else state
 
     def tell(self, state: State) -> bool:
         """Whoever listens, and whoever keeps states; whether a listener says that it is enough."""
@@ -142,7 +155,9 @@ class Settings:
         effective = float(effective_weights(state.normal, held))
         ending, done = Ending(int(state.code)), int(state.iteration)
         ending = Ending.STOPPED if enough and ending is Ending.RUNNING else ending
-        return TrainingRun(state.w, state.normal, ridge, effective, done, ending, seconds)
+        losses, converged = (float(state.mark), float(state.normal.loss)), int(state.code) != Ending.RUNNING
+        tail = Tail.of(self.limit, done, *losses, converged=converged)
+        return TrainingRun(state.w, state.normal, ridge, effective, done, ending, seconds, tail=tail)
 
 
 def minimise(
@@ -166,8 +181,9 @@ def minimise(
     burst, enough = 1, False
     while settings.runs(state) and not enough:
         tick = training_clock()
-        stop = min(int(state.iteration) + burst, settings.iterations)
+        stop = min(int(state.iteration) + burst, settings.limit.next_look(int(state.iteration)))
         state = jax.block_until_ready(_advance(criterion, state, arguments, options, np.int64(stop)))
+        state = settings.marked(state)
         burst = burst_length(burst, training_clock() - tick)
         enough = settings.tell(state)
     return settings.ended(state, training_clock() - began, enough=enough)
@@ -194,6 +210,7 @@ def driven(
     while settings.runs(state) and not enough:
         step = _proposed(state)
         state = _judged(state, step, normal_at(state.w + step, state.normal.overlap), options)
+        state = settings.marked(state)
         enough = settings.tell(state)
     return settings.ended(state, training_clock() - began, enough=enough)
 
@@ -217,6 +234,7 @@ def _begun(w: Any, normal: Normal, ridge: Any) -> State:
         accepted=jnp.asarray(0),
         small=jnp.asarray(0),
         code=jnp.where(finite, jnp.where(spanned(normal), Ending.SPANNED, Ending.RUNNING), Ending.NON_FINITE),
+        mark=normal.loss,
     )
 
 
@@ -274,6 +292,7 @@ def _judged(state: State, step: Any, trial: Normal, options: Options) -> State:
         accepted=accepted,
         small=small,
         code=code,
+        mark=state.mark,
     )
 
 

@@ -20,6 +20,7 @@ from jaxtyping import Bool
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import training_clock
 from orthaug._base.progress import Enough, RunTell, quiet
+from orthaug.fitting.solvers.limit import Limit, Tail
 from orthaug.fitting.status import Ending
 
 _SETTLED = 0.1  # of the objective: a step that lowers it by less belongs to the end of a run
@@ -107,6 +108,8 @@ class Descent(NamedTuple):
     seconds: float
     path: tuple[Vector, ...] = ()
     """p of every accepted trial, the start first."""
+    tail: Tail | None = None
+    """The last steps; None where the start has no derivative."""
 
 
 class Pause(NamedTuple):
@@ -125,12 +128,16 @@ class Pause(NamedTuple):
 
 
 class _Counts(NamedTuple):
-    """Steps that were tried, accepted ones before the last, whether evidence has begun, and the loss of the start."""
+    """Steps that were tried, accepted ones before the last, whether evidence has begun, and two losses.
+
+    These are the loss of the start, and where the last window of the limit began.
+    """
 
     done: int
     taken: int
     begun: bool
     first_loss: float
+    mark: float
 
 
 class _Iterate(NamedTuple):
@@ -157,7 +164,7 @@ def descend(
     p: Vector,
     start: Any,
     *,
-    iterations: int,
+    limit: Limit,
     tolerance: float,
     damping: Damping,
     ridge: float = 0.0,
@@ -183,11 +190,11 @@ def descend(
     began = training_clock()
     limits = tuple(np.full(len(p), side) for side in (-np.inf, np.inf))
     if bounds is not None:
-        for limit, side in zip(limits, bounds, strict=True):
-            limit[: objective.physics] = side
+        for whole, side in zip(limits, bounds, strict=True):
+            whole[: objective.physics] = side
     paused = None if kept is None else kept.state()
     if paused is not None:
-        iterate, (done, taken, begun, first_loss), ending = _resumed(objective, paused)
+        iterate, (done, taken, begun, first_loss, mark), ending = _resumed(objective, paused)
     else:
         flown = objective.fly(np.clip(p, *limits), start)
         linear = objective.linearise(flown) if np.isfinite(flown.loss) else None
@@ -195,8 +202,8 @@ def descend(
             return Descent(flown, None, ridge, 0.0, 0, Ending.NON_FINITE, training_clock() - began)
         largest = 1.0 if damping.diagonal else float(np.diag(linear.hessian).max(initial=1e-300))
         iterate, first_loss = _Iterate(flown, linear, ridge, damping.first * largest, path=(flown.p,)), flown.loss
-        ending, done, taken, begun = Ending.RUNNING, 0, 1, not evidence_settled
-    while ending is Ending.RUNNING and done < iterations:
+        ending, done, taken, begun, mark = Ending.RUNNING, 0, 1, not evidence_settled, first_loss
+    while ending is Ending.RUNNING and not limit.reached(done, mark, iterate.flown.loss):
         iterate, ending = _trial(objective, iterate, limits, tolerance, damping, ceiling)
         if evidence and not begun:
             lower = iterate.flown.loss < LEARNED * first_loss or iterate.small > 0
@@ -207,17 +214,19 @@ def descend(
             iterate = iterate._replace(ridge=_next_ridge(objective, iterate))
         taken = len(iterate.path)
         done += 1
+        mark = iterate.flown.loss if limit.begins_window(done) else mark
         try:
             progress(done, iterate.flown.loss)
         except Enough:
             ending = Ending.STOPPED if ending is Ending.RUNNING else ending
             break
         if kept is not None:
-            counts = _Counts(done, taken, begun, first_loss)
+            counts = _Counts(done, taken, begun, first_loss, mark)
             kept.keep(partial(_paused, objective, iterate, counts, ending), ended=ending is not Ending.RUNNING)
     effective = effective_weights(iterate.linear.hessian, iterate.ridge, objective.physics)
-    seconds = training_clock() - began
-    return Descent(iterate.flown, iterate.linear, iterate.ridge, effective, done, ending, seconds, iterate.path)
+    converged = ending not in (Ending.RUNNING, Ending.STOPPED)
+    tail, seconds = Tail.of(limit, done, mark, iterate.flown.loss, converged=converged), training_clock() - began
+    return Descent(iterate.flown, iterate.linear, iterate.ridge, effective, done, ending, seconds, iterate.path, tail)
 
 
 def _paused(objective: Any, iterate: _Iterate, counts: _Counts, ending: Ending) -> Pause:
@@ -231,7 +240,7 @@ def _resumed(objective: Any, paused: Pause) -> tuple[_Iterate, _Counts, Ending]:
     ridge, damping, growth = (float(paused[i]) for i in (1, 2, 3))
     path, done = tuple(paused.path), paused.counts.tolist()
     iterate = _Iterate(flown, objective.linearise(flown), ridge, damping, growth, int(paused.small), path)
-    counts = _Counts(int(done[0]), int(done[1]), bool(done[2]), done[3])
+    counts = _Counts(int(done[0]), int(done[1]), bool(done[2]), done[3], done[4])
     return iterate._replace(coloured=bool(paused.coloured)), counts, Ending(int(paused.ending))
 
 
@@ -271,17 +280,26 @@ def _trial(
 
 
 def _next_ridge(objective: SquaredResiduals, iterate: _Iterate) -> float:
-    """MacKay's fixed point `α = γσ²/(κ‖w‖²)`, κ the share of the residuals that is independent.
+    effective = effective_weights(iterate.linear.hessian, iterate.ridge, objective.physics)
+    return evidence_ridge(objective, iterate.flown, effective, coloured=iterate.coloured)
+
+
+def evidence_ridge(objective: SquaredResiduals, flown: Any, effective: float, *, coloured: bool = True) -> float:
+    """Return MacKay's fixed point `α = γσ²/(κ‖w‖²)`, κ the share of the residuals that is independent.
 
     Residuals of a free run are coloured: N of them say as much as κN independent ones. So the data weigh less against
     the prior.
+
+    Args:
+        objective: that the weights minimise.
+        flown: the trial at the weights.
+        effective: number γ of effective weights there.
+        coloured: whether the colour of the residuals counts.
     """
-    flown, physics = iterate.flown, objective.physics
     count, share = objective.samples(flown)
-    share = share if iterate.coloured else 1.0
-    effective = effective_weights(iterate.linear.hessian, iterate.ridge, physics)
+    share = share if coloured else 1.0
     variance = flown.loss / max(count - effective / share, 1.0)
-    size = float(np.sum(flown.p[physics:] ** 2))
+    size = float(np.sum(flown.p[objective.physics :] ** 2))
     return float(np.clip(effective * variance / (share * max(size, 1e-300)), 1e-12, 1e12))
 
 

@@ -1,0 +1,137 @@
+"""Learners that their regularization silenced: the warning, and runs with weaker regularizations beside them.
+
+Evidence starts from a learner that does nothing yet. A learner that first finds a constant, since the physics has no
+offset, lowers the loss by that, and evidence may then find that one weight is all it needs: dry friction is lost so.
+Such a run is made again without regularization, and with the ridge that evidence finds where that ended; held-out rows
+choose. Ard is for training one step ahead, where "auto" has compared it already.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import Matrix
+from orthaug._base.errors import Warning
+from orthaug.fitting.held_out import HeldOut, mean_square
+from orthaug.fitting.learned import Learned
+from orthaug.fitting.solvers.descent import evidence_ridge
+from orthaug.fitting.status import Ending
+
+_SILENT = 0.5  # effective weights: fewer do nothing
+_CONSTANT = 1.5  # effective weights for each output of the learner: one is a constant
+_FLAT = 0.01  # of the learner's RMS: a smaller standard deviation is that of a constant
+
+
+def silenced(effective: float, outputs: int) -> bool:
+    """Return whether a regularization left no more than a constant of each output of the learner."""
+    return effective < _CONSTANT * outputs
+
+
+def add_retries(
+    starts: list[Any],
+    runs: list[Any],
+    outputs: int,
+    make: Callable[[list[Any]], tuple[list[Any], list[Any]]],
+) -> tuple[list[Any], list[Any]]:
+    """Return the planned runs with their ends, and where evidence silenced all of them those of weaker ones.
+
+    Args:
+        starts, runs: planned runs and how they ended.
+        outputs: of the learner.
+        make: makes planned runs; one that fails is planned anew.
+    """
+    by_evidence = all(start.regularization == "evidence" for start in starts)
+    ended = all(run.ending.usable and run.ending is not Ending.STOPPED for run in runs)
+    if not (by_evidence and ended and all(silenced(run.effective, outputs) for run in runs)):
+        return starts, runs
+    free, ends = make([start._replace(regularization="none") for start in starts])
+    usable = [end for end in ends if end.ending.usable]
+    if not usable:
+        return starts, runs
+    lowest = min(usable, key=lambda end: end.end.flown.loss)
+    ridge = float(f"{evidence_ridge(lowest.objective, lowest.end.flown, lowest.effective):.3g}")
+    more, others = make([start._replace(regularization=ridge) for start in starts])
+    return starts + free + more, runs + ends + others
+
+
+def tell_retries(
+    planned: int, starts: Sequence[Any], runs: Sequence[Any], held_out: HeldOut | None, best: int
+) -> list[Warning]:
+    """Return the warning that evidence silenced the learner and what was tried then; none where nothing was.
+
+    Args:
+        planned: number of the runs before any were added.
+        starts, runs: all runs and how they ended, those by evidence first.
+        held_out: their errors.
+        best: number of the run that is kept; negative for physics alone.
+    """
+    choices = list(dict.fromkeys(start.regularization for start in starts))
+    if held_out is None or len(runs) == planned:
+        return []
+    errors = {
+        choice: min(
+            np.sqrt(mean_square(pieces))
+            for start, pieces in zip(starts, held_out.runs, strict=True)
+            if start.regularization == choice
+        )
+        for choice in choices
+    }
+    found = ", ".join(f"{_name(choice)} {_error(error)}" for choice, error in errors.items())
+    kept = "physics alone" if best < 0 else _name(starts[best].regularization)
+    effective = max(run.effective for run in runs[:planned])
+    tried = " and ".join(_name(choice) for choice in choices[1:])
+    text = (
+        f"evidence left {counted_weights(effective)} of the learner, no more than a constant, so training was tried "
+        f"again with {tried}. Errors in {held_out.where}, in deviations "
+        f"of the output: {found}, physics alone {_error(np.sqrt(mean_square(held_out.alone)))}. Kept is {kept}."
+    )
+    return [Warning("evidence_retried", text)]
+
+
+def learner_silent(learned: Learned, values: Matrix | None = None) -> list[Warning]:
+    """Return the warning that a learner does nothing, or no more than a constant; none otherwise.
+
+    Args:
+        learned: a trained learner.
+        values: of the learner (N, ny) over the training rows, where they are known.
+    """
+    bound = learned.bound
+    if bound is None or not learned.ending.usable or learned.ending is Ending.SPANNED or not bound.size:
+        return []
+    if learned.effective < _SILENT or (values is not None and not values.any()):
+        does = "the learner is silent: the fit is that of physics alone"
+    elif values is not None and silenced(learned.effective, bound.ny) and _is_flat(values):
+        does = "the learner has learned nothing but a constant"
+    else:
+        return []
+    left = f"training left {counted_weights(learned.effective)} of {bound.size}"
+    text = (
+        f"{does} ({left}). Either there is nothing to learn from what it sees, and it can be left out, or its "
+        'regularization was too strong: compare `regularization = "none"` and a small ridge such as 0.01 on held-out '
+        "data. A constant that the physics lacks belongs into the physics."
+    )
+    return [Warning("learner_silent", text)]
+
+
+def counted_weights(effective: float) -> str:
+    """Return a number of effective weights in words."""
+    return f"{effective:.1f} effective weights"
+
+
+def _is_flat(values: Matrix) -> bool:
+    """Return whether every output of the learner is a constant."""
+    size = np.sqrt(np.mean(values**2, axis=0))
+    return bool(np.all(np.std(values, axis=0) <= _FLAT * size))
+
+
+def _name(choice: str | float) -> str:
+    if isinstance(choice, str):
+        return "no regularization" if choice == "none" else choice
+    return f"a ridge of {choice:g}"
+
+
+def _error(error: float) -> str:
+    return f"{error:.3g}" if np.isfinite(error) else "infinite (a run diverges)"

@@ -1,0 +1,136 @@
+"""Whether the chosen terms leave the physics its parameters: θ of physics alone beside θ with the terms.
+
+A term within the span of the physics takes over a part of it: the sum predicts as before, and θ means nothing any more.
+So each parameter is compared before and after, in units of what the two standard errors allow, and of each column the
+share is given that the others leave: one over it is the factor by which they widen its standard error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.errors import Warning
+from orthaug.selection.forward import Equations, spanned
+from orthaug.selection.term_runs import Able, Point, TermRuns
+
+MOVED, SPANNED = "physics_moved", "terms_within_span"
+_SURE = 1.96  # standard errors
+
+
+@dataclass(frozen=True)
+class Shift:
+    """A parameter of physics alone, and with the chosen terms.
+
+    Standard errors are those of the search's criterion, `None` where the data do not determine the parameter. `left` is
+    the share of the parameter's regressor, of its norm, that the other columns of the model leave.
+    """
+
+    parameter: str
+    unit: str | None
+    before: float
+    before_std: float | None
+    after: float
+    after_std: float | None
+    left: float
+
+    @property
+    def times(self) -> float | None:
+        """By how many times what the standard errors allow at 95 % the parameter moves."""
+        if self.before_std is None or self.after_std is None:
+            return None
+        allowed = _SURE * float(np.hypot(self.before_std, self.after_std))
+        return abs(self.after - self.before) / allowed if allowed > 0 else None
+
+    @property
+    def moved(self) -> bool:
+        """Whether the parameter moves by more than its standard errors allow."""
+        return self.times is None or self.times > 1
+
+    def __str__(self) -> str:
+        before, after = _figure(self.before, self.before_std), _figure(self.after, self.after_std)
+        return f"{self.parameter} from {before} to {after}{f' {self.unit}' if self.unit else ''}"
+
+
+@dataclass(frozen=True, eq=False)
+class KeptPhysics:
+    """How the physics fares beside the chosen terms."""
+
+    shifts: tuple[Shift, ...]
+    left: dict[str, float]
+    """Of each chosen term the share of its norm that physics and the other terms leave."""
+    condition: float
+    """Of the columns of physics and terms, each scaled to norm 1."""
+    excluded: int
+    """Candidate terms that are not chosen and lie within the span of physics and chosen terms."""
+    candidates: int
+    collinear: float
+    """Share of a term's deviation below which it lies within the span."""
+
+    @property
+    def notes(self) -> list[Warning]:
+        """Warnings for parameters that moved, and a note on the candidates within the span."""
+        notes, moved = [], [shift for shift in self.shifts if shift.moved]
+        if moved and self.left:
+            times = max((shift.times for shift in moved if shift.times is not None), default=None)
+            allowed = (
+                "more" if times is None else f"up to {times:.2g} times" if len(moved) > 1 else f"{times:.2g} times"
+            )
+            least = min(moved, key=lambda shift: shift.left)
+            text = (
+                f"the chosen terms move {'; '.join(map(str, moved))}: {allowed} what the standard errors allow. Beside "
+                f"the terms {100 * least.left:.2g} % of the regressor of {least.parameter} is left. Either physics "
+                "alone was biased by what the terms now explain, or the terms took over a part of the physics: compare "
+                "both values with what is known of the parameters, and where the first is right, put the missing "
+                "effect into the physics or `exclude` the terms that stand in for it."
+            )
+            notes.append(Warning(MOVED, text))
+        if self.excluded:
+            beside = "physics and the chosen terms" if self.left else "the physics"
+            text = (
+                f"{self.excluded} of {self.candidates} candidate terms lie within the span of {beside} and were not "
+                f"taken: less than {100 * self.collinear:g} % of each is left beside these, whose condition number is "
+                f"{self.condition:.3g}."
+            )
+            notes.append(Warning(SPANNED, text))
+        return notes
+
+
+def kept_physics(runs: TermRuns, alone: Point, chosen: Point, able: Able = None) -> KeptPhysics:
+    """Compare θ of physics alone with θ beside the chosen terms, both trained on the criterion.
+
+    Args:
+        able: the terms that the choice was made among.
+    """
+    physics, nt, texts = runs.problem.baseline, len(alone.c), runs.library.texts
+    columns = [*range(nt), *(nt + i for i in chosen.chosen)]
+    every = runs.equations(chosen, able)
+    before_std, _, _ = _statistics(runs, alone, runs.equations(alone, ()).of(range(nt)))
+    after_std, left, condition = _statistics(runs, chosen, every.of(columns))
+    shifts = tuple(
+        Shift(p.name, p.unit, float(alone.c[i]), before_std[i], float(chosen.c[i]), after_std[i], float(left[i]))
+        for i, p in enumerate(physics.parameters)
+    )
+    within = spanned(every, columns, runs.collinear, runs.constant) if columns else []
+    terms = dict(zip((texts[i] for i in chosen.chosen), map(float, left[nt:]), strict=True))
+    return KeptPhysics(shifts, terms, condition, len(within), len(texts), runs.collinear)
+
+
+def _statistics(runs: TermRuns, point: Point, own: Equations) -> tuple[list[float | None], Vector, float]:
+    """Return standard errors of all columns, what the others leave of each, and the condition of their Gram matrix."""
+    size = np.sqrt(np.maximum(np.diag(own.hessian), 1e-300))
+    gram: Matrix = own.hessian / np.outer(size, size)
+    values = np.linalg.eigvalsh(gram) if len(gram) else np.ones(1)
+    inverse = np.linalg.pinv(gram, rcond=1e-14, hermitian=True)
+    left = 1 / np.sqrt(np.maximum(np.diag(inverse), 1.0))
+    determined = bool(values[0] > 1e-14 * values[-1])
+    variance = max(own.miss(own.solve()), 0.0) / max(own.rows - len(gram), 1) / runs.independent_share(point)
+    stds = np.sqrt(variance * np.diag(inverse)) / size
+    condition = float(np.sqrt(values[-1] / values[0])) if determined else np.inf
+    return [float(std) if determined and np.isfinite(std) else None for std in stds], left, condition
+
+
+def _figure(value: float, std: float | None) -> str:
+    return f"{value:.4g}" if std is None else f"{value:.4g} ± {std:.2g}"
