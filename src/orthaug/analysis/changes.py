@@ -67,14 +67,16 @@ class Change:
         """Whether the error is predicted to fall by enough to name it."""
         return self.fall >= fall_of(WORTH)
 
-    def __str__(self) -> str:
+    @property
+    def prediction(self) -> str:
+        """What it is predicted to gain, as a clause."""
         if self.kind == "criterion" and not self.gains:
-            return (
-                f"with {self.name} the parameters would not be biased so; the error of its free run is not predicted "
-                "to fall"
-            )
+            return "the parameters would not be biased so; the error of its free run is not predicted to fall"
         error = "its error one step ahead" if self.of == "prediction" else "the error of its free run"
-        return f"with {self.name} {error} is predicted to fall by {percent(self.fall)}"
+        return f"{error} is predicted to fall by {percent(self.fall)}"
+
+    def __str__(self) -> str:
+        return f"with {self.name} {self.prediction}"
 
 
 def fall_of(share: float) -> float:

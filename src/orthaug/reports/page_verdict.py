@@ -342,7 +342,7 @@ def _change(change: object) -> str:
     """Return a change with what it is predicted to gain, as the middle of a sentence."""
     told = {key: getattr(change, key) for key in ("kind", "what", "fall", "of", "output")}
     predicted = Change(**{**told, "fall": told["fall"] or 0.0})
-    return str(predicted).removeprefix("with ")
+    return f"{predicted.name}, with which {predicted.prediction}"
 
 
 def _joined(words: list[str]) -> str:
