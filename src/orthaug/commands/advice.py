@@ -28,6 +28,7 @@ from orthaug.reports.result import FitResult
 _PIECES = 3  # of the training rows, the last of which is held out where there is no validation part
 _MOST = 5  # changes that are tried
 _LEAST_SECONDS = 1.0  # that trials may take, however short the fit was: programs are compiled for each
+_SAME = 1e-6  # relative: two terms of one error span the same beside the physics, as a dead zone and a limit
 _LISTED = 3  # changes without gain that the text names
 
 
@@ -177,15 +178,18 @@ def _concluded(
     base: Pieces, tried: Sequence[Tried], rows: HeldOutRows, left: int, learns: bool
 ) -> tuple[list[AdviceResult], AdviceTrialsResult]:
     before = math.sqrt(mean_square(base))
-    better = [one for one in tried if one.pieces is not None and _ratio(one.pieces, base).code == "helps"]
-    better.sort(key=lambda one: one.error)
+    helps = [one for one in tried if one.pieces is not None and _ratio(one.pieces, base).code == "helps"]
+    better: list[Tried] = []
+    for one in sorted(helps, key=lambda one: one.error):
+        if not any(math.isclose(one.error, other.error, rel_tol=_SAME) for other in better):
+            better.append(one)
     advice = [
         AdviceResult(change=one.proposal.change, text=_advice_text(one, before, rows), before=before, after=one.error)
         for one in better
     ]
-    worse = [one for one in tried if one not in better]
+    worse = [one for one in tried if one not in helps]
     text = f"Tried by a refit of {'physics and learner' if learns else 'the physics'} and a free run over {rows.where}"
-    text += f"{rows.which}: {counted(len(tried), 'change')} of the spec, {_which(len(better), len(tried))}."
+    text += f"{rows.which}: {counted(len(tried), 'change')} of the spec, {_which(len(helps), len(tried))}."
     if worse:
         named = "; ".join(f"{one.proposal.words} ({_after(one)})" for one in worse[:_LISTED])
         more = f" and {len(worse) - _LISTED} more" if len(worse) > _LISTED else ""

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from orthaug.models.response import Response, Scores
 
 SHOWN = 8  # signals of a design that are listed
+ADVISED = 2  # changes that a text advises at most; result.json has all
 
 
 def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
@@ -55,7 +56,7 @@ def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
 
 def _advice_lines(result: FitResult) -> list[str]:
     """Changes of the spec that bettered the free run in a trial, and an account of all trials."""
-    lines = [f"{'Next: ' if i == 0 else 'Or: '}{advice.text}" for i, advice in enumerate(result.advice)]
+    lines = [f"{'Next: ' if i == 0 else 'Or: '}{advice.text}" for i, advice in enumerate(result.advice[:ADVISED])]
     return lines + ([result.advice_trials.text] if result.advice_trials is not None else [])
 
 
