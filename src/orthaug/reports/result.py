@@ -266,7 +266,7 @@ class PhysicsAloneResult(Content):
 class FitResult(Headed):
     """What `orthaug fit` leaves."""
 
-    absent: ClassVar = frozenset({"motion", "terms", "equation", "advice_trials"})
+    absent: ClassVar = frozenset({"motion", "terms", "equation"})
 
     spec: dict[str, Any]
     data: DataResult
