@@ -127,7 +127,7 @@ def test_a_learner_is_named_with_what_it_does_not_see():
     blind = fitted(learner=MLP((3,), inputs=("u[k-1]",)), cubic=-0.01, noise=0.1, sensor=0.0)
     (change,) = (one for one in changes_of(blind) if one.kind == "learner")
     assert change.what == "a learner that also sees y[k-1], y[k-2]"
-    assert str(change).startswith("give it a learner that also sees y[k-1], y[k-2]: its error one step ahead is")
+    assert str(change).startswith("with a learner that also sees y[k-1], y[k-2] its error one step ahead is")
 
 
 @pytest.mark.parametrize("criterion", [None, Simulation(0, 40)], ids=["one step", "free run"])
@@ -146,7 +146,7 @@ def test_the_output_that_lacks_a_term_is_told():
              Term("d", "u2[k-1]", output="y2")]  # fmt: skip
     change = changes_of(estimate(Record.from_arrays(u, y), Baseline.from_terms(terms), learner=None))[0]
     assert (change.what, change.output) == ("u1[k-2]", "y2")
-    assert "give the physics of y2 (or the learner) the further input lag u1[k-2]" in str(change)
+    assert "the further input lag u1[k-2] in the physics of y2 (or the learner)" in str(change)
 
 
 def test_long_records_are_looked_at_in_stretches():
@@ -170,8 +170,8 @@ def test_too_few_rows_name_nothing(rows):
 
 def test_a_change_in_words():
     criterion = Change("criterion", "simulation", 0.123, "simulation")
-    assert str(criterion) == ('train with focus = "simulation": the error of its free run is predicted to fall by 12 %')
+    assert str(criterion) == 'with focus = "simulation" the error of its free run is predicted to fall by 12 %'
     told = str(Change("criterion", "simulation", 0.0, "simulation"))
-    assert told.startswith('for the parameters train with focus = "simulation"') and "%" not in told
+    assert told.startswith('with focus = "simulation" the parameters would not be biased so') and "%" not in told
     assert "not predicted to fall" in told
-    assert Change("offset", "1", 0.2, "prediction", "y2").advice == "give the physics of y2 an offset"
+    assert Change("offset", "1", 0.2, "prediction", "y2").name == "an offset in the physics of y2"

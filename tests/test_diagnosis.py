@@ -252,7 +252,7 @@ def test_an_unmodelled_residual_is_told_with_its_size_and_advice():
     found = of(second_order(0, equation=0.1, missing="lag of u"))
     share = 100 * found.one_step[0].rms / second_order(0, equation=0.1, missing="lag of u").experiments[0].outputs.std()
     assert f"residual, {share:.2g} % of the output's deviation" in found.text
-    assert "Give the physics (or the learner) the further input lag u[k-2]: its error one step ahead" in found.text
+    assert "With the further input lag u[k-2] in the physics (or the learner) its error one step ahead" in found.text
     assert "coloured" in dict(found.warnings)["coloured_residual"]
 
 
@@ -299,7 +299,7 @@ def test_one_step_with_sensor_noise_is_warned_and_told_the_criterion():
     (warning,) = found.warnings
     assert warning.code == "sensor_noise" and "intervals do not cover" in warning.text
     assert 'focus = "simulation"' in warning.text
-    assert 'train with focus = "simulation"' in found.text and "inconsistent" in found.text
+    assert 'those of focus = "simulation" are not' in found.text and "inconsistent" in found.text
 
 
 @pytest.mark.parametrize(("step", "told"), [(0.3, True), (0.02, False), (None, False)])
@@ -315,7 +315,7 @@ def test_steps_of_an_output_are_told_where_the_one_step_error_has_their_size(ste
     assert not found.one_step[0].practically_white()
     assert (found.steps is not None) is told and ("measured in steps of 0.3" in found.text) is told
     if told:
-        assert found.steps == {"y": pytest.approx(0.3)} and "measure more finely" in found.text
+        assert found.steps == {"y": pytest.approx(0.3)} and "a finer measurement" in found.text
 
 
 def test_sampling_too_fast_is_told():

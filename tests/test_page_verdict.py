@@ -5,7 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 from orthaug.reports.fields import WarningResult
-from orthaug.reports.findings import BiasResult, ChangeResult, DiagnosisResult, ValidationResult
+from orthaug.reports.findings import (
+    AdviceResult,
+    AdviceTrialsResult,
+    BiasResult,
+    ChangeResult,
+    DiagnosisResult,
+    ValidationResult,
+)
 from orthaug.reports.page_verdict import compare_verdict, fit_verdict
 from orthaug.reports.result import (
     CompareResult,
@@ -82,13 +89,23 @@ def test_a_refuted_model_is_of_use_for_the_next_sample_only_where_that_is_predic
 
 def test_a_learner_that_was_tried_and_is_not_better_is_not_advised():
     both = told(LEARNER, LAG)
-    assert fit_verdict(fitted(residuals=both)).then.startswith("Give it a learner")
+    assert fit_verdict(fitted(residuals=both)).then.startswith("An option, not tried here: a learner, with which")
     for code in ("no_help", "helps"):
         fell_back = [WarningResult(code="physics_alone", text="")]
         then = fit_verdict(fitted(residuals=both, validation=judged(code), warnings=fell_back)).then
         assert "further input lag u[k-4]" in then
-    assert fit_verdict(fitted(residuals=both, validation=judged("helps"))).then.startswith("Give it a learner")
-    assert "Give it a learner" not in fit_verdict(fitted(residuals=told(LEARNER), validation=judged("no_help"))).then
+    assert ": a learner, " in fit_verdict(fitted(residuals=both, validation=judged("helps"))).then
+    assert ": a learner, " not in fit_verdict(fitted(residuals=told(LEARNER), validation=judged("no_help"))).then
+
+
+def test_what_was_tried_comes_first_and_what_was_not_is_an_option():
+    text = "With an offset the free run on rows held out improves from 0.2 to 0.1 of the output's deviation."
+    tried = AdviceTrialsResult(text="", tried=2, not_tried=0)
+    better = [AdviceResult(change={"motion.hold": "spline"}, text=text, before=0.2, after=0.1)]
+    both = told(LEARNER, LAG)
+    assert fit_verdict(fitted(residuals=both, advice=better, advice_trials=tried)).then == text
+    then = fit_verdict(fitted(residuals=both, advice_trials=tried)).then  # both were tried and did not better it
+    assert then.startswith("None of the changes that were tried betters the free run") and "lag" not in then
 
 
 def test_physics_alone_that_was_taken_for_a_learner_is_not_told_to_be_hurt_by_it():

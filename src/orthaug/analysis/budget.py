@@ -315,7 +315,7 @@ def _warning(
     if not large:
         return None
     listed, share, there = told_biases(large), explains(cause), f" in {cause.suspect.output}" if of_one else ""
-    rival, cures = rival_of(ground, cause, suspects), remedies(ground, cause, [row.name for row in large])
+    rival, cure = rival_of(ground, cause, suspects), " or ".join(remedies(ground, cause, [row.name for row in large]))
     other = "" if rival is None else f" ({rival.suspect.name} explains as much and would move them elsewhere)"
     if share < SURE_SHARE:
         near = near_causes(ground, cause, suspects)
@@ -324,12 +324,12 @@ def _warning(
         return Warning(
             "biased",
             f"what the learner found{there} looks most like {name} ({percent(share)} of it{beside}), which would move "
-            f"{listed}, and the standard errors do not cover that{other}: if it is that term, {' or '.join(cures)}.",
+            f"{listed}, and the standard errors do not cover that{other}{f': if it is that, {cure}' if cure else ''}.",
         )
     return Warning(
         "biased",
         f"{name} explains {100 * share:.0f} % of the learner{there} and moves {listed}, "
-        f"which the standard errors do not cover{other}: {' or '.join(cures)}.",
+        f"which the standard errors do not cover{other}{f': {cure}' if cure else ''}.",
     )
 
 

@@ -51,15 +51,15 @@ class Change:
     output: str | None = None
 
     @property
-    def advice(self) -> str:
-        """What to do, as the beginning of a sentence."""
+    def name(self) -> str:
+        """The change, to go on from "with"."""
         where = f" of {self.output}" if self.output else ""
         return {
-            "criterion": f'train with focus = "{self.what}"',
-            "input_lag": f"give the physics{where} (or the learner) the further input lag {self.what}",
-            "output_lag": f"give the physics{where} (or the learner) the further output lag {self.what}",
-            "offset": f"give the physics{where} an offset",
-            "learner": f"give it {self.what}",
+            "criterion": f'focus = "{self.what}"',
+            "input_lag": f"the further input lag {self.what} in the physics{where} (or the learner)",
+            "output_lag": f"the further output lag {self.what} in the physics{where} (or the learner)",
+            "offset": f"an offset in the physics{where}",
+            "learner": self.what,
         }[self.kind]
 
     @property
@@ -67,14 +67,16 @@ class Change:
         """Whether the error is predicted to fall by enough to name it."""
         return self.fall >= fall_of(WORTH)
 
-    def __str__(self) -> str:
+    @property
+    def prediction(self) -> str:
+        """What it is predicted to gain, as a clause."""
         if self.kind == "criterion" and not self.gains:
-            return (
-                f"for the parameters {self.advice}, which does not bias them; the error of its free run is not "
-                "predicted to fall"
-            )
+            return "the parameters would not be biased so; the error of its free run is not predicted to fall"
         error = "its error one step ahead" if self.of == "prediction" else "the error of its free run"
-        return f"{self.advice}: {error} is predicted to fall by {percent(self.fall)}"
+        return f"{error} is predicted to fall by {percent(self.fall)}"
+
+    def __str__(self) -> str:
+        return f"with {self.name} {self.prediction}"
 
 
 def fall_of(share: float) -> float:

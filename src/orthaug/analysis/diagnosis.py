@@ -137,8 +137,11 @@ def _concluded(seen: Finding) -> Diagnosis:
     seen = replace(seen, complete=complete)
     if verdict == "equation_noise" and seen.fit.criterion.simulates and seen.white:
         seen = replace(seen, changes=_toward_prediction(seen))
+    wild = wild_rows(seen.one_step, seen.fit.problem.record.experiments)
+    if wild:  # a larger learner would follow them
+        seen = replace(seen, changes=tuple(change for change in seen.changes if change.kind != "learner"))
     text, warnings = words(verdict, seen)
-    warnings = (*wild_rows(seen.one_step, seen.fit.problem.record.experiments), *warnings)
+    warnings = (*wild, *warnings)
     tested = seen.tests, seen.free_tests, seen.ratio, seen.noise
     return Diagnosis(verdict, text, *tested, warnings, seen.predictable, seen.changes, steps=seen.steps or None)
 

@@ -236,26 +236,26 @@ def _of_residual(table: Sequence[TermBias]) -> _Found | None:
 
 
 def _motion_warning(found: _Found, rows: Sequence[ParameterBias], *, learns: bool) -> Warning | None:
-    """One sentence on what is biased by more than its standard error: causes, their sizes, remedy."""
+    """One sentence on what is biased by more than its standard error: causes and their sizes."""
     large = [entry for entry in rows if (entry.errors or 0.0) > 1]
     if not large:
         return None
     several, first = len(found.causes) > 1, sorted(found.rivals, key=explains, reverse=True)[:2]
     named = " and ".join(f"{rival.suspect.name}, {percent(explains(rival))}" for rival in first)
     other = f" (near it: {named}, and would move them elsewhere)" if first else ""
-    where = " and ".join(cause.equation for cause in found.causes)
-    cure = f"add it to the equation of {where}, with its size as a parameter"
-    cure = f"add them to the equations of {where}, with their sizes as parameters" if several else cure
     what = "the learner" if learns else "the squares that the free run leaves"
-    told = " and ".join(f"{c.suspect.name} of size {_size(c):.3g} {c.suspect.unit}".rstrip() for c in found.causes)
+    told = " and ".join(
+        f"{c.suspect.name} of size {_size(c):.3g} {c.suspect.unit}".rstrip() + f" in the equation of {c.equation}"
+        for c in found.causes
+    )
     if learns and found.share < SURE_SHARE:
         return Warning(
             "biased",
             f"what the learner found looks most like {told} ({percent(found.share)} of it), which would move "
-            f"{told_biases(large)}, and the standard errors do not cover that{other}: if it is that, {cure}.",
+            f"{told_biases(large)}, and the standard errors do not cover that{other}.",
         )
     return Warning(
         "biased",
         f"{told} explain{'' if several else 's'} {100 * found.share:.0f} % of {what} and move{'' if several else 's'} "
-        f"{told_biases(large)}, which the standard errors do not cover{other}: {cure}.",
+        f"{told_biases(large)}, which the standard errors do not cover{other}.",
     )

@@ -129,14 +129,12 @@ def _words(
             f"the equations say: {late[0].gain}."
         )
     if lacks is not None:
-        return f"What the free run leaves ({sizes}) holds more than noise. {_named(lacks, fit)}"
+        return f"What the free run leaves ({sizes}) holds more than noise. {_named(lacks)}"
     what = [f"{name} follows {', '.join(given)}" for name, given in followed.items()]
     what += [f"{name} is not flat over {', '.join(given)}" for name, given in curved.items()]
     what = what or [f"{100 * max(s.inputs for s in shares):.0f} % follows from the inputs"]
-    learner = "let the learner see more" if fit.model.form.bound is not None else "add a learner where it acts"
-    holds = ', try another hold of the inputs, or delay one (step = "shift" of data.prepare)'
-    remedy = f"{learner}{holds if fit.problem.motion.inputs else ''}"
-    return f"What the free run leaves ({sizes}) holds more than noise: {'; '.join(what)}. Physics is missing; {remedy}."
+    held = "Physics is missing" + (", or inputs run otherwise between samples" if fit.problem.motion.inputs else "")
+    return f"What the free run leaves ({sizes}) holds more than noise: {'; '.join(what)}. {held}."
 
 
 def _traces(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) -> str:
@@ -160,18 +158,10 @@ def _colour(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) ->
     return "; ".join(told)
 
 
-def _named(lacks: MissingTest, fit: MotionEstimate) -> str:
-    """What is most likely missing, and where to put it."""
+def _named(lacks: MissingTest) -> str:
+    """The terms that are most likely missing."""
     best, *others = lacks.terms
     text = f"Most likely {best} would explain {percent(best.share)} of its square"
     if others:
         text += f", as would {' or '.join(f'{term.expression} in that of {term.equation}' for term in others[:2])}"
-    learned = {fit.problem.motion.names_of_states[i] for i in fit.problem.motion.learned[0]}
-    seen = fit.model.form.bound is not None and best.equation in learned
-    sees = f" that may see {best.variable}" if best.variable else ""
-    remedy = (
-        f"let the learner see {best.variable or 'more'}"
-        if seen
-        else f"add a learner to the equation of {best.equation}{sees}"
-    )
-    return f"{text}. Give the physics such a term, or {remedy}."
+    return f"{text}."

@@ -1,8 +1,7 @@
-"""What would remove a bias: other learner inputs, another measure, a term for the physics. Only what works is named."""
+"""Remedies of a bias: other learner inputs, another measure. Each is computed, and only what works is named."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -20,19 +19,13 @@ from orthaug.inference.measures import Symmetrized, Uniform, weigh_problem
 from orthaug.physics.output_weights import times
 from orthaug.physics.shared import seen, shared_directions
 
-_LONG = re.compile(r"\d+\.\d{5,}(?:e[-+]?\d+)?")
 _REMOVED = 0.1  # of the bias may remain
 _MEASURED_ROWS = 50_000  # above which no other measure is tried
 
 
 def remedies(ground: Ground, cause: SuspectedBias, biased: Sequence[str]) -> list[str]:
-    """Sentences on what removes the bias by a cause from the parameters named, the easiest first."""
-    return [*_by_inputs(ground, cause, biased), *_by_measure(ground, cause, biased), _by_term(cause.suspect)]
-
-
-def _by_term(suspect: Suspect) -> str:
-    text = _LONG.sub(lambda number: f"{float(number[0]):.4g}", suspect.expression)
-    return f"give the physics the term {text}"
+    """Return sentences on what removes the bias by a cause from the parameters named, the easiest first."""
+    return [*_by_inputs(ground, cause, biased), *_by_measure(ground, cause, biased)]
 
 
 def _by_inputs(ground: Ground, cause: SuspectedBias, biased: Sequence[str]) -> Iterator[str]:

@@ -24,12 +24,12 @@ _TOO_FAST = 0.05  # noise variance / smallest variance among the lagged outputs
 _BIASED = Warning(
     "sensor_noise",
     "noise on the measured output biases the one-step θ, and its intervals do not cover that bias: "
-    'train with focus = "simulation".',
+    'training on the free run (focus = "simulation") has none.',
 )
 _INCONSISTENT = Warning(
     "coloured_residual",
     "the one-step residual is coloured: what disturbs one row is in the lagged outputs of the next, which biases the "
-    'one-step θ, and its intervals do not cover that bias. Train with focus = "simulation" for the parameters.',
+    'one-step θ, and its intervals do not cover that bias. Training on the free run (focus = "simulation") has none.',
 )
 _COLOUR = 0.1  # of the residual's variance that its own past tells: from there on that bias may matter
 
@@ -159,13 +159,13 @@ def _sensor_noise(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     if seen.simulated:
         more = f" {_sentence(seen.changes[0])}" if seen.changes else ""
         return f"{text}, which the simulation criterion suits.{more}", ()
-    text += '. One-step estimates of θ are then inconsistent: train with focus = "simulation"'
+    text += '. One-step estimates of θ are then inconsistent, those of focus = "simulation" are not'
     if seen.changes and seen.changes[0].kind == "criterion":
         fall = seen.changes[0].fall
         text += (
-            f"; the error of the free run is predicted to fall by {percent(fall)}"
+            f"; the error of the free run is predicted to fall by {percent(fall)} with it"
             if seen.changes[0].gains
-            else " for the sake of the parameters; the error of the free run is not predicted to fall"
+            else "; the error of the free run is not predicted to fall with it"
         )
     if seen.noise is not None and seen.noise > _TOO_FAST:
         text += (
@@ -195,10 +195,10 @@ def _quantised(seen: Finding) -> str:
     each = {test.name: f"{test.name} is measured in steps of {seen.steps[test.name]:.3g}{units[test.name]}, and the "
             f"one-step residual ({test.rms:.2g}{units[test.name]}) is no larger"
             for test in seen.tests if test.name in seen.steps}  # fmt: skip
-    trained = "" if seen.simulated else 'train with focus = "simulation", '
+    trained = "" if seen.simulated else 'training on the free run (focus = "simulation"), '
     return (
         f"{'; '.join(each.values())}: such steps colour it as noise on the output does, and bias one-step estimates of "
-        f"θ. For that {trained}take fewer samples (`decimate` of data.prepare), or measure more finely."
+        f"θ. Against that help {trained}fewer samples (`decimate` of data.prepare), or a finer measurement."
     )
 
 
@@ -262,7 +262,7 @@ def _advice(seen: Finding, otherwise: str) -> str:
     if seen.changes:
         return _sentence(seen.changes[0])
     if not seen.predictable:
-        return "Try more lags, other learner inputs or neurons."
+        return "Options that were not tried are more lags, other learner inputs or neurons."
     limit = 100 * fall_of(WORTH)
     return f"No further lag, offset or learner is predicted to lower it by {percent(limit / 100)}: {otherwise}."
 

@@ -111,6 +111,14 @@ class Job(ABC):
         """What trains a variant on a fold."""
         return lambda fold: self.run(variant.on(fold))
 
+    @abstractmethod
+    def changed(self, spec: Spec) -> Job:
+        """Return the job of another spec on the data of this one, to be fitted to folds of them.
+
+        Raises:
+            InputError: what the spec declares cannot be fitted to the training data.
+        """
+
     @property
     def runner(self) -> Any:
         """Who makes independent runs of this job."""

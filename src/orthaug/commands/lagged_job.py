@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -105,6 +105,14 @@ class LaggedJob(Job):
             lags, learner_inputs = spec.lag_orders(), spec.learner_inputs()
         posed = (self.problem.baseline, lags, learner_inputs)
         return partial(_fitted_to, posed=posed, weights=weights, options=options)
+
+    def changed(self, spec: Spec) -> LaggedJob:
+        physics, baseline = spec.physics_map(self.train.record.sampling_time), spec.declared_baseline()
+        baseline = baseline if physics is None else with_initial(physics, baseline)
+        lags = spec.lag_orders() if spec.declared_learner() is not None else None
+        weights = spec.training.output_weights
+        problem = pose(self.train.record, baseline, lags, spec.learner_inputs(), output_weights=weights)
+        return replace(self, spec=spec, problem=problem, physics=physics, checkpoints=None)
 
     def run(self, variant: Variant = AS_DECLARED, progress: Progress = SILENT) -> Estimate:
         from orthaug.fitting.estimation import fit

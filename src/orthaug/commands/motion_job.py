@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -66,6 +66,13 @@ class MotionJob(Job):
     def structure(self) -> Structure:
         """The structure that the spec declares, under its measure."""
         return self.spec.declared_structure(None, self.measure)
+
+    def changed(self, spec: Spec) -> MotionJob:
+        assert spec.motion is not None
+        motion = spec.motion.declared(spec.data.inputs, spec.data.outputs)
+        inputs = spec.learner_inputs() if spec.declared_learner() is not None else None
+        problem = pose_motion(self.train.record, motion, inputs, spec.training.output_weights)
+        return replace(self, spec=spec, problem=problem, checkpoints=None)
 
     def run(self, variant: Variant = AS_DECLARED, progress: Progress = SILENT) -> MotionEstimate:
         from orthaug.fitting.motion_estimation import fit_motion

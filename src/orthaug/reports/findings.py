@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from pydantic import Field
 
 from orthaug.reports.fields import ByName, Content, Flag, Number, Numbers, WarningResult, Whole
@@ -303,6 +305,27 @@ class HoldResult(Content):
     residual: Number
     declared: Flag
     parameters: ByName | None
+
+
+class AdviceResult(Content):
+    """A change of the spec that was tried and bettered the free run where nothing was fitted.
+
+    `change` has the new values by their keys, `before` and `after` the RMS errors in standard deviations of the
+    training output; `before` is None where the model as it is diverges.
+    """
+
+    change: dict[str, Any]
+    text: str
+    before: Number
+    after: Number
+
+
+class AdviceTrialsResult(Content):
+    """How many changes of the spec were tried, and how many were left out to spare time."""
+
+    text: str
+    tried: Whole
+    not_tried: Whole
 
 
 class MotionCheckResult(Content):

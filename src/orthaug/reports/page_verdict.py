@@ -110,7 +110,7 @@ def _taken(rows: Sequence[RowResult], errors: Mapping[str, float]) -> str:
 
 def _after_comparison(result: CompareResult, row: RowResult) -> str:
     if row.residuals is not None and row.residuals.changes:
-        return f"{_change(row.residuals.changes[0])}."
+        return f"An option, not tried here: {_change(row.residuals.changes[0])}."
     if not result.data.tests and not result.data.validation:
         return "Hold out a test part, on which the models can be judged."
     if not result.data.validation:
@@ -267,57 +267,71 @@ def _is(names: list[str]) -> str:
 
 
 def _then(result: FitResult) -> str:
-    """The first thing to do."""
-    causes = [row.bias for row in _rows(result) if _biased(row) and row.bias]
-    cause = max(causes, key=lambda bias: bias.share or 0.0, default=None)
-    missing = result.residuals.missing.terms if result.residuals and result.residuals.missing else []
-    significant = result.residuals is not None and result.residuals.verdict == "unmodelled"
-    if _code(result) == "hurts":
-        return 'Take physics alone (`learner.kind = "none"`), or give the learner other inputs or fewer neurons.'
-    if missing and significant:
-        return f"Add {missing[0].expression} to the equation of {missing[0].equation}."
-    if cause is not None and (cause.share or 0.0) > _NAMED:
-        return _advised(cause, result.learns)
-    tried = result.validation is not None and _code(result) != "helps"
-    changes = [c for c in result.residuals.changes if c.kind != "learner" or not tried] if result.residuals else []
-    if changes:
-        return f"{_change(changes[0])}."
-    if cause is not None:
-        return _advised(cause, result.learns)
-    if _warned(result, _RAN_AWAY):
-        return 'Train on the free run (`focus = "simulation"`), or record data over the range that it leaves.'
-    if not result.data.tests and not result.data.validation:
-        return "Hold out a test part (`[data.tests.NAME]`), on which the model can be judged."
-    if result.status.code == "stopped":
-        return "Train it to the end, for it was stopped on request."
-    if result.status.code == "iteration_limit":
-        return "Give training more iterations (`training.iterations`)."
-    if result.validation is not None and result.validation.extrapolation:
-        entry = result.validation.extrapolation[0]
-        low, high = entry.found
-        return f"Record training data that reach {entry.regressor} from {number(low, 3)} to {number(high, 3)}."
-    if _warned(result, "closed_loop"):
-        return "Record the reference and model the whole loop, move it more, or record without the controller."
-    if _undecided(result):
-        return "Keep the learner (`training.fallback = false`) and look: cross-validation leaves undecided if it helps."
-    if result.residuals is not None and result.residuals.steps:
-        told = 'Train on the free run (`focus = "simulation"`), take fewer samples, or measure more finely'
-        return f"{told}: {_joined(list(result.residuals.steps))} has steps as large as the one-step residual."
-    if not _noise_alone(result):
-        return "Look at what the residual still follows (residual tests), and give the physics or a learner that."
-    if _worse(result.scores) is not None:
-        return f"Find what is different on {(_worse(result.scores) or ('', ''))[1]}, or train on more data of its kind."
+    """Return the first thing to do: a change that bettered the free run in a trial; else an option, named as one."""
+    if result.advice:
+        return result.advice[0].text
+    option = _option(result)
+    if option is not None:
+        return f"An option, not tried here: {option}."
+    if result.advice_trials is not None and result.advice_trials.tried:
+        text = "None of the changes that were tried betters the free run; export it (`orthaug export`), or design the"
+        return f"{text} next experiment."
     return "Nothing further is predicted to help; export it (`orthaug export`) or design the next experiment."
 
 
-def _advised(cause: BiasResult, learned: bool) -> str:
-    """What to do about a cause of what was learned, or of what the free run leaves."""
-    share = percent(cause.share)
-    if not learned:
-        return f"Add “{cause.cause}” to the physics, for it explains {share} of what the free run leaves."
-    if (cause.share or 0.0) < SURE_SHARE:
-        return f"Try “{cause.cause}” in the physics: what was learned looks most like it ({share} of it)."
-    return f"Add “{cause.cause}” to the physics, for it explains {share} of what was learned."
+def _option(result: FitResult) -> str | None:
+    """Return what may help and was not tried, as the middle of a sentence."""
+    if _code(result) == "hurts":
+        return 'physics alone (`learner.kind = "none"`), or a learner of other inputs or fewer neurons'
+    predicted = None if result.advice_trials is not None else _predicted(result)
+    if predicted is not None:
+        return predicted
+    if not result.data.tests and not result.data.validation:
+        return "a test part (`[data.tests.NAME]`), held out to judge the model on"
+    if result.status.code == "stopped":
+        return "training to the end, for it was stopped on request"
+    if result.status.code == "iteration_limit":
+        return "more iterations (`training.iterations`), for training ended at their limit"
+    if result.validation is not None and result.validation.extrapolation:
+        entry = result.validation.extrapolation[0]
+        low, high = entry.found
+        return f"training data that reach {entry.regressor} from {number(low, 3)} to {number(high, 3)}"
+    if _warned(result, _RAN_AWAY):
+        return "data over the range that the free run leaves"
+    if _warned(result, "closed_loop"):
+        return "data with the reference recorded, to model the whole loop, with more of its motion, or in open loop"
+    if _undecided(result):
+        return "the learner (`training.fallback = false`), for cross-validation leaves undecided if it helps"
+    if result.residuals is not None and result.residuals.steps:
+        steps = _joined(list(result.residuals.steps))
+        return f"fewer samples, or a finer measurement, for the steps of {steps} are as large as the one-step residual"
+    if not _noise_alone(result):
+        return "physics of your own for what the residual still follows (residual tests; `[[suspects]]` tests a form)"
+    worse = _worse(result.scores)
+    return None if worse is None else f"more training data of the kind of {worse[1]}, on which the error is larger"
+
+
+def _predicted(result: FitResult) -> str | None:
+    """Return the change with the largest gain that findings predict, where none was tried."""
+    causes = [row.bias for row in _rows(result) if _biased(row) and row.bias]
+    cause = max(causes, key=lambda bias: bias.share or 0.0, default=None)
+    missing = result.residuals.missing.terms if result.residuals and result.residuals.missing else []
+    if missing and result.residuals is not None and result.residuals.verdict == "unmodelled":
+        return f"the term {missing[0].expression} in the equation of {missing[0].equation}"
+    if cause is not None and (cause.share or 0.0) > _NAMED:
+        return _cause_option(cause, result.learns)
+    tried = result.validation is not None and _code(result) != "helps"
+    changes = [c for c in result.residuals.changes if c.kind != "learner" or not tried] if result.residuals else []
+    if changes:
+        return _change(changes[0])
+    return None if cause is None else _cause_option(cause, result.learns)
+
+
+def _cause_option(cause: BiasResult, learned: bool) -> str:
+    """Return a cause of what was learned, or of what the free run leaves, as a term of the physics."""
+    looks = "looks most like it" if (cause.share or 0.0) < SURE_SHARE and learned else "is that"
+    what = "what was learned" if learned else "what the free run leaves"
+    return f"“{cause.cause}” in the physics, for {percent(cause.share)} of {what} {looks}"
 
 
 def _undecided(result: FitResult) -> bool:
@@ -327,10 +341,10 @@ def _undecided(result: FitResult) -> bool:
 
 
 def _change(change: object) -> str:
-    """A change that is predicted to help, as the beginning of a sentence."""
+    """Return a change with what it is predicted to gain, as the middle of a sentence."""
     told = {key: getattr(change, key) for key in ("kind", "what", "fall", "of", "output")}
-    text = str(Change(**{**told, "fall": told["fall"] or 0.0}))
-    return text[0].upper() + text[1:]
+    predicted = Change(**{**told, "fall": told["fall"] or 0.0})
+    return f"{predicted.name}, with which {predicted.prediction}"
 
 
 def _joined(words: list[str]) -> str:

@@ -13,6 +13,8 @@ from orthaug.physics.baseline import Parameter
 from orthaug.physics.parameters import PhysicalParameter
 from orthaug.reports.fields import ByName, Content, Flag, Number, Numbers, WarningResult, Whole
 from orthaug.reports.findings import (
+    AdviceResult,
+    AdviceTrialsResult,
     BiasResult,
     DiagnosisResult,
     MissingLagsResult,
@@ -293,6 +295,8 @@ class FitResult(Headed):
     motion: MotionFitResult | None = None
     terms: list[TermResult] | None = None
     equation: EquationResult | None = None
+    advice: list[AdviceResult] = []
+    advice_trials: AdviceTrialsResult | None = None
     warnings: list[WarningResult]
 
     @property

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from orthaug.models.response import Response, Scores
 
 SHOWN = 8  # signals of a design that are listed
+ADVISED = 2  # changes that a text advises at most; result.json has all
 
 
 def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
@@ -49,7 +50,14 @@ def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
     findings += [result.stability] if result.motion is not None else []
     told = [finding.text for finding in findings if finding]
     blocks += [told, warning_lines(w for w in dict.fromkeys(result.warnings) if w.text not in told)]
+    blocks.append(_advice_lines(result))
     return "\n\n".join("\n".join(fold(lines)) for lines in blocks if lines)
+
+
+def _advice_lines(result: FitResult) -> list[str]:
+    """Changes of the spec that bettered the free run in a trial, and an account of all trials."""
+    lines = [f"{'Next: ' if i == 0 else 'Or: '}{advice.text}" for i, advice in enumerate(result.advice[:ADVISED])]
+    return lines + ([result.advice_trials.text] if result.advice_trials is not None else [])
 
 
 def check_text(result: CheckResult) -> str:

@@ -1,0 +1,185 @@
+"""Advice is tried before it is given: refits of a changed spec, compared by free runs over rows held out."""
+
+from __future__ import annotations
+
+import html
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tomlkit
+from helpers import unfolded
+from test_motion_cli import friction, orthaug
+
+import orthaug as oa
+from orthaug.reports.page_verdict import fit_verdict
+
+LAGGED = """
+[data]
+sampling_time = 0.01
+inputs = ["u"]
+outputs = ["v"]
+train = { files = ["run.csv"] }
+[[baseline.terms]]
+parameter = "a"
+regressor = "v[k-1]"
+[[baseline.terms]]
+parameter = "b"
+regressor = "u[k-1]"
+[learner]
+kind = "none"
+"""
+MOTION = """
+[data]
+sampling_time = 0.01
+inputs = ["force"]
+outputs = ["position"]
+train = { files = ["run.csv"] }
+[motion]
+substeps = 1
+[motion.states]
+x = { derivative = "v", start = "position" }
+v = { derivative = "(force - c*v - k*x)/m", start = "derivative of position" }
+[motion.outputs]
+position = "x"
+[motion.parameters]
+m = { initial = 1.0, min = 0 }
+c = { initial = 2.0, min = 0 }
+k = { initial = 100.0, min = 0 }
+[learner]
+kind = "none"
+"""
+
+
+def driven(step: Any, rows: int = 900) -> np.ndarray:
+    """Input and output (rows, 2) of v[k] = step(k, v, u) + noise under a random staircase."""
+    random = np.random.default_rng(1)
+    u = np.repeat(random.uniform(-1, 1, rows // 10 + 1), 10)[:rows]
+    v = np.zeros(rows)
+    for k in range(1, rows):
+        v[k] = step(k, v[k - 1], u[k - 1]) + 0.002 * random.normal()
+    return np.column_stack([u, v])
+
+
+def with_friction(k: int, v: float, u: float) -> float:
+    return 0.9 * v + 0.1 * u - 0.03 * np.sign(v)
+
+
+def put(folder: Path, text: str, data: np.ndarray, names: str = "u,v") -> Path:
+    np.savetxt(folder / "run.csv", data, delimiter=",", header=names, comments="")
+    spec = folder / "spec.toml"
+    spec.write_text(text)
+    return spec
+
+
+def errors(text: str) -> tuple[float, float]:
+    """The figures of an advice."""
+    before, after = text.split(" improves from ")[1].split(" of the output")[0].split(" to ")
+    return float(before), float(after)
+
+
+def suspect(kind: str, on: str, more: str = "") -> str:
+    return f'[[suspects]]\nkind = "{kind}"\non = "{on}"\n{more}'
+
+
+def test_the_right_term_is_advised_with_its_figure_in_text_page_and_numbers(tmp_path):
+    spec = put(tmp_path, LAGGED, driven(with_friction))
+    code, out, _ = orthaug("fit", spec, "--out", tmp_path / "out")
+    printed = unfolded(out)
+    assert code == 0
+    told = json.loads((tmp_path / "out/result.json").read_text())
+    term = next(a for a in told["advice"] if "the term sign(v[k-1]) in the physics" in a["text"])
+    assert term["after"] < 0.5 * term["before"]
+    assert errors(term["text"]) == pytest.approx((term["before"], term["after"]), rel=5e-3)
+    assert term["change"]["baseline.terms"][-1] == {"parameter": "size", "regressor": "sign(v[k-1])"}
+    assert told["advice"] == sorted(told["advice"], key=lambda a: a["after"])
+    first = told["advice"][0]["text"]
+    assert f"Next: {first}" in printed and told["advice_trials"]["text"] in printed
+    assert first in html.unescape((tmp_path / "out/report.html").read_text())
+
+
+def test_advice_that_is_followed_does_what_it_says(tmp_path):
+    """The change as it stands in result.json makes the spec whose free run is better on a test as well."""
+    text = LAGGED.replace("[[baseline", 'tests.other = { files = ["run.csv"], rows = [600, 900] }\n[[baseline', 1)
+    text = text.replace('files = ["run.csv"] }', 'files = ["run.csv"], rows = [0, 600] }', 1)
+    spec = put(tmp_path, text, driven(with_friction))
+    fitted = oa.fit_spec(str(spec))
+    change = next(a.change for a in fitted.result.advice if "sign(v[k-1])" in a.text)
+    content = tomllib.loads(text) | {"baseline": {"terms": change["baseline.terms"]}}
+    spec.write_text(tomlkit.dumps(content))
+    followed = oa.fit_spec(str(spec))
+    before, after = (f.result.scores["tests.other"].simulation.nrmse[0] for f in (fitted, followed))
+    assert after < 0.5 * before
+    assert not any("sign(v[k-1])" in a.text for a in followed.result.advice)
+
+
+def test_a_term_that_looks_best_but_hurts_where_nothing_was_fitted_is_not_advised(tmp_path):
+    """Over the record u² explains most of the residual, but it turns its sign where the rows are held out."""
+
+    def turning(k: int, v: float, u: float) -> float:
+        return 0.9 * v + 0.1 * u + (0.05 if k < 600 else -0.03) * (u**2 - 1 / 3)
+
+    more = suspect("expression", "u[k-1]**2 - 1/3") + suspect("cubic", "v[k-1]")
+    fitted = oa.fit_spec(str(put(tmp_path, LAGGED + more, driven(turning))))
+    assert fitted.result.advice_trials is not None
+    assert "the term u[k-1]**2 - 1/3 in the physics (" in fitted.result.advice_trials.text  # among those without gain
+    assert not any("u[k-1]**2" in a.text for a in fitted.result.advice)
+    assert "u[k-1]**2" not in fit_verdict(fitted.result).then
+
+
+def test_what_the_spec_has_is_never_advised(tmp_path):
+    """A term of the physics that is a suspect, too; the focus that was tried; a learner that sees all lags."""
+    text = LAGGED.replace("[learner]", '[[baseline.terms]]\nparameter = "d"\nregressor = "sign( v[k-1] )"\n[learner]')
+    text = text.replace('kind = "none"', 'kind = "mlp"\nhidden = [3]\n[validation]\nblocks = 0\n')
+    fitted = oa.fit_spec(str(put(tmp_path, text + suspect("coulomb", "v[k-1]"), driven(with_friction, 400))))
+    trials = "" if fitted.result.advice_trials is None else fitted.result.advice_trials.text
+    told = " ".join([a.text for a in fitted.result.advice] + [trials, fit_verdict(fitted.result).then])
+    assert "sign(" not in told and "also sees" not in told and "focus" not in told
+
+
+def dead(u: float, width: float = 0.4) -> float:
+    return u - np.clip(u, -width, width)
+
+
+@pytest.mark.parametrize(("beyond", "advised"), [(0.1, True), (-0.08, False)], ids=["dead zone", "limit"])
+def test_a_dead_zone_of_negative_size_is_never_advised(tmp_path, beyond: float, advised: bool):
+    """Where the slope falls beyond the width, the same columns would fit as well, but that is no dead zone."""
+    slope = 0.02 if advised else 0.1
+    data = driven(lambda k, v, u: 0.9 * v + slope * u + beyond * dead(u))
+    text = LAGGED + suspect("dead_zone", "u[k-1]", "width = 0.4")
+    fitted = oa.fit_spec(str(put(tmp_path, text, data)))
+    assert any("max(min(u[k-1], 0.4), -0.4)" in a.text for a in fitted.result.advice) == advised
+
+
+@pytest.fixture(scope="module")
+def moved(tmp_path_factory) -> Any:
+    """A mass with friction, of which the physics knows nothing."""
+    folder = tmp_path_factory.mktemp("moved")
+    return oa.fit_spec(str(put(folder, MOTION, friction(300, 3), "force,position")))
+
+
+def test_the_right_term_of_a_motion_is_advised_with_its_figure(moved):
+    first = moved.result.advice[0]
+    assert "the term sign(v) in the equation of v" in first.text and first.after < 0.7 * first.before
+    assert first.change["motion.states.v.derivative"] == "(force - c*v - k*x)/m + size*(sign(v))"
+    assert fit_verdict(moved.result).then == first.text
+    trials = moved.result.advice_trials
+    assert trials.tried >= 1 and (trials.not_tried == 0) == ("not tried" not in trials.text)
+
+
+def test_a_motion_is_not_advised_the_hold_or_the_learner_input_that_it_has(moved, tmp_path):
+    changes = [a.change for a in moved.result.advice]
+    assert not any(change.get("motion.hold") == "zero-order" for change in changes)
+    text = MOTION.replace('"derivative of position" }', '"derivative of position", learned = true }')
+    text = text.replace('kind = "none"', 'hidden = [3]\ninputs = ["v"]\n[training]\niterations = 5\n')
+    text += "[validation]\nblocks = 0\n"
+    fitted = oa.fit_spec(str(put(tmp_path, text, friction(300, 3), "force,position")))
+    told = [
+        fit_verdict(fitted.result).then,
+        *(a.text for a in fitted.result.advice),
+        *(w.text for w in fitted.result.warnings),
+    ]
+    assert not any("sees v" in text or "learner see" in text for text in told)
