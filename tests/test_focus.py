@@ -46,7 +46,10 @@ def test_noise_on_the_sensor_asks_for_the_free_run():
     data, test = record(sensor=0.02), record(seed=7)
     found, one_step = (oa.estimate(data, PHYSICS, learner=LEARNER, criterion=c) for c in (oa.Auto(), oa.Prediction()))
     assert found.focus.chosen == "simulation" and len(found.focus.candidates) == 4
-    assert "one step ahead is not enough" in found.focus.text and "trained on the free run" in found.focus.text
+    assert (
+        "trained one step ahead and, because its residual" in found.focus.text
+        and "trained on the free run" in found.focus.text
+    )
     assert free_run_error(found.model, test) < 0.7 * free_run_error(one_step.model, test)
     assert found.physics_alone.model.form.bound is None
     assert free_run_error(found.model, test) < free_run_error(found.physics_alone.model, test)
@@ -140,7 +143,7 @@ def test_both_models_are_kept_and_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write(tmp_path, sensor=0.02)
     done = run("fit", "spec.toml", "--out", "out")
-    assert done.code == 0 and "One step ahead is not enough" in done.out.replace("\n  ", " ")
+    assert done.code == 0 and "Trained one step ahead and, because" in done.out.replace("\n  ", " ")
     result = json.loads((tmp_path / "out/result.json").read_text())
     assert result["focus"]["chosen"] == "simulation" and len(result["focus"]["candidates"]) == 4
     scores = {}

@@ -212,8 +212,8 @@ def fit(
         return choose_focus(problem, fit, options, criterion)
     criterion = _settled(criterion, problem)
     blocks = _check_blocks(blocks)
-    conditions = {"linear": problem.baseline.linear, "validated": validation is not None}
-    choices = tried(regularization, solver, criterion, structure, learner=learner, **conditions)
+    given = {"linear": problem.baseline.linear, "validated": validation is not None, "learner": learner}
+    choices = tried(regularization, solver, criterion, structure, **given)
     auto = _check_regularizations(regularization, choices, validation is not None or blocks > 0)
     restarts, seed = checked_starts(restarts, seed, warm=initial is not None, ensemble=ensemble)
     check_solver(solver, criterion, () if learner is None else choices)
@@ -241,7 +241,6 @@ def fit(
     estimate = replace(estimate, warnings=(*told, *estimate.warnings))
     if problem.weight.choice != "covariance" or problem.weight.kind == "covariance" or not solved:
         return estimate
-
     more = {"learner": learner, "structure": structure, "criterion": criterion, "solver": solver, "engine": engine}
     return reweighted(estimate, partial(_again, **more, progress=progress))
 

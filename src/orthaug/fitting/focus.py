@@ -58,7 +58,7 @@ def choose_focus(problem: Any, fit: Fit, options: Mapping[str, Any], criterion: 
     try:
         return _best(_Choosing(problem, first, fit, options, flown), reason)
     except InputError as error:  # too few rows for a free run
-        text = f"{reason}, but the free run cannot be trained: {error}"
+        text = f"trained one step ahead; {reason}, but the free run cannot be trained: {error}"
         return replace(first, focus=Focus(ONE_STEP, text))
 
 
@@ -222,9 +222,9 @@ def _best(choosing: _Choosing, reason: str) -> Any:
     best, compared = choosing.estimate(key), tuple(Candidate(*one, error) for one, error in errors.items())
     named = {(one.focus, one.learner): one for one in compared}
     text = (
-        f"one step ahead is not enough: {reason}. So the free run was trained, too. Errors of free runs where nothing "
-        f"was fitted, in standard deviations of the output: {'; '.join(one.described for one in compared)}. "
-        f"The result is {named[key]}."
+        f"trained one step ahead and, because {reason}, on the free run as well. Errors of free runs where nothing was "
+        f"fitted, in standard deviations of the output: {'; '.join(one.described for one in compared)}. The result is "
+        f"{named[key]}."
     )
     warnings = list(best.warnings)
     if choosing.learns and not key[1]:
