@@ -35,8 +35,8 @@ initial = 0.9
 ALONE = '[learner]\nkind = "none"\n'
 SMALL = "[learner]\nhidden = [4]\n"
 GREEDY = "[learner]\nhidden = [30]\n"
-FREE = '[training]\nfocus = "simulation"\nsegment = 64\nwashout = 8\nstart_iterations = 5\niterations = 25\n'
-QUICK = '[training]\niterations = 40\nregularization = "none"\n'
+FREE = '[training]\nfocus = "simulation"\nsegment = 64\nwashout = 8\nstart_iterations = 5\n'
+QUICK = '[training]\nfocus = "prediction"\niterations = 40\nregularization = "none"\n'
 FAR = '[data.tests.far]\nfiles = ["far.csv"]\n'
 
 
