@@ -35,8 +35,9 @@ initial = 0.9
 ALONE = '[learner]\nkind = "none"\n'
 SMALL = "[learner]\nhidden = [4]\n"
 GREEDY = "[learner]\nhidden = [30]\n"
-FREE = '[training]\nfocus = "simulation"\nsegment = 64\nwashout = 8\nstart_iterations = 5\niterations = 25\n'
-QUICK = '[training]\niterations = 40\nregularization = "none"\n'
+UNBOUNDED = GREEDY + 'beyond = "free"\n'
+FREE = '[training]\nfocus = "simulation"\nsegment = 64\nwashout = 8\nstart_iterations = 5\n'
+QUICK = '[training]\nfocus = "prediction"\niterations = 40\nregularization = "none"\n'
 FAR = '[data.tests.far]\nfiles = ["far.csv"]\n'
 
 
@@ -118,7 +119,7 @@ def test_the_free_run_is_better_than_after_one_step_training(free, tmp_path):
 WAYS = {
     "whole": FREE.replace("segment = 64", "segment = 0"),
     "exact": FREE.replace("washout = 8", "washout = 0").replace("start_iterations = 5", "start_iterations = 0"),
-    "five steps": "[training]\nhorizon = 5\niterations = 20\n",
+    "five steps": "[training]\nhorizon = 5\n",
     "ensemble": FREE + "ensemble = true\nrestarts = 2\n",
 }
 
@@ -141,7 +142,7 @@ def test_physics_alone_on_the_free_run(tmp_path):
 
 
 def test_one_step_with_sensor_noise_is_told(tmp_path):
-    spec = project(tmp_path / "p", ALONE, **system(0, 600, sensor=0.3))
+    spec = project(tmp_path / "p", ALONE, QUICK, **system(0, 600, sensor=0.3))
     printed, result = printed_fit(spec)
     assert result["residuals"]["verdict"] == "sensor_noise"
     told = [w["text"] for w in result["warnings"]]
@@ -203,7 +204,7 @@ def test_a_question_ends_with_its_own_mark(tmp_path):
 @pytest.fixture(scope="module")
 def overfitted(tmp_path_factory):
     """151 weights on 60 noisy rows of a linear system, tested far outside: the spec."""
-    spec = project(tmp_path_factory.mktemp("over") / "p", GREEDY, QUICK, FAR, **system(3, 60, equation=0.3))
+    spec = project(tmp_path_factory.mktemp("over") / "p", UNBOUNDED, QUICK, FAR, **system(3, 60, equation=0.3))
     write_csv(spec.parent / "far.csv", **system(4, 200, equation=0.3, scale=4.0))
     return spec
 
@@ -254,7 +255,13 @@ def test_a_record_too_short_for_blocks_is_told(tmp_path, blocks):
     """No verdict, and a sentence that says why."""
     rows, learner = (300, SMALL) if blocks else (60, GREEDY)
     result = fit(
-        project(tmp_path / "p", learner, "[training]\niterations = 5\n", blocks, **system(0, rows, equation=0.1))
+        project(
+            tmp_path / "p",
+            learner,
+            '[training]\nfocus = "prediction"\niterations = 5\n',
+            blocks,
+            **system(0, rows, equation=0.1),
+        )
     )
     assert result["validation"] is None
     assert any("too few" in w["text"] and "blocks" in w["text"] for w in result["warnings"])

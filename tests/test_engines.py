@@ -41,6 +41,7 @@ nb = 2
 [learner]
 hidden = [3]
 [training]
+focus = "prediction"
 iterations = 8
 regularization = {regularization}
 [structure]

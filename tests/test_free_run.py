@@ -25,7 +25,7 @@ from orthaug.models.learners import MLP
 from orthaug.physics.baseline import Baseline, Term
 
 STRUCTURES = (Orthogonal(), Additive(), OrthogonalPenalty(1.0), BaselinePenalty(1.0))
-LM, FREE, NETWORK = LevenbergMarquardt(40), Simulation(64, 8, 10), MLP(hidden=(3,))
+LM, FREE, NETWORK = LevenbergMarquardt(150), Simulation(64, 8, 10), MLP(hidden=(3,))
 TERMS = [Term("a", "y[k-1]", 0.8), Term("b", "y[k-2]", -0.2), Term("g", "u[k-1]", 0.4)]
 PHYSICS = Baseline.from_terms(TERMS)
 
@@ -631,7 +631,7 @@ def test_a_run_that_is_stopped_is_kept_and_tried_on_no_block():
 def test_a_theta_that_the_data_do_not_determine_beside_the_learner_has_a_sentence(monkeypatch):
     nothing = np.full((3, 3), np.nan)
     monkeypatch.setattr("orthaug.fitting.flights.theta_block", lambda *_: nothing)
-    fit = choosing(nonlinear(), PHYSICS, learner=NETWORK, criterion=FREE, solver=LevenbergMarquardt(3), blocks=0)
+    fit = choosing(nonlinear(), PHYSICS, learner=NETWORK, criterion=FREE, blocks=0)
     assert np.isnan(fit.std).all()
     assert [w.text[:60] for w in fit.warnings if w.code == "no_standard_errors"] == [
         "no standard errors: beside the learner's weights the data do"

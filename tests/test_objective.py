@@ -15,6 +15,7 @@ from orthaug.fitting.flight_plan import FlightPlan, StructuredObjective
 from orthaug.fitting.initial_states import Start
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.solvers.descent import MARQUARDT, SquaredResiduals, descend
+from orthaug.fitting.solvers.limit import Limit
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
 from orthaug.models.learners import MLP
@@ -157,7 +158,7 @@ class Rejecting:
 def test_a_rejected_trial_leaves_nothing_behind(evidence):
     given = objective()
     p, q = points(given)
-    options = {"iterations": 6, "tolerance": 1e-9, "damping": MARQUARDT, "ridge": 1.0, "evidence": evidence}
+    options = {"limit": Limit(6, 6), "tolerance": 1e-9, "damping": MARQUARDT, "ridge": 1.0, "evidence": evidence}
     plain = descend(given, p, nowhere(given), **options)
     disturbed = descend(Rejecting(given, q), p, nowhere(given), **options)
     assert plain.ending is Ending.RUNNING and plain.flown.loss < given.fly(p, nowhere(given)).loss

@@ -28,7 +28,7 @@ def spec(tmp_path: Path) -> Path:
         run = record.experiments[0].rows(0, 1500)
         table = np.column_stack([run.inputs, run.outputs])
         np.savetxt(tmp_path / f"{name}.csv", table, fmt="%.17g", delimiter=",", header="force,position", comments="")
-    text = demo.SPEC.replace("[training]", "[training]\niterations = 3")
+    text = demo.SPEC.replace("[training]", "[training]\nfocus = \"prediction\"\niterations = 3")
     (tmp_path / "spec.toml").write_text(text, encoding="utf-8")
     return tmp_path / "spec.toml"
 

@@ -13,6 +13,7 @@ import scipy.signal
 
 from orthaug.fitting.colour import independent_share
 from orthaug.fitting.solvers.descent import MARQUARDT, SquaredResiduals, descend
+from orthaug.fitting.solvers.limit import Limit
 from orthaug.fitting.status import Ending
 
 
@@ -68,8 +69,8 @@ class Outcome(NamedTuple):
     ending: Ending
 
 
-def run(objective, p, *, physics=None, **options):
-    options = {"iterations": 200, "tolerance": 1e-14, "damping": MARQUARDT} | options
+def run(objective, p, *, physics=None, iterations=200, **options):
+    options = {"limit": Limit(iterations, iterations), "tolerance": 1e-14, "damping": MARQUARDT} | options
     objective.physics = len(p) if physics is None else physics
     end = descend(objective, np.array(p, dtype=float), None, **options)
     hessian = None if end.linear is None else end.linear.hessian

@@ -23,7 +23,7 @@ from orthaug.physics.baseline import Baseline, Term
 from orthaug.reports.result import MeasureResult
 from orthaug.studies.synthetic import static
 
-QUICK = LevenbergMarquardt(iterations=15)
+QUICK = LevenbergMarquardt()
 WIDE = Uniform({"u[k]": (-0.6, 0.6)})
 RNG = np.random.default_rng(2)
 ROWS = 300
@@ -59,7 +59,7 @@ FIXED = {"y1": lambda x: -0.2 * x["y1[k-2]"], "y2": lambda x: 0.0}
 @pytest.fixture(scope="module")
 def two():
     """Several outputs, a shared parameter, a fixed term."""
-    return estimate(plant(), Baseline.from_terms(TERMS), learner=NET, solver=QUICK)
+    return estimate(plant(), Baseline.from_terms(TERMS), learner=MLP((4,), beyond="free"), solver=QUICK)
 
 
 @pytest.fixture(scope="module")
@@ -223,7 +223,7 @@ def test_the_uniform_measure_finds_the_papers_parameters(data_set, coarser):
 
 
 def test_estimate_under_a_measure_is_the_split(coarser):
-    example = static(3)
+    example = static(3, noise=True)
     given = {"learner": NET, "solver": QUICK}
     direct = estimate(example.train, example.baseline, structure=Orthogonal(measure=WIDE), **given)
     split = estimate(example.train, example.baseline, **given).split(WIDE)

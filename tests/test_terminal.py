@@ -22,6 +22,7 @@ COMMAND = [sys.executable, "-m", "orthaug"]
 LEARNER = """kind = "mlp"
 hidden = [3]
 [training]
+focus = "prediction"
 iterations = 3
 restarts = 2
 [validation]

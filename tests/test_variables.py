@@ -247,6 +247,8 @@ files = ["{file}"]
 rows = [2000, 3499]
 [learner]
 kind = "none"
+[training]
+focus = "prediction"
 """
 
 
@@ -284,6 +286,8 @@ parameter = "b"
 regressor = "u[k-1]"
 [learner]
 kind = "none"
+[training]
+focus = "prediction"
 """
 
 

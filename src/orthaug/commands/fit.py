@@ -182,7 +182,7 @@ def told_of(job: Job, fit: Any) -> Fitted:
     physics, alone = fit.physics_alone, {}
     if physics is not None and physics.status.ok:
         alone = {part.name: score_part(physics.model, part, [])[0] for part in job.parts}
-    if fit.status.ok and job.spec.training.focus == "prediction" and fit.model.form.bound is not None:
+    if fit.status.ok and job.spec.training.chosen_focus() == "prediction" and fit.model.form.bound is not None:
         warnings += _one_step_only(scores, alone, [part.name for part in job.parts if part not in job.tests])
     fit, told = kind_of(job).content(job, fit, responses, warnings)
     if fit.status.ok and told["residuals"] is not None:

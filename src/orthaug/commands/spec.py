@@ -167,9 +167,14 @@ class TrainingSection(KindSection):
     @model_validator(mode="after")
     def _check(self) -> TrainingSection:
         check_starts(self.restarts, self.seed, ensemble=self.ensemble)
-        solver, criterion = self.declared(SOLVERS, self.solver), self.declared(CRITERIA, self.focus)
+        solver, criterion = self.declared(SOLVERS, self.solver), self.declared(CRITERIA, self.chosen_focus())
         check_solver(solver, criterion, _as_list(self.regularization))
         return self
+
+    def chosen_focus(self) -> str:
+        """Return the focus; `prediction` where `horizon` asks for more than one step ahead and no focus is written."""
+        ahead = "focus" not in self.model_fields_set and getattr(self, "horizon", 1) > 1
+        return "prediction" if ahead else self.focus
 
 
 class SelectionSection(Section):
@@ -298,7 +303,7 @@ class Spec(Section):
         """The criterion. A motion is trained on its free run, from starts that are estimated: without a washout."""
         training = self.training
         if self.motion is None:
-            return resolve(training.declared(CRITERIA, training.focus))
+            return resolve(training.declared(CRITERIA, training.chosen_focus()))
         focus = "simulation" if training.focus == "auto" else training.focus
         washout = {} if "washout" in training.model_fields_set else {"washout": 0}
         return resolve(training.model_copy(update=washout).declared(CRITERIA, focus))
