@@ -22,6 +22,7 @@ from orthaug.data.record import Record
 from orthaug.fitting.criteria import Prediction
 from orthaug.fitting.held_out import Candidate, Focus, Pieces, blocked, mean_square, squared_errors
 from orthaug.fitting.training import FOLD_ITERATIONS
+from orthaug.fitting.unfinished import NOT_CONVERGED
 
 ONE_STEP, FREE_RUN = "prediction", "simulation"
 BLOCKS = 4  # blocks that are held out in turn where that is not said
@@ -156,9 +157,9 @@ class _Choosing:
 
     @cached_property
     def free(self) -> Any:
-        """The fit on the free run, from one start: all of them begin at physics alone with a silent learner."""
+        """The fit on the free run, from one start, for all begin at physics alone; within its limit, to save time."""
         chosen = {**self.options, "fallback": False, "blocks": 0, "restarts": 1}
-        return self.fit(self.problem, criterion=self.flown, **chosen)
+        return self.fit(self.problem, criterion=self.flown, **chosen | {"solver": self.options["solver"].within_limit})
 
     @cached_property
     def free_physics(self) -> Any:
@@ -227,6 +228,8 @@ def _best(choosing: _Choosing, reason: str) -> Any:
         f"{named[key]}."
     )
     warnings = list(best.warnings)
+    if any(warning.code == NOT_CONVERGED for warning in warnings):
+        text += ' Training on the free run stopped at its limit to save time; `focus = "simulation"` goes on.'
     if choosing.learns and not key[1]:
         rival = min((one for one in compared if one.learner), key=lambda one: one.error)
         told = f"no learner is better in free run where nothing was fitted ({rival.described}), so the result is"
