@@ -897,8 +897,8 @@ def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
     page.get_by_label("or its path").fill(str(tmp_path / "absent.csv"))
     page.get_by_role("button", name="Open").click()
     page.wait_for_selector("text=no such file")
-    (tmp_path / "run.txt").write_text("no data")
-    page.set_input_files("#dropped", tmp_path / "run.txt")
+    (tmp_path / "run.docx").write_text("no data")
+    page.set_input_files("#dropped", tmp_path / "run.docx")
     page.wait_for_selector("text=no data file that is known")
     tab.told.clear()  # the browser tells of the 422
     (tmp_path / "own.csv").write_text(csv.read_text().replace("u,y", "force,<i>way</i>"))
