@@ -478,7 +478,7 @@ def test_a_split_takes_the_rows_of_the_training(inside, tmp_path):
 
 def test_the_measure_of_the_spec_is_that_of_split(inside, tmp_path):
     text = (
-        SPEC.replace('kind = "none"\n', MLP)
+        SPEC.replace('kind = "none"\n', MLP.replace("iterations = 5", 'focus = "prediction"'))
         + '[structure.measure]\nkind = "uniform"\nbox = { "u[k-1]" = [-0.6, 0.6] }\n'
     )
     Path("uniform.toml").write_text(text)
