@@ -25,7 +25,7 @@ from orthaug.fitting.learned import Learned, Task
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.silence import add_retries, tell_retries
 from orthaug.fitting.status import Ending
-from orthaug.fitting.structures import Structure
+from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.models.learners import Bound
 
 _INFLATION = 1.4  # of the effective weights in cross-validation, against what follows the noise (Kim and Gu 2004)
@@ -153,7 +153,7 @@ def train(
         *tell_retries(planned, starts, runs, held_out, best),
     )
     kept = best >= 0 and task.bound is not None and not hasattr(task.problem, "source")  # no further pass over files
-    physics = _alone(conclude, task, structure) if kept else None
+    physics = _kept_physics(conclude, task, structure) if kept else None
     return replace(
         estimate, restarts=restarts, status=status, held_out=held_out, physics_alone=physics, warnings=warnings
     )
@@ -330,6 +330,12 @@ def _fell_back(held_out: HeldOut) -> Warning:
 def _alone(conclude: Concluding, task: Task, structure: Structure) -> Any:
     rows, learned = task.physics_alone()
     return replace(conclude(rows, structure, learned), criterion=task.criterion)
+
+
+def _kept_physics(conclude: Concluding, task: Task, structure: Structure) -> Any:
+    """Return physics alone to set beside a learner: least squares one step ahead, whatever penalty θ has beside it."""
+    plain = task.criterion.one_step and not structure.projects
+    return _alone(conclude, task, Orthogonal() if plain else structure)
 
 
 def _concluded(conclude: Concluding, task: Task, structure: Structure, learned: Learned) -> Any:
