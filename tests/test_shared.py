@@ -291,7 +291,7 @@ def test_a_bound_holds_beside_the_learner():
 
 
 def test_an_ensemble_says_that_it_has_no_standard_errors():
-    options = {"restarts": 2, "ensemble": True}
+    options = {"solver": LevenbergMarquardt(5), "restarts": 2, "ensemble": True}
     fit = estimate(oscillator(), OSCILLATOR, learner=VELOCITY, **options)
     assert fit.std is None and "no_standard_errors" in [warning.code for warning in fit.warnings]
 
