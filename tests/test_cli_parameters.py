@@ -478,14 +478,14 @@ def test_a_split_takes_the_rows_of_the_training(inside, tmp_path):
 
 def test_the_measure_of_the_spec_is_that_of_split(inside, tmp_path):
     text = (
-        SPEC.replace('kind = "none"\n', MLP)
+        SPEC.replace('kind = "none"\n', MLP.replace("iterations = 5", 'focus = "prediction"\nregularization = "none"'))
         + '[structure.measure]\nkind = "uniform"\nbox = { "u[k-1]" = [-0.6, 0.6] }\n'
     )
     Path("uniform.toml").write_text(text)
     done = run("fit", "uniform.toml", "--json", "--out", tmp_path / "out")
     result = finite_json(done.out)
     split = finite_json(
-        run("split", "out", "run.csv", "--measure", "uniform", "--box", "u[k-1]=-0.6:0.6", "--json").out
+        run("split", tmp_path / "out", "run.csv", "--measure", "uniform", "--box", "u[k-1]=-0.6:0.6", "--json").out
     )
     assert result["measure"] == "uniform" and load(tmp_path / "out").measure == "uniform"
     for key in ("value", "std"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,6 +41,8 @@ class Fitted:
     result: FitResult
     responses: Mapping[str, tuple[Response, Response]]
     """One-step prediction and free run of every part, by its name; none where training failed."""
+    alone: Mapping[str, tuple[Response, Response]] = field(default_factory=dict)
+    """The same of physics alone, where that was fitted, too."""
 
     def __repr__(self) -> str:
         return f"Fitted({self.job.path.name}: {self.fit!r})"
@@ -95,7 +97,8 @@ def judged(fitted: Fitted) -> Fitted:
         return fitted
     failed: list[Any] = []
     physics = cache(partial(_physics_alone, fitted))
-    verdict = attempt("the judgement of the learner", lambda: judge_fit(fitted, physics), failed, None)
+    alone = fitted.alone or None
+    verdict = attempt("the judgement of the learner", lambda: judge_fit(fitted, physics, alone=alone), failed, None)
     warnings += failed
     asked = fit.model.form.bound is not None and job.spec.validation.blocks != 0
     if verdict is None and asked and not failed:
@@ -179,9 +182,10 @@ def told_of(job: Job, fit: Any) -> Fitted:
     if fit.status.ok:
         for part in job.parts:
             scores[part.name], responses[part.name] = score_part(fit.model, part, warnings)
-    physics, alone = fit.physics_alone, {}
+    physics, alone, ran = fit.physics_alone, {}, {}
     if physics is not None and physics.status.ok:
-        alone = {part.name: score_part(physics.model, part, [])[0] for part in job.parts}
+        ran = {part.name: score_part(physics.model, part, []) for part in job.parts}
+        alone = {name: scored for name, (scored, _) in ran.items()}
     if fit.status.ok and job.spec.training.chosen_focus() == "prediction" and fit.model.form.bound is not None:
         warnings += _one_step_only(scores, alone, [part.name for part in job.parts if part not in job.tests])
     fit, told = kind_of(job).content(job, fit, responses, warnings)
@@ -206,7 +210,9 @@ def told_of(job: Job, fit: Any) -> Fitted:
     if terms:
         written = {writing: equation(fit.model, writing) for writing in ("text", "latex")}
         content |= {"terms": terms, "equation": written}
-    return Fitted(job, fit, FitResult.model_validate(content), responses)
+    return Fitted(
+        job, fit, FitResult.model_validate(content), responses, {name: both for name, (_, both) in ran.items()}
+    )
 
 
 def _status(fit: Any, warnings: Sequence[Any]) -> Any:

@@ -59,7 +59,7 @@ def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estim
     told: list[Warning] = []
     if unfinished(learned) and follows_training(structure, problem, learned):
         learned = withheld(learned)
-        told.append(not_converged(learned))
+        told += [not_converged(learned)] if learned.tilt is None else []  # longer training gives an ensemble none
     share = task.share(learned)
     finite = bool(np.isfinite(share.square) and np.isfinite(share.coordinates).all())
     ending = learned.ending if finite else Ending.NON_FINITE

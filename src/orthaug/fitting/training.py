@@ -25,7 +25,7 @@ from orthaug.fitting.learned import Learned, Task
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.silence import add_retries, tell_retries
 from orthaug.fitting.status import Ending
-from orthaug.fitting.structures import Structure
+from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.models.learners import Bound
 
 _INFLATION = 1.4  # of the effective weights in cross-validation, against what follows the noise (Kim and Gu 2004)
@@ -158,7 +158,7 @@ def train(
 def _beside(conclude: Concluding, task: Task, structure: Structure) -> Any:
     """The estimate of physics alone that a learner stands beside; None without one, and where it costs a pass."""
     streamed = hasattr(task.problem, "source")
-    return None if task.bound is None or streamed else _alone(conclude, task, structure)
+    return None if task.bound is None or streamed else _kept_physics(conclude, task, structure)
 
 
 def _restart(start: PlannedRun, run: Any, loss: float, error: float, score: float, *, chosen: bool) -> Restart:
@@ -332,6 +332,12 @@ def _fell_back(held_out: HeldOut) -> Warning:
 def _alone(conclude: Concluding, task: Task, structure: Structure) -> Any:
     rows, learned = task.physics_alone()
     return replace(conclude(rows, structure, learned), criterion=task.criterion)
+
+
+def _kept_physics(conclude: Concluding, task: Task, structure: Structure) -> Any:
+    """Return physics alone to set beside a learner: least squares one step ahead, whatever penalty θ has beside it."""
+    plain = task.criterion.one_step and not structure.projects
+    return _alone(conclude, task, Orthogonal() if plain else structure)
 
 
 def _concluded(conclude: Concluding, task: Task, structure: Structure, learned: Learned) -> Any:

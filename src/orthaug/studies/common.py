@@ -147,7 +147,7 @@ def trained(
     """
     if pipeline == "scripts":
         return published.train(example, structure, PIPELINES[which], seed)
-    solver = AdamLBFGS(*PIPELINES[which]) if pipeline == "paper" else LevenbergMarquardt(iterations)
+    solver = AdamLBFGS(*PIPELINES[which]) if pipeline == "paper" else LevenbergMarquardt(iterations, longest=iterations)
     options: dict[str, Any] = {"structure": structure, "solver": solver, "regularization": regularization}
     return estimate(example.train, example.baseline, seed=seed, **options)
 
