@@ -332,7 +332,7 @@ def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(fitted:
     term = found.missing.terms[0]
     assert (term.equation, term.variable, term.shape) == ("v", "v", "jump") and term.share > 0.5
     assert term.coefficient == pytest.approx(-0.6, rel=0.15)
-    assert "the equation of v lacks something odd in v" in found.text and "that may see v" in found.text
+    assert "the equation of v lacks something odd in v" in found.text and "*sign(v) would explain" in found.text
     helps = oa.verdict(fitted, alone, {"other": data(seed=9)})
     assert helps.code == "helps" and helps.trials[0].model < 0.5 * helps.trials[0].alone
     assert {e.lag for e in helps.extrapolation} <= {"x", "v", "u"}

@@ -31,7 +31,6 @@ angle = "q"
 w2 = {{ initial = 8, min = 0 }}
 c = {{ initial = 0.3, min = 0 }}
 [training]
-iterations = 30
 [validation]
 blocks = 0
 [learner]

@@ -73,8 +73,11 @@ def run(*words: object) -> None:
     assert stop.value.code in (0, None)
 
 
-def test_the_counts_of_a_fit(spec: Path, tmp_path: Path, counted: Counter[str]) -> None:
+def test_the_counts_of_a_fit(
+    spec: Path, tmp_path: Path, counted: Counter[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Both parts are scored, of the model and of physics alone, which the verdict takes; the page drops the learner."""
+    monkeypatch.setattr("orthaug.commands.fit.advised", lambda fitted: fitted)  # which fits other specs
     run("fit", spec, "--out", tmp_path / "result")
     assert counted["pose"] == counted["factor"] == counted["stack_rows"] == 1
     assert counted["simulate"] == 2

@@ -2,16 +2,16 @@
 
 The model as it is and every change of it are fitted to the same rows and run over the same others: the validation part,
 or the last third of the training rows as one long run. A change is advised where it lowers the error there surely, by
-the rule that all models are compared by (`Ratio`). Trials take no longer than the fit did; the rest is counted.
+the rule that all models are compared by (`Ratio`). A few changes are tried, the same on every machine; the rest is
+counted.
 """
 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from orthaug._base.errors import InputError
@@ -26,8 +26,7 @@ from orthaug.reports.findings import AdviceResult, AdviceTrialsResult
 from orthaug.reports.result import FitResult
 
 _PIECES = 3  # of the training rows, the last of which is held out where there is no validation part
-_MOST = 5  # changes that are tried
-_LEAST_SECONDS = 1.0  # that trials may take, however short the fit was: programs are compiled for each
+_MOST, _MOST_OF_A_MOTION = 3, 2  # changes that are tried: together they take about as long as the fit
 _SAME = 1e-6  # relative: two terms of one error span the same beside the physics, as a dead zone and a limit
 _LISTED = 3  # changes without gain that the text names
 
@@ -69,24 +68,16 @@ class Tried:
         return math.inf if self.pieces is None else math.sqrt(mean_square(self.pieces))
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Trials:
-    """Fits of changed specs, until `seconds` are spent."""
+    """Fits of changed specs."""
 
     job: Job
     rows: HeldOutRows
     variant: Variant
     unit: Any
-    seconds: float
     substeps: int | None = None
     """Of a motion that is integrated."""
-    spent: float = 0.0
-    longest: float = field(default=0.0)
-
-    @property
-    def exhausted(self) -> bool:
-        """Whether another trial would take longer than is left."""
-        return self.spent + self.longest > self.seconds
 
     def changed(self, change: dict[str, Any]) -> Job:
         """Return the job of a changed spec, with the substeps of the fit: looking for them would cost most.
@@ -99,7 +90,6 @@ class Trials:
 
     def run(self, job: Job, variant: Variant, accepts: Callable[[Any], bool] = lambda fit: True) -> Pieces | None:
         """Squared errors of the free run of a job's model; None where there is none, or it is not accepted."""
-        began = time.monotonic()
         try:
             fit = job.fold_fit(variant)(self.rows.training)
             if not fit.status.ok or not accepts(fit):
@@ -108,9 +98,6 @@ class Trials:
         except InputError as error:
             LOG.info("a change was not tried: %s", error)
             return None
-        finally:
-            took = time.monotonic() - began
-            self.spent, self.longest = self.spent + took, max(self.longest, took)
 
     def of(self, proposal: Proposal, *, physics_only: bool) -> Tried:
         """The trial of a proposal."""
@@ -139,15 +126,10 @@ def changed(declaration: dict[str, Any], change: dict[str, Any]) -> dict[str, An
     return found
 
 
-def advise(
-    job: Job, fit: Any, result: FitResult, seconds: float
-) -> tuple[list[AdviceResult], AdviceTrialsResult] | None:
+def advise(job: Job, fit: Any, result: FitResult) -> tuple[list[AdviceResult], AdviceTrialsResult] | None:
     """Return the changes that better the free run where nothing was fitted, and an account of all trials.
 
     None where nothing is proposed, or nothing can be tried.
-
-    Args:
-        seconds: that training took: trials take no longer.
     """
     found = proposals(job, result, fit)
     if not found or job.train.source is not None or job.spec.engine.kind not in ("auto", "memory"):
@@ -160,17 +142,12 @@ def advise(
     variant = Variant(None if learns else ALONE, criterion=fit.criterion)
     motion = result.motion
     substeps = None if motion is None or motion.integrator == "discrete" else motion.substeps
-    trials = Trials(job, rows, variant, fit.problem.deviation, max(seconds, _LEAST_SECONDS), substeps)
+    trials = Trials(job, rows, variant, fit.problem.deviation, substeps)
     base = trials.run(trials.changed({}), variant)
     if base is None:
         return None
-    physics_only = learns and trials.spent * (1 + min(len(found), _MOST)) > trials.seconds
-    tried: list[Tried] = []
-    for proposal in found[:_MOST]:
-        only = physics_only and not proposal.learns
-        if tried and trials.exhausted:
-            break
-        tried.append(trials.of(proposal, physics_only=only))
+    chosen = found[: _MOST if motion is None else _MOST_OF_A_MOTION]
+    tried = [trials.of(proposal, physics_only=False) for proposal in chosen]
     return _concluded(base, tried, rows, len(found) - len(tried), learns)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
@@ -71,20 +70,17 @@ class Fitted:
 @one_blas_thread()
 def fit_job(job: Job, progress: Progress = SILENT) -> Fitted:
     """Train as the spec says, score every part, ask whether the learner earns its place, and try what may better it."""
-    began = time.monotonic()
-    fitted = fit_variant(job, AS_DECLARED, progress)
-    seconds = time.monotonic() - began
-    return advised(judged(fitted), seconds)
+    return advised(judged(fit_variant(job, AS_DECLARED, progress)))
 
 
-def advised(fitted: Fitted, seconds: float) -> Fitted:
-    """Return a fit with the changes of its spec that were tried; its training took `seconds`."""
+def advised(fitted: Fitted) -> Fitted:
+    """Return a fit with the changes of its spec that were tried."""
     from orthaug.commands.advice import advise
 
     if not fitted.fit.status.ok or _stopped(fitted.fit):
         return fitted
     failed: list[Any] = []
-    found = attempt("the trial of advice", lambda: advise(fitted.job, fitted.fit, fitted.result, seconds), failed, None)
+    found = attempt("the trial of advice", lambda: advise(fitted.job, fitted.fit, fitted.result), failed, None)
     warnings = [*fitted.result.warnings, *(WarningResult.model_validate(warning) for warning in failed)]
     told = {"warnings": warnings} if found is None else {"advice": found[0], "advice_trials": found[1]}
     return replace(fitted, result=FitResult.model_validate({**dict(fitted.result), **told}))

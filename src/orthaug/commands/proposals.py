@@ -82,7 +82,8 @@ def _missing_terms(job: Job, result: FitResult) -> Iterator[Proposal]:
 
 def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
     """The suspects that explain most of what the learner found, or of what the physics leaves."""
-    left = _residual_columns(fit) if job.spec.motion is None and fit.model.form.bound is None else None
+    plain = job.spec.motion is None and fit.model.form.bound is None and len(fit.theta) > 0
+    left = _residual_columns(fit) if plain else None
     found = []
     for entry in result.bias or ():
         share, size = entry.explained, entry.coefficient_found
