@@ -598,7 +598,7 @@ def test_standard_deviations_of_the_physics(criterion):
 
 @pytest.mark.proof
 def test_standard_deviations_beside_a_regularised_learner(record_property):
-    criterion, solver = Simulation(64, 8, 10), LevenbergMarquardt(12)
+    criterion, solver = Simulation(64, 8, 10), LevenbergMarquardt()
     theta, std = monte_carlo(60, learner=MLP((2,)), criterion=criterion, regularization="evidence", solver=solver)
     ratio = theta.std(axis=0, ddof=1) / std.mean(axis=0)
     record_property("scatter over std", ", ".join(f"{one:.2f}" for one in ratio))
