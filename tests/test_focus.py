@@ -73,6 +73,16 @@ def test_a_learner_that_finds_noise_is_left_out():
     assert min(errors, key=errors.get)[1] is False
 
 
+def test_a_learner_that_is_wanted_is_kept():
+    """Few rows and noise: physics alone is better where nothing was fitted, and `fallback` says to keep the learner."""
+    data = record(rows=120, sensor=0.1, friction=0.0)
+    options = {"criterion": oa.Auto(), "regularization": "none", "fallback": False}
+    found = oa.estimate(data, PHYSICS, learner=oa.MLP(hidden=(24,)), **options)
+    errors = {(c.focus, c.learner): c.error for c in found.focus.candidates}
+    assert min(errors, key=errors.get)[1] is False
+    assert found.model.form.bound is not None and "one_step_only" not in [w.code for w in found.warnings]
+
+
 def test_a_validation_part_chooses():
     data, validation = record(sensor=0.02), record(seed=3, sensor=0.02)
     found = oa.estimate(data, PHYSICS, learner=LEARNER, criterion=oa.Auto(), validation=validation)

@@ -235,7 +235,7 @@ def _best(choosing: _Choosing, reason: str) -> Any:
         told = f"no learner is better in free run where nothing was fitted ({rival.described}), so the result is"
         warnings.append(Warning("physics_alone", f"{told} {named[key].described}."))
     if lost:
-        told = "every free run diverges over the training data, so the result is for one-step prediction only."
+        told = "every free run diverges, over training or held-out rows: the model is for one-step prediction only."
         warnings.append(Warning("one_step_only", told))
     physics = min((one for one in errors if not one[1]), key=lambda one: errors[one])
     kept = choosing.estimate(physics) if key[1] else None
@@ -243,19 +243,19 @@ def _best(choosing: _Choosing, reason: str) -> Any:
 
 
 def _ranked(errors: Mapping[Key, float], *, with_learner: bool) -> list[Key]:
-    """Return the candidates, the least error first and of alike ones the simplest; with a learner if it is wanted."""
+    """Return the candidates, the least error first and of alike ones the simplest; wanted learners before physics."""
     among = [key for key in errors if key[1] or not with_learner]
     least = min(errors[key] for key in among)
     alike = [key for key in among if errors[key] <= _SLACK * least]
-    return alike + sorted((key for key in among if key not in alike), key=lambda key: errors[key])
+    return alike + sorted((key for key in errors if key not in alike), key=lambda key: (key not in among, errors[key]))
 
 
 def _sound(choosing: _Choosing, key: Key) -> bool:
-    """Return whether a candidate runs over all training data, with a learner no worse than physics alone does."""
+    """Return whether a candidate runs over all training data, with a learner no worse than physics if that may be."""
     if not math.isfinite(choosing.errors[key]):
         return False
     problem = choosing.problem
     own = mean_square(_errors(choosing.estimate(key), problem.record, problem))
-    if not key[1] or not math.isfinite(own):
+    if not key[1] or not math.isfinite(own) or not choosing.options["fallback"]:
         return math.isfinite(own)
     return own <= _SLACK**2 * mean_square(_errors(choosing.estimate((key[0], False)), problem.record, problem))
