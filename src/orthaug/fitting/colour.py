@@ -11,6 +11,11 @@ _ROWS_PER_LAG = 20
 _NOISE = 1.5  # deviations of a correlation: what is below it on average is noise
 
 
+def autocorrelation(residuals: Matrix) -> Vector | None:
+    """Return the correlations ρ_1, ρ_2, … of stretches (s, T); None of fewer than 3 steps, and of zeros."""
+    return _correlations(_spectrum(residuals), residuals.shape[1])
+
+
 def independent_share(residuals: Matrix) -> float:
     """1 / (1 + 2 Σ ρ_i), the inverse autocorrelation time, summed up to the first correlation that is noise.
 

@@ -11,6 +11,7 @@ from annotated_types import Ge
 from orthaug._base.checks import check_count
 from orthaug._base.errors import KeyedError
 from orthaug._base.registry import LIBRARY_ONLY, check_fields
+from orthaug.fitting.colour import autocorrelation
 
 if TYPE_CHECKING:
     from orthaug.data.record import Record
@@ -240,11 +241,9 @@ def segment_for(record: Record, first_row: int, washout: int) -> int:
     steps = len(longest) - first_row
     outputs = longest.outputs[:_LOOKED_AT]
     centred = np.nan_to_num(outputs - np.nanmean(outputs, axis=0))
-    size = 2 ** int(np.ceil(np.log2(2 * len(centred))))
-    spectrum = np.abs(np.fft.rfft(centred, size, axis=0)) ** 2
-    correlation = np.fft.irfft(spectrum, size, axis=0)[: len(centred)]
-    short = (correlation <= correlation[0] / np.e).all(axis=1)
-    remembered = int(np.argmax(short)) if np.any(short) else len(centred)
+    found = [rho for rho in (autocorrelation(own[None]) for own in centred.T) if rho is not None]
+    short = np.all([rho <= 1 / np.e for rho in found], axis=0)  # none of constant outputs
+    remembered = int(np.argmax(np.append(short, True))) + 1
     segment = max(SHORT, _MEMORIES * remembered, 2 * washout)
     return 0 if 2 * segment > steps else segment
 

@@ -19,6 +19,7 @@ import numpy as np
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.progress import LOG
 from orthaug.data.record import Record
+from orthaug.fitting.colour import autocorrelation
 from orthaug.fitting.criteria import Prediction
 from orthaug.fitting.held_out import Candidate, Focus, Pieces, blocked, mean_square, squared_errors
 from orthaug.fitting.training import FOLD_ITERATIONS
@@ -124,11 +125,10 @@ def _coloured(fit: Any) -> bool:
     """Return whether the residual one step ahead is correlated with its own past, clearly and by more than a little."""
     for trajectory in fit.model.predict(fit.problem.record).trajectories:
         errors = (trajectory.measured - trajectory.model)[trajectory.start :]
-        errors = errors - errors.mean(axis=0)
-        squares, rows = np.sum(errors**2, axis=0), len(errors)
-        limit = max(_COLOURED, _SIGNIFICANT / math.sqrt(max(rows, 1)))
-        for lag in range(1, min(_LAGS, rows - 1) + 1):
-            if np.any(np.abs(np.sum(errors[lag:] * errors[:-lag], axis=0)) > limit * squares):
+        limit = max(_COLOURED, _SIGNIFICANT / math.sqrt(len(errors)))
+        for own in (errors - errors.mean(axis=0)).T:
+            found = autocorrelation(own[None])
+            if found is not None and np.any(np.abs(found[:_LAGS]) > limit):
                 return True
     return False
 
