@@ -173,6 +173,15 @@ def test_both_models_are_kept_and_run(tmp_path, monkeypatch):
     assert refused.code == 2 and "model-physics" in refused.err
 
 
+def test_physics_is_there_where_the_learner_was_left_out(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path, SPEC.replace("hidden = [4]", "hidden = [24]") + NOISY.replace('focus = "prediction"\n', ""),
+          rows=120, sensor=0.1, friction=0.0)  # fmt: skip
+    assert run("fit", "spec.toml", "--out", "out").code == 0
+    assert oa.load(tmp_path / "out").form.bound is None
+    assert run("simulate", "out", "last.csv", "--model", "physics", "--out", "p.csv").code == 0
+
+
 def test_one_step_by_hand_is_kept_and_named(tmp_path, monkeypatch):
     """A learner that is fitted to noise one step ahead runs worse than physics alone: the first line says so."""
     monkeypatch.chdir(tmp_path)

@@ -375,6 +375,8 @@ def fill_result(fitted: Fitted, folder: Path) -> None:
     (folder / "model").mkdir()
     storage.write(fitted.fit.model, folder / "model")
     physics = fitted.fit.physics_alone
+    if physics is None and fitted.fit.model.form.bound is None and fitted.job.spec.declared_learner() is not None:
+        physics = fitted.fit  # the learner was left out
     if physics is not None and physics.status.ok:
         (folder / PHYSICS).mkdir()
         storage.write(physics.model, folder / PHYSICS)
