@@ -250,7 +250,7 @@ class ModesResult(Content):
 class StabilityResult(Content):
     """Evidence on the free run."""
 
-    absent = frozenset({"modes"})
+    absent = frozenset({"modes", "radius_beyond"})
 
     feedback: FeedbackResult | None
     contraction: ContractionResult | None
@@ -258,6 +258,7 @@ class StabilityResult(Content):
     searched: Number
     lipschitz: LipschitzResult | None
     modes: ModesResult | None = None
+    radius_beyond: Number = None
     warnings: list[WarningResult]
     text: str
 
