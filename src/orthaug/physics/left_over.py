@@ -94,7 +94,9 @@ class LeftOver:
     def _beside(self, known: Matrix) -> tuple[Matrix, Vector]:
         """Return coordinates in which the slopes, beside those along known directions, have unit size; and the sizes."""
         size = np.sqrt(np.maximum(np.diag(self.linear), 0.0))
-        unit = np.where(size > 1e-9 * np.sqrt(np.maximum(np.diag(self.whole), 1e-300)), 1 / np.maximum(size, 1e-300), 0.0)
+        unit = np.where(
+            size > 1e-9 * np.sqrt(np.maximum(np.diag(self.whole), 1e-300)), 1 / np.maximum(size, 1e-300), 0.0
+        )
         scaled = self.linear * np.outer(unit, unit)
         values, vectors = np.linalg.eigh(scaled)
         kept = values > 1e-8 * max(values.max(initial=0.0), 1e-300)
@@ -164,7 +166,7 @@ class _Smoother:
         n, scaled = len(z), (z - (low + high) / 2) / half
         rng = np.random.default_rng(_SEED)
         slopes = rng.normal(size=(_WAVES, z.shape[1]))
-        slopes *= (np.exp(rng.uniform(0, np.log(_STEEPEST), (_WAVES, 1))) / np.linalg.norm(slopes, axis=1)[:, None])
+        slopes *= np.exp(rng.uniform(0, np.log(_STEEPEST), (_WAVES, 1))) / np.linalg.norm(slopes, axis=1)[:, None]
         centres = scaled[rng.integers(n, size=_WAVES)]
         parts = [np.tanh(scaled @ slopes.T - np.sum(slopes * centres, axis=1))]
         nz = z.shape[1]
