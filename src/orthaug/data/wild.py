@@ -7,6 +7,7 @@ hammer are none. One rule for the data of every physics.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,14 +49,16 @@ def wild_samples(record: Record) -> tuple[WildSample, ...]:
     values = [np.hstack([e.inputs, e.outputs]) for e in record.experiments]
     names = [c.name for c in (*record.inputs, *record.outputs)]
     inputs = len(record.inputs)
-    place = [(i, k) for i, part in enumerate(values) for k in range(len(part))]
+    starts = np.cumsum([0, *map(len, values)])
     whole = np.concatenate(values)
     distance = np.stack([_distance(column) for column in whole.T], axis=1)
     found = []
     for j, name in enumerate(names):
         rows, apart = _far(distance[:, j])
-        if len(rows) and not _explained(distance, rows, j, inputs, place):
-            found += [WildSample(*place[k], j, name, float(whole[k, j]), apart) for k in rows]
+        if len(rows) and not _explained(distance, rows, j, inputs, starts):
+            owner = np.searchsorted(starts, rows, side="right") - 1
+            at = [(int(i), int(k - starts[i])) for i, k in zip(owner, rows, strict=True)]
+            found += [WildSample(*p, j, name, float(whole[k, j]), apart) for p, k in zip(at, rows, strict=True)]
     return tuple(found)
 
 
@@ -78,11 +81,11 @@ def _far(distance: Vector) -> tuple[list[int], float]:
     return [], 0.0
 
 
-def _explained(distance: Matrix, rows: list[int], j: int, inputs: int, place: list[tuple[int, int]]) -> bool:
-    """Return whether the other channels answer for these samples: as a response of outputs, or an input as the cause."""
+def _explained(distance: Matrix, rows: list[int], j: int, inputs: int, starts: np.ndarray) -> bool:
+    """Return whether other channels answer for these samples: outputs by a response, an input as the cause."""
     first = rows[0]
     if j < inputs:
-        if place[first][1] < _FIRST:
+        if first - starts[np.searchsorted(starts, first, side="right") - 1] < _FIRST:
             return True
         return any(_stands_out(distance[:, i], first, first + _RESPONSE) for i in range(inputs, distance.shape[1]))
     return any(_stands_out(distance[:, i], first - _RESPONSE, first + 1) for i in range(inputs))
@@ -112,16 +115,16 @@ def threshold_for(record: Record, samples: tuple[WildSample, ...]) -> float:
     return float(f"{min(max(np.sqrt(max(others, 1.0) * least), 4.0), 0.9 * least):.2g}")
 
 
-def data_warnings(record: Record, effect: str = "") -> list[Warning]:
+def data_warnings(record: Record, effect: Callable[[tuple[WildSample, ...]], str] | None = None) -> list[Warning]:
     """Return warnings of wild samples, of rows that stand there twice, and of outputs that stand still.
 
     Args:
-        effect: what the wild samples do to the parameters, in a sentence.
+        effect: says in a sentence what a fit without some samples gives.
     """
     found, samples = [], wild_samples(record)
     for name in dict.fromkeys(sample.name for sample in samples):
         own = tuple(sample for sample in samples if sample.name == name)
-        found.append(Warning("wild_samples", _wild_text(record, own, effect)))
+        found.append(Warning("wild_samples", _wild_text(record, own, effect(samples) if effect else "")))
     return [*found, *_twice(record), *_frozen(record)]
 
 
@@ -134,12 +137,21 @@ def _wild_text(record: Record, own: tuple[WildSample, ...], effect: str) -> str:
     answer = "no output responds" if own[0].column < len(record.inputs) else "no input causes it"
     if own[0].column >= len(record.inputs) and not record.inputs:
         answer = "no neighbour is near it"
+    effect = f" {effect}" if effect else ""
     far = f"{own[0].apart:.3g} times farther from the median than" if np.isfinite(own[0].apart) else "apart from"
     return (
-        f"{'; '.join(where)}{more}{of}, {far} every other sample, and {answer}: a wild sample. {effect + ' ' if effect else ''}"
-        f'Mark it with a step of [[data.prepare]], step = "outliers", channels = ["{name}"], threshold = '
-        f'{threshold_for(record, own):g}, with `missing = "skip"` in [data] or a step "fill" behind it.'
+        f"{'; '.join(where)}{more}{of}, {far} every other sample, and {answer}: a wild "
+        f"sample, {percent(_share_of(record, own), 3)} of the squares of {name}.{effect} Mark it with a step of "
+        f'[[data.prepare]], step = "outliers", channels = ["{name}"], threshold = {threshold_for(record, own):g}, with `missing = "skip"` in [data] or a step "fill" behind it.'
     )
+
+
+def _share_of(record: Record, own: tuple[WildSample, ...]) -> float:
+    """Return the share of a channel's squares about its median that these samples make up."""
+    column = np.concatenate([np.hstack([e.inputs, e.outputs])[:, own[0].column] for e in record.experiments])
+    middle, scale = np.median(column), max(abs(s.value) for s in own)
+    squares = float(np.sum(((column - middle) / scale) ** 2))
+    return min(float(np.sum([((s.value - middle) / scale) ** 2 for s in own])) / max(squares, 1e-300), 1.0)
 
 
 def _twice(record: Record) -> list[Warning]:
@@ -153,8 +165,8 @@ def _twice(record: Record) -> list[Warning]:
             if pairs.mean() > _TWICE and between.mean() < 1 - _TWICE:
                 where = experiment.where(first)
                 text = (
-                    f"{where}: from here on each row stands there twice, in all channels: the file was written at twice "
-                    "the rate of the measurement. Standard errors count every sample twice, and dynamics over one step "
+                    f"{where}: from here on each row stands there twice, in all channels: the file was written at "
+                    "twice the rate of the measurement. Standard errors count every sample twice, and dynamics over one step "
                     "are none. Give `every = 2` for these files, with the sampling time of the measurement."
                 )
                 return [Warning("rows_twice", text)]

@@ -22,8 +22,8 @@ from orthaug._base.jax import Array, jax, jnp
 from orthaug.models.dynamics import Numbers
 from orthaug.models.motion_field import MotionField
 from orthaug.models.moving import Moving
-from orthaug.physics.motion import Motion
 from orthaug.physics.left_over import LeftOver, left_over
+from orthaug.physics.motion import Motion
 from orthaug.physics.shared import Shared, agreeing, moves, spanned
 
 _BATCH = 4096  # points at a time

@@ -31,7 +31,7 @@ _STEEPEST = 30.0  # slope of a wave, in units of 1 / half of the range
 _NEIGHBOURS = 3
 _RIDGES = (1e-8, 1e-5, 1e-2)  # of the mean square of a function
 _MARGIN = 1.5  # times what M leaves of known functions
-_LEAST, _MOST = 1e-4, 0.2  # between which that limit is taken
+_LEAST, _MOST = 1e-4, 0.1  # between which that limit is taken
 _PROBES = 6  # of each kind
 _SMALL = 0.1  # of a direction's size: entries below it are left out where the direction stays shared
 _SEED = 20_261_124
@@ -92,7 +92,7 @@ class LeftOver:
         return direction
 
     def _beside(self, known: Matrix) -> tuple[Matrix, Vector]:
-        """Return coordinates in which the slopes, beside those along known directions, have unit size; and the sizes."""
+        """Return coordinates in which slopes, beside those along known directions, have unit size; and the sizes."""
         size = np.sqrt(np.maximum(np.diag(self.linear), 0.0))
         unit = np.where(
             size > 1e-9 * np.sqrt(np.maximum(np.diag(self.whole), 1e-300)), 1 / np.maximum(size, 1e-300), 0.0
@@ -132,7 +132,7 @@ def left_over(
     slopes = slopes / np.where(size > 0, size, 1.0)
     n, m, nt = slopes.shape
     smoother = _Smoother.of(z)
-    flat = np.moveaxis(slopes[:, learned], 0, 0).reshape(n, -1)
+    flat = slopes[:, learned].reshape(n, -1)
     probes = smoother.beyond_linear(smoother.probes())
     linear = smoother.beyond_linear(flat)
     rest = smoother.left(np.concatenate([linear, probes], axis=1), probes.shape[1])

@@ -66,10 +66,9 @@ class Shared:
         moved = [
             name for name, row, own in zip(self.names, more, self.basis, strict=True) if row.any() and not own.any()
         ]
-        size = np.sqrt(np.maximum(np.diag(rest.whole), 1e-300))
-        return Shared(
-            self.names, _reduced(np.column_stack([self.basis, more]) * size[:, None], 1 / size), tuple(moved), rest
-        )
+        size = np.sqrt(np.maximum(np.diag(rest.whole), 1e-300))[:, None]
+        basis = _reduced(np.column_stack([self.basis, more]) * size, 1 / size[:, 0]) / size
+        return Shared(self.names, basis, tuple(moved), rest)
 
     @property
     def all(self) -> bool:
