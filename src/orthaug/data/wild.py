@@ -142,7 +142,8 @@ def _wild_text(record: Record, own: tuple[WildSample, ...], effect: str) -> str:
     return (
         f"{'; '.join(where)}{more}{of}, {far} every other sample, and {answer}: a wild "
         f"sample, {percent(_share_of(record, own), 3)} of the squares of {name}.{effect} Mark it with a step of "
-        f'[[data.prepare]], step = "outliers", channels = ["{name}"], threshold = {threshold_for(record, own):g}, with `missing = "skip"` in [data] or a step "fill" behind it.'
+        f'[[data.prepare]], step = "outliers", channels = ["{name}"], threshold = {threshold_for(record, own):g}, with '
+        'missing = "skip" in [data] or a step "fill" behind it.'
     )
 
 
@@ -166,8 +167,8 @@ def _twice(record: Record) -> list[Warning]:
                 where = experiment.where(first)
                 text = (
                     f"{where}: from here on each row stands there twice, in all channels: the file was written at "
-                    "twice the rate of the measurement. Standard errors count every sample twice, and dynamics over one step "
-                    "are none. Give `every = 2` for these files, with the sampling time of the measurement."
+                    "twice the rate of the measurement. Standard errors count every sample twice, and over one step "
+                    "nothing moves. Give `every = 2` for these files, with the sampling time of the measurement."
                 )
                 return [Warning("rows_twice", text)]
     return []
