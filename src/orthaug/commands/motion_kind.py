@@ -49,7 +49,9 @@ def checked(job: MotionJob) -> CheckResult:
     course = MotionCourse.of(without_learner(problem), None, criterion)
     told = identified(course)
     if told is None:
-        raise InputError(f"{job.path}: physics alone has no finite free run from its initial values; give others.")
+        wild = "".join(f" {warning.text}" for warning in job.warnings if warning.code == "wild_samples")
+        remedy = f"it runs on a sample that is none.{wild}" if wild else "give others."
+        raise InputError(f"{job.path}: physics alone has no finite free run from its initial values; {remedy}")
     shared, on_rows = None, []
     if spec.declared_learner() is not None and job.structure.shared != "all":
         form = Moving(motion, problem.features, None, problem.record.sampling_time, problem.substeps)
