@@ -438,7 +438,8 @@ def test_a_motion_asks_the_rows_too():
         for k in range(rows - 1):
             if column == "side":
                 extra[k] = np.sign(v[k])
-            v[k + 1] = v[k] + step * (drive[k] - 3.0 * v[k] - 8.0 * x[k] - 1.5 * extra[k])
+            friction = 3.0 * np.sin(2 * v[k])  # that the physics lacks
+            v[k + 1] = v[k] + step * (drive[k] - 3.0 * v[k] - 8.0 * x[k] - 1.5 * extra[k] - friction)
             x[k + 1] = x[k] + step * v[k + 1]
         record = oa.Record.from_arrays(
             np.column_stack([drive, extra]), x, sampling_time=step, inputs=["drive", "extra"], outputs=["place"]
