@@ -52,7 +52,7 @@ COLUMNS: dict[str, Callable[[np.ndarray, np.ndarray, np.random.Generator], np.nd
     "speed times its size": lambda v, p, rng: v * np.abs(v),
     "sign of a noisy speed": _noisy_sign,
     "speed 20 samples ago": lambda v, p, rng: np.roll(v, 20),
-    "low-pass of the speed": lambda v, p, rng: scipy.signal.lfilter([0.05], [1, -0.95], v),
+    "low-pass of the speed": lambda v, p, rng: np.asarray(scipy.signal.lfilter([0.05], [1, -0.95], v)),
     "independent noise": lambda v, p, rng: rng.normal(size=len(v)),
     "independent steps": lambda v, p, rng: np.repeat(rng.normal(size=len(v) // 20), 20),
 }
