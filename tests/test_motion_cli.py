@@ -542,6 +542,16 @@ def test_a_defect_of_an_analysis_loses_no_training_either(monkeypatch):
 
 
 BAD = {
+    "sampling time": (
+        "[motion.parameters]",
+        "[motion.constants]\nTs = 0.5\n[motion.parameters]",
+        "the constant 'Ts' is 0.5",
+    ),
+    "parameter Ts": (
+        "[motion.parameters]",
+        "[motion.parameters]\nTs = { initial = 1.0 }",
+        "'Ts' cannot name a parameter",
+    ),
     "undefined": ("c*v", "cc*v", "the equation of 'v' = (force - cc*v - k*x)/m: unknown name 'cc', did you mean 'c'?"),
     "lag": ("(force -", "(force[k] -", "a signal such as y[k-1] is no part of it"),
     "no derivative": ('derivative = "v", ', "", "`states.x` has no `derivative`; expected its equation"),

@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -130,8 +131,18 @@ class Job(ABC):
 
     @property
     def warnings(self) -> tuple[Warning, ...]:
-        """What was done to the data."""
-        return tuple(warning for part in self.parts for warning in part.warnings)
+        """What was done to the data, and which samples of the training data are no measurements."""
+        return (*(warning for part in self.parts for warning in part.warnings), *self._of_samples)
+
+    @cached_property
+    def _of_samples(self) -> tuple[Warning, ...]:
+        from orthaug.data.wild import data_warnings
+
+        return tuple(data_warnings(self.train.record, self.without))
+
+    def without(self, samples: Any) -> str:
+        """Return what a fit without these samples of the training data gives, in a sentence; "" where that is dear."""
+        return ""
 
     @property
     def run_count(self) -> int:

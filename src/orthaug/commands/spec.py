@@ -272,8 +272,7 @@ class Spec(Section):
         if self.physics is None or self.baseline is None:
             return None
         parameters = [section.declared(name) for name, section in self.physics.parameters.items()]
-        known = {} if SAMPLING_TIME in self.physics.parameters else {SAMPLING_TIME: sampling_time}
-        return PhysicsMap.of(parameters, self.physics.theta, known | self.baseline.constants)
+        return PhysicsMap.of(parameters, self.physics.theta, {SAMPLING_TIME: sampling_time} | self.baseline.constants)
 
     def declared_learner(self) -> Learner | None:
         """The learner; None for physics alone, as of a motion that nothing is added to."""
