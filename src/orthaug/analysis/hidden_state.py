@@ -18,12 +18,12 @@ from scipy.signal import lfilter
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug.analysis.memory import KINDS, MemoryTerm, filtered, memory_terms
-from orthaug.analysis.missing_terms import doubted
 from orthaug.analysis.output_response import LinearRun, linear_runs
 from orthaug.analysis.predictability import BlockSums, Share
 from orthaug.analysis.whiteness import whitening
-from orthaug.fitting.estimates import Estimate
-from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.data.record import Record
+from orthaug.models.model import Model
+from orthaug.models.motion_model import MotionModel
 
 _MOST_ROWS = 6000
 _VARIABLES, _EQUATIONS = 6, 3  # looked at, at most
@@ -41,7 +41,7 @@ class FamilyTest:
     """A family of terms in one equation: `share` of the filtered errors' square that it predicts on held-out blocks.
 
     `error` is the standard error of the share, `p` that of the F-test, times the number of families. `moves` is by how
-    much each parameter moves once the best term is fitted beside it, in the coordinates that are estimated.
+    much each parameter moves once the best `term` is fitted beside it, in the coordinates that are estimated.
     """
 
     equation: str
@@ -52,6 +52,11 @@ class FamilyTest:
     p: float
     term: MemoryTerm | None = None
     moves: tuple[float, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """What it is, in words."""
+        return f"a function of {self.on}" if self.term is None else f"a {self.term.name}"
 
     @property
     def sure(self) -> bool:
@@ -81,8 +86,10 @@ class StructureTest:
     @property
     def has_memory(self) -> bool:
         """Whether a hidden state is the likely cause: memory is sure beside static terms, and predicts more."""
-        return self.hidden is not None and self.memory is not None and (
-            self.static is None or self.memory.share >= self.static.share
+        return (
+            self.hidden is not None
+            and self.memory is not None
+            and (self.static is None or self.memory.share >= self.static.share)
         )
 
 
@@ -94,38 +101,43 @@ class _Family:
     terms: tuple[MemoryTerm | None, ...]
 
 
-def structure_test(fit: Estimate | MotionEstimate) -> StructureTest | None:
-    """Test what the free run of the training data leaves; None where it has no slopes, or there are too few rows."""
-    settled = _settled(fit)
+def structure_test(model: Model | MotionModel, record: Record) -> StructureTest | None:
+    """Test what the free run of a model leaves of its training data.
+
+    None where the run leaves all bounds or has no slopes, or there are too few rows.
+    """
+    settled = _settled(model, record)
     if settled is None:
         return None
     theta, runs = settled
     whole = np.concatenate([run.error for run in runs])
-    if np.all(whole.std(axis=0) < _ROUNDING * fit.problem.deviation):
+    if np.all(whole.std(axis=0) < _ROUNDING * model.deviation):
         return None
-    return _tested(runs, _base_columns(fit, runs), *_added_columns(fit, runs), theta - fit.model.numbers.theta)
+    return _tested(
+        runs, _base_columns(model, runs), *_added_columns(model, runs), theta - np.asarray(model.numbers.theta)
+    )
 
 
-def _settled(fit: Estimate | MotionEstimate) -> tuple[Vector, list[LinearRun]] | None:
+def _settled(model: Model | MotionModel, record: Record) -> tuple[Vector, list[LinearRun]] | None:
     """Move the parameters of the physics to where the filtered errors of the free run are least (Gauss-Newton).
 
     Noise on the sensor, or coloured noise, biases what was fitted one step ahead: its run is then far from the data
     even though nothing is missing.
     """
-    theta = np.asarray(fit.model.numbers.theta, dtype=float)
-    runs = linear_runs(fit, _MOST_ROWS, theta)
+    theta = np.asarray(model.numbers.theta, dtype=float)
+    runs = linear_runs(model, record, _MOST_ROWS, theta)
     if runs is None:
         return None
     for _ in range(_SETTLING):
-        base = _base_columns(fit, runs)
+        base = _base_columns(model, runs)
         pieces, colours = _coloured(runs, base)
         rows, nt = np.concatenate([_filtered(piece, colours) for piece in pieces]), len(theta)
         step, before = _least_squares(rows[:, :-1], rows[:, -1])[:nt], _left(rows[:, nt:-1], rows[:, -1])
         scale, trial, after = _scale(runs), None, np.inf
         for _ in range(_HALVINGS):
-            trial, after = linear_runs(fit, _MOST_ROWS, theta + step), np.inf
+            trial, after = linear_runs(model, record, _MOST_ROWS, theta + step), np.inf
             if trial is not None:
-                beside = [one[..., nt:] for one in _base_columns(fit, trial)]
+                beside = [one[..., nt:] for one in _base_columns(model, trial)]
                 moved = np.concatenate([_filtered(piece, colours) for piece in _pieces(trial, beside, scale)])
                 after = _left(moved[:, :-1], moved[:, -1])
             if after < before:
@@ -152,11 +164,11 @@ def _left(columns: Matrix, target: Vector) -> float:
     return float(rest @ rest)
 
 
-def _signals(fit: Estimate | MotionEstimate, run: LinearRun) -> dict[str, Vector]:
+def _signals(model: Model | MotionModel, run: LinearRun) -> dict[str, Vector]:
     """Return what terms may be of: each channel of the regressor and its velocity, or states and inputs."""
-    form = fit.model.form
-    if isinstance(fit, MotionEstimate):
-        names = (*fit.problem.motion.names_of_states, *fit.problem.motion.inputs)
+    form = model.form
+    if isinstance(model, MotionModel):
+        names = (*model.form.motion.names_of_states, *model.form.motion.inputs)
         found = dict(zip(names, np.concatenate([run.states, run.inputs], axis=1).T, strict=True))
         seen = form.seen(run.states.T, run.inputs.T, np) if form.bound is not None else ()
         found |= {str(entry): row for entry, row in zip(form.features, seen, strict=False) if str(entry) not in found}
@@ -173,54 +185,56 @@ def _signals(fit: Estimate | MotionEstimate, run: LinearRun) -> dict[str, Vector
     return dict(list(moving.items())[:_VARIABLES])
 
 
-def _features(fit: Estimate | MotionEstimate, run: LinearRun) -> Matrix:
+def _features(model: Model | MotionModel, run: LinearRun) -> Matrix:
     """Return what the learner sees along the run, (T, nz)."""
-    form = fit.model.form
+    form = model.form
     if form.bound is None:
         return np.zeros((len(run.error), 0))
-    if isinstance(fit, MotionEstimate):
+    if isinstance(model, MotionModel):
         return np.asarray(form.seen(run.states.T, run.inputs.T, np)).T
     return np.asarray(form.features.evaluate(form.regressor(run.states.T, run.rows.T, np).T, form.layout, np))
 
 
-def _equations(fit: Estimate | MotionEstimate) -> tuple[tuple[int, str], ...]:
+def _equations(model: Model | MotionModel) -> tuple[tuple[int, str], ...]:
     """Return the equations that may lack something: of outputs, or of states that have a parameter or a learner."""
-    if isinstance(fit, MotionEstimate):
-        names = fit.problem.motion.names_of_states
-        return tuple((i, names[i]) for i in doubted(fit)[:_EQUATIONS])
-    return tuple(enumerate(fit.problem.outputs))[:_EQUATIONS]
+    if isinstance(model, MotionModel):
+        motion = model.form.motion
+        names, places = motion.names_of_states, set(motion.learned[0])
+        places |= {i for i, name in enumerate(names) if motion.functions is not None or motion.parameters_in(name)}
+        return tuple((i, names[i]) for i in sorted(places))[:_EQUATIONS]
+    return tuple(enumerate(model.form.outputs))[:_EQUATIONS]
 
 
-def _respond(fit: Estimate | MotionEstimate, run: LinearRun, place: int, columns: Matrix) -> np.ndarray:
+def _respond(model: Model | MotionModel, run: LinearRun, place: int, columns: Matrix) -> np.ndarray:
     """Compute how the outputs follow signals (T, k) that are added to an equation, (T, ny, k)."""
     (t, k), n0, ny = columns.shape, run.states.shape[1], run.error.shape[1]
     into_state, into_output = np.zeros((t, n0, k)), np.zeros((t, ny, k))
-    if not isinstance(fit, MotionEstimate):
+    if not isinstance(model, MotionModel):
         into_output[:, place] = columns
         if n0:
             into_state[:, place] = columns
-    elif fit.problem.motion.integrator == "discrete":
+    elif model.form.motion.integrator == "discrete":
         into_state[:, place] = columns
     else:
-        half = fit.problem.record.sampling_time / 2
+        half = model.sampling_time / 2
         into_state += half * run.to_state[:, :, place, None] * columns[:, None]
         into_state[:, place] += half * np.concatenate([columns[1:], columns[-1:]])
     return run.respond(into_state, into_output, np.zeros((n0, k)))
 
 
-def _base_columns(fit: Estimate | MotionEstimate, runs: list[LinearRun]) -> list[np.ndarray]:
+def _base_columns(model: Model | MotionModel, runs: list[LinearRun]) -> list[np.ndarray]:
     """Return what the model explains, of every run (T, ny, k): starts, parameters, functions of what it sees."""
-    features = [_features(fit, run) for run in runs]
+    features = [_features(model, run) for run in runs]
     bends = _bends(np.concatenate(features))
-    places = [i for i, _ in _equations(fit)]
-    if isinstance(fit, MotionEstimate):
-        places = list(fit.problem.motion.learned[0])
+    places = [i for i, _ in _equations(model)]
+    if isinstance(model, MotionModel):
+        places = list(model.form.motion.learned[0])
     found = []
     for j, (run, z) in enumerate(zip(runs, features, strict=True)):
         starts = run.starts()
         own = np.zeros((*starts.shape[:2], starts.shape[2] * len(runs)))
         own[..., j * starts.shape[2] : (j + 1) * starts.shape[2]] = starts
-        learned = [_respond(fit, run, place, bends(z)) for place in places] if z.shape[1] else []
+        learned = [_respond(model, run, place, bends(z)) for place in places] if z.shape[1] else []
         found.append(np.concatenate([run.parameters(), own, *learned], axis=2))
     return found
 
@@ -250,9 +264,9 @@ def _static(values: Vector, size: float) -> list[Vector]:
     return [v, np.abs(v), v * np.abs(v), v**3, np.tanh(10 * v)]
 
 
-def _added_columns(fit: Estimate | MotionEstimate, runs: list[LinearRun]) -> tuple[list[_Family], list[np.ndarray]]:
+def _added_columns(model: Model | MotionModel, runs: list[LinearRun]) -> tuple[list[_Family], list[np.ndarray]]:
     """Return the families of terms, and of every run the responses to all their terms, (T, ny, K)."""
-    step, signals = fit.problem.record.sampling_time, [_signals(fit, run) for run in runs]
+    step, signals = model.sampling_time, [_signals(model, run) for run in runs]
     names = [name for name in signals[0] if all(name in other for other in signals)]
     families, columns = [], [[] for _ in runs]
     for name in names:
@@ -261,11 +275,11 @@ def _added_columns(fit: Estimate | MotionEstimate, runs: list[LinearRun]) -> tup
         terms = memory_terms(name, joined, step)
         kinds = [("static", (None,) * _STATIC)]
         kinds += [(kind, tuple(term for term in terms if term.kind == kind)) for kind in KINDS]
-        for place, equation in _equations(fit):
+        for place, equation in _equations(model):
             families += [_Family(equation, name, kind, own) for kind, own in kinds]
             for found, own, run in zip(columns, signals, runs, strict=True):
                 values = _static(own[name], size) + [filtered(term, own[name], step) / size for term in terms]
-                found.append(_respond(fit, run, place, np.stack(values, axis=1)))
+                found.append(_respond(model, run, place, np.stack(values, axis=1)))
     return families, [np.concatenate(found, axis=2) for found in columns]
 
 
@@ -343,9 +357,7 @@ def _range(columns: Matrix) -> Matrix:
 def _filtered(piece: np.ndarray, colours: list[Vector]) -> Matrix:
     """Return columns and errors (T, ny, k) filtered by the autoregression of each output, rows in their order."""
     memory = max(map(len, colours)) - 1
-    rows = np.stack(
-        [lfilter(a, [1.0], piece[:, o], axis=0)[memory:] for o, a in enumerate(colours)], axis=1
-    )
+    rows = np.stack([lfilter(a, [1.0], piece[:, o], axis=0)[memory:] for o, a in enumerate(colours)], axis=1)
     return rows.reshape(-1, piece.shape[2])
 
 

@@ -6,7 +6,7 @@ along the run. The signal acts on the newest output of lagged physics, and on a 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -16,8 +16,9 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import jax, jnp, padded_length
 from orthaug.analysis.whiteness import LARGEST
-from orthaug.fitting.estimates import Estimate
-from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.data.record import Record
+from orthaug.models.model import Model
+from orthaug.models.motion_model import MotionModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,14 +61,13 @@ class LinearRun:
         return self.respond(self.theta_to_state, self.theta_to_output, np.zeros((n0, nt)))
 
 
-def linear_runs(fit: Estimate | MotionEstimate, most: int, theta: Vector) -> list[LinearRun] | None:
-    """Linearise the free run over the training data; None where it leaves all bounds or has no slopes.
+def linear_runs(model: Model | MotionModel, record: Record, most: int, theta: Vector) -> list[LinearRun] | None:
+    """Linearise the free run over a record; None where it leaves all bounds or has no slopes.
 
     Args:
         most: rows of all experiments together, of which the first of each are taken.
         theta: parameters of the physics, coordinates of a motion's, instead of those of the fit.
     """
-    model, record = fit.model, fit.problem.record
     form: Any = model.form
     if not form.differentiable:
         return None
@@ -78,9 +78,10 @@ def linear_runs(fit: Estimate | MotionEstimate, most: int, theta: Vector) -> lis
         first = form.first_row
         if count - first < 2:
             continue
-        start: Any = model._start("measured", experiment.outputs) if fit.lagged else model._start(experiment, "measured", record)  # fmt: skip
-        rows = np.asarray(form.inputs(experiment, record))[: count - first]
-        run = _linearize(form, numbers, start, rows, experiment.outputs[first:count], experiment.inputs[first:count])
+        part = replace(experiment, inputs=experiment.inputs[:count], outputs=experiment.outputs[:count])
+        start = model.first_state(part, record)
+        rows = np.asarray(form.inputs(part, record))
+        run = _linearize(form, numbers, start, rows, part.outputs[first:], part.inputs[first:])
         if run is None:
             return None
         runs.append(run)
