@@ -54,7 +54,8 @@ def filtered(term: MemoryTerm, values: Vector, sampling_time: float) -> Vector:
     """Compute the internal state of a term along a signal (N,), from rest at its first value.
 
     A lag is exact for a held input. The others are driven by the increments d of the signal:
-    play `z = min(max(z, x − w), x + w)`; LuGre `z⁺ = z + d − |d| z/w`; Bouc-Wen `z⁺ = z + d − (|d| |z| z + d z²)/(2w²)`.
+    play `z = min(max(z, x − w), x + w)`, LuGre `z⁺ = z + d − |d| z/w`, and Bouc-Wen
+    `z⁺ = z + d − (|d| |z| z + d z²)/(2w²)`.
     """
     if term.kind == "lag":
         pole = float(np.exp(-sampling_time / term.scale))

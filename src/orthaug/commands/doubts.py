@@ -20,7 +20,6 @@ from orthaug.reports.result import FitResult, ParameterResult
 
 if TYPE_CHECKING:
     from orthaug.analysis.hidden_state import FamilyTest, StructureTest
-    from orthaug.commands.fit import Fitted
 
 _LISTED = 3  # parameters, and terms with memory
 _DETERMINED = re.compile(
@@ -28,8 +27,8 @@ _DETERMINED = re.compile(
 )
 
 
-def doubted(fitted: Fitted) -> Fitted:
-    """Return a fit with the warnings `unexplained` and `hidden_state`, and with intervals that say what they count."""
+def doubted(fitted: Any) -> Any:
+    """Return a `Fitted` with the warnings `unexplained` and `hidden_state`, and with intervals that say what they count."""
     from orthaug.analysis.hidden_state import structure_test
 
     fit, result = fitted.fit, fitted.result
