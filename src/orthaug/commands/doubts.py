@@ -28,7 +28,7 @@ _DETERMINED = re.compile(
 
 
 def doubted(fitted: Any) -> Any:
-    """Return a `Fitted` with the warnings `unexplained` and `hidden_state`, and with intervals that say what they count."""
+    """Return a `Fitted` with the warnings `unexplained` and `hidden_state`, and intervals that say what they count."""
     from orthaug.analysis.hidden_state import structure_test
 
     fit, result = fitted.fit, fitted.result
