@@ -43,7 +43,7 @@ def doubted(fitted: Any) -> Any:
         warnings.append(WarningResult(code="unexplained", text=_unexplained(test, bool(result.residuals))))
     if test is not None and test.has_memory:
         warnings.append(WarningResult(code="hidden_state", text=_hidden_state(fit, test)))
-    found = {"warnings": [*result.warnings, *warnings]}
+    found: dict[str, Any] = {"warnings": [*result.warnings, *warnings]}
     if test is not None and test.found:
         found["unexplained"] = _structure(fit, test)
     if any(warning.code == "unexplained" for warning in found["warnings"]):
