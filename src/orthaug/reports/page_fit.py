@@ -109,12 +109,15 @@ def _parameters(result: FitResult) -> list[Any]:
         "plain": "Standard errors are those of a white residual.",
         None: "There are no standard errors.",
     }
-    columns = ["parameter", "value", "unit", "standard error", "95 % interval", "initial"]
+    between = "95 %, noise only" if result.noise_only else "95 % interval"
+    columns = ["parameter", "value", "unit", "standard error", between, "initial"]
     biased = any(row.bias for row in rows)
     columns += ["bias", "95 % interval with it"] if biased else []
     shared = any(row.shared is not None for row in rows)
     columns += ["learner could imitate it"] if shared else []
     caption = f"What was estimated. {told[result.standard_errors]}"
+    if result.noise_only:
+        caption += " Intervals count noise only: the model leaves more than noise, which may have moved the parameters."
     if any(row.derived_unit for row in rows):
         caption += " A unit in brackets is not the spec's: the channels' units ask for it."
     if biased:

@@ -37,13 +37,14 @@ def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
     """Parameters, scores on every part, what the residual says, whether the learner earns its place, warnings."""
     if not fit.status.ok:
         return ""
-    blocks = [[w.text.capitalize() for w in result.warnings if w.code == "one_step_only"], list(fit.lines())]
+    lines = [_as_doubted(line, result) for line in fit.lines()]
+    blocks = [[w.text.capitalize() for w in result.warnings if w.code == "one_step_only"], lines]
     if result.focus is not None and result.focus.candidates:
         blocks.append([f"{result.focus.text[0].upper()}{result.focus.text[1:]}"])
     if result.physical_parameters:
         blocks.append(_physical_lines(result))
     blocks.append(_score_lines(fit, result))
-    if result.shared is not None and not result.shared.everything:
+    if result.shared is not None and (not result.shared.everything or result.shared.doubt):
         blocks.append([result.shared.text])
     blocks.append(_bias_lines(result))
     findings = [result.residuals, result.missing_lags, result.validation]
@@ -52,6 +53,15 @@ def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
     blocks += [told, warning_lines(w for w in dict.fromkeys(result.warnings) if w.text not in told)]
     blocks.append(_advice_lines(result))
     return "\n\n".join("\n".join(fold(lines)) for lines in blocks if lines)
+
+
+def _as_doubted(line: str, result: FitResult) -> str:
+    """Return a line of a fit with intervals that say that they count noise only, and without withdrawn claims."""
+    if result.noise_only:
+        line = line.replace(f"{'95 % interval':^29}", f"{'95 %, noise only':^29}")
+    if result.shared is not None and result.shared.doubt and line.startswith("shared "):
+        line = f"{line.partition('; told by the fit: ')[0]}; told by the fit: none, see below"
+    return line
 
 
 def _advice_lines(result: FitResult) -> list[str]:
@@ -224,7 +234,8 @@ def _rounded(share: float) -> float:
 def _physical_lines(result: FitResult) -> list[str]:
     rows = result.physical_parameters or []
     width = _width(rows)
-    lines = [f"{'physical':<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  {'initial':>11}  unit"]
+    between = "95 %, noise only" if result.noise_only else "95 % interval"
+    lines = [f"{'physical':<{width}}  {'value':>14}  {'std':>11}  {between:^29}  {'initial':>11}  unit"]
     for row in rows:
         cells = _value_cells(row, row.profile95 or row.ci95, width)
         lines.append(f"{cells}  {row.initial:11.5g}  {row.unit}".rstrip())
