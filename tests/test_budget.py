@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from orthaug._base.errors import InputError
-from orthaug.analysis.budget import SURE_SHARE, bias_budget, budget_on, ground_of, near_causes
+from orthaug.analysis.budget import SURE_SHARE, budget_on, ground_of, near_causes
+from orthaug.analysis.budgets import bias_budget
 from orthaug.analysis.measure_bias import Ground
 from orthaug.analysis.missing_lags import missing_lags
 from orthaug.analysis.suspects import Suspect, usual_suspects

@@ -4,7 +4,7 @@ A cause that explains the share s of what the learner holds beside the physics l
 the noise puts into the learner, `ν = E‖noise of it‖²/‖it‖²`, and what no form of the catalogue has; so a cause may be
 the true one where
 
-    1 − s ≤ 2 (1 − s_best) + 3 ν + 0.005.
+    1 − s ≤ 2 (1 − s_best) + 3 ν + 0.001.
 
 Terms that are nearly the physics itself, `|v|^1.1`, fit anything with a huge size and stay out. Every such cause has an interval about the estimate less its bias, as wide as noise and what it leaves. What is shown is
 the hull of them; where that is wider than the value itself, the data do not determine it beside this learner.
@@ -25,7 +25,7 @@ from orthaug.inference.covariance import interval, reach
 
 _AS_CLOSE = 2.0  # times what the best leaves of the learner: where no form fits, others are as likely
 _NOISE = 3.0  # times ν: over 20 draws of seven forms the true one left at most 2 ν
-_CLOSE = 0.005  # of the learner: rounding of a sharp form by the network
+_CLOSE = 0.001  # of the learner: rounding of a sharp form by the network
 MOST_PHYSICS = 0.986  # cosine with the physics: beyond it a term is six times larger than what the learner shows of it
 _LEAST = 0.5  # of the best share: what explains less is no likely cause
 _TOLD = 4  # parameters that a warning lists at most
@@ -46,13 +46,25 @@ class Candidate:
         return np.abs(self.moved) * np.sqrt(max(1 - self.share, 0.0) / self.share)
 
 
+@dataclass(frozen=True, eq=False)
+class Named(Candidate):
+    """The cause that is named, with the standard deviation of what it leaves."""
+
+    rest: Vector | float = 0.0
+
+    @property
+    def unsure(self) -> Vector:
+        """Standard deviation of the bias that it does not explain."""
+        return self.rest + np.zeros(len(self.moved))
+
+
 def compatible(candidates: Sequence[Candidate], noise: float) -> list[Candidate]:
     """Return the causes that noise cannot tell from the best; of these the declared ones alone where there are any.
 
     Args:
         noise: ν, the share of what the learner holds that is noise.
     """
-    likely = [c for c in candidates if c.share > 0 and np.isfinite(c.moved).all()]
+    likely = [c for c in candidates if c.share > 0]
     if not likely:
         return []
     best = max(c.share for c in likely)
@@ -69,9 +81,7 @@ def hull(
     Args:
         extra: a standard deviation that every cause has beside its own.
     """
-    each = np.array(
-        [interval(value - c.moved, np.sqrt(std**2 + c.unsure**2 + extra**2), freedom) for c in candidates]
-    )
+    each = np.array([interval(value - c.moved, np.sqrt(std**2 + c.unsure**2 + extra**2), freedom) for c in candidates])
     return np.stack([each[..., 0].min(axis=0), each[..., 1].max(axis=0)], axis=-1)
 
 

@@ -20,7 +20,15 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import percent, plain_number
 from orthaug.analysis.bias import SuspectedBias, orthogonal_part
-from orthaug.analysis.bias_hull import MOST_PHYSICS, Candidate, compatible, hull, is_determined, undetermined_warning
+from orthaug.analysis.bias_hull import (
+    MOST_PHYSICS,
+    Candidate,
+    Named,
+    compatible,
+    hull,
+    is_determined,
+    undetermined_warning,
+)
 from orthaug.analysis.catalogue import catalogue
 from orthaug.analysis.measure_bias import Ground, physical_with_bias
 from orthaug.analysis.remedies import remedies
@@ -94,38 +102,14 @@ def ground_of(fit: Estimate, measure: Measure, physics: PhysicsMap | None = None
     return Ground(weighed, fit.problem, fit.theta, physics, learned, fit.model.shared)
 
 
-def bias_budget(
+def lagged_budget(
     fit: Estimate,
     suspects: Sequence[Suspect] = (),
     *,
     physics: PhysicsMap | None = None,
     measure: Measure | None = None,
 ) -> Budget | None:
-    """The bias that what the learner found implies; None where no cause explains enough of it.
-
-    Args:
-        fit: with a learner and the orthogonal structure; of others there is no budget.
-        suspects: terms that may be missing, looked at first.
-        physics: the map from physical parameters to θ, for their biases.
-        measure: what θ was split under, where that is not the training measure.
-
-    Returns:
-        The `cause`, the `share` of the learner that it explains, and the bias of each of `parameters` and `physical`,
-        estimate less truth, with an interval that covers bias and noise together.
-
-    Raises:
-        InputError: another measure than that of the fit; a suspect on channels or lags that the data do not have.
-
-    Examples:
-        >>> import orthaug as oa
-        >>> u = np.random.default_rng(0).uniform(-1, 1, 300)
-        >>> record = oa.Record.from_arrays(u, 2 * u + u**3 + 0.05 * np.random.default_rng(1).normal(size=300))
-        >>> gain = oa.Baseline.from_terms([oa.Term("gain", "u[k]")])
-        >>> fit = oa.estimate(record, gain, learner=oa.Terms(("u[k]**3",)), structure=oa.Orthogonal(shared="all"))
-        >>> budget = bias_budget(fit, [oa.Suspect("cubic", "u[k]**3")])
-        >>> budget.cause.suspect.name, round(budget.of("gain").value, 1)  # θ took 0.6 of the cubic
-        ('cubic', 0.6)
-    """
+    """Return `bias_budget` of a fit of difference equations."""
     if not fit.status.ok or fit.model.structure != "orthogonal" or fit.model.form.bound is None:
         return None
     measure = Training() if measure is None else measure
@@ -205,17 +189,6 @@ def _candidates(
         ]  # fmt: skip
         kept += compatible(likely, noise_share(own, fit))
     return kept
-
-
-@dataclass(frozen=True, eq=False)
-class Named(Candidate):
-    """The cause that is named, with what it leaves, as `left_over` has it."""
-
-    rest: Vector | float = 0.0
-
-    @property
-    def unsure(self) -> Vector:
-        return self.rest + np.zeros(len(self.moved))
 
 
 def _physical_rows(
@@ -396,9 +369,7 @@ def parameter_biases(
             errors, relative = float(abs(b) / s) if s > 0 else None, float(b / v) if v else None
             limits = (float(ci[0]), float(ci[1])) if np.isfinite(ci).all() else None
             told = limits is None or is_determined(float(v), float(s), freedom, *limits)
-            found.append(
-                ParameterBias(name, float(b), cause, share, relative, errors, limits if told else None, told)
-            )
+            found.append(ParameterBias(name, float(b), cause, share, relative, errors, limits if told else None, told))
     return tuple(found)
 
 
