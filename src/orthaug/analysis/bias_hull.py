@@ -4,10 +4,10 @@ A cause that explains the share s of what the learner holds beside the physics l
 the noise puts into the learner, `ν = E‖noise of it‖²/‖it‖²`, and what no form of the catalogue has; so a cause may be
 the true one where
 
-    1 − s ≤ 2 (1 − s_best) + 3 ν + 0.001.
+    1 − s ≤ 3 (1 − s_best) + 3 ν + 0.02.
 
-Terms that are nearly the physics itself, `|v|^1.1`, fit anything with a huge size and stay out. Every such cause has an interval about the estimate less its bias, as wide as noise and what it leaves. What is shown is
-the hull of them; where that is wider than the value itself, the data do not determine it beside this learner.
+Terms that are nearly the physics itself, `|v|^1.1`, fit anything with a huge size and stay out. Every such cause has an
+interval about the estimate less its bias, as wide as noise and what it leaves. What is shown is the hull of them; where that is wider than the value itself, the data do not determine it beside this learner.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from orthaug._base.errors import Warning
 from orthaug._base.lines import percent
 from orthaug.inference.covariance import interval, reach
 
-_AS_CLOSE = 2.0  # times what the best leaves of the learner: where no form fits, others are as likely
+_AS_CLOSE = 3.0  # times what the best leaves of the learner: where no form fits, others are as likely
 _NOISE = 3.0  # times ν: over 20 draws of seven forms the true one left at most 2 ν
-_CLOSE = 0.001  # of the learner: rounding of a sharp form by the network
+_CLOSE = 0.02  # of the learner: a network smooths the cusp of √|v| and rounds a jump, whatever the noise
 MOST_PHYSICS = 0.986  # cosine with the physics: beyond it a term is six times larger than what the learner shows of it
 _LEAST = 0.5  # of the best share: what explains less is no likely cause
 _TOLD = 4  # parameters that a warning lists at most

@@ -39,7 +39,8 @@ def bias_budget(
         cannot tell apart. Where `determined` is False that is wider than the value itself, and there is none.
 
     Raises:
-        InputError: arguments that the kind of physics does not take; another measure than that of the fit; a suspect on channels or lags that the data do not have.
+        InputError: arguments that the kind of physics does not take; another measure than that of the fit; a suspect on
+            channels or lags that the data do not have.
 
     Examples:
         >>> import orthaug as oa
