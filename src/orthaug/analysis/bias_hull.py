@@ -7,7 +7,8 @@ the true one where
     1 − s ≤ 3 (1 − s_best) + 3 ν + 0.02.
 
 Terms that are nearly the physics itself, `|v|^1.1`, fit anything with a huge size and stay out. Every such cause has an
-interval about the estimate less its bias, as wide as noise and what it leaves. What is shown is the hull of them; where that is wider than the value itself, the data do not determine it beside this learner.
+interval about the estimate less its bias, as wide as noise and what it leaves. What is shown is the hull of them; where
+that is wider than the value itself, the data do not determine it beside this learner.
 """
 
 from __future__ import annotations

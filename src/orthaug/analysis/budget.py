@@ -34,7 +34,6 @@ from orthaug.analysis.measure_bias import Ground, physical_with_bias
 from orthaug.analysis.remedies import remedies
 from orthaug.analysis.suspects import Suspect, saturations, usual_suspects, usual_terms
 from orthaug.fitting.estimates import Estimate
-from orthaug.inference.covariance import interval
 from orthaug.inference.measures import Measure, Training, weigh_problem
 from orthaug.physics.output_weights import times
 from orthaug.physics.parameters import PhysicsMap
@@ -342,15 +341,6 @@ def left_over(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect])
 def _moved(cause: SuspectedBias) -> Vector:
     """What a cause of the size found makes of θ."""
     return (cause.coefficient_found or 0.0) * np.array(cause.bias)
-
-
-def with_bias(value: Vector, std: Vector, freedom: float, bias: Vector, rest: Vector) -> Float[np.ndarray, "n 2"]:
-    """95 % intervals that cover bias and noise, (n, 2): about the estimate less its bias.
-
-    Args:
-        rest: standard deviation of the bias that its cause does not tell, as `left_over` gives it.
-    """
-    return interval(value - bias, np.sqrt(std**2 + rest**2), freedom)
 
 
 def parameter_biases(

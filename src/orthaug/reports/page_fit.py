@@ -121,8 +121,7 @@ def _parameters(result: FitResult) -> list[Any]:
         caption += " A unit in brackets is not the spec's: the channels' units ask for it."
     if biased:
         caption += f"{BIAS_TOLD[:-1]};"
-        caption += " the interval with it is the hull over all causes that noise cannot tell apart, each that of the estimate less "
-        caption += "its bias."
+        caption += " the interval with it is the hull over all causes that noise cannot tell apart."
     blocks: list[Any] = [Table(caption, columns, [_parameter_cells(row, biased, shared) for row in rows])]
     plot = interval_plot(rows)
     blocks += [plot] if plot else []
