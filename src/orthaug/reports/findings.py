@@ -77,6 +77,8 @@ class BiasResult(Content):
     value: Number
     cause: str
     share: Number
+    determined: Flag = True
+    """Whether the causes that noise cannot tell apart agree enough for an interval to be of use."""
 
 
 class PhysicalBias(Content):

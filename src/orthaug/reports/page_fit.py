@@ -118,11 +118,13 @@ def _parameters(result: FitResult) -> list[Any]:
     caption = f"What was estimated. {told[result.standard_errors]}"
     if result.noise_only:
         caption += " Intervals count noise only: the model leaves more than noise, which may have moved the parameters."
+    if result.standard_errors is not None:
+        caption += " Intervals hold for the inputs that were applied; under others the bias is another one."
     if any(row.derived_unit for row in rows):
         caption += " A unit in brackets is not the spec's: the channels' units ask for it."
     if biased:
         caption += f"{BIAS_TOLD[:-1]};"
-        caption += " the interval with it is that of the estimate less its bias."
+        caption += " the interval with it is the hull over all causes that noise cannot tell apart."
     blocks: list[Any] = [Table(caption, columns, [_parameter_cells(row, biased, shared) for row in rows])]
     plot = interval_plot(rows)
     blocks += [plot] if plot else []
@@ -156,7 +158,8 @@ def _parameter_cells(row: ParameterResult, biased: bool, shared: bool) -> list[s
         number(row.initial),
     ]
     if biased:
-        cells += [bias_cell(row), interval(row.ci95_with_bias)]
+        known = row.bias is None or row.bias.determined
+        cells += [bias_cell(row), interval(row.ci95_with_bias) if known else "not determined by these data"]
     return cells + ([{True: "yes", False: "no", None: "–"}[row.shared]] if shared else [])
 
 

@@ -12,6 +12,7 @@ from orthaug.analysis.budget import SURE_SHARE
 from orthaug.reports.biases import biased_by
 from orthaug.reports.fields import WarningResult
 from orthaug.reports.findings import SharedResult, SuspectResult
+from orthaug.reports.page_blocks import digits_for
 from orthaug.reports.result import (
     CheckResult,
     CompareResult,
@@ -222,7 +223,8 @@ def _bias_line(row: ParameterResult, width: int) -> str:
     bias = _rounded((bias or 0.0) / (value or 1.0)) * (value or 1.0)
     errors = f"{plain_number(abs(bias) / row.std) if row.std else '–':>7}"
     part = f"{percent(_rounded(bias / value), sign='+') if value else '–':>9}"
-    limits = f"[{_limit(reach[0])}, {_limit(reach[1])}]" if reach else f"{'–':^29}"
+    none = "–" if row.bias is None or row.bias.determined else "not determined by these data"
+    limits = f"[{_limit(reach[0])}, {_limit(reach[1])}]" if reach else f"{none:^29}"
     return f"{row.name:<{width}}  {bias:+11.3g}  {errors}  {part}  {limits}".rstrip()
 
 
@@ -338,7 +340,8 @@ def _estimate(parameter: ParameterResult) -> str:
     spread = f" ± {parameter.std:.2g}" if parameter.std is not None else ""
     bias = parameter.bias.value if parameter.bias and parameter.std is not None else None
     large = bias is not None and parameter.std is not None and abs(bias) > parameter.std
-    return f"{parameter.value:.6g}{spread}{f' (bias {bias:+.2g})' if large else ''}"
+    digits = digits_for(parameter.value, parameter.std, 6)
+    return f"{parameter.value:.{digits}g}{spread}{f' (bias {bias:+.2g})' if large else ''}"
 
 
 def _numbers(values: Sequence[float | None] | None) -> str:
