@@ -254,7 +254,7 @@ def test_an_unmodelled_residual_is_told_with_its_size_and_advice():
     share = 100 * found.one_step[0].rms / second_order(0, equation=0.1, missing="lag of u").experiments[0].outputs.std()
     assert f"residual, {share:.2g} % of the output's deviation" in found.text
     assert "With the further input lag u[k-2] in the physics (or the learner) its error one step ahead" in found.text
-    assert "coloured" in dict(found.warnings)["coloured_residual"]
+    assert "coloured" in dict(found.warnings)["inconsistent"]
 
 
 def test_a_coloured_disturbance_biases_the_one_step_parameters_and_is_told():

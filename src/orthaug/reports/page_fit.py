@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from orthaug.models.response import Response
+from orthaug.fitting.estimates import STD_KINDS
 from orthaug.reports.biases import biased_by
 from orthaug.reports.learned_part import LearnedPart
 from orthaug.reports.page_blocks import (
@@ -115,6 +116,8 @@ def _parameters(result: FitResult) -> list[Any]:
     shared = any(row.shared is not None for row in rows)
     columns += ["learner could imitate it"] if shared else []
     caption = f"What was estimated. {told[result.standard_errors]}"
+    if result.standard_errors_by is not None:
+        caption = f"What was estimated. Standard errors: {STD_KINDS[result.standard_errors_by]}."
     if any(row.derived_unit for row in rows):
         caption += " A unit in brackets is not the spec's: the channels' units ask for it."
     if biased:

@@ -266,7 +266,7 @@ class PhysicsAloneResult(Content):
 class FitResult(Headed):
     """What `orthaug fit` leaves."""
 
-    absent: ClassVar = frozenset({"motion", "terms", "equation"})
+    absent: ClassVar = frozenset({"motion", "terms", "equation", "standard_errors_by"})
 
     spec: dict[str, Any]
     data: DataResult
@@ -274,6 +274,8 @@ class FitResult(Headed):
     restarts: list[RestartResult]
     parameters: list[ParameterResult]
     standard_errors: str | None
+    standard_errors_by: str | None = None
+    """How they were made, a key of `fitting.estimates.STD_KINDS`; None for those of white and even errors."""
     physical_parameters: list[ParameterResult] | None
     physical_consistency: ConsistencyResult | None
     sensitivities: dict[str, ByName] | None
