@@ -85,18 +85,19 @@ def test_errors_that_remember_for_long_have_no_length():
 # --- the intervals
 
 
-def record(seed, pole, samples=2000):
+def record(seed, pole, samples=2000, uneven=False):
     """A slow input, noise of deviation 0.5 on the sensor."""
     rng = np.random.default_rng([seed, 12])
     u = lfilter([1.0], [1.0, -0.8], rng.normal(size=samples + 200))
     y = lfilter([0.0, THETA[2]], [1.0, -THETA[0], -THETA[1]], u) + THETA[3] / (1 - THETA[0] - THETA[1])
     e = lfilter([np.sqrt(1 - pole**2)], [1.0, -pole], rng.normal(size=samples + 200))
+    e = e * np.abs(u) / u.std() if uneven else e
     return Record.from_arrays(u[200:], (y + 0.5 * e)[200:])
 
 
 @cache
-def flown(seed, pole=0.9, segment=0, samples=2000):
-    return estimate(record(seed, pole, samples), PHYSICS, learner=None, criterion=Simulation(segment, 40))
+def flown(seed, pole=0.9, segment=0, samples=2000, uneven=False):
+    return estimate(record(seed, pole, samples, uneven), PHYSICS, learner=None, criterion=Simulation(segment, 40))
 
 
 def test_blocks_cover_where_plain_intervals_do_not():
