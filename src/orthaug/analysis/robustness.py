@@ -104,9 +104,14 @@ def _withheld(fit: Any) -> Any:
     if len(known) == len(lengths) and max(known) <= fit.scores.longest:
         why = f"for {max(known)} steps, and the {segments.count} that were trained on hold too few stretches of that"
     else:
-        why = f"for longer than the segments that were trained on ({fit.scores.longest} steps) or a good part of the data"
-    each = "" if fit.std is None else "; for white errors it would be " + ", ".join(
-        f"{std:.2g} of {name}" for name, std in zip(_names(fit), fit.std, strict=True) if np.isfinite(std)
+        why = (
+            f"for longer than the segments that were trained on ({fit.scores.longest} steps) or a good part of the data"
+        )
+    each = (
+        ""
+        if fit.std is None
+        else "; for white errors it would be "
+        + ", ".join(f"{std:.2g} of {name}" for name, std in zip(_names(fit), fit.std, strict=True) if np.isfinite(std))
     )
     text = (
         f"no standard errors and no intervals: the errors of the free run remember each other {why}, so their number "
