@@ -227,8 +227,7 @@ def selected_level(draws: int = 20) -> list[tuple[str, float]]:
     found = []
     for noise, hold in (("white", 1), ("AR(0.9)", 10)):
         tests = [
-            oa.select(lagged_record(noise, seed, hold=hold), LAGGED, kinds=("terms",)).nonlinearity
-            for seed in range(draws)
+            oa.select(lagged_record(noise, seed, hold=hold), LAGGED, learner=None).nonlinearity for seed in range(draws)
         ]
         found.append(
             (

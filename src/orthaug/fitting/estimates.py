@@ -262,7 +262,7 @@ class Estimate(AnyFit):
         trajectories = self.model.predict(self.problem.record).trajectories
         residual = np.concatenate([(t.measured - t.model)[t.start :] for t in trajectories])  # type: ignore[operator]
         slopes, share = one_step_slopes(self.problem, self.model), self.problem.count / len(self.problem.rows)
-        own = hc3(statistics, slopes, residual @ self.problem.weight.matrix.T, share)
+        own = hc3(statistics, slopes, residual @ self.problem.weight.matrix.T, len(self.theta), share)
         return replace(
             self,
             model=replace(self.model, statistics=own),

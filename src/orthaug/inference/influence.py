@@ -44,10 +44,14 @@ class Influence:
     along: Float[np.ndarray, "nt r"]
 
     @classmethod
-    def of(cls, slopes: Slopes, statistics: Statistics, k: Float[np.ndarray, "nt n"]) -> Influence:
-        """From derivatives ψ (N, ny, n), the statistics that have their Gram matrix and prior, and K."""
+    def of(cls, slopes: Slopes, statistics: Statistics, k: Float[np.ndarray, "m n"], nt: int) -> Influence:
+        """From derivatives ψ (N, ny, n), the statistics that have their Gram matrix and prior, and K.
+
+        Args:
+            nt: how many of the n unknowns are θ.
+        """
         assert statistics.gram is not None
-        root = half_inverse(statistics.gram + np.diag(prior_of(statistics, len(k))), len(k))
+        root = half_inverse(statistics.gram + np.diag(prior_of(statistics, nt)), nt)
         return cls(slopes @ root, root, k @ root)
 
     def less_leverage(self, errors: Matrix) -> Matrix:
@@ -109,13 +113,14 @@ def prior_of(statistics: Statistics, nt: int) -> Vector:
     return np.concatenate([np.zeros(nt), statistics.ridge * np.ones(len(statistics.gram) - nt)])
 
 
-def hc3(statistics: Statistics, slopes: Slopes, errors: Matrix, share: float = 1.0) -> Statistics:
+def hc3(statistics: Statistics, slopes: Slopes, errors: Matrix, nt: int, share: float = 1.0) -> Statistics:
     """Return statistics whose middle `ΣψᵀΣ_eψ` is made of every row's own error (HC3), not of one noise for all.
 
     Args:
         errors: of the same rows (N, ny), whitened as ψ is.
+        nt: how many of the unknowns are θ.
         share: how many times more rows were trained on than these, which then stand for them.
     """
-    influence = Influence.of(slopes, statistics, np.eye(slopes.shape[2]))
+    influence = Influence.of(slopes, statistics, np.eye(slopes.shape[2]), nt)
     scores = np.einsum("kon,ko->kn", slopes, influence.less_leverage(errors))
     return replace(statistics, middle=share * scores.T @ scores)
