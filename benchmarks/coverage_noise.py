@@ -1,7 +1,7 @@
 """Do intervals hold, or say that they do not, where the noise is coloured or uneven? Lagged physics and motions.
 
-A silent miss is a parameter outside its interval without a warning that speaks of it. The level of the nonlinearity test
-under such noise, and of White's and Hausman's test, is here too.
+A silent miss is a parameter outside its interval without a warning that speaks of it. The level of the nonlinearity
+test under such noise is here too.
 Run: python benchmarks/coverage_noise.py [draws of lagged rows, default 40] [of motions, default 10]
 """
 
@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,8 +24,8 @@ from orthaug.physics.problem import pose
 from orthaug.selection.nonlinearity import nonlinearity
 
 DOUBTS = {
-    "inconsistent", "sensor_noise", "coloured_residual", "too_long_memory", "unexplained", "not_identified", "not_unique",
-    "no_standard_errors",
+    "inconsistent", "sensor_noise", "coloured_residual", "too_long_memory", "unexplained", "not_identified",
+    "not_unique", "no_standard_errors",
 }  # fmt: skip
 """Codes that say that an interval may not hold."""
 THETA = np.array([1.35, -0.48, 0.5])
@@ -243,7 +244,7 @@ def main(lagged: int = 40, motions: int = 10) -> None:
     print("\n| system | noise | learner sees | draws | held | silent misses | median width | shown | warned |")
     print(9 * "|---" + "|")
     began = time.perf_counter()
-    for one in (*lagged_rows(lagged), *motion_rows(motions)):
+    for one in chain(lagged_rows(lagged), motion_rows(motions)):
         shares = f"{one.held:.0f} % | {one.silent:.1f} % | {one.width:.2g} % | {one.shown:.0f} % | {one.warned:.0f} %"
         print(f"| {one.system} | {one.noise} | {one.learner} | {one.draws} | {shares} |", flush=True)
     print(f"\n{time.perf_counter() - began:.0f} s. Nonlinearity test, rejections at 5 % where nothing is missing:")

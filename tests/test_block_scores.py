@@ -144,7 +144,7 @@ def test_white_errors_keep_plain_intervals():
 @pytest.mark.parametrize("why", ["few rows", "short segments"])
 def test_errors_that_remember_for_too_long_have_no_interval(why):
     """Plain intervals held 40 to 75 % there; no number is called one of 95 %."""
-    plain = flown(*{"few rows": (0, 0.9, 0, 300), "short segments": (0, 0.9, 50)}[why])
+    plain = flown(*{"few rows": (0, 0.9, 0, 180), "short segments": (0, 0.9, 50)}[why])
     fit = default(plain)
     assert fit.std is None and fit.interval is None and fit.std_kind == "none"
     np.testing.assert_array_equal(fit.plain_covariance, plain.covariance)

@@ -7,8 +7,8 @@ import itertools
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.signal import lfilter
 import scipy.signal
+from scipy.signal import lfilter
 from test_cli import finite_json, one_line, run
 
 import orthaug as oa

@@ -1,16 +1,16 @@
 """Is one-step θ inconsistent? A test of coloured errors in the equation, in standard errors of θ (Hausman 1978).
 
-Coloured errors stand in the lagged outputs of the next rows, which moves θ̂ by an amount that more rows do not lessen.
-With a model of the colour, `e_k = Σ_j ρ_j e_{k−j} + ν_k` with ν white, they do not. One Gauss-Newton step from ρ = 0 gives
-ρ̂ and what it moves θ̂ by (Durbin 1970, Breusch 1978, Godfrey 1978): with the past errors E and `E⊥` what the model's
-derivatives ψ leave of them, `ρ̂ = (EᵀE⊥)⁻¹Eᵀe` and `Δp̂ = −M⁻¹ψᵀE ρ̂`. The derivatives in the learner's weights are among
-ψ, with their prior, so that what a learner takes is partialled out (Frisch and Waugh 1933, Lovell 1963). The Wald test of
-ρ takes the errors as uneven (White 1980), and knows nothing of the standard errors of the fit: robust ones cannot
-silence it. A short and a longer autoregression are tried: the first finds weak colour, the second that of noise on a
-sensor or of a disturbance that swings.
+Coloured errors stand in the lagged outputs of the next rows, which moves θ̂ by an amount that more rows do not
+lessen. With a model of the colour, `e_k = Σ_j ρ_j e_{k−j} + ν_k` with ν white, they do not. One Gauss-Newton step
+from ρ = 0 gives ρ̂ and what it moves θ̂ by (Durbin 1970, Breusch 1978, Godfrey 1978): with the past errors E and `E⊥`
+what the model's derivatives ψ leave of them, `ρ̂ = (EᵀE⊥)⁻¹Eᵀe` and `Δp̂ = −M⁻¹ψᵀE ρ̂`. The derivatives in the
+learner's weights are among ψ, with their prior, so that what a learner takes is partialled out (Frisch and Waugh
+1933, Lovell 1963). The Wald test of ρ takes the errors as uneven (White 1980), and knows nothing of the standard
+errors of the fit: robust ones cannot silence it. A short and a longer autoregression are tried: the first finds weak
+colour, the second that of noise on a sensor or of a disturbance that swings.
 
-What θ is with the colour modelled comes from iterating; instruments, the outputs of the free run in place of the measured
-ones (Young 1970, Söderström and Stoica 1983), need no model of the colour and judge it.
+What θ is with the colour modelled comes from iterating; instruments, the outputs of the free run in place of the
+measured ones (Young 1970, Söderström and Stoica 1983), need no model of the colour and judge it.
 """
 
 from __future__ import annotations
@@ -71,13 +71,13 @@ class Inconsistency:
     def warning(self) -> Warning:
         """What to be warned of, with the values that the remedies give."""
         each = [
-            f"{self.names[i]} is then {self.modelled[i]:.6g} ± {self.modelled_std[i]:.2g} instead of {self.theta[i]:.6g}, "
-            f"{abs(self.apart[i]):.1f} standard errors away"
+            f"{self.names[i]} is then {self.modelled[i]:.6g} ± {self.modelled_std[i]:.2g} instead of "
+            f"{self.theta[i]:.6g}, {abs(self.apart[i]):.1f} standard errors away"
             for i in self.moved
         ]
         text = (
-            "one-step θ is inconsistent: its errors are coloured, so they stand in the lagged outputs of later rows, and "
-            f"more rows do not help. With a model of the colour (autoregression of order {self.order}) "
+            "one-step θ is inconsistent: its errors are coloured, so they stand in the lagged outputs of later rows, "
+            f"and more rows do not help. With a model of the colour (autoregression of order {self.order}) "
             f"{'; '.join(each)}."
         )
         if self.instruments is not None and self.instruments_std is not None:
@@ -264,7 +264,7 @@ def _with_colour(rows: _Rows, order: int) -> tuple[Vector | None, Vector]:
 
 
 def _by_instruments(rows: _Rows, free_run: Response) -> tuple[Vector, Vector] | None:
-    """How θ moves with the free run's outputs in place of the measured ones, and its standard errors; None if unknown."""
+    """How θ moves with the free run's outputs in place of the measured ones, and its standard errors; or None."""
     fit = rows.fit
     form, record = fit.model.form, fit.problem.record
     pieces: Sequence[Matrix] = [

@@ -49,7 +49,7 @@ def robust_where_asked(fit: Estimate, response: Response) -> Estimate:
 
 
 def robust_free_run(fit: Any) -> Any:
-    """The fit of a free run, of lagged physics or of a motion, with batch means where its errors are coloured or uneven.
+    """The fit of a free run, of lagged physics or of a motion, with batch means where its errors ask for them.
 
     Where they are coloured and the record holds too few stretches that do not remember each other, there are no
     standard errors, and no interval.
@@ -80,7 +80,7 @@ def _has_rows(fit: Any, rows: int) -> bool:
     gram = fit.model.statistics.gram
     if gram is None or fit.model.numbers.tilt is not None or isinstance(fit.problem, StreamedProblem):
         return False
-    return _FEWEST_TESTED <= rows and rows * len(fit.problem.deviation) * len(gram) <= LARGEST
+    return rows >= _FEWEST_TESTED and rows * len(fit.problem.deviation) * len(gram) <= LARGEST
 
 
 def _is_uneven(fit: Any, slopes: Any, errors: Matrix) -> bool:
@@ -116,8 +116,8 @@ def _withheld(fit: Any) -> Any:
     )
     text = (
         f"no standard errors and no intervals: the errors of the free run remember each other {why}, so their number "
-        f"does not say how well they average out{each}, which is too small. Longer segments, a longer record, or physics "
-        "that leaves less may tell."
+        f"does not say how well they average out{each}, which is too small. Longer segments, a longer record, or "
+        "physics that leaves less may tell."
     )
     return replace(
         fit,

@@ -1,11 +1,11 @@
 """How much each row moves an estimate: derivatives of the model by rows, influences on θ, leverage, uneven noise.
 
-To first order `p̂ − p = M⁻¹ Σ_k ψ_kᵀe_k` with `M = Σψᵀψ + ridge`, and `θ̂ − θ = Σ_k b_kᵀe_k` with `b_k = ψ_k M⁻¹ Kᵀ`, K how
-θ follows p = (c, w). The plain covariance takes all errors for equally large. Where their size goes with what b_k is made
-of it is wrong, and there alone: White's test (Econometrica 1980) regresses e_k² on the products of the entries of b_k,
-in the form of Koenker (J. Econometrics 1981), whose level does not rest on normal errors. HC3 (MacKinnon and White 1985),
-`Σ ψᵀẽẽᵀψ` with `ẽ_k = (I − ψ_k M⁻¹ψ_kᵀ)⁻¹e_k`, holds for both, also of few rows. The rows are those of one step ahead or
-of a free run: both have ψ and e.
+To first order `p̂ − p = M⁻¹ Σ_k ψ_kᵀe_k` with `M = Σψᵀψ + ridge`, and `θ̂ − θ = Σ_k b_kᵀe_k` with `b_k = ψ_k M⁻¹ Kᵀ`,
+K how θ follows p = (c, w). The plain covariance takes all errors for equally large. Where their size goes with what
+b_k is made of it is wrong, and there alone: White's test (Econometrica 1980) regresses e_k² on the products of the
+entries of b_k, in the form of Koenker (J. Econometrics 1981), whose level does not rest on normal errors. HC3
+(MacKinnon and White 1985), `Σ ψᵀẽẽᵀψ` with `ẽ_k = (I − φ_k(ΦᵀΦ)⁻¹φ_kᵀ)⁻¹e_k`, holds for both, also of few rows. The
+rows are those of one step ahead or of a free run: both have ψ and e.
 """
 
 from __future__ import annotations
@@ -41,7 +41,11 @@ class Influence:
 
     rows: Float[np.ndarray, "N ny r"]
     root: Float[np.ndarray, "n r"]
-    along: Float[np.ndarray, "nt r"]
+    along: Float[np.ndarray, "m r"]
+    physics: Float[np.ndarray, "N ny s"]
+    """The same rows of θ alone, in coordinates of their own: their squares are its leverage."""
+    inflation: float
+    """What the learner has used up: √(N / (N − effective weights)), for its leverage is no matter of a single row."""
 
     @classmethod
     def of(cls, slopes: Slopes, statistics: Statistics, k: Float[np.ndarray, "m n"], nt: int) -> Influence:
@@ -52,11 +56,14 @@ class Influence:
         """
         assert statistics.gram is not None
         root = half_inverse(statistics.gram + np.diag(prior_of(statistics, nt)), nt)
-        return cls(slopes @ root, root, k @ root)
+        rows, own = slopes @ root, slopes[..., :nt] @ half_inverse(statistics.gram[:nt, :nt], nt)
+        used, count = max(float(np.sum(rows**2) - np.sum(own**2)), 0.0), rows.shape[0] * rows.shape[1]
+        return cls(rows, root, k @ root, own, float(np.sqrt(count / max(count - used, 1.0))))
 
     def less_leverage(self, errors: Matrix) -> Matrix:
-        """`(I − ψ_k M⁻¹ψ_kᵀ)⁻¹ e_k` of every row (N, ny): the error that a fit without this row leaves."""
-        own = np.eye(errors.shape[1]) - np.einsum("kor,kpr->kop", self.rows, self.rows)
+        """`(I − H_k)⁻¹ e_k` of every row (N, ny): the error that physics fitted without this row leaves of it."""
+        own = np.eye(errors.shape[1]) - np.einsum("kor,kpr->kop", self.physics, self.physics)
+        errors = self.inflation * errors
         if errors.shape[1] == 1:
             return errors / np.maximum(own[:, :, 0], np.sqrt(np.finfo(float).eps))
         values, vectors = np.linalg.eigh(own)

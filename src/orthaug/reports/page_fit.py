@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from orthaug.models.response import Response
 from orthaug.fitting.estimates import STD_KINDS
+from orthaug.models.response import Response
 from orthaug.reports.biases import biased_by
 from orthaug.reports.learned_part import LearnedPart
 from orthaug.reports.page_blocks import (

@@ -1,11 +1,12 @@
 """Is anything nonlinear missing, before a learner is trained? A test of what linear lags leave one step ahead.
 
 Squares, cubes and sizes of each regressor, less what physics and linear lags express of them, are multiplied by what
-these leave of the output. Their sums over blocks of rows change sign at random if nothing is missing, so the statistic
-is compared with itself under random signs, a wild bootstrap by blocks (Liu 1988, Shao 2010): its level does not rest on
-white or normal errors. A block is three times as long as the products remember each other, and a twentieth of the rows
-at least. What physics and linear lags leave of a block is too small, for the block has helped to fit them: it is divided
-by what it did not use, `(I − H_bb)⁻¹e_b` with H their projector (Bell and McCaffrey 2002), as HC3 does for a row.
+these leave of the output. Their sums over blocks of rows change sign at random if nothing is missing, so the
+statistic is compared with itself under random signs, a wild bootstrap by blocks (Liu 1988, Shao 2010): its level does
+not rest on white or normal errors. A block is three times as long as the products remember each other, and a
+twentieth of the rows at least. What physics and linear lags leave of a block is too small, for the block has helped
+to fit them: it is divided by what it did not use, `(I − H_bb)⁻¹e_b` with H their projector (Bell and McCaffrey 2002),
+as HC3 does for a row.
 """
 
 from __future__ import annotations
@@ -101,7 +102,7 @@ def nonlinearity(problem: Problem, lags: Sequence[str], draws: int = _DRAWS) -> 
 
 
 def _blocks(products: Matrix) -> int:
-    """Return how many blocks remember little of each other: none where the products remember each other for too long."""
+    """Return how many blocks remember little of each other: none where the products remember for too long."""
     lengths = [correlation_length(column[None]) for column in products.T]
     if any(length is None for length in lengths):
         return 0
