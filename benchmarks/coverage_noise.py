@@ -124,7 +124,7 @@ def lagged_fit(record: Any, sees: str | None, seed: int) -> tuple[Any, set[str],
 
 def motion_fit(record: Any, sees: str | None, seed: int, segment: int | None = None) -> tuple[Any, set[str], Any, Any]:
     learner = None if sees is None else oa.MLP((6,), inputs=(sees,))
-    options = {} if segment is None else {"criterion": oa.Simulation(segment=segment)}
+    options: dict[str, Any] = {} if segment is None else {"criterion": oa.Simulation(segment=segment)}
     fit = robust_free_run(oa.estimate(record, motion(), learner=learner, blocks=0, seed=seed, **options))
     return fit, codes_of(fit), fit.values, fit.interval
 
