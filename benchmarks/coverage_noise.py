@@ -58,7 +58,7 @@ def noise_of(kind: str, rng: np.random.Generator, u: np.ndarray) -> np.ndarray:
     white = rng.normal(size=len(u))
     if kind.startswith("AR("):
         pole = float(kind[3:-1])
-        return lfilter([np.sqrt(1 - pole**2)], [1.0, -pole], white)
+        return np.asarray(lfilter([np.sqrt(1 - pole**2)], [1.0, -pole], white))
     if kind == "heavy":
         return rng.standard_t(4, size=len(u)) / np.sqrt(2)
     if kind == "uneven":
