@@ -15,7 +15,7 @@ from machine import describe
 from scipy.signal import lfilter
 
 import orthaug as oa
-from orthaug.analysis.robustness import robust_where_coloured
+from orthaug.analysis.robustness import robust_where_asked
 
 SAMPLES, NOISE, WARM_UP = 3000, 0.5, 200
 THETA = np.array([1.5, -0.7, 0.3, 0.2])
@@ -39,7 +39,7 @@ def coverage(pole: float, segment: int, draws: int) -> tuple[np.ndarray, np.ndar
     criterion = oa.Simulation(segment, 40)
     for seed in range(draws):
         fit = oa.estimate(record(seed, pole), BASELINE, learner=None, criterion=criterion)
-        default += robust_where_coloured(fit, fit.model.predict(fit.problem.record)).plain_covariance is not None
+        default += robust_where_asked(fit, fit.model.predict(fit.problem.record)).plain_covariance is not None
         for i, found in enumerate((fit, fit.robust())):
             inside[i] += (found.interval[:, 0] <= THETA) & (found.interval[:, 1] >= THETA)
     return inside[0] / draws, inside[1] / draws, default / draws

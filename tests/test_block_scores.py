@@ -11,7 +11,7 @@ from test_initial_states import FED_BACK, eliminated, start_rows, states_of
 from test_segments import CASES, assert_close, case, dense, found_of
 
 from orthaug._base.errors import InputError
-from orthaug.analysis.robustness import robust_where_coloured
+from orthaug.analysis.robustness import robust_where_asked
 from orthaug.data.record import Record
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.colour import correlation_length
@@ -85,18 +85,19 @@ def test_errors_that_remember_for_long_have_no_length():
 # --- the intervals
 
 
-def record(seed, pole, samples=2000):
+def record(seed, pole, samples=2000, uneven=False):
     """A slow input, noise of deviation 0.5 on the sensor."""
     rng = np.random.default_rng([seed, 12])
     u = lfilter([1.0], [1.0, -0.8], rng.normal(size=samples + 200))
     y = lfilter([0.0, THETA[2]], [1.0, -THETA[0], -THETA[1]], u) + THETA[3] / (1 - THETA[0] - THETA[1])
     e = lfilter([np.sqrt(1 - pole**2)], [1.0, -pole], rng.normal(size=samples + 200))
+    e = e * np.abs(u) / u.std() if uneven else e
     return Record.from_arrays(u[200:], (y + 0.5 * e)[200:])
 
 
 @cache
-def flown(seed, pole=0.9, segment=0, samples=2000):
-    return estimate(record(seed, pole, samples), PHYSICS, learner=None, criterion=Simulation(segment, 40))
+def flown(seed, pole=0.9, segment=0, samples=2000, uneven=False):
+    return estimate(record(seed, pole, samples, uneven), PHYSICS, learner=None, criterion=Simulation(segment, 40))
 
 
 def test_blocks_cover_where_plain_intervals_do_not():
@@ -109,7 +110,7 @@ def test_blocks_cover_where_plain_intervals_do_not():
 
 
 def default(fit):
-    return robust_where_coloured(fit, fit.model.predict(fit.problem.record))
+    return robust_where_asked(fit, fit.model.predict(fit.problem.record))
 
 
 @pytest.mark.parametrize("segment", [0, 512])
@@ -135,10 +136,34 @@ def test_their_predictions_and_splits_are_robust_too():
     assert plain.split(Symmetrized()).plain_covariance is None
 
 
-@pytest.mark.parametrize("why", ["white", "few rows", "short segments"])
-def test_otherwise_they_stay_plain(why):
-    given = {"white": (0, 0.0), "few rows": (0, 0.9, 0, 300), "short segments": (0, 0.9, 50)}[why]
-    assert default(flown(*given)).plain_covariance is None
+def test_white_errors_keep_plain_intervals():
+    fit = default(flown(0, 0.0))
+    assert fit.plain_covariance is None and fit.std_kind == "plain"
+
+
+@pytest.mark.parametrize("why", ["few rows", "short segments"])
+def test_errors_that_remember_for_too_long_have_no_interval(why):
+    """Plain intervals held 40 to 75 % there; no number is called one of 95 %."""
+    plain = flown(*{"few rows": (0, 0.9, 0, 180), "short segments": (0, 0.9, 50)}[why])
+    fit = default(plain)
+    assert fit.std is None and fit.interval is None and fit.std_kind == "none"
+    np.testing.assert_array_equal(fit.plain_covariance, plain.covariance)
+    text = dict(fit.warnings)["too_long_memory"]
+    assert "no standard errors and no intervals" in text and "Longer segments" in text
+    assert "std         none" in fit.summary() and fit.split(Training()).std is None
+    assert default(fit) is fit
+
+
+def test_white_errors_of_uneven_size_have_batch_means_by_default():
+    fit = default(flown(0, 0.0, uneven=True))
+    assert fit.std_kind == "batch-means-uneven" and (fit.std > 1.15 * flown(0, 0.0, uneven=True).std).any()
+
+
+def test_the_sensitivities_of_every_step_make_the_scores():
+    scores = flown(0, 0.9, segment=512).scores
+    rows = np.einsum("kon,ko->n", scores.slopes(), scores.whitened())
+    every = scores.unit * scores.blocks(1).sum(axis=0)
+    np.testing.assert_allclose(rows, every, atol=1e-6 * np.abs(scores.slopes()).sum(axis=(0, 1)).max())
 
 
 def test_for_white_errors_they_are_the_plain_ones():

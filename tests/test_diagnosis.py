@@ -11,6 +11,7 @@ import pytest
 from scipy.signal import lfilter
 
 from orthaug.analysis.diagnosis import diagnose
+from orthaug.analysis.inconsistency import inconsistency
 from orthaug.analysis.predictability import Predictable
 from orthaug.analysis.verdict_text import _shares
 from orthaug.data.record import Channel, Record
@@ -253,7 +254,7 @@ def test_an_unmodelled_residual_is_told_with_its_size_and_advice():
     share = 100 * found.one_step[0].rms / second_order(0, equation=0.1, missing="lag of u").experiments[0].outputs.std()
     assert f"residual, {share:.2g} % of the output's deviation" in found.text
     assert "With the further input lag u[k-2] in the physics (or the learner) its error one step ahead" in found.text
-    assert "coloured" in dict(found.warnings)["coloured_residual"]
+    assert "coloured" in dict(found.warnings)["inconsistent"]
 
 
 def test_a_coloured_disturbance_biases_the_one_step_parameters_and_is_told():
@@ -264,10 +265,55 @@ def test_a_coloured_disturbance_biases_the_one_step_parameters_and_is_told():
         e[k] = 0.9 * e[k - 1] + 0.02 * rng.normal()
         y[k] = 1.5 * y[k - 1] - 0.7 * y[k - 2] + u[k - 1] + e[k]
     one, two = (of(Record.from_arrays(u, y), criterion=c) for c in (Prediction(), Simulation()))
-    told = dict(one.warnings)["coloured_residual"]
-    assert "biases the one-step θ" in told and 'focus = "simulation"' in told
+    told = dict(one.warnings)["inconsistent"]
+    assert "one-step θ is inconsistent" in told and "standard errors away" in told and 'focus = "simulation"' in told
     assert not any("one-step θ" in warning.text for warning in two.warnings)
     assert of(second_order(0, equation=0.1)).warnings == ()
+
+
+def noisy_equation(seed, colour, rows=3000, delta=0.0):
+    """A second-order system under AR(1) noise in its equation, y = 1.35 y₁ − 0.48 y₂ + 0.5 u + δ(v) + e."""
+    rng = np.random.default_rng([11, seed])
+    u, white, e, y = rng.normal(size=rows), 0.3 * rng.normal(size=rows), np.zeros(rows), np.zeros(rows)
+    for k in range(2, rows):
+        e[k] = colour * e[k - 1] + white[k]
+        v = y[k - 1] - y[k - 2]
+        y[k] = 1.35 * y[k - 1] - 0.48 * y[k - 2] + 0.5 * u[k - 1] + delta * np.tanh(3 * v) + e[k]
+    return Record.from_arrays(u, y)
+
+
+def test_weak_colour_in_the_equation_is_inconsistent_in_standard_errors():
+    """AR(0.2) leaves a residual that is nearly white; θ is six standard errors off, and the cures give its values."""
+    for seed in range(3):
+        fit = estimate(noisy_equation(seed, 0.2), PHYSICS, learner=None)
+        for one in (fit, fit.robust()):  # standard errors of another kind do not silence it
+            found = diagnose(one)
+            text = dict(found.warnings)["inconsistent"]
+            assert "the intervals hold" not in found.text and "`inconsistent`" in found.text
+            assert "standard errors away" in text and "Instruments" in text and 'focus = "simulation"' in text
+        tested = inconsistency(fit, fit.model.predict(fit.problem.record), fit.model.simulate(fit.problem.record))
+        assert abs(tested.apart[0]) > 3 and tested.moved[0] == 0
+        for value, std in ((tested.modelled, tested.modelled_std), (tested.instruments, tested.instruments_std)):
+            assert abs(value[0] - 1.35) < 3 * std[0] < 0.05 < 10 * abs(fit.theta[0] - 1.35)
+
+
+def test_white_noise_in_the_equation_is_consistent():
+    p = []
+    for seed in range(40):
+        fit = estimate(noisy_equation(seed, 0.0, rows=500), PHYSICS, learner=None)
+        p.append(inconsistency(fit, fit.model.predict(fit.problem.record)).found)
+    assert np.mean(p) <= 0.075  # 1.2 of 40 are expected
+
+
+def test_a_learner_is_partialled_out_before_the_colour_is_looked_for():
+    def found(colour):
+        sees = MLP((4,), inputs=("y[k-1] - y[k-2]",))
+        fit = estimate(noisy_equation(1, colour, delta=0.2), PHYSICS, learner=sees, criterion=Prediction(), restarts=1)
+        return inconsistency(fit, fit.model.predict(fit.problem.record), fit.model.simulate(fit.problem.record))
+
+    white, coloured = found(0.0), found(0.2)
+    assert not white.found and coloured.found and coloured.instruments is not None
+    assert abs(coloured.modelled[2] - 0.5) < 4 * coloured.modelled_std[2]
 
 
 # --- the criterion that sensor noise asks for

@@ -316,13 +316,13 @@ def test_a_model_runs_on_other_records(fitted: oa.MotionEstimate) -> None:
 
 def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(fitted: oa.MotionEstimate) -> None:
     from orthaug.analysis.motion_diagnosis import diagnose_motion
-    from orthaug.analysis.robustness import robust_motion
+    from orthaug.analysis.robustness import robust_free_run
 
     found = diagnose_motion(fitted, fitted.model.simulate(data()))
     assert found is not None and found.verdict == "white" and "noise on the outputs" in found.text
     again = oa.diagnose(fitted)
     assert again is not None and again.text == found.text
-    assert robust_motion(fitted) is fitted
+    assert robust_free_run(fitted) is fitted
     assert found.missing is not None and not found.missing.found(0.01, 0.05)
     alone = oa.estimate(data(), spring(), learner=None, criterion=WHOLE)
     found = diagnose_motion(alone, alone.model.simulate(data()))

@@ -9,6 +9,7 @@ import pytest
 
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jax, jnp
+from orthaug.analysis.robustness import robust_where_asked
 from orthaug.data.record import Record
 from orthaug.fitting.conclusion import orthogonalize
 from orthaug.fitting.criteria import Simulation
@@ -445,6 +446,50 @@ def test_robust_intervals_cover_where_plain_ones_do_not():
 def test_robust_errors_with_a_learner(noisy):
     """White noise: about those of the calibrated form, less by rows of high leverage that the learner bends to."""
     np.testing.assert_allclose(noisy.robust().std, noisy.std, rtol=0.3)
+
+
+@cache
+def uneven_line(seed, rows=300, uneven=True):
+    """y = u − 2 + e, the size of e going with |u|."""
+    u, e = np.random.default_rng([seed, 23]).normal(size=(2, rows))
+    gain = Baseline.from_terms([Term("a", "u[k]"), Term("b", "1")])
+    return estimate(Record.from_arrays(u, u - 2 + 0.3 * e * (np.abs(u) if uneven else 1)), gain, learner=None)
+
+
+def by_default(fit):
+    return robust_where_asked(fit, fit.model.predict(fit.problem.record))
+
+
+def test_noise_of_uneven_size_has_hc3_by_default():
+    """The plain error of the slope is 1.7 times too small; HC3, written out, is what is used."""
+    inside = np.zeros((2, 2))
+    for seed in range(100):
+        plain = uneven_line(seed)
+        fit = by_default(plain)
+        for i, found in enumerate((plain, fit)):
+            inside[i] += (found.interval[:, 0] <= [1, -2]) & (found.interval[:, 1] >= [1, -2])
+    assert inside[0, 0] < 80 and (inside[1] >= 90).all()
+    assert fit.std_kind == "hc3" and "robust (HC3), for the errors are of uneven size" in fit.summary()
+    phi = np.column_stack([plain.problem.record.experiments[0].inputs[:, 0], np.ones(300)])
+    e = plain.problem.record.experiments[0].outputs[:, 0] - phi @ plain.theta
+    inverse = np.linalg.inv(phi.T @ phi)
+    own = e / (1 - np.einsum("ki,ij,kj->k", phi, inverse, phi))
+    np.testing.assert_allclose(fit.covariance, inverse @ (phi.T * own**2) @ phi @ inverse, rtol=1e-8)
+    np.testing.assert_array_equal(fit.plain_covariance, plain.covariance)
+    np.testing.assert_allclose(fit.split(Training()).covariance, fit.covariance, rtol=1e-6)
+
+
+def test_noise_of_even_size_keeps_plain_errors():
+    kinds = [by_default(uneven_line(seed, uneven=False)).std_kind for seed in range(100)]
+    assert kinds.count("plain") >= 88  # the level of the test is 5 %
+
+
+def test_hc3_with_a_learner_is_about_the_plain_one_for_even_noise(noisy):
+    fit = noisy.robust(kind="hc3")
+    np.testing.assert_allclose(fit.std, noisy.std, rtol=0.3)
+    assert prediction_std(fit.model, fit.problem.record)[0].shape == (len(fit.problem.record), 1)
+    with pytest.raises(InputError, match="`kind`"):
+        noisy.robust(kind="batch-means")
 
 
 def test_newey_west_of_no_lag_is_whites():

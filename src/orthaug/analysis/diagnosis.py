@@ -18,6 +18,7 @@ from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import counted, percent
 from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.changes import Change, fall_of, model_changes, own_share
+from orthaug.analysis.inconsistency import inconsistency
 from orthaug.analysis.motion_diagnosis import diagnose_motion
 from orthaug.analysis.predictability import predictable
 from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, errors_of, rms_errors
@@ -115,6 +116,7 @@ def _of_lagged(fit: Estimate, one_step: Response | None, free_run: Response | No
         free_white=free_tests is not None and all(test.practically_white() for test in free_tests),
         free_tests=free_tests,
         **_effects(fit, one_step, free_run if flown else None, fit.criterion.simulates),
+        inconsistent=None if sensor or seen.steps else _inconsistent(fit, one_step, free_run if flown else None),
     )
     if not simulated and not white:
         seen = replace(seen, changes=_with_criterion(seen, free_run if flown else None, trained))
@@ -144,6 +146,13 @@ def _concluded(seen: Finding) -> Diagnosis:
     warnings = (*wild, *warnings)
     tested = seen.tests, seen.free_tests, seen.ratio, seen.noise
     return Diagnosis(verdict, text, *tested, warnings, seen.predictable, seen.changes, steps=seen.steps or None)
+
+
+def _inconsistent(fit: Estimate, one_step: Response, free_run: Response | None) -> Warning | None:
+    """Return the warning that coloured errors move the one-step θ; None where they do not, as far as is seen."""
+    with one_blas_thread():
+        found = inconsistency(fit, one_step, free_run)
+    return found.warning if found is not None and found.found else None
 
 
 def _steps(problem: Problem, tests: tuple[ResidualTest, ...]) -> dict[str, float]:

@@ -11,6 +11,7 @@ rejects at the level divided by the number of families and it predicts blocks of
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy.special
@@ -166,7 +167,7 @@ def _left(columns: Matrix, target: Vector) -> float:
 
 def _signals(model: Model | MotionModel, run: LinearRun) -> dict[str, Vector]:
     """Return what terms may be of: each channel of the regressor and its velocity, or states and inputs."""
-    form = model.form
+    form: Any = model.form
     if isinstance(model, MotionModel):
         names = (*model.form.motion.names_of_states, *model.form.motion.inputs)
         found = dict(zip(names, np.concatenate([run.states, run.inputs], axis=1).T, strict=True))
@@ -187,7 +188,7 @@ def _signals(model: Model | MotionModel, run: LinearRun) -> dict[str, Vector]:
 
 def _features(model: Model | MotionModel, run: LinearRun) -> Matrix:
     """Return what the learner sees along the run, (T, nz)."""
-    form = model.form
+    form: Any = model.form
     if form.bound is None:
         return np.zeros((len(run.error), 0))
     if isinstance(model, MotionModel):

@@ -1,52 +1,135 @@
-"""Which standard errors a fit has by default: robust ones where its residual is coloured and the rows suffice."""
+"""Which standard errors a fit has by default: plain ones, robust ones against colour or uneven size, or none."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from orthaug._base.checks import Vector
-from orthaug._base.errors import InputError
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.errors import InputError, Warning
+from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.residuals import LAGS, PRACTICALLY_WHITE, ROUNDING, errors_of, rms_errors
 from orthaug.analysis.whiteness import ROWS_PER_LAG, autocorrelation, ljung_box
+from orthaug.fitting.colour import correlation_length
 from orthaug.fitting.estimates import Estimate
-from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.inference.influence import LARGEST, Influence, one_step_slopes
 from orthaug.models.response import Response
+from orthaug.physics.streamed import StreamedProblem
 
 _FEWEST_ROWS, _ROWS_PER_TERM = 100, 10  # rows that a sum of autocovariances needs, in all and for each of its lags
-_FEWEST_BLOCKS = 20  # of which the variance of a sum can be told: its standard error is then a third of it
+_FEWEST_BLOCKS = 12  # of which the variance of a sum can be told, Student's t counting them; shorter blocks held 85 %
+_FEWEST_TESTED = 40  # rows from which White's test is asked
+_SHORT = 5  # steps of a block of errors that are white and of uneven size
+UNEVEN = 0.05  # level of White's test
 _MEMORIES = 3  # times as many lags as the residual's correlation lasts: Bartlett's weights fade
 _LEVEL = 0.01  # of the test whether a residual is white
 
 
-def robust_where_coloured(fit: Estimate, response: Response) -> Estimate:
-    """The fit with robust standard errors, where it leaves a coloured residual: Newey and West, or batch means.
+def robust_where_asked(fit: Estimate, response: Response) -> Estimate:
+    """The fit with the standard errors that its errors ask for: plain, or robust against colour or uneven size.
 
-    `response` is the prediction of the training rows. Few rows, or ones that remember each other for long, leave the
-    plain errors: their robust ones would be too small.
+    One step ahead that is HC3 where White's test finds that the size of the errors goes with what moves θ, and Newey
+    and West where they are coloured and the rows suffice. `response` is the prediction of the training rows.
     """
     if not fit.status.ok or fit.covariance is None or fit.at_bound:
         return fit
-    lags = _memory(fit, response) if fit.criterion.flown is None else block_of(fit)
-    return _robust(fit, len(fit.problem.rows), lags)
-
-
-def robust_motion(fit: MotionEstimate) -> MotionEstimate:
-    """The fit with robust standard errors where its free run leaves coloured errors and the rows suffice."""
-    if not fit.status.ok or fit.covariance is None:
+    if fit.criterion.flown is not None:
+        return robust_free_run(fit)
+    lags, rows = _memory(fit, response), len(fit.problem.rows)
+    if lags is not None:
+        return _robust(fit, lags) if rows >= max(_FEWEST_ROWS, _ROWS_PER_TERM * lags) else fit
+    errors = np.concatenate(errors_of(response)) @ fit.problem.weight.matrix.T
+    if np.all(rms_errors(response) / fit.problem.deviation < ROUNDING) or len(errors) != rows:
         return fit
-    return _robust(fit, len(fit.problem.record), block_of(fit))
-
-
-def _robust(fit: Any, rows: int, lags: int | None) -> Any:
-    """Where so many rows tell a sum of so many autocovariances."""
-    if lags is None or rows < max(_FEWEST_ROWS, _ROWS_PER_TERM * lags):
+    if not _has_rows(fit, rows) or not _is_uneven(fit, one_step_slopes(fit.problem, fit.model), errors):
         return fit
+    return _robust(fit, None, "hc3")
+
+
+def robust_free_run(fit: Any) -> Any:
+    """The fit of a free run, of lagged physics or of a motion, with batch means where its errors ask for them.
+
+    Where they are coloured and the record holds too few stretches that do not remember each other, there are no
+    standard errors, and no interval.
+    """
+    if not fit.status.ok or fit.covariance is None or fit.scores is None:
+        return fit
+    if not _is_tested(fit):
+        return fit
+    if _coloured_run(fit):
+        steps = block_of(fit)
+        return _withheld(fit) if steps is None else _robust(fit, steps)
+    segments = fit.scores.segments
+    if not _has_rows(fit, segments.count) or not _is_uneven(fit, fit.scores.slopes(), fit.scores.whitened()):
+        return fit
+    return _robust(fit, _SHORT, "batch-means-uneven")
+
+
+def _robust(fit: Any, lags: int | None, kind: str | None = None) -> Any:
+    """The fit with robust standard errors; as it is where there can be none."""
     try:
-        return fit.robust(lags)
+        return fit.robust(lags) if kind is None else fit.robust(lags, kind)
     except InputError:  # an ensemble, or a fit without statistics
         return fit
+
+
+def _has_rows(fit: Any, rows: int) -> bool:
+    """Whether the derivatives of every row exist, and fit into memory."""
+    gram = fit.model.statistics.gram
+    if gram is None or fit.model.numbers.tilt is not None or isinstance(fit.problem, StreamedProblem):
+        return False
+    return rows >= _FEWEST_TESTED and rows * len(fit.problem.deviation) * len(gram) <= LARGEST
+
+
+def _is_uneven(fit: Any, slopes: Any, errors: Matrix) -> bool:
+    """Whether White's test rejects errors whose size has nothing to do with what moves the parameters."""
+    made = fit.moves_by()
+    if made is None or not np.isfinite(slopes).all() or not np.isfinite(errors).all():
+        return False
+    k, moves = made
+    statistics = fit.model.statistics
+    nt = len(fit.theta)
+    prior = np.broadcast_to(statistics.ridge, len(statistics.gram) - nt)[moves[nt:]]
+    own = replace(statistics, gram=statistics.gram[np.ix_(moves, moves)], ridge=prior)
+    with one_blas_thread():
+        return Influence.of(slopes[..., moves], own, k[:, moves], int(moves[:nt].sum())).uneven(errors) < UNEVEN
+
+
+def _withheld(fit: Any) -> Any:
+    """The fit without standard errors, which says why."""
+    segments = fit.scores.segments
+    lengths = [correlation_length(errors) for errors in fit.scores.errors()]
+    known = [length for length in lengths if length is not None]
+    if len(known) == len(lengths) and max(known) <= fit.scores.longest:
+        why = f"for {max(known)} steps, and the {segments.count} that were trained on hold too few stretches of that"
+    else:
+        why = (
+            f"for longer than the segments that were trained on ({fit.scores.longest} steps) or a good part of the data"
+        )
+    each = (
+        ""
+        if fit.std is None
+        else "; for white errors it would be "
+        + ", ".join(f"{std:.2g} of {name}" for name, std in zip(_names(fit), fit.std, strict=True) if np.isfinite(std))
+    )
+    text = (
+        f"no standard errors and no intervals: the errors of the free run remember each other {why}, so their number "
+        f"does not say how well they average out{each}, which is too small. Longer segments, a longer record, or "
+        "physics that leaves less may tell."
+    )
+    return replace(
+        fit,
+        covariance=None,
+        plain_covariance=fit.covariance,
+        std_kind="none",
+        warnings=(*fit.warnings, Warning("too_long_memory", text)),
+    )
+
+
+def _names(fit: Any) -> tuple[str, ...]:
+    return tuple(fit.problem.baseline.names if fit.lagged else fit.problem.motion.names)
 
 
 def _memory(fit: Estimate, response: Response) -> int | None:
@@ -66,18 +149,24 @@ def _memory(fit: Estimate, response: Response) -> int | None:
 
 def block_of(fit: Any) -> int | None:
     """Steps of a block for the errors of the free run; None where these are white, or leave too few blocks."""
-    if fit.scores is None:
-        return None
-    errors = fit.scores.errors()  # (ny, segments, steps), 0 where a step is not scored
-    size = np.sqrt(np.sum(errors**2, axis=(1, 2)) / max(fit.scores.segments.count, 1))
-    if not np.isfinite(size).all() or np.all(size / fit.problem.deviation < ROUNDING):
-        return None
-    if not any(_is_coloured([one[one != 0] for one in output]) for output in errors):
+    if fit.scores is None or not _is_tested(fit) or not _coloured_run(fit):
         return None
     steps = fit.scores.block()
-    if steps is None or fit.scores.segments.count < _FEWEST_BLOCKS * steps:
+    if steps is None or fit.scores.segments.count < max(_FEWEST_BLOCKS * steps, _FEWEST_ROWS):
         return None
     return steps
+
+
+def _is_tested(fit: Any) -> bool:
+    """Whether the errors of the free run are finite and more than rounding."""
+    errors = fit.scores.errors()  # (ny, segments, steps), 0 where a step is not scored
+    size = np.sqrt(np.sum(errors**2, axis=(1, 2)) / max(fit.scores.segments.count, 1))
+    return bool(np.isfinite(size).all() and not np.all(size / fit.problem.deviation < ROUNDING))
+
+
+def _coloured_run(fit: Any) -> bool:
+    """Whether the errors of the free run are coloured in some output."""
+    return any(_is_coloured([one[one != 0] for one in output]) for output in fit.scores.errors())
 
 
 def _is_coloured(pieces: list[Vector]) -> bool:

@@ -31,6 +31,7 @@ _INCONSISTENT = Warning(
     "the one-step residual is coloured: what disturbs one row is in the lagged outputs of the next, which biases the "
     'one-step θ, and its intervals do not cover that bias. Training on the free run (focus = "simulation") has none.',
 )
+_OFF = "The errors are coloured by enough to make the one-step θ inconsistent (warning `inconsistent`)."
 _COLOUR = 0.1  # of the residual's variance that its own past tells: from there on that bias may matter
 
 
@@ -82,6 +83,8 @@ class Finding:
     changes: tuple[Change, ...] = ()
     steps: Mapping[str, float] = field(default_factory=dict)
     """Steps of the outputs whose one-step error has their size."""
+    inconsistent: Warning | None = None
+    """That coloured errors move the one-step θ, by how many standard errors, and what the remedies give."""
 
     @property
     def lacks(self) -> bool:
@@ -118,8 +121,10 @@ def words(verdict: str, seen: Finding) -> tuple[str, tuple[Warning, ...]]:
         "sensor_noise": _sensor_noise,
         "unmodelled": _unmodelled,
     }[verdict](seen)
-    if verdict == "unmodelled" and _inconsistent(seen):
-        warnings = (*warnings, _INCONSISTENT)
+    if verdict == "unmodelled" and _inconsistent(seen) and (seen.lacks or seen.inconsistent is None):
+        warnings = (*warnings, _INCONSISTENT)  # where the physics lacks something, a model of the colour tells no θ
+    elif verdict != "sensor_noise" and seen.inconsistent is not None:
+        return f"{text} {_OFF}", (*warnings, seen.inconsistent)
     plain = seen.fit.std is not None and seen.fit.plain_covariance is None
     if plain and not warnings and not (seen.free_white if seen.simulated else seen.white):
         warnings = (_coloured("errors of the free run are" if seen.simulated else "one-step residual is"),)
@@ -134,6 +139,8 @@ def _inconsistent(seen: Finding) -> bool:
 
 
 def _white(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
+    if seen.complete and seen.inconsistent is not None:
+        return "The one-step residual is hardly coloured, by enough to move θ.", ()
     if seen.complete:
         told = "the intervals hold" if seen.fit.model.form.bound is None else "it is noise as far as it shows"
         return f"The one-step residual is white: {told}, and no criterion is better than this one.", ()
@@ -147,6 +154,8 @@ def _equation_noise(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     if seen.simulated:
         asked = " The one-step criterion is the more precise one here."
         asked += f" {_sentence(seen.changes[0])}" if seen.changes else ""
+    if seen.inconsistent is not None:
+        return "The one-step residual is nearly white, the free run's is not: the noise enters the equation.", ()
     return f"The one-step residual is white, the free run's is not: the noise enters the equation.{asked}", ()
 
 

@@ -66,13 +66,13 @@ def content(
     job: LaggedJob, fit: Estimate, responses: Mapping[str, tuple[Response, Response]], warnings: list[Any]
 ) -> tuple[Estimate, dict[str, Any]]:
     """The fit with the standard errors that its residual asks for, and what results tell of it; warnings are added."""
-    from orthaug.analysis.robustness import robust_where_coloured
+    from orthaug.analysis.robustness import robust_where_asked
 
     told: dict[str, Any] = dict.fromkeys((*_UNKNOWN, "residuals", "missing_lags", "stability"))
     if fit.status.ok:
         one_step, free_run = responses[job.train.name]
         plain = fit
-        fit = attempt("the robust covariance", lambda: robust_where_coloured(plain, one_step), warnings, plain)
+        fit = attempt("the robust covariance", lambda: robust_where_asked(plain, one_step), warnings, plain)
         told |= _physical_content(job, fit, warnings)
         told["bias"] = attempt("the bias by suspects", partial(_bias_of, job, fit), warnings, None)
         told |= _analysed(fit, one_step, free_run, warnings)
@@ -89,6 +89,7 @@ def content(
     rows = [row if row.unit else row.model_copy(update={"derived_unit": units.get(row.name)}) for row in rows]
     told |= {
         "standard_errors": None if fit.std is None else "plain" if fit.plain_covariance is None else "robust",
+        "standard_errors_by": None if fit.std_kind == "plain" else fit.std_kind,
         "measure_detail": fit.measure,
         "excitation": fit.excitation,
         "shared": shared,

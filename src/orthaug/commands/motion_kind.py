@@ -130,7 +130,7 @@ def content(
 ) -> tuple[MotionEstimate, dict[str, Any]]:
     """The fit, and what results tell of it; warnings are added."""
     from orthaug.analysis.imitation import MotionImitation
-    from orthaug.analysis.robustness import robust_motion
+    from orthaug.analysis.robustness import robust_free_run
     from orthaug.inference.nearly_shared import shared_warnings
     from orthaug.physics.excitation import Excitation, of_gram
 
@@ -140,7 +140,7 @@ def content(
     told: dict[str, Any] = dict.fromkeys((*_UNKNOWN, "residuals", "stability", "shared", "measure_detail"))
     if fit.status.ok:
         plain = fit
-        fit = attempt("the robust covariance", lambda: robust_motion(plain), warnings, plain)
+        fit = attempt("the robust covariance", lambda: robust_free_run(plain), warnings, plain)
         found = _analysed(job, fit, responses[job.train.name][1], warnings)
         warnings += closed_loop(job.train.record)
         told |= {name: found[name] for name in ("residuals", "stability", "bias")}
@@ -153,6 +153,7 @@ def content(
     return fit, told | {
         "parameters": _parameters(fit, budget),
         "standard_errors": None if fit.std is None else "plain" if fit.plain_covariance is None else "robust",
+        "standard_errors_by": None if fit.std_kind == "plain" else fit.std_kind,
         "excitation": Excitation(0, count, None, ()) if gram is None else of_gram(gram[:count, :count], motion.names),
         "motion": {
             "states": motion.names_of_states,

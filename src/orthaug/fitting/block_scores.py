@@ -22,7 +22,7 @@ from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError
 from orthaug.fitting.colour import correlation_length
 from orthaug.fitting.objective import errors_of
-from orthaug.fitting.segments import Segments, block_scores
+from orthaug.fitting.segments import Segments, block_scores, respond
 from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.statistics import Statistics
 
@@ -85,6 +85,29 @@ class FreeRunScores:
             scores = scores - of_state @ self.slope
         counts = np.stack([scored[:, place == block].sum(axis=1) for block in range(int(place[-1]) + 1)], axis=-1)
         return scores[counts > 0]
+
+    def slopes(self) -> Float[np.ndarray, "N ny n"]:
+        """The sensitivities of p on every scored step, the starts eliminated, in the units of the model's Gram matrix.
+
+        They are the scores of errors of 1 in one whitened output after the other.
+        """
+        model = np.asarray(respond(self.dynamics, self.numbers, self.segments, self.states))
+        scored, n0 = np.asarray(self.segments.scored), self.segments.start.shape[1]
+        place = np.arange(self.segments.steps, dtype=np.int32)
+        found = []
+        for unit in np.linalg.inv(self.weight).T:
+            segments = self.segments._replace(target=model + unit[:, None])
+            made = (self.dynamics, self.numbers, segments, self.states, self.weight, place, len(place))
+            sums = np.moveaxis(np.asarray(block_scores(*made)), -1, 1)  # (k, m, T, n0 + n)
+            own = sums[..., n0:] if self.slope is None else sums[..., n0:] - sums[..., :n0] @ self.slope
+            found.append(own[np.moveaxis(scored, -1, 1)])
+        return np.sqrt(self.unit) * np.stack(found, axis=1)
+
+    def whitened(self) -> Float[np.ndarray, "N ny"]:
+        """The errors of the same steps in whitened outputs, in the same units."""
+        errors = np.moveaxis(errors_of(self.dynamics, self.numbers, self.states, self.segments), 3, 1)  # (k, m, T, ny)
+        there = errors[np.moveaxis(np.asarray(self.segments.scored), -1, 1)]
+        return np.sqrt(self.unit) * there @ self.weight.T
 
     def middle(self, steps: int, used: float) -> tuple[Matrix, int]:
         """Ω of p in the units of the model's Gram matrix, and the number of blocks that it is made of.

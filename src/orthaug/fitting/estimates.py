@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from orthaug._base.checks import Matrix, Vector, check_count, check_type
+from orthaug._base.checks import Matrix, Vector, check_choice, check_count, check_type
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import fold
 from orthaug._base.views import ShownFit
@@ -20,6 +20,7 @@ from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.held_out import Focus, HeldOut
 from orthaug.fitting.status import Status
 from orthaug.inference.covariance import interval, joint_covariance, robust_covariance, robust_split_covariance
+from orthaug.inference.influence import hc3, one_step_slopes
 from orthaug.inference.learned_terms import equation, learned_terms, term_frame, term_lines
 from orthaug.inference.measures import Measure, Points, Support, Training
 from orthaug.inference.nearly_shared import grown
@@ -38,8 +39,15 @@ if TYPE_CHECKING:
 
 NOT_UNIQUE = "theta_not_unique"
 """The code of the warning that a split under a measure makes untrue."""
-ROBUST = "robust (Newey-West), for the one-step residual is coloured"
-ROBUST_FLOWN = "robust (batch means), for the errors of the free run are coloured"
+STD_KINDS = {
+    "plain": "those of white errors of even size",
+    "hc3": "robust (HC3), for the errors are of uneven size",
+    "newey-west": "robust (Newey-West), for the one-step residual is coloured",
+    "batch-means": "robust (batch means), for the errors of the free run are coloured",
+    "batch-means-uneven": "robust (batch means), for the errors of the free run are of uneven size",
+    "none": "none: the errors of the free run remember each other for too long",
+}
+"""How standard errors were made, in words."""
 
 
 @dataclass(frozen=True)
@@ -125,6 +133,8 @@ class Estimate(AnyFit):
     """Cov θ̂ for white noise, where `covariance` is robust; None where it is not."""
     scores: FreeRunScores | None = field(default=None, repr=False)
     """What robust standard errors of a free run are made of; None one step ahead."""
+    std_kind: str = "plain"
+    """How the standard errors were made, a key of `STD_KINDS`."""
     plain_statistics: Statistics | None = field(default=None, repr=False)
     """The model's statistics for white noise, where they are robust; None where they are not."""
 
@@ -194,8 +204,9 @@ class Estimate(AnyFit):
         return replace(
             self,
             model=replace(self.model, numbers=numbers, structure="orthogonal", measure=measure.name),
-            covariance=under.covariance,
+            covariance=None if self.std_kind == "none" else under.covariance,
             plain_covariance=plain,
+            std_kind=self.std_kind if plain is not None or self.std_kind == "none" else "plain",
             defect=under.defect,
             measure=under,
             warnings=(*(w for w in self.warnings if w.code != NOT_UNIQUE), *under.warnings, *unknown),
@@ -207,27 +218,32 @@ class Estimate(AnyFit):
             raise InputError("the joint covariance is that of a one-step fit with statistics of its own.")
         return joint_covariance(self.problem, self.model, convention)
 
-    def robust(self, lags: int | None = None) -> Estimate:
+    def robust(self, lags: int | None = None, kind: str | None = None) -> Estimate:
         """The same with standard errors of θ that hold for coloured and uneven noise.
 
-        One step ahead they are those of Newey and West. On the free run they are batch means of the scores, and hold
-        for predictions too (`fitting/block_scores.py`).
+        One step ahead they are those of Newey and West, or HC3 for noise that is uneven and white. On the free run they
+        are batch means of the scores (`fitting/block_scores.py`). Both these hold for predictions too.
 
         Args:
             lags: of the autocovariances; on the free run steps of a block. By default `⌊4 (N/100)^(2/9)⌋`, on the free
                 run three times as many as the correlation of the errors lasts.
+            kind: "newey-west" or "hc3" one step ahead, "batch-means" on the free run; None for the first that there is.
 
         Raises:
             InputError: a fit without standard errors or with a parameter at a bound; errors that remember each other
-                for too long.
+                for too long; a kind that is not for this criterion.
         """
         flown = self.criterion.flown is not None
+        kinds = ("batch-means", "batch-means-uneven") if flown else ("newey-west", "hc3")
+        kind = kinds[0] if kind is None else check_choice(kind, kinds, "`kind`")
         if self.covariance is None or self.at_bound or (flown and self.scores is None):
             raise InputError(
                 "robust standard errors are those of a fit that has standard errors, with no parameter at a bound."
             )
         if flown:
-            return self._robust_flown(lags)
+            return replace(self._robust_flown(lags), std_kind=kind)
+        if kind == "hc3":
+            return self._hc3()
         trajectories = self.model.predict(self.problem.record).trajectories
         residual = np.concatenate([(t.measured - t.model)[t.start :] for t in trajectories])  # type: ignore[operator]
         used = (self.problem, residual, self.effective_weights, lags)
@@ -237,9 +253,30 @@ class Estimate(AnyFit):
             slope = self._slope()
             covariance = robust_split_covariance(self.problem, self.model, slope, *used[1:])
         plain = self.covariance if self.plain_covariance is None else self.plain_covariance
-        shared = None if self.model.shared is None else self.problem.shared
-        covariance = grown(covariance, self.model.statistics, shared)
-        return replace(self, covariance=covariance, plain_covariance=plain)
+        covariance = self._grown(covariance, self.model.statistics)
+        return replace(self, covariance=covariance, plain_covariance=plain, std_kind=kind)
+
+    def _hc3(self) -> Estimate:
+        """With every row's own error in place of one noise variance."""
+        statistics = self.plain_statistics or self.model.statistics
+        if statistics.gram is None or self.model.numbers.tilt is not None or isinstance(self.problem, StreamedProblem):
+            raise InputError("the fit has no statistics that robust standard errors could be made of.")
+        trajectories = self.model.predict(self.problem.record).trajectories
+        residual = np.concatenate([(t.measured - t.model)[t.start :] for t in trajectories])  # type: ignore[operator]
+        slopes, share = one_step_slopes(self.problem, self.model), self.problem.count / len(self.problem.rows)
+        own = hc3(statistics, slopes, residual @ self.problem.weight.matrix.T, len(self.theta), share)
+        return replace(
+            self,
+            model=replace(self.model, statistics=own),
+            covariance=self._grown(self._cov_along(own, self._slope()), own),
+            plain_covariance=self.covariance if self.plain_covariance is None else self.plain_covariance,
+            plain_statistics=statistics,
+            std_kind="hc3",
+        )
+
+    def _grown(self, covariance: Matrix | None, statistics: Statistics) -> Matrix | None:
+        """Return Cov θ̂, larger along directions that the learner could nearly imitate on the rows."""
+        return grown(covariance, statistics, None if self.model.shared is None else self.problem.shared)
 
     def _robust_flown(self, steps: int | None) -> Estimate:
         """From blocks of so many steps of the free run."""
@@ -263,6 +300,11 @@ class Estimate(AnyFit):
         """Cov of `θ = c + θ_aux(w)` from statistics of (c, w)."""
         joint = statistics.joint(len(self.theta))
         return None if joint is None else joint.of(np.column_stack([np.eye(len(self.theta)), slope]))
+
+    def moves_by(self) -> tuple[Matrix, Vector] | None:
+        """How θ follows (c, w), [I ∂θ_aux/∂w], and which entries of these move."""
+        k = np.column_stack([np.eye(len(self.theta)), self._slope()])
+        return k, np.ones(k.shape[1], dtype=bool)
 
     def _slope(self) -> Matrix:
         """∂θ_aux/∂w under the measure that θ was split under."""
@@ -322,7 +364,7 @@ class Estimate(AnyFit):
             moved = ", ".join(f"{name} {value:.6g}" for name, value in zip(baseline.names, one_step, strict=True))
             lines.append(f"one step    Φ⁺Y would give {moved}")
         if self.plain_covariance is not None:
-            lines.append(f"std         {ROBUST if self.criterion.flown is None else ROBUST_FLOWN}")
+            lines.append(f"std         {STD_KINDS[self.std_kind]}")
         lines += ["", *parameter_lines(baseline.parameters, self.theta, self.std, self.interval)]
         return [*lines, *term_lines(learned_terms(self.model))]
 

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from jaxtyping import Bool
 
-from orthaug._base.checks import Matrix, Vector, check_type
+from orthaug._base.checks import Matrix, Vector, check_choice, check_type
 from orthaug._base.errors import InputError, Warning
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion
-from orthaug.fitting.estimates import ROBUST_FLOWN, AnyFit, Restart, parameter_frame, parameter_lines
+from orthaug.fitting.estimates import STD_KINDS, AnyFit, Restart, parameter_frame, parameter_lines
 from orthaug.fitting.held_out import Focus, HeldOut
 from orthaug.fitting.motion_measures import field_under, wobble
 from orthaug.fitting.status import Status
@@ -68,6 +68,8 @@ class MotionEstimate(AnyFit):
     """What robust standard errors are made of."""
     plain_covariance: Matrix | None = None
     """The covariance for white noise, where `covariance` is robust; None where it is not."""
+    std_kind: str = "plain"
+    """How the standard errors were made, a key of `STD_KINDS`."""
     at_bound: tuple[str, ...] = ()
     unidentified: tuple[str, ...] = ()
     """Parameters that no output tells beside the learner, or only the prior of its weights."""
@@ -151,16 +153,18 @@ class MotionEstimate(AnyFit):
         split = split_motion(measure.name, form, whole, self.alone, field, bounds, **options)
         return _with_split(self, replace(split, support=support), told)
 
-    def robust(self, steps: int | None = None) -> MotionEstimate:
+    def robust(self, steps: int | None = None, kind: str = "batch-means") -> MotionEstimate:
         """The same with standard errors that hold for coloured errors: batch means of the scores (`block_scores`).
 
         Args:
             steps: of a block; None to choose it by how long the errors remember each other.
+            kind: "batch-means", or "batch-means-uneven" where the errors are white and of uneven size.
 
         Raises:
-            InputError: no statistics, or errors that remember each other for too long.
+            InputError: another kind, no statistics, or errors that remember each other for too long.
         """
         statistics = self.model.statistics
+        check_choice(kind, ("batch-means", "batch-means-uneven"), "`kind`")
         if self.scores is None or self.covariance is None or statistics.gram is None:
             raise InputError("the fit has no statistics that robust standard errors could be made of.")
         used = len(self.theta) + self.effective_weights
@@ -168,8 +172,13 @@ class MotionEstimate(AnyFit):
         plain = self.covariance if self.plain_covariance is None else self.plain_covariance
         model = replace(self.model, statistics=statistics)
         kept = tuple(w for w in self.warnings if w.code == "measure_beyond_data")
-        robust = replace(self, model=model, freedom=statistics.freedom, plain_covariance=plain)
+        robust = replace(self, model=model, freedom=statistics.freedom, plain_covariance=plain, std_kind=kind)
         return _with_split(robust, self.split_by, kept)
+
+    def moves_by(self) -> tuple[Matrix, Vector] | None:
+        """How the coordinates follow (c, w), and which entries of these move; None without statistics."""
+        made = free_covariance(self)
+        return None if made is None or self.split_by.slope is None else (self.split_by.slope, made[1])
 
     def __repr__(self) -> str:
         values = ", ".join(f"{n} = {v:.6g}" for n, v in zip(self.problem.motion.names, self.values, strict=True))
@@ -191,7 +200,7 @@ class MotionEstimate(AnyFit):
         if bound is not None:
             lines += [f"shared      {shared_in_words(self.shared)}", f"measure     {self.split_by.name}"]
         if self.plain_covariance is not None:
-            lines.append(f"std         {ROBUST_FLOWN}")
+            lines.append(f"std         {STD_KINDS[self.std_kind]}")
         lines += ["", *parameter_lines(motion.parameters, self.values, self.std, self.interval)]
         return [*lines, *term_lines(learned_terms(self.model))]
 
@@ -215,7 +224,7 @@ def _with_split(fit: MotionEstimate, split: MotionSplit, told: tuple[Warning, ..
     return replace(
         fit,
         model=model,
-        covariance=grown(covariance, fit.model.statistics, split.shared),
+        covariance=None if fit.std_kind == "none" else grown(covariance, fit.model.statistics, split.shared),
         defect=split.defect,
         split_by=split,
         at_bound=at_bound,

@@ -183,7 +183,7 @@ def _variances(
 
 
 @partial(jax.jit, static_argnames="form")
-def _changes(
+def changes(
     form: Lagged, numbers: Numbers, x: Float[Array, "k nx m"], root: Float[Array, "n r"]
 ) -> Float[Array, "k ro m"]:
     """How far each prediction moves along the columns of `root`."""
@@ -254,10 +254,10 @@ def robust_split_covariance(
     half = half_inverse(statistics.gram + np.diag(prior), nt)
     root = half @ (half.T @ np.column_stack([np.eye(nt), slope]).T)
     chunks = jnp.asarray(in_chunks(problem.rows.x, chunk_shape(len(residual)), repeat=True))
-    changes = from_chunks(np.asarray(_changes(model.form, model.numbers, chunks, jnp.asarray(root))), len(residual))
+    moved = from_chunks(np.asarray(changes(model.form, model.numbers, chunks, jnp.asarray(root))), len(residual))
     matrix = problem.weight.matrix
     weighed = residual @ (matrix.T @ matrix)
-    scores = np.einsum("kro,ko->kr", changes.reshape(len(residual), nt, ny), weighed)
+    scores = np.einsum("kro,ko->kr", moved.reshape(len(residual), nt, ny), weighed)
     return _correction(problem, residual, used) * newey_west(by_experiment(problem, scores), lags)
 
 

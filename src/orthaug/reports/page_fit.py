@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from orthaug.fitting.estimates import STD_KINDS
 from orthaug.models.response import Response
 from orthaug.reports.biases import biased_by
 from orthaug.reports.learned_part import LearnedPart
@@ -116,6 +117,8 @@ def _parameters(result: FitResult) -> list[Any]:
     shared = any(row.shared is not None for row in rows)
     columns += ["learner could imitate it"] if shared else []
     caption = f"What was estimated. {told[result.standard_errors]}"
+    if result.standard_errors_by is not None:
+        caption = f"What was estimated. Standard errors: {STD_KINDS[result.standard_errors_by]}."
     if result.noise_only:
         caption += " Intervals count noise only: the model leaves more than noise, which may have moved the parameters."
     if result.standard_errors is not None:

@@ -269,7 +269,7 @@ class PhysicsAloneResult(Content):
 class FitResult(Headed):
     """What `orthaug fit` leaves."""
 
-    absent: ClassVar = frozenset({"motion", "terms", "equation", "unexplained"})
+    absent: ClassVar = frozenset({"motion", "terms", "equation", "unexplained", "standard_errors_by"})
 
     spec: dict[str, Any]
     data: DataResult
@@ -277,6 +277,8 @@ class FitResult(Headed):
     restarts: list[RestartResult]
     parameters: list[ParameterResult]
     standard_errors: str | None
+    standard_errors_by: str | None = None
+    """How they were made, a key of `fitting.estimates.STD_KINDS`; None for those of white and even errors."""
     physical_parameters: list[ParameterResult] | None
     physical_consistency: ConsistencyResult | None
     sensitivities: dict[str, ByName] | None
