@@ -47,6 +47,7 @@ k = { initial = 120.0, unit = "N/m", min = 0 }
 hidden = [3]
 inputs = ["v"]
 [training]
+restarts = 1
 iterations = 40
 segment = 150
 [validation]
@@ -404,6 +405,7 @@ kind = "dead_zone"
 on = "force"
 equation = "v"
 [training]
+restarts = 1
 """
 
 
@@ -473,6 +475,7 @@ kind = "cubic"
 on = "i"
 equation = "w"
 [training]
+restarts = 1
 iterations = 5
 [validation]
 blocks = 0

@@ -176,7 +176,7 @@ def _candidates(
 ) -> list[Candidate]:
     """Return the named causes, and what may stand instead of one of them."""
     several = " and ".join(cause.suspect.name for _, cause in found)
-    kept = [Named(several, min(explains(cause) for _, cause in found), bias, rest=rest)]
+    kept: list[Candidate] = [Named(several, min(explains(cause) for _, cause in found), bias, rest=rest)]
     for own, cause in found:
         others = (*_declared(own, suspects), *_usual(own), *_families(own))
         others += own.table(saturations([entry.suspect for entry in others]), certify=False, every=False)
@@ -208,12 +208,12 @@ def _physical_rows(
         for sign in (-1.0, 1.0):
             wide = [sign * row @ c.moved + np.sqrt(np.sum((row * c.unsure) ** 2)) for c in candidates]
             chosen.append(candidates[int(np.argmax(np.nan_to_num(wide, nan=-np.inf)))])
-    ends, shifts = [], None
-    for c in {id(c): c for c in chosen}.values():
+    ends, shifts = [], np.zeros(len(physical.names))
+    for i, c in enumerate({id(c): c for c in chosen}.values()):
         spread = np.outer(c.unsure, c.unsure) + np.diag(np.zeros(len(bias)) + other) ** 2
         spread = spread + (0.0 if fit.covariance is None else fit.covariance)
         moves, limits = physical_with_bias(ground, c.moved, fit.covariance, spread, fit.freedom)
-        shifts = moves if shifts is None else shifts
+        shifts = shifts if i else moves
         ends.append(limits)
     ends = np.stack([np.min(ends, axis=0)[:, 0], np.max(ends, axis=0)[:, 1]], axis=-1)  # NaN where one has none
     owners = _owners(causes, moved @ turned.T) if slopes else []
