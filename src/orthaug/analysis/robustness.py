@@ -20,6 +20,7 @@ from orthaug.physics.streamed import StreamedProblem
 
 _FEWEST_ROWS, _ROWS_PER_TERM = 100, 10  # rows that a sum of autocovariances needs, in all and for each of its lags
 _FEWEST_BLOCKS = 12  # of which the variance of a sum can be told, Student's t counting them; shorter blocks held 85 %
+_FEWEST_INDEPENDENT = 10  # errors less one, by which an autoregressive model tells a variance: Student's t counts them
 _FEWEST_TESTED = 40  # rows from which White's test is asked
 _SHORT = 5  # steps of a block of errors that are white and of uneven size
 UNEVEN = 0.05  # level of White's test
@@ -51,8 +52,9 @@ def robust_where_asked(fit: Estimate, response: Response) -> Estimate:
 def robust_free_run(fit: Any) -> Any:
     """The fit of a free run, of lagged physics or of a motion, with batch means where its errors ask for them.
 
-    Where they are coloured and the record holds too few stretches that do not remember each other, there are no
-    standard errors, and no interval.
+    Where they are coloured and the record holds too few stretches that do not remember each other for blocks, a model
+    of their colour takes the place of these; where it says that the record is too short, there are no standard errors,
+    and no interval.
     """
     if not fit.status.ok or fit.covariance is None or fit.scores is None:
         return fit
@@ -60,11 +62,20 @@ def robust_free_run(fit: Any) -> Any:
         return fit
     if _coloured_run(fit):
         steps = block_of(fit)
-        return _withheld(fit) if steps is None else _robust(fit, steps)
+        return _by_colour(fit) if steps is None else _robust(fit, steps)
     segments = fit.scores.segments
     if not _has_rows(fit, segments.count) or not _is_uneven(fit, fit.scores.slopes(), fit.scores.whitened()):
         return fit
     return _robust(fit, _SHORT, "batch-means-uneven")
+
+
+def _by_colour(fit: Any) -> Any:
+    """The fit with the standard errors of an autoregressive model of its errors; without any where these are few."""
+    if _has_rows(fit, fit.scores.segments.count):
+        found = _robust(fit, None, "autoregressive")
+        if found.std_kind == "autoregressive" and found.freedom >= _FEWEST_INDEPENDENT:
+            return found
+    return _withheld(fit)
 
 
 def _robust(fit: Any, lags: int | None, kind: str | None = None) -> Any:

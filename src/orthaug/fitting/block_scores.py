@@ -9,6 +9,9 @@ has steps (Andrews 1991); in the words of cluster-robust errors (Liang and Zeger
 The state that a segment starts from is an unknown too. It is eliminated from every step alike, with χ_k the sensitivity
 to it: `s_k − S_px S_xx⁻¹ χ_k`, the Schur complement of M. That is linear in the steps, so it can follow the sum over a
 block. What the measured state adds counts to the first block of its segment. No block crosses the end of a segment.
+
+A record that is too short for blocks may still tell the colour by few numbers: with e an autoregressive process of
+autocovariance γ, `Ω = Σ_jk s_jᵀ γ_{j−k} s_k`, for s follows the inputs and not the noise (`fitting/colour.py`).
 """
 
 from __future__ import annotations
@@ -16,11 +19,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.linalg
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError
-from orthaug.fitting.colour import correlation_length
+from orthaug.fitting.colour import autoregression, correlation_length
 from orthaug.fitting.objective import errors_of
 from orthaug.fitting.segments import Segments, block_scores, respond
 from orthaug.models.dynamics import Dynamics, Numbers
@@ -120,12 +124,46 @@ class FreeRunScores:
         correction = blocks / max(blocks - 1, 1) * rows / max(rows - used, 1.0)
         return self.share * correction * self.unit**2 * scores.T @ scores, blocks
 
-    def robust(self, statistics: Statistics, freedom: float, used: float, steps: int | None) -> Statistics:
+    def coloured_middle(self, used: float) -> tuple[Matrix, float]:
+        """Ω of p under autoregressive errors, in the units of the model's Gram matrix, and their independent number.
+
+        Errors of several outputs are whitened against each other; each has a colour of its own.
+
+        Args:
+            used: parameters of the fit, by which its errors are too small.
+        """
+        lengths = np.asarray(self.segments.scored).sum(axis=1).ravel()
+        ends = np.cumsum(lengths)[:-1]
+        slopes, errors = np.split(self.slopes(), ends), np.split(self.whitened(), ends)
+        outputs, rows = errors[0].shape[1], self.share * sum(lengths)
+        total, independent = 0.0, np.inf
+        for o in range(outputs):
+            colour = autoregression([piece[:, o] for piece in errors if len(piece)])
+            gamma = colour.autocovariance(max(lengths))
+            for own in slopes:
+                if len(own):
+                    total = total + own[:, o].T @ scipy.linalg.matmul_toeplitz(gamma[: len(own)], own[:, o])
+            independent = min(independent, self.share * float(colour.independent(lengths)))
+        correction = rows * outputs / max(rows * outputs - used, 1.0) * independent / max(independent - 1.0, 1.0)
+        return self.share * correction * np.asarray(total), independent
+
+    def robust(
+        self, statistics: Statistics, freedom: float, used: float, steps: int | None, *, modelled: bool = False
+    ) -> Statistics:
         """The model's statistics for coloured errors, from blocks of so many steps; None for as many as `block` says.
+
+        Args:
+            statistics, freedom: of errors that are white.
+            used: parameters of the fit.
+            steps: of a block.
+            modelled: take the errors for an autoregressive process instead of blocks.
 
         Raises:
             InputError: errors that remember each other for too long.
         """
+        if modelled:
+            middle, independent = self.coloured_middle(used)
+            return replace(statistics, middle=middle, freedom=float(min(freedom, max(independent - 1.0, 1.0))))
         steps = self.block() if steps is None else steps
         if steps is None:
             raise InputError("the errors of the free run remember each other for too long to take them in blocks.")

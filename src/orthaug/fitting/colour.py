@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
@@ -9,6 +12,61 @@ from orthaug._base.checks import Matrix, Vector
 _NO_CORRELATION = 0.05  # below it a correlation of the errors does not count
 _ROWS_PER_LAG = 20
 _NOISE = 1.5  # deviations of a correlation: what is below it on average is noise
+_MOST_ORDERS = 30  # of an autoregression
+_ROWS_PER_ORDER = 20
+_POINTS = 1 << 16  # at least, of the spectrum that autocovariances are made of
+
+
+@dataclass(frozen=True)
+class Autoregression:
+    """Errors that follow `e_k = Σ a_i e_{k−i} + w_k`, w white of some variance."""
+
+    coefficients: Vector
+    variance: float
+
+    def autocovariance(self, lags: int) -> Vector:
+        """Return γ_0 … γ_{lags−1}, from the spectrum `variance / |A|²`."""
+        points = max(1 << int(4 * lags).bit_length(), _POINTS)
+        polynomial = np.fft.rfft(np.concatenate([[1.0], -self.coefficients]), points)
+        return np.fft.irfft(self.variance / np.abs(polynomial) ** 2, points)[:lags]
+
+    def independent(self, lengths: Sequence[int] | Vector) -> float:
+        """Return how many independent errors tell a mean square as well as stretches of these lengths do.
+
+        For a normal process that is `N / Σ ρ_j²` over all lags j of both signs (Bartlett 1946).
+        """
+        rho = self.autocovariance(int(max(lengths)))
+        rho = rho / rho[0]
+        pairs = sum(np.maximum(length - np.arange(len(rho)), 0) for length in lengths)
+        rows = float(sum(lengths))
+        return rows**2 / float(rows + 2 * np.sum(pairs[1:] * rho[1:] ** 2))
+
+
+def autoregression(pieces: Sequence[Vector]) -> Autoregression:
+    """Return the autoregression of stretches of errors, by Burg, with the order of the least Akaike criterion (AICc).
+
+    Burg's estimate is stable always. Of stretches that are too short for an order, that order is not tried.
+    """
+    rows = sum(map(len, pieces))
+    most = max(min(_MOST_ORDERS, rows // _ROWS_PER_ORDER, max(map(len, pieces)) - 2), 0)
+    forward, backward = list(pieces), list(pieces)
+    variance = sum(float(np.sum(piece**2)) for piece in pieces) / max(rows, 1)
+    found, best = np.zeros(0), (np.log(max(variance, 1e-300)), np.zeros(0), variance)
+    for order in range(1, most + 1):
+        ahead = [f[1:] for f in forward if len(f) > 1]
+        behind = [b[:-1] for b in backward if len(b) > 1]
+        power = sum(float(f @ f + b @ b) for f, b in zip(ahead, behind, strict=True))
+        if not power > 0:
+            break
+        reflection = 2 * sum(float(f @ b) for f, b in zip(ahead, behind, strict=True)) / power
+        found = np.append(found - reflection * found[::-1], reflection)
+        variance *= 1 - reflection**2
+        forward = [f - reflection * b for f, b in zip(ahead, behind, strict=True)]
+        backward = [b - reflection * f for f, b in zip(ahead, behind, strict=True)]
+        cost = np.log(max(variance, 1e-300)) + 2 * (order + 1) / max(rows - order - 2, 1)
+        if cost < best[0]:
+            best = (cost, found, variance)
+    return Autoregression(best[1], best[2])
 
 
 def autocorrelation(residuals: Matrix) -> Vector | None:

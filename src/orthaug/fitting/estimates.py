@@ -44,6 +44,7 @@ STD_KINDS = {
     "hc3": "robust (HC3), for the errors are of uneven size",
     "newey-west": "robust (Newey-West), for the one-step residual is coloured",
     "batch-means": "robust (batch means), for the errors of the free run are coloured",
+    "autoregressive": "robust (an autoregressive model of the errors), for the errors of the free run are coloured",
     "batch-means-uneven": "robust (batch means), for the errors of the free run are of uneven size",
     "none": "none: the errors of the free run remember each other for too long",
 }
@@ -227,21 +228,22 @@ class Estimate(AnyFit):
         Args:
             lags: of the autocovariances; on the free run steps of a block. By default `⌊4 (N/100)^(2/9)⌋`, on the free
                 run three times as many as the correlation of the errors lasts.
-            kind: "newey-west" or "hc3" one step ahead, "batch-means" on the free run; None for the first that there is.
+            kind: "newey-west" or "hc3" one step ahead; on the free run "batch-means", or "autoregressive" for errors of
+                an autoregressive process; None for the first that there is.
 
         Raises:
             InputError: a fit without standard errors or with a parameter at a bound; errors that remember each other
                 for too long; a kind that is not for this criterion.
         """
         flown = self.criterion.flown is not None
-        kinds = ("batch-means", "batch-means-uneven") if flown else ("newey-west", "hc3")
+        kinds = ("batch-means", "batch-means-uneven", "autoregressive") if flown else ("newey-west", "hc3")
         kind = kinds[0] if kind is None else check_choice(kind, kinds, "`kind`")
         if self.covariance is None or self.at_bound or (flown and self.scores is None):
             raise InputError(
                 "robust standard errors are those of a fit that has standard errors, with no parameter at a bound."
             )
         if flown:
-            return replace(self._robust_flown(lags), std_kind=kind)
+            return replace(self._robust_flown(lags, kind), std_kind=kind)
         if kind == "hc3":
             return self._hc3()
         trajectories = self.model.predict(self.problem.record).trajectories
@@ -278,15 +280,16 @@ class Estimate(AnyFit):
         """Return Cov θ̂, larger along directions that the learner could nearly imitate on the rows."""
         return grown(covariance, statistics, None if self.model.shared is None else self.problem.shared)
 
-    def _robust_flown(self, steps: int | None) -> Estimate:
-        """From blocks of so many steps of the free run."""
+    def _robust_flown(self, steps: int | None, kind: str) -> Estimate:
+        """From blocks of so many steps of the free run, or from the colour of its errors."""
         assert self.scores is not None
         statistics = self.model.statistics
         if statistics.gram is None or self.model.numbers.tilt is not None:
             raise InputError("the fit has no statistics that robust standard errors could be made of.")
         steps = None if steps is None else check_count(steps, "lags")
         used = len(self.theta) + self.effective_weights
-        statistics = self.scores.robust(statistics, self.freedom, used, steps)
+        modelled = kind == "autoregressive"
+        statistics = self.scores.robust(statistics, self.freedom, used, steps, modelled=modelled)
         return replace(
             self,
             model=replace(self.model, statistics=statistics),

@@ -158,17 +158,19 @@ class MotionEstimate(AnyFit):
 
         Args:
             steps: of a block; None to choose it by how long the errors remember each other.
-            kind: "batch-means", or "batch-means-uneven" where the errors are white and of uneven size.
+            kind: "batch-means", "batch-means-uneven" where the errors are white and of uneven size, or "autoregressive"
+                for errors of an autoregressive process.
 
         Raises:
             InputError: another kind, no statistics, or errors that remember each other for too long.
         """
         statistics = self.model.statistics
-        check_choice(kind, ("batch-means", "batch-means-uneven"), "`kind`")
+        check_choice(kind, ("batch-means", "batch-means-uneven", "autoregressive"), "`kind`")
         if self.scores is None or self.covariance is None or statistics.gram is None:
             raise InputError("the fit has no statistics that robust standard errors could be made of.")
         used = len(self.theta) + self.effective_weights
-        statistics = self.scores.robust(statistics, self.freedom, used, steps)
+        modelled = kind == "autoregressive"
+        statistics = self.scores.robust(statistics, self.freedom, used, steps, modelled=modelled)
         plain = self.covariance if self.plain_covariance is None else self.plain_covariance
         model = replace(self.model, statistics=statistics)
         kept = tuple(w for w in self.warnings if w.code == "measure_beyond_data")
