@@ -16,7 +16,7 @@ from orthaug._base.parallel import one_blas_thread
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.views import MAKERS
 from orthaug.commands.attempt import attempt
-from orthaug.commands.folder import PHYSICS, not_a_result
+from orthaug.commands.folder import PHYSICS
 from orthaug.commands.job import ALONE, AS_DECLARED, DEFAULT_BLOCKS, Job, Variant, origin_of
 from orthaug.commands.kinds import kind_of
 from orthaug.commands.parts import Part
@@ -359,7 +359,7 @@ def _scored_along(model: Any, part: Part, warnings: list[Any]) -> PartScores:
 
 def write_result(fitted: Fitted, folder: Path, *, force: bool = False) -> None:
     """result.json, model/ and figures/, whole or not at all; without a model where training failed."""
-    with whole_folder(folder, not_a_result, force=force) as partial:
+    with whole_folder(folder, force=force) as partial:
         fill_result(fitted, partial)
     if fitted.job.checkpoints is not None:
         fitted.job.checkpoints.discard()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -33,11 +33,6 @@ from orthaug.physics.motion import Motion
 FORMAT = 2
 _DECLARATION, _ARRAYS = "model.json", "arrays.safetensors"
 _KINDS: dict[type, ModuleType] = {Model: lagged_storage, MotionModel: motion_storage}
-
-
-def not_a_model(folder: Path, names: Sequence[str]) -> str | None:
-    """A file in a folder without manifest that is no part of a model; None where an older version saved one."""
-    return next((name for name in names if name not in (_DECLARATION, _ARRAYS)), None)
 
 
 def save(model: Model | MotionModel, folder: str | Path, *, force: bool = False) -> None:
@@ -65,7 +60,7 @@ def save(model: Model | MotionModel, folder: str | Path, *, force: bool = False)
         ...     load(Path(folder, "model"))
         Model(orthogonal, θ: gain, learner: none)
     """
-    with whole_folder(Path(folder), not_a_model, force=force) as partial:
+    with whole_folder(Path(folder), force=force) as partial:
         write(model, partial)
 
 
