@@ -172,7 +172,7 @@ def exchange(folder: Path) -> None:
         (add_note, "note.txt, which orthaug did not write"),
         (change, "ours, which was changed since orthaug wrote it"),
         (link, "deep, which orthaug did not write"),
-        (exchange, "manifest.json and no manifest.json that says"),
+        (exchange, "manifest.json and no manifest.json that says orthaug wrote it"),
     ],
 )
 def test_a_result_with_something_else_is_kept_unless_forced(tmp_path, alter, words):

@@ -174,6 +174,12 @@ def told_of(job: Job, fit: Any) -> Fitted:
     warnings: list[Any] = [*job.warnings, *fit.warnings]
     if job.checkpoints is not None and job.checkpoints.lost:
         warnings.append(Warning("checkpoint_lost", f"the last state of training was not kept: {job.checkpoints.lost}."))
+    if job.checkpoints is not None and job.checkpoints.spoilt:
+        text = (
+            f"a kept state of training is damaged ({job.checkpoints.folder.name}/{job.checkpoints.spoilt[0]}), so "
+            "training began anew there; the result is that of a whole training."
+        )
+        warnings.append(Warning("checkpoint_spoilt", text))
     scores, responses = {}, {}
     if fit.status.ok:
         for part in job.parts:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from orthaug._base.checks import check_choice
 from orthaug._base.errors import InputError
 from orthaug._base.folders import check_new_file, check_replaceable, remember, whole_file
-from orthaug.commands.job import Job
+from orthaug.commands.job import Job, date_of_results
 
 if TYPE_CHECKING:
     from orthaug.reports.drawing import Figure
@@ -47,6 +47,7 @@ def results_beside(model: Path) -> Iterator[Any]:
 
 def check_folder(folder: Path, *, force: bool = False) -> None:
     """Raise InputError early where the result could not be written."""
+    date_of_results()
     check_replaceable(folder, force=force)
     remember(folder)
 
