@@ -6,6 +6,7 @@ import csv
 import ctypes
 import importlib.util
 import os
+import re
 import shutil
 import subprocess
 import sys

@@ -20,6 +20,7 @@ from test_motion_cli import put
 import orthaug as oa
 from orthaug.commands.compare import compare_report
 from orthaug.commands.fit import fit_report
+from orthaug.commands.folder import check_folder
 from orthaug.commands.job import origin_of
 from orthaug.data.record import Channel
 from orthaug.models.response import Response, Trajectory

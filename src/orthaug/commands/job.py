@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from orthaug import __version__
-from orthaug._base.errors import InputError, Warning
+from orthaug._base.errors import InputError, Warning, shown
 from orthaug._base.parallel import Threads
 from orthaug._base.progress import SILENT, Plan, Progress
 from orthaug.commands.parts import Part

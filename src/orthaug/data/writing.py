@@ -129,7 +129,7 @@ _TEX = {
 
 
 def tex_text(text: str) -> str:
-    """Return plain text for TeX: no letter of it begins a command, a group or a comment.
+    r"""Return plain text for TeX: no letter of it begins a command, a group or a comment.
 
     Examples:
         >>> print(tex_text(r"50 % of \\input{x}"))

@@ -25,6 +25,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
 from orthaug.models import lagged_storage, motion_storage
 from orthaug.models.learners import Learner
+from orthaug.models.loaded import check_loaded
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 from orthaug.physics.baseline import Baseline
@@ -111,7 +112,9 @@ def load(
     path = folder / _DECLARATION
     try:
         kind = motion_storage if declared.get("kind") == "motion" else lagged_storage
-        return kind.rebuild(declared, arrays, baseline, learner, path)
+        model = kind.rebuild(declared, arrays, baseline, learner, path)
+        check_loaded(model, path)
+        return model
     except InputError:
         raise
     except Exception as error:  # the checksum holds, so someone made it: there is no list of what that can hold

@@ -1,0 +1,65 @@
+"""Whether the parts of a model that was read fit together: every command that loads one relies on it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.checks import is_number
+from orthaug._base.errors import InputError, shown
+
+
+def check_loaded(model: Any, path: Path) -> None:
+    """Refuse a model whose numbers have other sizes than its form, or are not finite.
+
+    Raises:
+        InputError: the first part that does not fit.
+    """
+    if not is_number(model.sampling_time) or model.sampling_time <= 0:
+        raise InputError(f"{path}: its sampling time is {shown(model.sampling_time)}; expected a positive number.")
+    for name in ("structure", "measure", "time_column"):
+        if not isinstance(getattr(model, name), str | None):
+            raise InputError(f"{path}: its {name} is {shown(getattr(model, name))}; expected a word.")
+    for name, value, shape in _expected(model):
+        if value is None:
+            raise InputError(f"{path}: the model has no {name}; it was not written by orthaug.")
+        array = np.asarray(value)
+        if shape is not None and array.shape != shape:
+            raise InputError(f"{path}: {name} has the shape {array.shape}; the model's form needs {shape}.")
+        if not np.isfinite(array).all():
+            raise InputError(f"{path}: {name} holds a number that is not finite; fit again, or copy the model again.")
+    for name, value in (("deviation", model.deviation), ("halfwidth", model.numbers.halfwidth)):
+        if (np.asarray(value) < 0).any():
+            raise InputError(f"{path}: {name} is negative; it was not written by orthaug.")
+
+
+def _expected(model: Any) -> Iterator[tuple[str, Any, tuple[int, ...] | None]]:
+    """Names, values and shapes of what a model computes with; None for a shape that something else has checked."""
+    form, numbers, kept = model.form, model.numbers, model.statistics
+    outputs, parameters = len(model.outputs), len(model.estimated[0])
+    yield "theta", numbers.theta, (parameters,)
+    yield "theta_aux", numbers.theta_aux, (parameters,)
+    yield "largest_output", model.largest_output, (outputs,)
+    yield "deviation", model.deviation, (outputs,)
+    yield "output_weight", model.weight, (outputs, outputs)
+    if form.bound is not None:
+        yield "centre", numbers.centre, (form.bound.nz,)
+        yield "halfwidth", numbers.halfwidth, (form.bound.nz,)
+        yield "gain", numbers.gain, (form.bound.ny,)
+        yield "weights", numbers.weights, None
+    for name in ("tilt", "pull"):
+        if getattr(numbers, name) is not None:
+            yield name, getattr(numbers, name), None
+    square = (outputs, outputs)
+    for name, value, shape in (
+        ("noise", kept.noise, square),
+        ("gram", kept.gram, None),
+        ("middle", kept.middle, None if kept.gram is None else np.shape(kept.gram)),
+        ("disturbance", kept.disturbance, None),
+        ("sensor", kept.sensor, square),
+    ):
+        if value is not None:
+            yield name, value, shape
