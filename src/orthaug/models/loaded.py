@@ -10,6 +10,7 @@ import numpy as np
 
 from orthaug._base.checks import is_number
 from orthaug._base.errors import InputError, shown
+from orthaug._base.jax import jax
 
 
 def check_loaded(model: Any, path: Path) -> None:
@@ -34,6 +35,20 @@ def check_loaded(model: Any, path: Path) -> None:
     for name, value in (("deviation", model.deviation), ("halfwidth", model.numbers.halfwidth)):
         if (np.asarray(value) < 0).any():
             raise InputError(f"{path}: {name} is negative; it was not written by orthaug.")
+    for entry in getattr(model.form.features, "entries", model.form.features):
+        if not isinstance(entry.text, str):
+            raise InputError(f"{path}: a learner's input is {shown(entry.text)}; expected an expression.")
+    if model.form.differentiable:
+        _check_step(model, path)
+
+
+def _check_step(model: Any, path: Path) -> None:
+    """Trace one step, which computes nothing: expressions, layout and learner must fit the channels and the state."""
+    state, row = np.zeros(len(model.state_names)), np.zeros(len(model.step_inputs))
+    following, outputs = jax.eval_shape(model.step, state, row)
+    shapes = tuple(following.shape), tuple(outputs.shape)
+    if shapes != (state.shape, (len(model.outputs),)):
+        raise InputError(f"{path}: a step of the model makes {shapes}; its state and outputs need other shapes.")
 
 
 def _expected(model: Any) -> Iterator[tuple[str, Any, tuple[int, ...] | None]]:

@@ -53,7 +53,7 @@ class Gate:
         return f"http://127.0.0.1:{self.port}/?token={self.token}"
 
     def ticket(self) -> str:
-        """Return an address that opens the page once, for a browser's arguments: every user of the machine reads those."""
+        """Return an address that opens the page once: every user of the machine reads a browser's arguments."""
         token = secrets.token_urlsafe(32)
         self._tickets.add(token)
         return f"http://127.0.0.1:{self.port}/?token={token}"
