@@ -20,6 +20,7 @@ from orthaug.commands.folder import PHYSICS
 from orthaug.commands.job import ALONE, AS_DECLARED, DEFAULT_BLOCKS, Job, Variant, origin_of
 from orthaug.commands.kinds import kind_of
 from orthaug.commands.parts import Part
+from orthaug.commands.scales import describe_scales
 from orthaug.inference.learned_terms import equation, learned_terms
 from orthaug.reports.fields import WarningResult
 from orthaug.reports.result import FitResult, PartScores, ScoreResult
@@ -220,7 +221,13 @@ def told_of(job: Job, fit: Any) -> Fitted:
 def _status(fit: Any, warnings: Sequence[Any]) -> Any:
     """How training ended; of a model that does not run freely its message begins with that."""
     first = next((warning.text for warning in warnings if warning.code == "one_step_only"), "")
-    return replace(fit.status, reason=f"{first} {fit.status.message}".strip()) if first else fit.status
+    last = "" if fit.status.ok else describe_scales(fit.problem.record)
+    if not (first or last):
+        return fit.status
+    message = fit.status.message
+    if last and message:
+        last = f"{'' if message.endswith('.') else '.'} {last[0].upper()}{last[1:]}"
+    return replace(fit.status, reason=f"{first} {message}{last}".strip())
 
 
 def _one_step_only(

@@ -11,6 +11,7 @@ from orthaug._base.errors import InputError, RankError, Warning
 from orthaug.analysis.closed_loop import closed_loop
 from orthaug.commands.attempt import attempt, attempt_warned
 from orthaug.commands.motion_job import MotionJob
+from orthaug.commands.scales import describe_scales
 from orthaug.reports.result import CheckResult, FitResult, MeasureResult, ParameterResult, parameter_rows
 
 if TYPE_CHECKING:
@@ -47,7 +48,11 @@ def checked(job: MotionJob) -> CheckResult:
     course = MotionCourse.of(without_learner(problem), None, criterion)
     told = identified(course)
     if told is None:
-        raise InputError(f"{job.path}: physics alone has no finite free run from its initial values; give others.")
+        scales = describe_scales(problem.record)
+        cause = f" {scales[0].upper()}{scales[1:]}" if scales else ""
+        raise InputError(
+            f"{job.path}: physics alone has no finite free run from its initial values; give others.{cause}"
+        )
     shared = None
     if spec.declared_learner() is not None and job.structure.shared != "all":
         form = Moving(motion, problem.features, None, problem.record.sampling_time, problem.substeps)

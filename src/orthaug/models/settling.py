@@ -92,7 +92,10 @@ def _steps(
     sound: Any = np.isfinite(damped).all(axis=(1, 2)) & np.isfinite(right).all(axis=1)
     damped = np.where(sound[:, None, None], damped, np.eye(matrix.shape[1]))
     right = np.where(sound[:, None], right, 0.0)
-    return np.linalg.solve(damped, right[..., None])[..., 0].T
+    try:
+        return np.linalg.solve(damped, right[..., None])[..., 0].T
+    except np.linalg.LinAlgError:  # states beyond what double precision tells apart: there is no step to take
+        return np.zeros_like(right).T
 
 
 def _linearised(
