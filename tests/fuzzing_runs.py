@@ -50,9 +50,14 @@ def try_forged(seed: int, original: dict[str, bytes], folder: Path) -> str:
     else:
         name = sorted(arrays)[rng.integers(len(arrays))]
         values = np.array(arrays[name])
-        arrays[name] = (values * np.nan, values * np.inf, values[..., None], np.zeros(0), values.ravel()[:1], -values)[
-            rng.integers(6)
-        ]
+        arrays[name] = (
+            np.full_like(values, np.nan),
+            np.full_like(values, np.inf),
+            values[..., None],
+            np.zeros(0),
+            values.ravel()[:1],
+            -values,
+        )[rng.integers(6)]
     said = {k: v for k, v in declared.items() if k not in ("format", "orthaug", "arrays_sha256")}
     storage.write_packed(storage.pack(storage.FORMAT, said, arrays), place, numbers)
     u, y = signals()
@@ -81,12 +86,15 @@ def try_command(seed: int, folder: Path) -> str:
     out, err = io.StringIO(), io.StringIO()
 
     def judge() -> str:
-        with patch.object(sys, "argv", ["orthaug", *words]), contextlib.chdir(folder):
-            with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-                try:
-                    cli.main()
-                except SystemExit as stop:
-                    code = stop.code
+        code = None
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(patch.object(sys, "argv", ["orthaug", *words]))
+            for context in (contextlib.chdir(folder), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)):
+                stack.enter_context(context)
+            try:
+                cli.main()
+            except SystemExit as stop:
+                code = stop.code
         text = err.getvalue()
         if "Traceback" in text or code not in (0, 1, 2):
             return f"exit {code}: {words} {text}"[:300]

@@ -326,5 +326,5 @@ def test_an_npz_that_is_made_to_fill_the_memory(tmp_path, monkeypatch):
     monkeypatch.setattr(variables, "_LARGE", 1e5)
     path = tmp_path / "run.npz"
     np.savez_compressed(path, u=np.zeros(100_000), y=np.random.default_rng(0).normal(size=20_000))
-    assert "'u' is " in refusal(path, "u") and "Store it without compression" in refusal(path, "u")
+    assert "'u' is 781 KiB in" in refusal(path, "u") and "store it uncompressed" in refusal(path, "u")
     assert len(read_table(path, ("y",)).columns["y"]) == 20_000

@@ -124,10 +124,8 @@ def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Held
         return Held(f"cut: {in_words(info.file_size - begin)} of {in_words(size)}", None)
 
     if size > _LARGE and size > _DENSEST * info.compress_size:
-        raise InputError(
-            f"{path}: '{info.filename}' declares {in_words(size)} in {in_words(info.compress_size)} of the file, more "
-            "than measured numbers are compressed; is it made to fill the memory? Store it without compression."
-        )
+        packed = in_words(info.compress_size)
+        return Held(f"{in_words(size)} in {packed} of the file, denser than measurements; store it uncompressed", None)
 
     def load() -> np.ndarray:
         with archive.open(info) as member:
