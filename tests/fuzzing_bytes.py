@@ -13,7 +13,7 @@ from orthaug.data.expressions import parse_named
 from orthaug.data.tables import column_names
 from orthaug.models import storage
 
-_KNOWN = ("x", "v", "u", "k")
+_KNOWN = dict.fromkeys(("x", "v", "u", "k"))
 
 
 def expression(data: bytes) -> None:

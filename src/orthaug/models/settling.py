@@ -64,7 +64,8 @@ def settle(
     """
     count = np.shape(states)[1]
     begun = np.pad(np.asarray(states, dtype=float), ((0, 0), (0, -count % _LANES)), mode="edge")
-    prior = 1 / np.asarray(loose, dtype=float) ** 2
+    with np.errstate(over="ignore"):  # a start beyond all others has no prior
+        prior = 1 / np.asarray(loose, dtype=float) ** 2
     laid = windows.padded()  # once for all iterations
     best, damping = begun, np.full(begun.shape[1], _FIRST_DAMPING)
     matrix, right, misfit = _linearised(form, numbers, begun, laid, weight, begun, prior)
