@@ -13,7 +13,7 @@ from orthaug.data.expressions import parse_named
 from orthaug.data.tables import column_names
 from orthaug.models import storage
 
-_KNOWN = dict.fromkeys(("x", "v", "u", "k"))
+_KNOWN = dict.fromkeys(("x", "v", "u", "k"), 1.0)
 
 
 def expression(data: bytes) -> None:

@@ -26,4 +26,4 @@ def describe_scales(record: Record) -> str:
                 found.append(f"{channel.name} varies by {spread:.3g}{unit} about {middle:.3g}{unit}")
     if not found:
         return ""
-    return f"{', '.join(found)}: check `scale`, `offset` and `unit` in [data.channels] against the initial values."
+    return f"in the data {', '.join(found)}: check `scale`, `offset` and `unit` in [data.channels] against the initial values."
