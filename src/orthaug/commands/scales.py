@@ -26,4 +26,5 @@ def describe_scales(record: Record) -> str:
                 found.append(f"{channel.name} varies by {spread:.3g}{unit} about {middle:.3g}{unit}")
     if not found:
         return ""
-    return f"in the data {', '.join(found)}: check `scale`, `offset` and `unit` in [data.channels] against the initial values."
+    named = ", ".join(found)
+    return f"in the data {named}: check `scale`, `offset` and `unit` in [data.channels] against the initial values."
