@@ -156,7 +156,7 @@ def _record(plant: Plant, random: np.random.Generator, difficulty: str, wanted: 
 
 
 def oscillator(name: str, seed: int, effect: str, difficulty: str, as_motion: bool) -> Problem:
-    """One of the 40: the test has a larger input, another spectrum, or both."""
+    """One of the 40; one test is alike, with an input like that of training, the other has a larger or another one."""
     random = np.random.default_rng([36, seed])
     rows = _FEW if difficulty == "few rows" else int(random.integers(600, 1500))
     kind = int(random.integers(3))
@@ -168,9 +168,13 @@ def oscillator(name: str, seed: int, effect: str, difficulty: str, as_motion: bo
     amplitude, other = ((1.6, 0), (1.0, 1), (1.3, 2))[seed % 3]
     tested = amplitude * _signal(random, _TEST_ROWS, (kind + other) % 3)
     train, test = (_record(plant, random, difficulty, one) for one in (training, tested))
+    again = np.random.default_rng([36, seed, 1])
+    alike = _record(plant, again, difficulty, _signal(again, _TEST_ROWS, kind))
     motion = (MOTION if plant.k else DRIVE) if as_motion else ""
     what = f"{effect}, {difficulty}"
-    return Problem(name, GENERATED, ("u",), ("y",), _TS, [train], {"new": test}, motion=motion, what=what)
+    return Problem(
+        name, GENERATED, ("u",), ("y",), _TS, [train], {"new": test, "alike": alike}, motion=motion, what=what
+    )
 
 
 def oscillators() -> dict[str, Callable[[], Problem]]:

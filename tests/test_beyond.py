@@ -1,12 +1,14 @@
 """What a learned correction does beyond its training: the physics goes on with its θ, and what it adds is bounded."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from test_cli import run
 
 import orthaug as oa
+from orthaug.analysis import stability
 
 
 def plant(rows=600, amplitude=1.0, seed=0, noise=0.0) -> oa.Record:
@@ -171,3 +173,43 @@ def test_a_motion_fades():
     physics = np.asarray(model.alone.step(np.array([0.0, 1e3]), np.zeros(1))[0])
     np.testing.assert_allclose(fast, physics, rtol=1e-9)
     assert p["k"] > 0 and np.isfinite(slow).all()
+
+
+def test_a_bounded_correction_on_stable_physics_is_a_proof(tmp_path, monkeypatch):
+    """What goes on far away is the physics with θ̂: its spectral radius is in the result, but not of a free learner."""
+    monkeypatch.chdir(tmp_path)
+    rng, rows = np.random.default_rng(1), 300
+    u, y = rng.standard_normal(rows), np.zeros(rows)
+    for k in range(2, rows):
+        v = y[k - 1] - y[k - 2]
+        y[k] = 1.2 * y[k - 1] - 0.5 * y[k - 2] + 0.3 * u[k - 1] - 0.1 * np.tanh(3 * v) + 1e-3 * rng.standard_normal()
+    Path("d.csv").write_text("u,y\n" + "\n".join(f"{a},{b}" for a, b in zip(u, y, strict=True)))
+    terms = [("a1", "y[k-1]"), ("a2", "y[k-2]"), ("b1", "u[k-1]")]
+    spec = '[data]\ntrain = ["d.csv"]\nsampling_time = 1.0\ninputs = ["u"]\noutputs = ["y"]\n'
+    spec += "".join(f'[[baseline.terms]]\nparameter = "{p}"\nregressor = "{r}"\n' for p, r in terms)
+    spec += '[learner]\nkind = "mlp"\nhidden = [4]\nbeyond = "BEYOND"\n'
+    spec += '[training]\nfocus = "prediction"\nfallback = false\n'
+    for beyond in ("hold", "free"):
+        Path("spec.toml").write_text(spec.replace("BEYOND", beyond))
+        assert run("fit", "spec.toml", "--out", "out", "--force").code == 0
+        result = json.loads(Path("out/result.json").read_text())
+        theta = {p["name"]: p["value"] for p in result["parameters"]}
+        found = result["stability"]
+        if beyond == "hold":
+            expected = np.abs(np.roots([1, -theta["a1"], -theta["a2"]])).max()
+            assert found["radius_beyond"] == pytest.approx(expected, rel=1e-9) and expected < 1
+            assert "bounded inputs give a bounded free run" in found["text"]
+        else:
+            assert "radius_beyond" not in found and "bounded inputs" not in found["text"]
+
+
+def test_nonlinear_physics_proves_nothing():
+    """With y² in the physics, what goes on far away is no one linear system."""
+    rng, rows = np.random.default_rng(2), 300
+    u, y = rng.standard_normal(rows), np.zeros(rows)
+    for k in range(1, rows):
+        y[k] = 0.6 * y[k - 1] + 0.3 * u[k - 1] - 0.02 * y[k - 1] ** 2 - 0.1 * np.tanh(3 * y[k - 1])
+    record = oa.Record.from_arrays(u=u, y=y, sampling_time=1.0)
+    terms = [oa.Term("a", "y[k-1]"), oa.Term("c", "y[k-1]**2"), oa.Term("b", "u[k-1]")]
+    fit = oa.estimate(record, oa.Baseline.from_terms(terms), learner=oa.MLP((4,)), fallback=False)
+    assert stability(fit.model, record).radius_beyond is None

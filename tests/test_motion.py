@@ -71,6 +71,13 @@ def test_positive_parameters_are_estimated_as_logarithms() -> None:
         ({"states": [oa.State("x", "k*m*u", start=np.inf)]}, "the start of 'x' must be a finite number"),
         ({"inputs": ["x"]}, "'x' is a state and an input"),
         ({"inputs": ["a b"]}, "'a b' cannot name an input"),
+        ({"inputs": ["Ts"]}, "'Ts' cannot name an input: expressions read it as the sampling time of the data"),
+        ({"states": [oa.State("Ts", "k*m*u")]}, "'Ts' cannot name a state: expressions read it as the sampling time"),
+        ({"define": {"Ts": "k*m"}}, "'Ts' cannot name a definition: expressions read it as the sampling time"),
+        (
+            {"parameters": [M, K, oa.PhysicalParameter("Ts", 1.0)]},
+            "'Ts' cannot name a parameter: expressions read it as the sampling time of the data",
+        ),
         ({"integrator": "euler"}, "`integrator`"),
         ({"hold": "cubic"}, "`hold`"),
         ({"substeps": 0}, "`substeps` must be a whole number from 1"),
@@ -92,6 +99,7 @@ def test_what_is_no_motion_is_refused_in_words(changed: dict, message: str) -> N
     [
         (motion(), record(outputs=["z"]), None, "the output 'z' has no expression in the motion"),
         (motion(), record(y=np.ones(50)), None, "channel 'y' is constant"),
+        (motion(constants={"Ts": 0.5}), record(), None, "the constant 'Ts' is 0.5, but the data are sampled every"),
         (motion(), record(), ["m*v"], "learner input = m*v: unknown name 'm'"),
         (motion(define={"a": "k*x"}), record(), ["a"], "learner input = a: 'a' contains parameters"),
         (

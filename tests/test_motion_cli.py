@@ -205,7 +205,9 @@ def test_a_result_has_what_a_motion_has_and_null_for_the_rest(result):
     assert result["validation"]["verdict"] == "helps"
     assert result["excitation"]["rank"] == result["excitation"]["columns"] == 3
     assert result["orthogonality_defect"] < 1e-10
-    assert result["shared"]["inputs"] == ["v"] and result["shared"]["determined"] == ["m", "k"]
+    assert status["code"] == "iteration_limit"  # so that nothing counts as determined by the fit
+    assert result["shared"]["inputs"] == ["v"] and result["shared"]["determined"] == []
+    assert result["shared"]["withdrawn"] == ["m", "k"] and result["shared"]["doubt"] == "training had not converged"
     own = {"states": ["x", "v"], "integrator": "rk4", "substeps": 1, "hold": "zero-order"}
     assert {key: result["motion"][key] for key in own} == own
     assert set(result["motion"]) == {*own, "window", "parts", "substep_bias"}
@@ -575,6 +577,16 @@ def test_a_defect_of_an_analysis_loses_no_training_either(monkeypatch):
 
 
 BAD = {
+    "sampling time": (
+        "[motion.parameters]",
+        "[motion.constants]\nTs = 0.5\n[motion.parameters]",
+        "the constant 'Ts' is 0.5",
+    ),
+    "parameter Ts": (
+        "[motion.parameters]",
+        "[motion.parameters]\nTs = { initial = 1.0 }",
+        "'Ts' cannot name a parameter",
+    ),
     "undefined": ("c*v", "cc*v", "the equation of 'v' = (force - cc*v - k*x)/m: unknown name 'cc', did you mean 'c'?"),
     "lag": ("(force -", "(force[k] -", "a signal such as y[k-1] is no part of it"),
     "no derivative": ('derivative = "v", ', "", "`states.x` has no `derivative`; expected its equation"),

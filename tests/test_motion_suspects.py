@@ -216,7 +216,7 @@ def test_friction_that_turns_round_smoothly_is_no_drag() -> None:
     rivals = rivals_of(beside.cause, (*table, *smooth))
     assert [rival.suspect.name[:15] for rival in rivals] == ["coulomb as tanh"] and rivals[0] is not beside.cause
     twice = motion_budget(fit, [beside.cause, replace(table[1], explained=beside.share)])  # a rival that is elsewhere
-    assert twice.of("c").ci95[1] > alone.of("c").ci95[0]
+    assert not twice.of("c").determined or twice.of("c").ci95[1] > alone.of("c").ci95[0]
     assert "(near it: quadratic_drag, " in twice.warnings[0].text
 
 
@@ -229,7 +229,7 @@ def test_usual_terms_that_the_learner_sees_are_weighed_too(
     assert [entry.suspect.name for entry in table] == [*(f"{kind} of v" for kind in kinds), "offset"]
     assert len(smooth) == 6
     found = motion_budget(learned, table, smooth)
-    assert found.cause.suspect.name.startswith("coulomb of v") and found.share > 0.9
+    assert found.cause.suspect.name.startswith(("coulomb of v", "tanh(v")) and found.share > 0.9
     low, high = found.of("c").ci95
     assert low < TRUTH[1] < high < learned.values[1]
     assert usual_biases(alone) == ([], [])

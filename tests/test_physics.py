@@ -548,6 +548,7 @@ REFUSED = [
     ),
     ([P("mass", 1.0)], {"a": "mas"}, {}, "physics.theta 'a' = mas: unknown name 'mas', did you mean 'mass'?."),
     ([M], {"a": "m*zeta"}, {"Ts": 1.0}, "physics.theta 'a' = m*zeta: unknown name 'zeta'; known are Ts, m."),
+    ([M, P("Ts", 1.0)], {"a": "m*Ts"}, {}, "'Ts' cannot name a parameter: expressions read it as the sampling time .*"),
     ([M], {"a": "m*k"}, {}, "physics.theta 'a' = m*k: unknown name 'k'; known are m."),
     ([M], {"a": "m if m else m"}, {}, "physics.theta 'a': 'm if m else m': 'm if m else m' is not allowed .*"),
     ([M], {"a": "m +"}, {}, "physics.theta 'a': 'm +' is not an expression .*"),

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from functools import cache
 
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.signal
+from test_cli import run
 
+import orthaug as oa
 from orthaug._base.jax import jnp
 from orthaug.analysis.imitation import imitation
 from orthaug.data.expressions import parse
@@ -21,6 +25,7 @@ from orthaug.inference.measures import Training, Uniform
 from orthaug.models.learners import MLP, Function
 from orthaug.models.storage import load, save
 from orthaug.physics.baseline import Baseline, Term
+from orthaug.physics.left_over import left_over
 from orthaug.physics.parameters import PhysicalParameter, PhysicsMap
 from orthaug.physics.problem import pose
 from orthaug.physics.shared import Shared, shared_directions
@@ -115,7 +120,7 @@ def test_two_hundred_random_bases_against_algebra():
     """Shared are the a whose gradient of φa vanishes along the null space of the learner's linear forms."""
     rng, layout = np.random.default_rng(1), Lags(3, 2, 1).layout(("y",), ("u",))
     names = [str(lag) for lag in layout]
-    cases = 0
+    cases = by_rows = 0
     while cases < 200:
         case = random_case(rng, names)
         if case is None:
@@ -134,11 +139,16 @@ def test_two_hundred_random_bases_against_algebra():
         terms = [Term(f"t{i}", f"({linear_form(form, names)})**{p}") for i, (form, p) in enumerate(physics)]
         features = Features(tuple(parse(linear_form(row, names), {}) for row in z))
         found = shared_directions(Baseline.from_terms(terms), features, layout, ("y",), x)
+        if found.on_data:  # a form that lies within some per cent of the learner's: 300 rows do not tell it apart
+            by_rows += 1
+            cases += 1
+            continue
         assert found.basis.shape[1] == len(physics) - rank, (z, physics)
         if found.basis.size:
             change = gradient @ found.basis
             assert np.abs(change).max() <= 1e-5 * np.abs(gradient).max(initial=1.0) * np.abs(found.basis).max()
         cases += 1
+    assert by_rows <= 6
 
 
 def test_units_do_not_matter():
@@ -324,3 +334,129 @@ def test_a_learner_that_sees_everything_in_words():
     assert told.everything and told.text.endswith("along every direction.")
     assert told.physical == ()
     assert {other.inputs: other.physical for other in told.alternatives}[("y[k-1]-y[k-2]",)] == ("ks",)
+
+
+STAGE = """
+[data]
+sampling_time = 0.01
+inputs = ["speed", "place", "acceleration", "extra"]
+outputs = ["force"]
+[data.train]
+files = ["stage.csv"]
+[[baseline.terms]]
+parameter = "damping"
+regressor = "speed[k]"
+[[baseline.terms]]
+parameter = "e"
+regressor = "extra[k]"
+[[baseline.terms]]
+parameter = "m"
+regressor = "acceleration[k]"
+[[baseline.terms]]
+parameter = "offset"
+regressor = "1"
+[learner]
+kind = "mlp"
+hidden = [8]
+inputs = ["speed[k]", "place[k]"]
+"""
+COMPUTED = {  # from what the learner sees, and what the rows must say of it
+    "sign": (lambda v, p, rng: np.sign(v), "shared_on_data"),
+    "product": (lambda v, p, rng: v * p, "shared_on_data"),
+    "noisy sign": (lambda v, p, rng: np.sign(v + 0.1 * v.std() * rng.normal(size=len(v))), "nearly_shared"),
+    "lagged": (lambda v, p, rng: np.roll(v, 20), None),
+    "filtered": (lambda v, p, rng: scipy.signal.lfilter([0.05], [1, -0.95], v), None),
+    "independent": (lambda v, p, rng: rng.normal(size=len(v)), None),
+    "steps": (lambda v, p, rng: np.repeat(rng.normal(size=len(v) // 20), 20), None),
+}
+
+
+def stage(column, seed: int = 0, rows: int = 800) -> tuple[np.ndarray, np.ndarray]:
+    """Signals (rows, 4) and force of a stage whose friction is a function of speed and place."""
+    rng = np.random.default_rng(seed)
+    t = 0.01 * np.arange(rows)
+    v = sum(rng.uniform(0.3, 1) * np.sin(2 * np.pi * f * t + rng.uniform(0, 6.28)) for f in rng.uniform(0.2, 3, 6))
+    p, a = 0.01 * np.cumsum(v), np.gradient(v, 0.01)
+    extra = column(v, p, rng)
+    friction = 0.4 * np.sin(3 * p) + 0.3 * np.exp(-np.abs(v) / 0.1) * np.sign(v)
+    force = 2.0 * v + 1.5 * extra + 0.8 * a + 0.3 + friction + 0.02 * rng.normal(size=rows)
+    return np.column_stack([v, p, a, extra]), force
+
+
+@pytest.mark.parametrize(("column", "code"), COMPUTED.values(), ids=COMPUTED)
+def test_check_asks_the_rows_what_the_learner_could_imitate(tmp_path, column, code):
+    signals, force = stage(column)
+    head = "speed,place,acceleration,extra,force"
+    np.savetxt(tmp_path / "stage.csv", np.column_stack([signals, force]), delimiter=",", header=head, comments="")
+    (tmp_path / "stage.toml").write_text(STAGE)
+    done = run("check", tmp_path / "stage.toml", "--json")
+    assert done.code == 0, done.err
+    result = json.loads(done.out)
+    codes = ("shared_on_data", "nearly_shared")
+    told = {one["code"]: one["text"] for one in result["warnings"] if one["code"] in codes}
+    assert list(told) == ([code] if code else [])
+    assert ("e" in result["shared"]["determined"]) == (code != "shared_on_data")
+    assert "m" in result["shared"]["determined"]
+    if code:
+        assert " e" in told[code] and "%" in told[code] and "speed[k], place[k]" in told[code]
+
+
+def test_a_computed_column_has_the_papers_projection_and_the_rest_stays_determined():
+    signals, force = stage(COMPUTED["sign"][0])
+    names = ["speed", "place", "acceleration", "extra"]
+    record = oa.Record.from_arrays(signals, force, sampling_time=0.01, inputs=names, outputs=["force"])
+    terms = {"damping": "speed[k]", "e": "extra[k]", "m": "acceleration[k]", "offset": "1"}
+    baseline = oa.Baseline.from_terms([oa.Term(*term) for term in terms.items()])
+    fit = oa.estimate(record, baseline, learner=oa.MLP(hidden=(8,), inputs=("speed[k]", "place[k]")))
+    phi = np.column_stack([signals[:, 0], signals[:, 3], np.ones(len(force))])
+    rest = force - 0.8 * signals[:, 2]  # the paper's projection on the shared directions, beside the known mass
+    expected = np.linalg.lstsq(phi, rest, rcond=None)[0]
+    assert fit.theta[[0, 1, 3]] == pytest.approx(expected, abs=0.02)
+    low, high = fit.interval[2]
+    assert low <= 0.8 <= high
+    assert fit.problem.shared.on_data == ("e",)
+
+
+def test_independent_columns_are_hardly_ever_called_shared():
+    rng, called = np.random.default_rng(7), 0
+    for _ in range(200):
+        rows, nz = int(rng.integers(100, 800)), int(rng.integers(1, 4))
+        z = scipy.signal.lfilter([1.0], [1, -rng.uniform(0, 0.95)], rng.normal(size=(rows, nz)), axis=0)
+        noise = scipy.signal.lfilter([1.0], [1, -rng.uniform(0, 0.95)], rng.standard_t(4, size=(rows, 3)), axis=0)
+        rest = left_over(noise[:, None, :], z)
+        assert rest is not None
+        called += rest.imitated(np.zeros((3, 0))).shape[1] > 0
+    assert called == 0
+
+
+def test_a_motion_asks_the_rows_too():
+    """A column that is the sign of the speed beside a learner that sees the speed; and one that is not."""
+    rng = np.random.default_rng(1)
+    rows, step = 500, 0.02
+    drive, other = (np.repeat(rng.normal(size=rows // 10), 10) * 6 for _ in range(2))
+    for column, shared in (("side", True), ("other", False)):
+        x, v, extra = np.zeros(rows), np.zeros(rows), other / 6
+        for k in range(rows - 1):
+            if column == "side":
+                extra[k] = np.sign(v[k])
+            x[k + 1], v[k + 1] = x[k], v[k]
+            for _ in range(20):  # the input is held between samples; the physics lacks the sine
+                pull = drive[k] - 3.0 * v[k + 1] - 8.0 * x[k + 1] - 1.5 * extra[k] - 3.0 * np.sin(2 * v[k + 1])
+                v[k + 1] += step / 20 * pull
+                x[k + 1] += step / 20 * v[k + 1]
+        record = oa.Record.from_arrays(
+            np.column_stack([drive, extra]), x, sampling_time=step, inputs=["drive", "extra"], outputs=["place"]
+        )
+        physics = oa.Motion.from_equations(
+            states=[
+                oa.State("x", "v", start="place"),
+                oa.State("v", "(drive - c*v - k*x - e*extra)/m", start="derivative of place", learned=True),
+            ],
+            outputs=[oa.Output("place", "x")],
+            parameters=[oa.PhysicalParameter(n, s) for n, s in (("m", 1.0), ("c", 3.0), ("k", 8.0), ("e", 1.5))],
+            inputs=["drive", "extra"],
+        )
+        fit = oa.estimate(record, physics, learner=oa.MLP(hidden=(4,), inputs=("v",)))
+        assert fit.model.form.bound is not None and fit.shared.rest is not None
+        assert ("e" in fit.shared.on_data) == shared, fit.shared.rest.share
+        assert not {"m", "k"} & set(fit.shared.on_data)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import re
+
 import numpy as np
 import pytest
 import scipy.signal
+from test_cli import run
 
 import orthaug as oa
 
@@ -31,3 +35,117 @@ def test_a_wrong_sample_in_training_is_named(at):
 
 def test_heavy_tails_alone_are_none():
     assert warned(0.0) == []
+
+
+SPEC = """
+[data]
+sampling_time = 0.1
+inputs = ["u"]
+outputs = ["y"]
+{missing}
+[data.train]
+files = ["run.csv"]
+{prepare}
+[[baseline.terms]]
+parameter = "a"
+regressor = "y[k-1]"
+[[baseline.terms]]
+parameter = "b"
+regressor = "u[k-1]"
+[learner]
+kind = "none"
+"""
+MOTION = """
+[data]
+sampling_time = 0.1
+inputs = ["u"]
+outputs = ["y"]
+{missing}
+[data.train]
+files = ["run.csv"]
+{prepare}
+[motion.states]
+x = {{ derivative = "(g*u - x)/tau", start = "y" }}
+[motion.outputs]
+y = "x"
+[motion.parameters]
+tau = {{ initial = 0.2, min = 0 }}
+g = {{ initial = 0.8 }}
+"""
+
+
+def measured(folder, wrong: str = "", shape: str = "noise") -> None:
+    """A first-order system of 400 rows, `wrong` with the channel of a cell of 1e6 in row 200."""
+    rng = np.random.default_rng(3)
+    u = {"noise": rng.normal(size=400), "steps": np.repeat(rng.normal(size=20), 20), "hammer": np.zeros(400)}[shape]
+    if shape == "hammer":
+        u[[60, 170, 290]] = [40.0, 55.0, 30.0]
+    heavy = 0.02 * rng.standard_t(4, 400)
+    y = scipy.signal.lfilter([0, 0.3], [1, -0.7], u) + heavy
+    cells = {"u": u, "y": y}
+    if wrong == "twice":
+        cells = {name: np.repeat(column, 2) for name, column in cells.items()}
+    elif wrong == "frozen":
+        y[100:160] = y[100]
+    elif wrong:
+        cells[wrong][200] = 1e6
+    np.savetxt(folder / "run.csv", np.column_stack(list(cells.values())), delimiter=",", header="u,y", comments="")
+
+
+def told(folder, spec: str, *, command: str = "check", prepare: str = "", missing: str = "") -> dict:
+    """The result of a command on the spec."""
+    (folder / "spec.toml").write_text(spec.format(prepare=prepare, missing=missing))
+    options = ["--out", str(folder / "out"), "--force"] if command == "fit" else []
+    done = run(command, folder / "spec.toml", "--json", *options)
+    assert done.code == 0, done.err
+    return json.loads(done.out)
+
+
+def text_of(result: dict, code: str) -> str:
+    return " ".join(warning["text"] for warning in result["warnings"] if warning["code"] == code)
+
+
+@pytest.mark.parametrize("spec", [SPEC, MOTION], ids=["lagged", "motion"])
+@pytest.mark.parametrize("channel", ["u", "y"])
+def test_a_wild_cell_is_named_before_the_fit_and_its_remedy_works(tmp_path, spec, channel):
+    measured(tmp_path, channel)
+    (tmp_path / "spec.toml").write_text(spec.format(prepare="", missing=""))
+    done = run("check", tmp_path / "spec.toml", "--json")  # of a motion it is refused where its run goes beyond numbers
+    text = text_of(json.loads(done.out), "wild_samples") if done.code == 0 else done.err
+    assert "run.csv" in text and "row 200" in text and f"{channel} = 1e+06" in text and "[[data.prepare]]" in text
+    threshold = re.search(r"threshold = ([\d.e+]+)", text)
+    assert threshold is not None
+    step = f'[[data.prepare]]\nstep = "outliers"\nchannels = ["{channel}"]\nthreshold = {threshold[1]}\n'
+    if spec == SPEC:
+        assert "Without it physics alone gives" in text
+    mended = told(tmp_path, spec, command="fit", prepare=step, missing='missing = "skip"')
+    assert not text_of(mended, "wild_samples")
+    values = {row["name"]: row["value"] for row in mended["parameters"]}
+    expected = {"a": 0.7, "b": 0.3} if spec == SPEC else {"tau": 0.1 / np.log(1 / 0.7), "g": 1.0}
+    for name, value in expected.items():
+        assert values[name] == pytest.approx(value, rel=0.05)
+
+
+def test_a_fit_names_a_wild_cell_too(tmp_path):
+    measured(tmp_path, "u")
+    assert "u = 1e+06" in text_of(told(tmp_path, SPEC, command="fit"), "wild_samples")
+
+
+def test_init_names_a_wild_input(tmp_path):
+    measured(tmp_path, "u")
+    done = run("init", tmp_path / "run.csv", "--sampling-time", "0.1", "--out", tmp_path / "s.toml")
+    assert done.code == 0 and "u = 1e+06" in " ".join((done.out + done.err).split())
+
+
+@pytest.mark.parametrize("shape", ["noise", "steps", "hammer"])
+def test_heavy_tails_steps_and_impulses_are_no_wild_samples(tmp_path, shape):
+    measured(tmp_path, shape=shape)
+    codes = {warning["code"] for warning in told(tmp_path, SPEC)["warnings"]}
+    assert not codes & {"wild_samples", "rows_twice", "frozen_output"}
+
+
+@pytest.mark.parametrize(("wrong", "code"), [("twice", "rows_twice"), ("frozen", "frozen_output")])
+def test_rows_written_twice_and_a_frozen_sensor_are_named(tmp_path, wrong, code):
+    measured(tmp_path, wrong)
+    text = text_of(told(tmp_path, SPEC), code)
+    assert "run.csv" in text and ("every = 2" in text or "row 100" in text)

@@ -201,7 +201,7 @@ def bias_table(
     _check_shapes(projection, names, suspects, deltas, theta, physical, learned)
     gain = np.eye(deltas.shape[2]) if gain is None else _row_gain(gain, deltas.shape[1:])
     require_rank(excitation(projection.r, names), projection.q.shape[0] * projection.q.shape[1])
-    tilde = None if learned is None else _orthogonal_part(projection, times(gain, np.asarray(learned)), directions)
+    tilde = None if learned is None else orthogonal_part(projection, times(gain, np.asarray(learned)), directions)
     entries = []
     for i, (suspect, delta) in enumerate(zip(suspects, deltas, strict=True)):
         if not np.all(np.isfinite(delta)):
@@ -241,7 +241,7 @@ def _overlaps(
     inside = projection.coordinates(unit)
     inside = inside if directions is None else projection.along(directions) @ inside
     cosine = float(min(np.linalg.norm(inside) / norm, 1.0))
-    rest = _orthogonal_part(projection, unit, directions)
+    rest = orthogonal_part(projection, unit, directions)
     left = np.linalg.norm(rest)
     if tilde is None or not np.any(tilde) or left < IN_SPAN * norm:
         return cosine, None, None
@@ -250,7 +250,7 @@ def _overlaps(
     return cosine, float(min(explained, 1.0)), float(product / left / size)
 
 
-def _orthogonal_part(projection: Projection, values: Matrix, directions: Matrix | None) -> Matrix:
+def orthogonal_part(projection: Projection, values: Matrix, directions: Matrix | None) -> Matrix:
     """P⊥v, or what is left of v along some directions of θ."""
     if directions is None:
         return projection.orthogonal_part(values)

@@ -2,7 +2,9 @@
 
 With F the learner's values under the measure and Δ a cause's, the coefficient is that of P⊥F on P⊥Δ and the bias,
 estimate less truth, `Φ_μ⁺Δ` times it. One cause is named: the declared suspect that explains most of ‖P⊥F‖² if that is
-enough, else the usual suspect or product of lags that does; one of each output where none is sure to be all of it.
+enough, else the usual suspect or product of lags that does, or the member of a family (`catalogue`) that explains
+clearly more; one of each output where none is sure to be all of it. The interval is the hull over all causes that noise
+cannot tell from it (`bias_hull`).
 """
 
 from __future__ import annotations
@@ -17,12 +19,21 @@ from jaxtyping import Bool, Float
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import percent, plain_number
-from orthaug.analysis.bias import SuspectedBias
+from orthaug.analysis.bias import SuspectedBias, orthogonal_part
+from orthaug.analysis.bias_hull import (
+    MOST_PHYSICS,
+    Candidate,
+    Named,
+    compatible,
+    hull,
+    is_determined,
+    undetermined_warning,
+)
+from orthaug.analysis.catalogue import catalogue
 from orthaug.analysis.measure_bias import Ground, physical_with_bias
 from orthaug.analysis.remedies import remedies
 from orthaug.analysis.suspects import Suspect, saturations, usual_suspects, usual_terms
 from orthaug.fitting.estimates import Estimate
-from orthaug.inference.covariance import interval
 from orthaug.inference.measures import Measure, Training, weigh_problem
 from orthaug.physics.output_weights import times
 from orthaug.physics.parameters import PhysicsMap
@@ -53,6 +64,9 @@ class ParameterBias:
     errors: float | None
     """Its size in standard errors; None where there are none."""
     ci95: tuple[float, float] | None
+    """The hull over all causes that noise cannot tell apart; None where that determines nothing."""
+    determined: bool = True
+    """Whether the data determine the parameter beside this learner: the hull is no wider than the value itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,38 +101,14 @@ def ground_of(fit: Estimate, measure: Measure, physics: PhysicsMap | None = None
     return Ground(weighed, fit.problem, fit.theta, physics, learned, fit.model.shared)
 
 
-def bias_budget(
+def lagged_budget(
     fit: Estimate,
     suspects: Sequence[Suspect] = (),
     *,
     physics: PhysicsMap | None = None,
     measure: Measure | None = None,
 ) -> Budget | None:
-    """The bias that what the learner found implies; None where no cause explains enough of it.
-
-    Args:
-        fit: with a learner and the orthogonal structure; of others there is no budget.
-        suspects: terms that may be missing, looked at first.
-        physics: the map from physical parameters to θ, for their biases.
-        measure: what θ was split under, where that is not the training measure.
-
-    Returns:
-        The `cause`, the `share` of the learner that it explains, and the bias of each of `parameters` and `physical`,
-        estimate less truth, with an interval that covers bias and noise together.
-
-    Raises:
-        InputError: another measure than that of the fit; a suspect on channels or lags that the data do not have.
-
-    Examples:
-        >>> import orthaug as oa
-        >>> u = np.random.default_rng(0).uniform(-1, 1, 300)
-        >>> record = oa.Record.from_arrays(u, 2 * u + u**3 + 0.05 * np.random.default_rng(1).normal(size=300))
-        >>> gain = oa.Baseline.from_terms([oa.Term("gain", "u[k]")])
-        >>> fit = oa.estimate(record, gain, learner=oa.Terms(("u[k]**3",)), structure=oa.Orthogonal(shared="all"))
-        >>> budget = bias_budget(fit, [oa.Suspect("cubic", "u[k]**3")])
-        >>> budget.cause.suspect.name, round(budget.of("gain").value, 1)  # θ took 0.6 of the cubic
-        ('cubic', 0.6)
-    """
+    """Return `bias_budget` of a fit of difference equations."""
     if not fit.status.ok or fit.model.structure != "orthogonal" or fit.model.form.bound is None:
         return None
     measure = Training() if measure is None else measure
@@ -143,20 +133,92 @@ def budget_on(ground: Ground, fit: Estimate, suspects: Sequence[Suspect]) -> Bud
     causes, moved = tuple(cause for _, cause in found), np.array([_moved(cause) for _, cause in found])
     bias, rest = moved.sum(axis=0), [row for own, cause in found for row in left_over(own, cause, suspects)]
     rest = np.array([*rest, *map(_moved, nameless)])
+    candidates = _candidates(found, bias, np.linalg.norm(rest, axis=0), suspects, fit)
     std = np.full(len(bias), np.nan) if fit.std is None else fit.std
-    ends = with_bias(fit.theta, std, fit.freedom, bias, np.linalg.norm(rest, axis=0))
+    other = _norm([_moved(cause) for cause in nameless])
+    ends = hull(fit.theta, std, fit.freedom, candidates, other)
     names = ground.problem.baseline.names
-    parameters, rows, warnings = parameter_biases(names, fit.theta, std, bias, ends, _owners(causes, moved)), (), []
+    parameters = parameter_biases(names, fit.theta, std, bias, ends, _owners(causes, moved), fit.freedom)
+    rows, warnings = (), []
     if ground.physics is not None:
-        physical, slopes = fit.physical(ground.physics), ground.slopes
-        own = np.array([np.nan if s is None else s for s in physical.std])
-        spread = rest.T @ rest + (0.0 if fit.covariance is None else fit.covariance)
-        shifts, ends = physical_with_bias(ground, bias, fit.covariance, spread, fit.freedom)
-        owners = _owners(causes, moved @ np.array([slopes[0][name] for name in physical.names]).T) if slopes else []
-        rows = parameter_biases(physical.names, physical.value, own, shifts, ends, owners)
-        warnings += _unbounded(physical.names, own, ends)
+        rows, warnings = _physical_rows(ground, fit, candidates, moved, causes, other)
     told = (_warning(own, cause, (*rows, *parameters), suspects, own is not ground) for own, cause in found)
-    return Budget(causes, parameters, rows, (*(warning for warning in told if warning is not None), *warnings))
+    told = [warning for warning in told if warning is not None]
+    open_ones = [row.name for row in (*rows, *parameters) if not row.determined]
+    if open_ones:
+        own, cause = found[0]
+        told.append(undetermined_warning(open_ones, candidates, remedies(own, cause, open_ones)))
+    return Budget(causes, parameters, rows, (*told, *warnings))
+
+
+def _norm(rows: Sequence[Vector]) -> Vector | float:
+    return np.linalg.norm(np.array(rows), axis=0) if len(rows) else 0.0
+
+
+def noise_share(ground: Ground, fit: Estimate) -> float:
+    """ν: how much of what the learner holds beside the physics is noise, of which it takes σ² a weight that it uses."""
+    noise = fit.model.statistics.noise
+    if noise is None:
+        return 0.0
+    unit = ground.weighed.unit
+    own = orthogonal_part(ground.weighed.projection, times(unit, np.asarray(ground.learned)), ground.directions)
+    rows = np.ones((len(own), 1)) * np.sqrt(np.diag(noise))
+    taken = fit.effective_weights / ground.problem.count * np.sum(times(unit, rows) ** 2) / own.shape[1]
+    return float(taken / max(np.sum(own**2), np.finfo(float).tiny))
+
+
+def _candidates(
+    found: Sequence[tuple[Ground, SuspectedBias]],
+    bias: Vector,
+    rest: Vector,
+    suspects: Sequence[Suspect],
+    fit: Estimate,
+) -> list[Candidate]:
+    """Return the named causes, and what may stand instead of one of them."""
+    several = " and ".join(cause.suspect.name for _, cause in found)
+    kept = [Named(several, min(explains(cause) for _, cause in found), bias, rest=rest)]
+    for own, cause in found:
+        others = (*_declared(own, suspects), *_usual(own), *_families(own))
+        others += own.table(saturations([entry.suspect for entry in others]), certify=False, every=False)
+        likely = [
+            Candidate(entry.suspect.name, explains(entry), _moved(entry) + bias - _moved(cause),
+                      entry.suspect in suspects)
+            for entry in others
+            if entry.explained and (entry.suspect in suspects or (entry.cosine or 0.0) <= MOST_PHYSICS)
+        ]  # fmt: skip
+        kept += compatible(likely, noise_share(own, fit))
+    return kept
+
+
+def _physical_rows(
+    ground: Ground,
+    fit: Estimate,
+    candidates: Sequence[Candidate],
+    moved: Float[np.ndarray, "k n"],
+    causes: Sequence[SuspectedBias],
+    other: Vector | float,
+) -> tuple[tuple[ParameterBias, ...], list[Warning]]:
+    """The biases of the physical parameters: the hull over the causes that move any of them farthest."""
+    assert ground.physics is not None
+    physical, slopes, bias = fit.physical(ground.physics), ground.slopes, moved.sum(axis=0)
+    own = np.array([np.nan if s is None else s for s in physical.std])
+    turned = np.array([slopes[0][name] for name in physical.names]) if slopes else np.zeros((0, len(bias)))
+    chosen = [candidates[0]]
+    for row in turned:
+        for sign in (-1.0, 1.0):
+            wide = [sign * row @ c.moved + np.sqrt(np.sum((row * c.unsure) ** 2)) for c in candidates]
+            chosen.append(candidates[int(np.argmax(np.nan_to_num(wide, nan=-np.inf)))])
+    ends, shifts = [], None
+    for c in {id(c): c for c in chosen}.values():
+        spread = np.outer(c.unsure, c.unsure) + np.diag(np.zeros(len(bias)) + other) ** 2
+        spread = spread + (0.0 if fit.covariance is None else fit.covariance)
+        moves, limits = physical_with_bias(ground, c.moved, fit.covariance, spread, fit.freedom)
+        shifts = moves if shifts is None else shifts
+        ends.append(limits)
+    ends = np.stack([np.min(ends, axis=0)[:, 0], np.max(ends, axis=0)[:, 1]], axis=-1)  # NaN where one has none
+    owners = _owners(causes, moved @ turned.T) if slopes else []
+    rows = parameter_biases(physical.names, physical.value, own, shifts, ends, owners, fit.freedom)
+    return rows, _unbounded(physical.names, own, ends)
 
 
 def _causes(
@@ -196,8 +258,10 @@ def named_cause(ground: Ground, suspects: Sequence[Suspect], least: float = LEAS
 
     Of what no one declared only what the learner sees counts: the rest is no likely cause of what it found.
     """
-    for table in (_declared(ground, suspects), _usual(ground)):
-        best = max(table, key=explains, default=None)
+    for table, families in ((_declared(ground, suspects), ()), (_usual(ground), _families(ground))):
+        best, other = max(table, key=explains, default=None), max(families, key=explains, default=None)
+        if other is not None and (best is None or explains(best) < AS_MUCH * explains(other)):
+            best = other
         if best is not None and explains(best) >= least:
             return best
     return None
@@ -205,8 +269,8 @@ def named_cause(ground: Ground, suspects: Sequence[Suspect], least: float = LEAS
 
 def _likeliest(ground: Ground, suspects: Sequence[Suspect]) -> SuspectedBias | None:
     """What explains most of the learner, however little, declared or not."""
-    found = [best for group in {tuple(suspects), ()} if (best := named_cause(ground, group, 0.0)) is not None]
-    return max(found, key=explains, default=None)
+    found = (*_declared(ground, suspects), *_usual(ground))
+    return max((entry for entry in found if entry.explained), key=explains, default=None)
 
 
 def explains(entry: SuspectedBias | TermBias) -> float:
@@ -221,6 +285,12 @@ def _declared(ground: Ground, suspects: Sequence[Suspect]) -> tuple[SuspectedBia
 def _usual(ground: Ground) -> tuple[SuspectedBias, ...]:
     terms = (*usual_suspects(ground.problem), *usual_terms(ground.problem))
     return tuple(entry for entry in ground.table(terms, certify=False, every=False) if entry.seen is not False)
+
+
+def _families(ground: Ground) -> tuple[SuspectedBias, ...]:
+    """What every member of the catalogue does that the learner sees."""
+    table = ground.table(catalogue(ground.problem), certify=False, every=False)
+    return tuple(entry for entry in table if entry.seen is not False and (entry.cosine or 0.0) <= MOST_PHYSICS)
 
 
 def rival_of(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect]) -> SuspectedBias | None:
@@ -260,14 +330,12 @@ def left_over(ground: Ground, cause: SuspectedBias, suspects: Sequence[Suspect])
     """Standard deviations of the bias of θ that the cause does not tell: k directions, each of one unknown size.
 
     What it leaves of the learner counts as biased by as much for its size as the cause, of unknown sign; beside that by
-    what the next best cause makes of it, and by how far a rival of the cause would move θ elsewhere.
+    what the next best cause makes of it. What may stand instead of the cause is in the hull.
     """
     assert cause.explained
     after = _likeliest(ground.without(cause), [suspect for suspect in suspects if suspect != cause.suspect])
     rows = [_moved(cause) * np.sqrt((1 - cause.explained) / cause.explained)]
-    rows += [] if after is None else [_moved(after)]
-    rival = rival_of(ground, cause, suspects)
-    return np.array([*rows, *([] if rival is None else [_moved(rival) - _moved(cause)])])
+    return np.array([*rows, *([] if after is None else [_moved(after)])])
 
 
 def _moved(cause: SuspectedBias) -> Vector:
@@ -275,17 +343,14 @@ def _moved(cause: SuspectedBias) -> Vector:
     return (cause.coefficient_found or 0.0) * np.array(cause.bias)
 
 
-def with_bias(value: Vector, std: Vector, freedom: float, bias: Vector, rest: Vector) -> Float[np.ndarray, "n 2"]:
-    """95 % intervals that cover bias and noise, (n, 2): about the estimate less its bias.
-
-    Args:
-        rest: standard deviation of the bias that its cause does not tell, as `left_over` gives it.
-    """
-    return interval(value - bias, np.sqrt(std**2 + rest**2), freedom)
-
-
 def parameter_biases(
-    names: Sequence[str], value: Vector, std: Vector, bias: Vector, ends: Matrix, causes: Sequence[tuple[str, float]]
+    names: Sequence[str],
+    value: Vector,
+    std: Vector,
+    bias: Vector,
+    ends: Matrix,
+    causes: Sequence[tuple[str, float]],
+    freedom: float,
 ) -> tuple[ParameterBias, ...]:
     """A row for each parameter whose bias is known; `ends` are those of its interval, `causes` names and shares."""
     found = []
@@ -293,7 +358,8 @@ def parameter_biases(
         if np.isfinite(b):
             errors, relative = float(abs(b) / s) if s > 0 else None, float(b / v) if v else None
             limits = (float(ci[0]), float(ci[1])) if np.isfinite(ci).all() else None
-            found.append(ParameterBias(name, float(b), cause, share, relative, errors, limits))
+            told = limits is None or is_determined(float(v), float(s), freedom, *limits)
+            found.append(ParameterBias(name, float(b), cause, share, relative, errors, limits if told else None, told))
     return tuple(found)
 
 

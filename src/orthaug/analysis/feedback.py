@@ -19,6 +19,7 @@ from orthaug.analysis.visited import MOST_STEPS, Place, Visited, measured_by, po
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.model import Model
+from orthaug.models.motion_model import MotionModel
 from orthaug.models.response import Response
 
 _NO_DERIVATIVE = 1e100  # a derivative beyond is none
@@ -37,7 +38,7 @@ def linearised(model: Model, visited: Visited) -> tuple[Visited, Float[np.ndarra
 
 
 def transitions(
-    model: Model, states: Float[np.ndarray, "m n0"], inputs: Float[np.ndarray, "m nu"]
+    model: Model | MotionModel, states: Float[np.ndarray, "m n0"], inputs: Float[np.ndarray, "m nu"]
 ) -> Float[np.ndarray, "m n0 n0"]:
     """A_k at m points; not finite where there is no derivative."""
     n0 = states.shape[1]

@@ -1,6 +1,7 @@
 """Does a model's free run stay bounded and forget its start? All checks together, and what they say in words.
 
-They are evidence from sampled points, never a proof. Two of them look at A_k, the derivative of a step by the state:
+They are evidence from sampled points, no proof, but for the last: beyond the training a held correction is bounded, and
+stable linear physics keeps it so (`beyond_training`). Two of them look at A_k, the derivative of a step by the state:
 its spectral radius at every step (`feedback`), and a quadratic norm in which all sampled A_k contract (`contraction`).
 A third runs the model on larger and larger inputs (`boundedness`). The paper's `cond:pred_stab` is another matter: it
 asks for the one-step predictor, whose past is measured (`lipschitz`).
@@ -14,6 +15,7 @@ from dataclasses import dataclass, replace
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import Warning
 from orthaug._base.lines import percent
+from orthaug.analysis.beyond_training import describe_beyond, radius_beyond
 from orthaug.analysis.boundedness import divergence_scaling, margin
 from orthaug.analysis.contraction import Contraction, contraction
 from orthaug.analysis.feedback import Feedback, feedback
@@ -27,7 +29,8 @@ from orthaug.models.response import Response
 class Stability:
     """Evidence on the free run (None without a state); `diverges_at` is searched up to the factor `searched`.
 
-    `lipschitz` is None for a model that does not predict from lagged signals.
+    `lipschitz` is None for a model that does not predict from lagged signals. `radius_beyond` is the spectral radius of
+    what goes on far beyond the training (`beyond_training`), None where that is not one linear system.
     """
 
     feedback: Feedback | None
@@ -37,6 +40,7 @@ class Stability:
     lipschitz: Lipschitz | None
     warnings: tuple[Warning, ...]
     text: str
+    radius_beyond: float | None = None
 
 
 def stability(
@@ -70,8 +74,10 @@ def stability(
     gradients, run = lipschitz(model, record, x=x), feedback(model, record, response=response)
     contracts = contraction(model, record, box=box, along=run)
     factor = divergence_scaling(model, record, largest)
-    checks = Stability(run, contracts, factor, float(largest), gradients, (), "")
+    radius = None if run is None else radius_beyond(model, run.points.states, run.points.inputs)
+    checks = Stability(run, contracts, factor, float(largest), gradients, (), "", radius)
     says = list(_sentences(checks, bool(model.inputs)))
+    says += [(sentence, "") for sentence in (describe_beyond(model, radius),) if sentence]
     warnings = tuple(Warning(code, sentence) for sentence, code in says if code)
     return replace(checks, warnings=warnings, text="\n".join(sentence for sentence, _ in says))
 

@@ -142,9 +142,10 @@ class MotionGround:
         """∂f/∂q of the learned equations over the points, rows times the root of their weights over their sizes."""
         slopes = np.asarray(slopes_at(self.place.course.dynamics.alone, self.q, self.field.x, self.field.u))
         slopes = slopes[:, learned_places(self.motion)]
-        return Projection.factor(self._weighed(np.moveaxis(slopes, 2, 0)).transpose(1, 2, 0))
+        return Projection.factor(self.weighed(np.moveaxis(slopes, 2, 0)).transpose(1, 2, 0))
 
-    def _weighed(self, rows: np.ndarray) -> np.ndarray:
+    def weighed(self, rows: np.ndarray) -> np.ndarray:
+        """Return rows (M, nl) times the root of their weights over their sizes."""
         return rows * np.sqrt(self.field.weight)[:, None] / self.field.size
 
     def usual(self) -> tuple[MotionSuspect, ...]:
@@ -188,7 +189,7 @@ class MotionGround:
         if self.learns:
             delta = self._rows(suspect, place)
             held = delta if seen else response.held(dw, self.field.x, self.field.u)
-            held = self._weighed(held)
+            held = self.weighed(held)
             if not seen and trained and self.slope is not None:
                 moved = self.slope @ np.concatenate([moved, dw])
             elif basis.shape[1]:
@@ -196,7 +197,7 @@ class MotionGround:
             elif seen:
                 moved = np.zeros(len(names))
             if basis.shape[1] and len(held) <= CERTIFIED_POINTS and np.any(delta):
-                certificate = find_certificate(self.phi, self._weighed(delta), basis)
+                certificate = find_certificate(self.phi, self.weighed(delta), basis)
             explained, found = self._explained(held)
         moved = np.where(np.isin(names, self.unknown), np.nan, moved)
         coordinates = motion.coordinates
@@ -224,11 +225,29 @@ class MotionGround:
 
     def held(self, suspect: MotionSuspect) -> Matrix:
         """A term that the learner sees (M, nl), weighed."""
-        return self._weighed(self._rows(suspect, suspect.place(self.motion)))
+        return self.weighed(self._rows(suspect, suspect.place(self.motion)))
+
+    def physics_cosine(self, suspect: MotionSuspect) -> float:
+        """Return the cosine of a term that the learner sees with what the shared directions move."""
+        held = self.held(suspect)
+        size = float(np.linalg.norm(held))
+        return float(np.sqrt(max(1 - (np.linalg.norm(self.beside(held)) / size) ** 2, 0.0))) if size > 0 else 0.0
+
+    def seen_entry(self, suspect: MotionSuspect) -> TermBias:
+        """Return what a term that the learner sees does, by the measure alone: the free run need not be asked."""
+        motion, held = self.motion, self.held(suspect)
+        moved = self.phi.solve_along(held, self.shared.basis)
+        moved = np.where(np.isin(motion.names, self.unknown), np.nan, moved)
+        explained, found = self._explained(held)
+        coordinates = motion.coordinates
+        value, per_unit = coordinates.physical(self.q), coordinates.slopes(self.q) * moved
+        equation, size = equations_of(motion)[suspect.place(motion)], float(np.linalg.norm(held))
+        own = (suspect, equation, motion.names, moved, per_unit, value, None)
+        return TermBias(*own, None, size, True, explained, found, None, None)
 
     def told(self) -> Matrix:
         """The learner (M, nl), weighed, beside the shared directions."""
-        return self.beside(self._weighed(np.asarray(self.learned)))
+        return self.beside(self.weighed(np.asarray(self.learned)))
 
     def beside(self, values: Matrix) -> Matrix:
         """What the shared directions leave of values (M, nl) that are weighed."""

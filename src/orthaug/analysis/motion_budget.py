@@ -14,6 +14,14 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
 from orthaug._base.lines import percent
+from orthaug.analysis.bias_hull import (
+    MOST_PHYSICS,
+    Candidate,
+    Named,
+    compatible,
+    hull,
+    undetermined_warning,
+)
 from orthaug.analysis.budget import (
     AS_MUCH,
     LEAST_SHARE,
@@ -22,8 +30,9 @@ from orthaug.analysis.budget import (
     explains,
     parameter_biases,
     told_biases,
-    with_bias,
 )
+from orthaug.analysis.catalogue import motion_catalogue
+from orthaug.analysis.learned_part import learned_reach
 from orthaug.analysis.motion_bias import (
     CERTIFIED_POINTS,
     MotionGround,
@@ -34,6 +43,7 @@ from orthaug.analysis.motion_bias import (
 )
 from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.inference.covariance import reach
 
 _AS_CLOSE = 2.0  # times what a cause leaves of the learner: a rival that leaves no more cannot be told from it
 _CLOSE = 0.005  # of the learner: what leaves no more is as good as any
@@ -78,15 +88,41 @@ def told_budget(
         table: what every declared suspect does to the fit.
     """
     smooth = softened_bias(fit, declared)
-    budget = motion_budget(fit, table, smooth)
-    if budget is not None and budget.share >= SURE_SHARE:
+    ground = ground_after(fit)
+    families = [] if ground is None else families_of(ground)
+    budget = motion_budget(fit, table, smooth, families)
+    if budget is not None and budget.share >= SURE_SHARE and table:
         return budget
     usual, softer = usual_biases(fit)
-    return motion_budget(fit, (*table, *usual), (*smooth, *softer)) if usual else budget
+    return motion_budget(fit, (*table, *usual), (*smooth, *softer), families, declared) if usual else budget
+
+
+def families_of(ground: MotionGround) -> list[TermBias]:
+    """What every member of the catalogue does that the learner sees; nothing where it could imitate no parameter."""
+    if ground.learned is None or not ground.shared.basis.shape[1]:
+        return []
+    motion, field = ground.motion, ground.field
+    on = [entry.text for entry in ground.place.course.problem.features]
+    terms = motion_catalogue(motion, motion.coordinates.physical(ground.q), field.x, field.u, on)
+    entries = [ground.seen_entry(term) for term in terms if ground.sees(term)]
+    return [entry for entry in entries if ground.physics_cosine(entry.suspect) <= MOST_PHYSICS]
+
+
+def noise_share(fit: MotionEstimate, ground: MotionGround) -> float:
+    """ν: how much of what the learner holds beside the physics is noise, by the band of the learned curve."""
+    half = learned_reach(fit, ground.field.x, ground.field.u)
+    if half is None or not np.isfinite(half).all():
+        return 0.0
+    own = np.sum(ground.told() ** 2)
+    return float(np.sum(ground.weighed(half / reach(fit.freedom)) ** 2) / max(own, np.finfo(float).tiny))
 
 
 def motion_budget(
-    fit: MotionEstimate, table: Sequence[TermBias], smooth: Sequence[TermBias] = ()
+    fit: MotionEstimate,
+    table: Sequence[TermBias],
+    smooth: Sequence[TermBias] = (),
+    families: Sequence[TermBias] = (),
+    declared: Sequence[MotionSuspect] | None = None,
 ) -> MotionBudget | None:
     """By the suspect that explains most, or one in each learned equation; None where none explains enough.
 
@@ -94,22 +130,44 @@ def motion_budget(
         table: what every suspect does to the fit.
         smooth: the same of terms that stand beside those of the table (`softened_bias`), named where they explain
             clearly more of a learner.
+        families: the same of members of the catalogue (`families_of`).
+        declared: the suspects that were declared; by default those of the table.
     """
     learns = fit.model.form.bound is not None
-    found = _of_learner(fit, table, smooth) if learns else _of_residual(table)
+    found = _of_learner(fit, table, smooth, families) if learns else _of_residual(table)
     if found is None:
         return None
     value, bias, causes = fit.values, found.moved, found.causes
     std = np.full(len(value), np.nan) if fit.std is None else fit.std
     if learns and (fit.split_by.share or 0.0) < _NOTHING and not np.any(np.abs(bias) > _UNMOVED * std):
         return None
-    ends = with_bias(value, std, fit.freedom, bias, np.linalg.norm(found.unsure, axis=0))
+    own = {entry.suspect for entry in table} if declared is None else set(declared)
+    name = " and ".join(cause.suspect.name for cause in causes)
+    candidates = [Named(name, found.share, bias, rest=np.linalg.norm(found.unsure, axis=0))]
+    candidates += _instead(fit, (*table, *smooth, *families), own) if learns and len(causes) == 1 else []
+    ends = hull(value, std, fit.freedom, candidates)
     parameters = fit.problem.motion.parameters
     ends = np.clip(ends, [[p.min] for p in parameters], [[p.max] for p in parameters])
-    name = " and ".join(cause.suspect.name for cause in causes)
-    rows = parameter_biases(causes[0].names, value, std, bias, ends, [(name, found.share)] * len(bias))
+    rows = parameter_biases(causes[0].names, value, std, bias, ends, [(name, found.share)] * len(bias), fit.freedom)
     warning = _motion_warning(found, rows, learns=learns)
-    return MotionBudget(causes, found.share, rows, () if warning is None else (warning,))
+    warnings = [] if warning is None else [warning]
+    open_ones = [row.name for row in rows if not row.determined]
+    warnings += [undetermined_warning(open_ones, candidates, ())] if open_ones else []
+    return MotionBudget(causes, found.share, rows, tuple(warnings))
+
+
+def _instead(fit: MotionEstimate, table: Sequence[TermBias], declared: set[MotionSuspect]) -> list[Candidate]:
+    """Return what may be the cause as well as the one that is named."""
+    ground = ground_after(fit)
+    assert ground is not None
+    likely = [
+        Candidate(entry.suspect.name, explains(entry), _moved(entry), entry.suspect in declared)
+        for entry in table
+        if entry.seen
+        and entry.explained
+        and (entry.suspect in declared or ground.physics_cosine(entry.suspect) <= MOST_PHYSICS)
+    ]
+    return compatible(likely, noise_share(fit, ground))
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,10 +199,12 @@ def _moved(entry: TermBias) -> Vector:
     return (entry.coefficient_found or 0.0) * entry.per_unit
 
 
-def _of_learner(fit: MotionEstimate, table: Sequence[TermBias], smooth: Sequence[TermBias]) -> _Found | None:
+def _of_learner(
+    fit: MotionEstimate, table: Sequence[TermBias], smooth: Sequence[TermBias], families: Sequence[TermBias] = ()
+) -> _Found | None:
     """The term that explains most of the learner, or one of each equation that together leave much less of it."""
-    best, other = max(table, key=explains, default=None), max(smooth, key=explains, default=None)
-    if best is not None and other is not None and explains(best) < AS_MUCH * explains(other):
+    best, other = max(table, key=explains, default=None), max((*smooth, *families), key=explains, default=None)
+    if other is not None and (best is None or explains(best) < AS_MUCH * explains(other)):
         best = other
     ground, every = ground_after(fit), (*table, *smooth)
     alone = [] if best is None else [[best, *(entry for entry in every if entry is not best)]]
@@ -212,7 +272,8 @@ def _weighed(
     for cause, *others in each:
         near = rivals_of(cause, others)
         apart = [np.abs(_moved(rival) - _moved(cause)) for rival in near]
-        unsure.append(np.max([np.zeros(len(bias)), *apart], axis=0))
+        if len(each) > 1:  # of a single cause they are in the hull
+            unsure.append(np.max([np.zeros(len(bias)), *apart], axis=0))
         rivals += [rival for rival, by in zip(near, apart, strict=True) if np.any(by > _ELSEWHERE * np.abs(bias))]
     after = [] if ground is None else ground.after(causes, table)
     unsure += [_moved(max(after, key=explains))] if after else []

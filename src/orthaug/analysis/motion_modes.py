@@ -17,6 +17,7 @@ from orthaug._base.checks import Matrix
 from orthaug._base.errors import Warning
 from orthaug._base.jax import Array, jax
 from orthaug._base.lines import percent
+from orthaug.analysis.beyond_training import describe_beyond, radius_beyond
 from orthaug.analysis.boundedness import divergence_scaling, margin
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Numbers
@@ -58,6 +59,8 @@ class MotionStability:
     diverges_at: float | None = None
     """Factor on the inputs from which the free run leaves all bounds, searched up to `searched`; None: nowhere."""
     searched: float | None = None
+    radius_beyond: float | None = None
+    """Spectral radius of a sample's step far beyond the training (`beyond_training`)."""
 
     feedback = contraction = lipschitz = None
 
@@ -72,8 +75,16 @@ def motion_stability(model: MotionModel, x: Matrix, u: Matrix, record: Record | 
         return checks
     factor = divergence_scaling(model, record, _LARGEST)
     told, code = margin(factor, _LARGEST, driven=True)
-    text, warnings = f"{checks.text}\n{told}", (*checks.warnings, *((Warning(code, told),) if code else ()))
-    return replace(checks, text=text, warnings=warnings, diverges_at=factor, searched=_LARGEST)
+    radius = radius_beyond(model, x, _of_steps(model, record))
+    text = "\n".join(part for part in (checks.text, told, describe_beyond(model, radius)) if part)
+    warnings = (*checks.warnings, *((Warning(code, told),) if code else ()))
+    found = {"diverges_at": factor, "searched": _LARGEST, "radius_beyond": radius}
+    return replace(checks, text=text, warnings=warnings, **found)
+
+
+def _of_steps(model: MotionModel, record: Record) -> Matrix:
+    """Return what the steps of a record read, (T, nu)."""
+    return np.concatenate([model.form.inputs(experiment, record) for experiment in record.experiments])
 
 
 def _of_modes(model: MotionModel, x: Matrix, u: Matrix) -> MotionStability:

@@ -16,6 +16,7 @@ from orthaug._base.parallel import one_blas_thread
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.views import MAKERS
 from orthaug.commands.attempt import attempt
+from orthaug.commands.doubts import doubted
 from orthaug.commands.folder import PHYSICS
 from orthaug.commands.job import ALONE, AS_DECLARED, DEFAULT_BLOCKS, Job, Variant, origin_of
 from orthaug.commands.kinds import kind_of
@@ -71,7 +72,7 @@ class Fitted:
 @one_blas_thread()
 def fit_job(job: Job, progress: Progress = SILENT) -> Fitted:
     """Train as the spec says, score every part, ask whether the learner earns its place, and try what may better it."""
-    return advised(judged(fit_variant(job, AS_DECLARED, progress)))
+    return advised(doubted(judged(fit_variant(job, AS_DECLARED, progress))))
 
 
 def advised(fitted: Fitted) -> Fitted:

@@ -19,6 +19,7 @@ from orthaug.data.preparation import STEPS
 from orthaug.data.readers import read_record
 from orthaug.data.record import Channel, Record
 from orthaug.data.survey import Survey, survey
+from orthaug.data.wild import data_warnings
 from orthaug.selection.first_orders import LOOKED_AT, FirstModel, first_model
 
 Names = str | Sequence[str]  # columns, several in a text separated by commas
@@ -182,7 +183,19 @@ def draft(found: Survey, roles: Roles, out: Path) -> Draft:
     wild = f"{counted(lost, 'training row')} in longer runs of wild samples {'is' if lost == 1 else 'are'} left out"
     gaps = lacking(missing) if missing else wild if lost else ""
     text = spec_text(found, roles, out, rows, cut, gaps, named, model)
-    return Draft(text, _account(found, roles, rows, missing, cut, model, wild if lost and not missing else ""))
+    return Draft(
+        text,
+        _account(
+            found,
+            roles,
+            rows,
+            missing,
+            cut,
+            model,
+            wild if lost and not missing else "",
+            [w.text for w in data_warnings(record)],
+        ),
+    )
 
 
 def write_spec(found: Draft, out: Path, *, force: bool = False) -> None:
@@ -225,7 +238,16 @@ def _record(found: Survey, roles: Roles, cut: int, missing: int) -> tuple[Record
     return record, record.missing
 
 
-def _account(found: Survey, roles: Roles, rows: int, missing: int, cut: int, model: FirstModel, wild: str) -> str:
+def _account(
+    found: Survey,
+    roles: Roles,
+    rows: int,
+    missing: int,
+    cut: int,
+    model: FirstModel,
+    wild: str,
+    notes: Sequence[str] = (),
+) -> str:
     """What was seen, a line each."""
     step = f"{roles.sampling_time:g} s, as given" if roles.sampling_time else str(found.clock)
     if roles.sampling_time is None and found.clock.step is None:
@@ -247,6 +269,7 @@ def _account(found: Survey, roles: Roles, rows: int, missing: int, cut: int, mod
         if filled:
             lines[-1] = f"{lacking(missing)}: gaps of up to {FILLED} rows are filled, longer ones left out"
     lines += [wild] if wild else []
+    lines += notes
     for name, late, seen in zip(channel_names(roles.inputs), model.orders.nk, model.delays, strict=True):
         if seen is not None and seen != late:
             lines.append(f"the spec takes {name} from lag {late} on, which runs clearly better on rows held out")

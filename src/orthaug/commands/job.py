@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -130,8 +131,18 @@ class Job(ABC):
 
     @property
     def warnings(self) -> tuple[Warning, ...]:
-        """What was done to the data."""
-        return tuple(warning for part in self.parts for warning in part.warnings)
+        """What was done to the data, and which samples of the training data are no measurements."""
+        return (*(warning for part in self.parts for warning in part.warnings), *self._of_samples)
+
+    @cached_property
+    def _of_samples(self) -> tuple[Warning, ...]:
+        from orthaug.data.wild import data_warnings
+
+        return tuple(data_warnings(self.train.record, self.without))
+
+    def without(self, samples: Any) -> str:
+        """Return what a fit without these samples of the training data gives, in a sentence; "" where that is dear."""
+        return ""
 
     @property
     def run_count(self) -> int:
@@ -152,7 +163,7 @@ class Job(ABC):
             return ({"structure": ALONE},)
         kind, validated = variant.kind or spec.structure.kind, spec.data.validation is not None
         choices = spec.regularizations(linear=self.linear, validated=validated, kind=kind)
-        starts = range(1, spec.training.restarts + 1)
+        starts = range(1, spec.restarts + 1)
         return tuple({"structure": kind, "start": i, "regularization": choice} for choice in choices for i in starts)
 
     @property
@@ -204,7 +215,7 @@ class Job(ABC):
             "criterion": variant.criterion or spec.declared_criterion(),
             "solver": solver if fold is None else solver.at_most(FOLD_ITERATIONS),
             "regularization": choices[0] if fold is not None and isinstance(choices, list) else choices,
-            "restarts": training.restarts if fold is None else 1,
+            "restarts": spec.restarts if fold is None else 1,
             "seed": training.seed,
             "blocks": 0 if fold is not None else DEFAULT_BLOCKS if blocks is None else blocks,
             "fallback": training.fallback,

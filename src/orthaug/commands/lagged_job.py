@@ -52,6 +52,11 @@ class LaggedJob(Job):
     def warnings(self) -> tuple[Warning, ...]:
         return (*super().warnings, *self.left_out)
 
+    def without(self, samples: Any) -> str:
+        from orthaug.analysis.wild_effect import fit_without
+
+        return fit_without(self.problem, samples)
+
     @property
     def physics_in_words(self) -> str:
         return repr(self.problem.baseline)

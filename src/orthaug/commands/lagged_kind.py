@@ -17,6 +17,7 @@ from orthaug.commands.lagged_job import LaggedJob
 from orthaug.commands.suspects import declared
 from orthaug.fitting.elimination import directions
 from orthaug.inference.measures import weigh_problem
+from orthaug.inference.nearly_shared import shared_warnings
 from orthaug.physics.baseline import derived_units
 from orthaug.physics.excitation import identifiability, require_rank
 from orthaug.reports.result import CheckResult, FitResult, ParameterResult, parameter_rows, physical_rows
@@ -47,7 +48,7 @@ def checked(job: LaggedJob) -> CheckResult:
             "identifiability": identifiability(problem.baseline, problem.layout, problem.outputs, problem.rows.x),
             "shared": _shared_of(job),
             "bias": _bias_of(job) if problem.excitation.full_rank else None,
-            "warnings": [*job.warnings, *closed_loop(job.train.record)],
+            "warnings": [*job.warnings, *_said_of_shared(job), *closed_loop(job.train.record)],
         }
     )
 
@@ -92,6 +93,7 @@ def content(
         "excitation": fit.excitation,
         "shared": shared,
     }
+    warnings += _said_of_shared(job, fit) if fit.status.ok else ()
     budget = None
     if fit.status.ok:
         budget = attempt("the bias that the learner implies", partial(_budget_of, job, fit), warnings, None)
@@ -228,6 +230,16 @@ def _ground(job: LaggedJob, fit: Estimate | None) -> Ground:
         weighed = weigh_problem(job.measure, problem)
     learned = None if fit.model.form.bound is None else fit.model.learner_at(weighed.points.x)
     return Ground(weighed, problem, fit.theta, job.physics, learned, fit.model.shared)
+
+
+def _said_of_shared(job: LaggedJob, fit: Estimate | None = None) -> list[Warning]:
+    """What the rows say of directions that the names call determined beside the learner."""
+    structure, problem = job.spec.declared_structure(), fit.problem if fit else job.problem
+    if job.spec.declared_learner() is None or not structure.projects or structure.shared == "all":
+        return []
+    if not problem.baseline.names or not problem.features.entries or (fit and fit.model.form.bound is None):
+        return []
+    return shared_warnings(problem.shared, [str(entry) for entry in problem.features.entries])
 
 
 def _shared_of(job: LaggedJob, fit: Estimate | None = None, *, others: bool = True) -> Imitation | None:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from orthaug._base.checks import check_type
 from orthaug._base.errors import InputError, TrainingError
 from orthaug._base.folders import check_new_file, whole_file
+from orthaug.commands.doubts import doubted
 from orthaug.commands.fit import Fitted, fit_job, fit_report, judged, told_of, write_result
 from orthaug.commands.folder import check_folder, check_inputs_kept
 from orthaug.commands.job import Job, origin_of
@@ -182,7 +183,7 @@ def page_of(
     place = _checked(fit, path)
     job = job_of(fit, {} if tests is None else tests)
     made = replace(origin_of(job, "fit"), name="spec", command=f"{NAME} in Python", toml=_account(fit))
-    return _written(fit_report(judged(told_of(job, fit)), made), place)
+    return _written(fit_report(doubted(judged(told_of(job, fit))), made), place)
 
 
 def page_of_spec(fitted: Fitted, path: str | os.PathLike | None, tests: None = None) -> Page:

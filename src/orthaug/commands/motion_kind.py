@@ -41,6 +41,8 @@ def checked(job: MotionJob) -> CheckResult:
     from orthaug.analysis.motion_identifiability import identified
     from orthaug.fitting.motion_course import MotionCourse
     from orthaug.fitting.motion_estimation import without_learner
+    from orthaug.inference.motion_split import shared_of_motion
+    from orthaug.inference.nearly_shared import shared_warnings
     from orthaug.models.moving import Moving
 
     problem, spec = job.problem, job.spec
@@ -48,15 +50,17 @@ def checked(job: MotionJob) -> CheckResult:
     course = MotionCourse.of(without_learner(problem), None, criterion)
     told = identified(course)
     if told is None:
+        wild = "".join(f" {warning.text}" for warning in job.warnings if warning.code == "wild_samples")
         scales = describe_scales(problem.record)
         cause = f" {scales[0].upper()}{scales[1:]}" if scales else ""
-        raise InputError(
-            f"{job.path}: physics alone has no finite free run from its initial values; give others.{cause}"
-        )
-    shared = None
+        remedy = f"it runs on a sample that is none.{wild}" if wild else f"give others.{cause}"
+        raise InputError(f"{job.path}: physics alone has no finite free run from its initial values; {remedy}")
+    shared, on_rows = None, []
     if spec.declared_learner() is not None and job.structure.shared != "all":
         form = Moving(motion, problem.features, None, problem.record.sampling_time, problem.substeps)
         shared = imitation_before(form, motion.coordinates.initial, told.states, told.inputs)
+        seen = shared_of_motion(form, motion.coordinates.initial, told.states, told.inputs)
+        on_rows = shared_warnings(seen, [str(entry) for entry in form.features])
     posed, waves = (problem, Waves()) if spec.declared_learner() is not None else (without_learner(problem), None)
     trial = try_holds(posed, criterion, spec.declared_solver(), job.structure, waves)
     text, warnings = _about_steps(job, trial)
@@ -83,7 +87,7 @@ def checked(job: MotionJob) -> CheckResult:
                 "best_hold": trial.best,
                 "text": text,
             },
-            "warnings": [*job.warnings, *warnings, *closed_loop(job.train.record)],
+            "warnings": [*job.warnings, *on_rows, *warnings, *closed_loop(job.train.record)],
         }
     )
 
@@ -130,6 +134,7 @@ def content(
     """The fit, and what results tell of it; warnings are added."""
     from orthaug.analysis.imitation import MotionImitation
     from orthaug.analysis.robustness import robust_motion
+    from orthaug.inference.nearly_shared import shared_warnings
     from orthaug.physics.excitation import Excitation, of_gram
 
     motion, form = job.problem.motion, fit.model.form
@@ -144,7 +149,9 @@ def content(
         told |= {name: found[name] for name in ("residuals", "stability", "bias")}
     budget, coarse, parts = found["budget"], found["coarse"], found["parts"] or ()
     if fit.status.ok and form.bound is not None:
-        told["shared"] = MotionImitation.of([str(entry) for entry in form.features], fit.shared)
+        seen = [str(entry) for entry in form.features]
+        told["shared"] = MotionImitation.of(seen, fit.shared)
+        warnings += shared_warnings(fit.shared, seen)
         told["measure_detail"] = MeasureResult.of_motion(fit.split_by)
     return fit, told | {
         "parameters": _parameters(fit, budget),

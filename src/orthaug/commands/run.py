@@ -369,10 +369,21 @@ def explain_model(opened: ModelOnData, *, degree: int, functions: Sequence[str],
     Raises:
         InputError: physics alone, data without what the learner is evaluated at, too many candidates.
     """
+    from orthaug.analysis.hidden_state import structure_test
+    from orthaug.commands.attempt import attempt
+    from orthaug.commands.doubts import memory_result
+    from orthaug.reports.fields import WarningResult
     from orthaug.selection.explanation import explain
 
     try:
         explained = explain(opened.model, opened.record, degree=degree, functions=functions, most=most)
     except InputError as error:
         raise type(error)(f"{opened.source}: {error}") from None
-    return ExplainResult.model_validate(explained)
+    result = ExplainResult.model_validate(explained)
+    if not opened.record.outputs:
+        return result
+    failed: list[Any] = []
+    test = attempt("the search for memory", lambda: structure_test(opened.model, opened.record), failed, None)
+    memory = [memory_result(one) for one in test.families if one.sure] if test is not None else []
+    warnings = [*result.warnings, *map(WarningResult.model_validate, failed)]
+    return result.model_copy(update={"memory": memory, "warnings": warnings})

@@ -151,6 +151,9 @@ class StructureSection(KindSection):
     measure: MeasureSection = MeasureSection()
 
 
+_MOTION_RESTARTS = 3  # as `orthaug init` writes
+
+
 class TrainingSection(KindSection):
     """Solver, criterion and regularisation."""
 
@@ -269,8 +272,7 @@ class Spec(Section):
         if self.physics is None or self.baseline is None:
             return None
         parameters = [section.declared(name) for name, section in self.physics.parameters.items()]
-        known = {} if SAMPLING_TIME in self.physics.parameters else {SAMPLING_TIME: sampling_time}
-        return PhysicsMap.of(parameters, self.physics.theta, known | self.baseline.constants)
+        return PhysicsMap.of(parameters, self.physics.theta, {SAMPLING_TIME: sampling_time} | self.baseline.constants)
 
     def declared_learner(self) -> Learner | None:
         """The learner; None for physics alone, as of a motion that nothing is added to."""
@@ -344,7 +346,19 @@ class Spec(Section):
     def runs(self, *, linear: bool) -> int:
         """How many runs a fit makes: restarts times regularizations."""
         validated = self.data.validation is not None
-        return self.training.restarts * len(self.regularizations(linear=linear, validated=validated))
+        return self.restarts * len(self.regularizations(linear=linear, validated=validated))
+
+    @property
+    def restarts(self) -> int:
+        """Return how many starts training makes: those that are written, else several of a network in a motion.
+
+        Over whole experiments a free run has local minima that one start often ends in: benchmarks/defaults.py.
+        """
+        if self.motion is None or "restarts" in self.training.model_fields_set:
+            return self.training.restarts
+        learner = self.declared_learner()
+        drawn = learner is not None and not getattr(learner, "linear", False)
+        return _MOTION_RESTARTS if drawn else self.training.restarts
 
 
 def spec_model() -> type[Spec]:

@@ -32,6 +32,7 @@ from orthaug.fitting.unfinished import (
     withheld,
 )
 from orthaug.inference.covariance import degrees_of_freedom, noise_covariance, theta_covariance
+from orthaug.inference.nearly_shared import grown
 from orthaug.models.beyond import limits_of, pull_of
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
@@ -85,12 +86,15 @@ def conclude(task: OneStepTask, structure: Structure, learned: Learned) -> Estim
         told.append(Warning("no_standard_errors", _UNDETERMINED))
     reason = ALONE.get(ending, "") if learned.bound is None else ""
     reason = reason or ending_in_words(ending, learned.tail)
+    model = _model(problem, structure, learned, ThetaSplit(theta, theta_aux, fixed), errors, noise)
+    partly = learned.bound is not None and structure.projects and structure.shared != "all"
+    shared = problem.shared if partly and problem.features.entries else None
     return Estimate(
-        model=_model(problem, structure, learned, ThetaSplit(theta, theta_aux, fixed), errors, noise),
+        model=model,
         status=Status(ending, learned.iterations, learned.seconds, errors.mean_square, reason=reason),
         restarts=(),
         excitation=problem.excitation,
-        covariance=errors.covariance if known else None,
+        covariance=grown(errors.covariance, model.statistics, shared) if known else None,
         freedom=errors.freedom,
         effective_weights=learned.effective,
         defect=_defect(task, structure, share, ThetaSplit(theta, theta_aux, fixed), learned),

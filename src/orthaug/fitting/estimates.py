@@ -22,6 +22,7 @@ from orthaug.fitting.status import Status
 from orthaug.inference.covariance import interval, joint_covariance, robust_covariance, robust_split_covariance
 from orthaug.inference.learned_terms import equation, learned_terms, term_frame, term_lines
 from orthaug.inference.measures import Measure, Points, Support, Training
+from orthaug.inference.nearly_shared import grown
 from orthaug.inference.physical import PhysicalEstimate, profile, solve
 from orthaug.inference.splitting import MeasureSplit, learner_slope, split_under, streamed_slope
 from orthaug.models.model import Model
@@ -236,6 +237,8 @@ class Estimate(AnyFit):
             slope = self._slope()
             covariance = robust_split_covariance(self.problem, self.model, slope, *used[1:])
         plain = self.covariance if self.plain_covariance is None else self.plain_covariance
+        shared = None if self.model.shared is None else self.problem.shared
+        covariance = grown(covariance, self.model.statistics, shared)
         return replace(self, covariance=covariance, plain_covariance=plain)
 
     def _robust_flown(self, steps: int | None) -> Estimate:

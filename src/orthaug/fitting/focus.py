@@ -29,6 +29,7 @@ ONE_STEP, FREE_RUN = "prediction", "simulation"
 BLOCKS = 4  # blocks that are held out in turn where that is not said
 HALVES = 2  # the later one is run over by a fit to the other
 _SLACK = 1.02  # errors closer than this are the same: then the simpler candidate stays
+_PREFERRED = 1.1  # physics alone one step ahead has to be better by this to stand against that of the free run
 _LAGS = 20  # of the residual's autocorrelation
 _COLOURED = 0.1  # autocorrelation from which a residual is no noise of the equation, where it is significant, too
 _SIGNIFICANT = 4.0  # standard deviations of the autocorrelation of white noise: one lag in 16,000
@@ -243,10 +244,17 @@ def _best(choosing: _Choosing, reason: str) -> Any:
 
 
 def _ranked(errors: Mapping[Key, float], *, with_learner: bool) -> list[Key]:
-    """Return the candidates, the least error first and of alike ones the simplest; wanted learners before physics."""
+    """Return the candidates, the least error first and of alike ones the simplest; wanted learners before physics.
+
+    Physics alone that was fitted to the free run stands before that of one step ahead where the errors of a few
+    blocks do not clearly speak against it: it minimises what is compared.
+    """
     among = [key for key in errors if key[1] or not with_learner]
     least = min(errors[key] for key in among)
     alike = [key for key in among if errors[key] <= _SLACK * least]
+    one_step, free_run = (ONE_STEP, False), (FREE_RUN, False)
+    if alike[:1] == [one_step] and free_run in among and errors[free_run] <= _PREFERRED * errors[one_step]:
+        alike = [free_run, *(key for key in alike if key != free_run)]
     return alike + sorted((key for key in errors if key not in alike), key=lambda key: (key not in among, errors[key]))
 
 

@@ -22,6 +22,7 @@ from orthaug._base.jax import Array, jax, jnp
 from orthaug.models.dynamics import Numbers
 from orthaug.models.motion_field import MotionField
 from orthaug.models.moving import Moving
+from orthaug.physics.left_over import LeftOver, left_over
 from orthaug.physics.motion import Motion
 from orthaug.physics.shared import Shared, agreeing, moves, spanned
 
@@ -30,6 +31,7 @@ _ITERATIONS = 30
 _SETTLED = 1e-12  # of a step, relative
 _ROUNDING = 1e-13
 _FLAT = 1e-12  # curvature of the distance along directions of unit length: below it is none
+_ROWS = 2000  # at which the rows are asked what functions of the features leave
 _POINTS = 400  # at which the slopes of the physics are looked at
 _FEWEST = 4  # moves that succeed, for each parameter
 
@@ -94,7 +96,15 @@ def shared_of_motion(form: Moving, q: Vector, x: Matrix, u: Matrix) -> Shared:
     size = np.sqrt(np.mean(before**2, axis=(0, 2), keepdims=True))
     size = np.where(size > 0, size, 1.0)
     before, after = (np.concatenate(list(np.moveaxis(part / size, 1, 0))) for part in (before, after))
-    return Shared(names, agreeing(before, after))
+    return Shared(names, agreeing(before, after)).beside(_left_over(form, q, points, nx))
+
+
+def _left_over(form: Moving, q: Vector, points: Matrix, nx: int) -> LeftOver | None:
+    """What functions of the features leave of the slopes at the points."""
+    some = points[:: max(1, -(-len(points) // _ROWS))]
+    slopes = np.asarray(slopes_at(form, q, some[:, :nx], some[:, nx:]))
+    features = np.asarray(form.seen(some[:, :nx].T, some[:, nx:].T, np)).T
+    return left_over(slopes, features, _has_learner(form.motion))
 
 
 def _spanned(form: Moving, q: Vector, x: Matrix, u: Matrix) -> Shared:

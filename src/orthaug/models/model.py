@@ -260,6 +260,10 @@ class Model(OnRecords, Shown):
         largest = max(1, _WINDOW_CELLS // max(1, windows[0].size))  # windows overlap: they are copied batch by batch
         return _in_batches(lambda s, u: _ahead(self.form, self.numbers, s, u, horizon), (states, windows), largest)
 
+    def first_state(self, experiment: Experiment, record: Record) -> Vector:
+        """Return the state at the first row of the free run that starts from the measured outputs."""
+        return self._start("measured", experiment.outputs)
+
     def _start(self, initial: Any, measured: Matrix | None) -> Vector:
         """The state at the first row with an output."""
         if isinstance(initial, str) and initial == "zero":

@@ -295,6 +295,10 @@ class MotionModel(OnRecords, Shown):
         with np.errstate(all="ignore"):
             return self.beyond(np.asarray(self.form.seen(states.T, inputs.T, np)).T)
 
+    def first_state(self, experiment: Experiment, record: Record) -> Vector:
+        """Return the state at the first row of the free run that starts from the measured outputs."""
+        return self._start(experiment, "measured", record)
+
     def _start(self, experiment: Experiment, initial: str | Any, record: Record) -> Vector:
         """The state at the first row."""
         if isinstance(initial, str) and initial == "zero":

@@ -17,7 +17,8 @@ from orthaug._base.checks import Vector, check_choice, check_label, check_unique
 from orthaug._base.errors import InputError, shown
 from orthaug._base.views import Shown
 from orthaug.data.expressions import FUNCTIONS, SAMPLING_TIME, Expression, is_name, parse_named
-from orthaug.physics.parameters import Coordinates, PhysicalParameter, check_parameters
+from orthaug.physics.baseline import check_sampling_constant
+from orthaug.physics.parameters import Coordinates, PhysicalParameter, check_not_sampling_time, check_parameters
 
 INTEGRATORS = ("rk4", "exact", "discrete")
 HOLDS = ("zero-order", "first-order", "spline")
@@ -214,6 +215,8 @@ class Motion(Shown):
         for what, names in groups.items():
             check_unique(names, what.split()[-1])
             for name in names:
+                if what != "a constant":  # one of the sampling time's own value does no harm
+                    check_not_sampling_time(name, what)
                 if not is_name(name, FUNCTIONS):
                     raise InputError(
                         f"{shown(name)} cannot name {what}; use letters, digits and underscores, not starting with a "
@@ -292,8 +295,13 @@ class Motion(Shown):
         return {SAMPLING_TIME: 1.0} | named | dict.fromkeys((name for name, _ in self.definitions), 1.0)
 
     def sampled(self, sampling_time: float) -> Motion:
-        """The motion with this value [s] of `Ts`, where its expressions read it and it was not given."""
-        if SAMPLING_TIME in (*dict(self.constants), *self.names, *self.names_of_states, *self.inputs):
+        """The motion with this value [s] of `Ts`.
+
+        Raises:
+            InputError: a constant `Ts` of another value.
+        """
+        check_sampling_constant(self.constants, sampling_time)
+        if SAMPLING_TIME in dict(self.constants):
             return self
         return replace(self, constants=tuple(sorted((*self.constants, (SAMPLING_TIME, float(sampling_time))))))
 

@@ -250,6 +250,7 @@ def check_parameters(
         if not is_number(value):
             raise InputError(f"the constant '{name}' must be a finite number; got {shown(value)}.")
     for p in parameters:
+        check_not_sampling_time(p.name, "a parameter")
         if p.name in constants:
             raise InputError(f"'{p.name}' is a physical parameter and a constant; give one of them another name.")
         if not is_number(p.initial):
@@ -260,6 +261,15 @@ def check_parameters(
             raise InputError(
                 f"the initial value of '{p.name}' is {p.initial:g}; its bounds are {p.min:g} and {p.max:g}."
             )
+
+
+def check_not_sampling_time(name: str, what: str) -> None:
+    """Raise InputError for a name that expressions read as the sampling time."""
+    if name == SAMPLING_TIME:
+        raise InputError(
+            f"'{SAMPLING_TIME}' cannot name {what}: expressions read it as the sampling time of the data, in s. Give "
+            f"{what[2:].strip()} another name."
+        )
 
 
 def _parsed(name: str, text: str, known: Mapping[str, float], parameters: Sequence[str]) -> Expression:

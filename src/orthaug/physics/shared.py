@@ -11,7 +11,7 @@ Found by moves: pairs of regressors x, x′ with z(x) = z(x′) that differ othe
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug.data.expressions import Lag
 from orthaug.data.regressors import Features, Layout
 from orthaug.physics.baseline import Baseline
+from orthaug.physics.left_over import LeftOver, left_over
 
 _MOVES = 400
 _FEWEST = 4  # moves that succeed, for each parameter
@@ -29,6 +30,8 @@ _TOLERANCE = 1e-6  # change of φa over a move, against the size of φa
 _NEWTON = 30
 _ROUNDING = 1e-12  # of the largest singular value of features of unit size
 _SEED = 20_240_808
+NEARLY = 0.5
+"""Share of a regressor below which what the learner's features leave of it is reported."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +43,32 @@ class Shared:
 
     names: tuple[str, ...]
     basis: Matrix
+    on_data: tuple[str, ...] = ()
+    """Parameters that only the rows show to be shared: their regressors read what the learner does not see."""
+    rest: LeftOver | None = None
+    """What functions of the features leave of the physics on the rows; None where that was not asked."""
+
+    @property
+    def nearly(self) -> dict[str, float]:
+        """The parameters of which the features leave little on the rows, but more than nothing, with that share."""
+        if self.rest is None:
+            return {}
+        shares = zip(self.names, self.basis, self.rest.share, strict=True)
+        return {name: float(share) for name, row, share in shares if not row.any() and share < NEARLY}
+
+    def beside(self, rest: LeftOver | None) -> Shared:
+        """Return these directions and those that the rows do not tell from functions of the features."""
+        if rest is None:
+            return self
+        more = rest.imitated(self.basis)
+        if not more.shape[1]:
+            return replace(self, rest=rest)
+        moved = [
+            name for name, row, own in zip(self.names, more, self.basis, strict=True) if row.any() and not own.any()
+        ]
+        size = np.sqrt(np.maximum(np.diag(rest.whole), 1e-300))[:, None]
+        basis = _reduced(np.column_stack([self.basis, more]) * size, 1 / size[:, 0]) / size
+        return Shared(self.names, basis, tuple(moved), rest)
 
     @property
     def all(self) -> bool:
@@ -71,7 +100,7 @@ class Shared:
             left = basis - moved
             left[np.abs(left) <= _ROUNDING * np.maximum(np.abs(basis), np.abs(moved))] = 0.0
             basis = np.delete(left, j, axis=1)
-        return Shared(self.names, basis)
+        return replace(self, basis=basis)
 
 
 def shared_directions(
@@ -98,7 +127,9 @@ def shared_directions(
     if np.sum(kept) < _FEWEST * len(names):  # nothing is known: the paper's projection is right for any learner
         return everything
     before, after = (part[kept].reshape(-1, len(names)) for part in phi)
-    return Shared(names, agreeing(before, after))
+    with np.errstate(all="ignore"):
+        own = np.asarray(baseline.phi(x, layout, tuple(outputs), np))
+        return Shared(names, agreeing(before, after)).beside(left_over(own, _values(features, layout)(x)))
 
 
 def spanned(

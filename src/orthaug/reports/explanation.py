@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from orthaug._base.lines import fold, percent, table
 from orthaug.reports.fields import Content, Flag, Number, WarningResult, Whole
+from orthaug.reports.findings import MemoryResult
 from orthaug.reports.result import Headed
+
+_MEMORY = 5  # terms with memory that the text lists
 
 
 class ExplainingTermResult(Content):
@@ -55,6 +58,7 @@ class ExplainResult(Headed):
     parameters: list[MovedParameterResult]
     spec: str | None
     text: str
+    memory: list[MemoryResult] = []
     warnings: list[WarningResult]
 
 
@@ -68,6 +72,10 @@ def explain_text(result: ExplainResult) -> str:
     if result.singles:
         rows = [["share", "added to", "each term alone"]]  # which may be long
         rows += [[_percent(one.share), one.added_to, one.expression] for one in result.singles]
+        blocks.append(table(rows))
+    if result.memory:
+        rows = [["share", "equation", "term with memory of what the free run leaves"]]
+        rows += [[_percent(one.share), one.equation, one.name] for one in result.memory[:_MEMORY]]
         blocks.append(table(rows))
     if result.spec is not None:
         blocks.append(["Write into the spec, and fit again:", "", *result.spec.splitlines()])

@@ -22,7 +22,7 @@ class AlternativeResult(Content):
 class SharedResult(Content):
     """What the learner could imitate of the physics: there θ is split off."""
 
-    absent = frozenset({"alternatives"})
+    absent = frozenset({"alternatives", "withdrawn", "doubt"})
 
     inputs: list[str]
     everything: Flag
@@ -31,6 +31,33 @@ class SharedResult(Content):
     physical: list[str] | None
     text: str
     alternatives: list[AlternativeResult] | None = None
+    withdrawn: list[str] | None = None
+    """Parameters that the fit would determine, were it not for the `doubt`."""
+    doubt: str | None = None
+
+
+class MemoryResult(Content):
+    """A term in an equation that predicts what the free run leaves, and the parameters with it."""
+
+    absent = frozenset({"parameters"})
+
+    name: str
+    kind: str
+    on: str
+    scale: Number
+    """Time constant [s] of a lag, or width in the unit of `on`."""
+    equation: str
+    share: Number
+    p: Number
+    parameters: ByName | None = None
+
+
+class StructureResult(Content):
+    """What the free run leaves beside noise: the best function of a state or an input, and terms with memory."""
+
+    hidden_state: Flag
+    static: MemoryResult | None
+    memory: list[MemoryResult]
 
 
 class CertificateResult(Content):
@@ -50,6 +77,8 @@ class BiasResult(Content):
     value: Number
     cause: str
     share: Number
+    determined: Flag = True
+    """Whether the causes that noise cannot tell apart agree enough for an interval to be of use."""
 
 
 class PhysicalBias(Content):
@@ -250,7 +279,7 @@ class ModesResult(Content):
 class StabilityResult(Content):
     """Evidence on the free run."""
 
-    absent = frozenset({"modes"})
+    absent = frozenset({"modes", "radius_beyond"})
 
     feedback: FeedbackResult | None
     contraction: ContractionResult | None
@@ -258,6 +287,7 @@ class StabilityResult(Content):
     searched: Number
     lipschitz: LipschitzResult | None
     modes: ModesResult | None = None
+    radius_beyond: Number = None
     warnings: list[WarningResult]
     text: str
 

@@ -163,7 +163,9 @@ def card_of_result(fit: Estimate | MotionEstimate, result: FitResult) -> Card:
     if any(row.bias for row in parameters):
         columns += ["bias", "95 % interval with it"]
         for cells, row in zip(rows, parameters, strict=True):
-            cells += [_number(row.bias.value if row.bias else None, 3), _ends(row.ci95_with_bias)]
+            known = row.bias is None or row.bias.determined
+            shown = _ends(row.ci95_with_bias) if known else "not determined"
+            cells += [_number(row.bias.value if row.bias else None, 3), shown]
     notes = [warning.text for warning in result.warnings]
     return replace(card_of(fit), tables=[Table(columns, rows)], notes=notes)
 

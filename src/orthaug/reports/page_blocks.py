@@ -42,7 +42,10 @@ def interval(ends: Sequence[float | None] | None, digits: int = 5) -> str:
     known = [end for end in ends if end is not None]
     scale = max(map(abs, known), default=None)
     digits = digits_for(scale, max(known) - min(known), digits) if known else digits
-    return " … ".join(number(end, digits, scale) for end in ends)
+    decimals = None if not scale else digits - 1 - math.floor(math.log10(scale))
+    if decimals is None or not 0 < decimals <= _MOST_DIGITS or None in ends:
+        return " … ".join(number(end, digits, scale) for end in ends)
+    return " … ".join(f"{end:.{decimals}f}".replace("-", "−") for end in known)
 
 
 def digits_for(value: float | None, spread: float | None, least: int) -> int:

@@ -109,17 +109,22 @@ def _parameters(result: FitResult) -> list[Any]:
         "plain": "Standard errors are those of a white residual.",
         None: "There are no standard errors.",
     }
-    columns = ["parameter", "value", "unit", "standard error", "95 % interval", "initial"]
+    between = "95 %, noise only" if result.noise_only else "95 % interval"
+    columns = ["parameter", "value", "unit", "standard error", between, "initial"]
     biased = any(row.bias for row in rows)
     columns += ["bias", "95 % interval with it"] if biased else []
     shared = any(row.shared is not None for row in rows)
     columns += ["learner could imitate it"] if shared else []
     caption = f"What was estimated. {told[result.standard_errors]}"
+    if result.noise_only:
+        caption += " Intervals count noise only: the model leaves more than noise, which may have moved the parameters."
+    if result.standard_errors is not None:
+        caption += " Intervals hold for the inputs that were applied; under others the bias is another one."
     if any(row.derived_unit for row in rows):
         caption += " A unit in brackets is not the spec's: the channels' units ask for it."
     if biased:
         caption += f"{BIAS_TOLD[:-1]};"
-        caption += " the interval with it is that of the estimate less its bias."
+        caption += " the interval with it is the hull over all causes that noise cannot tell apart."
     blocks: list[Any] = [Table(caption, columns, [_parameter_cells(row, biased, shared) for row in rows])]
     plot = interval_plot(rows)
     blocks += [plot] if plot else []
@@ -153,7 +158,8 @@ def _parameter_cells(row: ParameterResult, biased: bool, shared: bool) -> list[s
         number(row.initial),
     ]
     if biased:
-        cells += [bias_cell(row), interval(row.ci95_with_bias)]
+        known = row.bias is None or row.bias.determined
+        cells += [bias_cell(row), interval(row.ci95_with_bias) if known else "not determined by these data"]
     return cells + ([{True: "yes", False: "no", None: "–"}[row.shared]] if shared else [])
 
 

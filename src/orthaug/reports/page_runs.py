@@ -20,6 +20,7 @@ from orthaug.reports.page_blocks import Plot, area, number, percent
 MOST_POINTS = 100_000  # of a curve
 _BUDGET = 560_000  # points of a page: three million letters
 _UPPER, _GAP = 0.64, 0.05  # share of a pair of panels that is the upper one, and what lies between panels
+_MOST_SHADES = 200  # areas of a plot
 _PANEL = 330  # pixels of a pair of panels
 _DASHES = ("dash", "solid", "dot", "dashdot")
 _MOST_BREAKS = 40  # between experiments that are marked
@@ -266,6 +267,7 @@ def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
                 panels.layout["shapes"].append(area("@band", **place, y0=low, y1=high))
         panels.finish(i, drawn)
     _mark(panels.layout, run, panels.start, panels.step)
+    panels.layout["shapes"] += _shades(response, panels.start, panels.step)
     time = "time [s]" if len(response.trajectories) == 1 else "time, experiments one after another [s]"
     return panels.plot(_label(run), _caption(run, most), time)
 
@@ -371,5 +373,26 @@ def _caption(run: Run, most: int) -> str:
     outside = [t.outside for t in response.trajectories if t.outside is not None]
     beyond = float(np.concatenate(outside).mean()) if outside else 0.0
     if beyond > 0:
-        told.append(f"On {percent(beyond)} of the samples the learner is outside what it was trained on.")
+        told.append(
+            f"On {percent(beyond)} of the samples, shaded, the learner is outside what it was trained on; "
+            "`learner.beyond` says what its correction does there."
+        )
     return " ".join(told)
+
+
+def _shades(response: Response, start: float, step: float) -> list[dict[str, Any]]:
+    """Return areas over the stretches on which the learner is outside its training, close ones as one."""
+    rows, flags = 0, []
+    for t in response.trajectories:
+        flags.append(np.zeros(len(t.model)) if t.outside is None else np.asarray(t.outside, dtype=float))
+        flags.append(np.zeros(1))  # the gap between experiments
+        rows += len(t.model) + 1
+    edges = np.diff(np.concatenate([[0.0], *flags, [0.0]]))
+    first, after = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
+    apart = np.flatnonzero(first[1:] - after[:-1] > rows // _MOST_SHADES)
+    first, after = first[np.concatenate([[0], apart + 1])[: len(first)]], after[np.append(apart, -1)[: len(after)]]
+    place = {"yref": "paper", "y0": 0, "y1": 1}
+    return [
+        area("@reach", **place, x0=start + step * (a - 0.5), x1=start + step * (b - 0.5))
+        for a, b in zip(first.tolist(), after.tolist(), strict=True)
+    ]

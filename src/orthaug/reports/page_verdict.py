@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from orthaug._base.lines import plain_number
 from orthaug.analysis.budget import SURE_SHARE
 from orthaug.analysis.changes import Change
 from orthaug.reports.findings import BiasResult
@@ -24,6 +25,7 @@ _GOOD, _POOR = 0.2, 0.5  # NRMSE of a free run up to which it is close, and from
 _ALIKE = 1.1  # ratio of errors up to which models are told to be as good as each other
 _SURE = 0.1  # standard error over value up to which a parameter is told to be known
 _NAMED = 0.5  # share of what was learned from which its cause is what to do first
+_FAR = 5.0  # standard errors from which the size of a bias is told in figures
 _MOST_DOUBTS = 3  # that are told in the first sentence
 _WORSE = 1.5  # times the error on the training data: a Gaussian error then leaves the 95 % band on a fifth of the rows
 _STOPPED = ("iteration_limit", "no_descent", "stopped")
@@ -185,7 +187,7 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
     biased = [row.name for row in _rows(result) if _biased(row)]
     if biased:
         one = len(biased) == 1
-        carry = "carries a bias larger than its standard error" if one else "carry biases larger than their errors"
+        carry = _size_of_bias([row for row in _rows(result) if _biased(row)])
         guessed = any(row.bias and (row.bias.share or 0.0) < SURE_SHARE for row in _rows(result) if _biased(row))
         carry = f"probably {carry}" if guessed and getattr(result, "motion", None) is None else carry
         yield f"the estimate{'' if one else 's'} of {_joined(biased)} {carry}"
@@ -206,6 +208,22 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
     if result.validation is not None and result.validation.extrapolation:
         left = dict.fromkeys(entry.part for entry in result.validation.extrapolation)
         yield f"{_joined(list(left))} {'leaves' if len(left) == 1 else 'leave'} the range of the training data"
+
+
+def _size_of_bias(rows: Sequence[ParameterResult]) -> str:
+    """How large the biases are; in figures where one is far larger than its standard error."""
+    one = len(rows) == 1
+    worst = max(rows, key=_errors_of)
+    if _errors_of(worst) < _FAR or worst.bias is None:
+        return "carries a bias larger than its standard error" if one else "carry biases larger than their errors"
+    share = "" if not worst.value else f", {percent(abs((worst.bias.value or 0.0) / worst.value))} of its value"
+    size = f"{plain_number(_errors_of(worst))} standard errors{share}"
+    return f"carries a bias of {size}" if one else f"carry biases, that of {worst.name} of {size}"
+
+
+def _errors_of(row: ParameterResult) -> float:
+    """The size of its bias in standard errors."""
+    return abs(row.bias.value or 0.0) / row.std if row.bias and row.std else 0.0
 
 
 def _rows(result: FitResult | RowResult) -> list[ParameterResult]:

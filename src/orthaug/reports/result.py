@@ -22,6 +22,7 @@ from orthaug.reports.findings import (
     MotionFitResult,
     SharedResult,
     StabilityResult,
+    StructureResult,
     SuspectResult,
     ValidationResult,
 )
@@ -106,7 +107,7 @@ class RestartResult(Content):
 class ParameterResult(Content):
     """A parameter with its interval."""
 
-    absent: ClassVar = frozenset({"derived_unit", "one_step", "profile95", "plain_std", "shared"})
+    absent: ClassVar = frozenset({"derived_unit", "one_step", "profile95", "plain_std", "shared", "ci95_counts"})
 
     name: str
     unit: str
@@ -118,6 +119,8 @@ class ParameterResult(Content):
     std: Number = None
     plain_std: Number = None
     ci95: Numbers | None = None
+    ci95_counts: Literal["noise only"] | None = None
+    """What the interval counts, where the model leaves more than noise."""
     profile95: Numbers | None = None
     shared: Flag | None = None
     bias: BiasResult | None = None
@@ -266,7 +269,7 @@ class PhysicsAloneResult(Content):
 class FitResult(Headed):
     """What `orthaug fit` leaves."""
 
-    absent: ClassVar = frozenset({"motion", "terms", "equation"})
+    absent: ClassVar = frozenset({"motion", "terms", "equation", "unexplained"})
 
     spec: dict[str, Any]
     data: DataResult
@@ -289,6 +292,7 @@ class FitResult(Headed):
     physics_alone: PhysicsAloneResult | None = None
     bias: list[SuspectResult] | None
     residuals: DiagnosisResult | None
+    unexplained: StructureResult | None = None
     missing_lags: MissingLagsResult | None
     stability: StabilityResult | None
     validation: ValidationResult | None
@@ -298,6 +302,11 @@ class FitResult(Headed):
     advice: list[AdviceResult] = []
     advice_trials: AdviceTrialsResult | None = None
     warnings: list[WarningResult]
+
+    @property
+    def noise_only(self) -> bool:
+        """Whether the intervals count noise only: the model leaves more than that."""
+        return any(row.ci95_counts for row in (*self.parameters, *(self.physical_parameters or ())))
 
     @property
     def learns(self) -> bool:

@@ -12,6 +12,7 @@ from orthaug.analysis.budget import SURE_SHARE
 from orthaug.reports.biases import biased_by
 from orthaug.reports.fields import WarningResult
 from orthaug.reports.findings import SharedResult, SuspectResult
+from orthaug.reports.page_blocks import digits_for
 from orthaug.reports.result import (
     CheckResult,
     CompareResult,
@@ -37,13 +38,14 @@ def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
     """Parameters, scores on every part, what the residual says, whether the learner earns its place, warnings."""
     if not fit.status.ok:
         return ""
-    blocks = [[w.text.capitalize() for w in result.warnings if w.code == "one_step_only"], list(fit.lines())]
+    lines = [_as_doubted(line, result) for line in fit.lines()]
+    blocks = [[w.text.capitalize() for w in result.warnings if w.code == "one_step_only"], lines]
     if result.focus is not None and result.focus.candidates:
         blocks.append([f"{result.focus.text[0].upper()}{result.focus.text[1:]}"])
     if result.physical_parameters:
         blocks.append(_physical_lines(result))
     blocks.append(_score_lines(fit, result))
-    if result.shared is not None and not result.shared.everything:
+    if result.shared is not None and (not result.shared.everything or result.shared.doubt):
         blocks.append([result.shared.text])
     blocks.append(_bias_lines(result))
     findings = [result.residuals, result.missing_lags, result.validation]
@@ -52,6 +54,15 @@ def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
     blocks += [told, warning_lines(w for w in dict.fromkeys(result.warnings) if w.text not in told)]
     blocks.append(_advice_lines(result))
     return "\n\n".join("\n".join(fold(lines)) for lines in blocks if lines)
+
+
+def _as_doubted(line: str, result: FitResult) -> str:
+    """Return a line of a fit with intervals that say that they count noise only, and without withdrawn claims."""
+    if result.noise_only:
+        line = line.replace(f"{'95 % interval':^29}", f"{'95 %, noise only':^29}")
+    if result.shared is not None and result.shared.doubt and line.startswith("shared "):
+        line = f"{line.partition('; told by the fit: ')[0]}; told by the fit: none, see below"
+    return line
 
 
 def _advice_lines(result: FitResult) -> list[str]:
@@ -212,7 +223,8 @@ def _bias_line(row: ParameterResult, width: int) -> str:
     bias = _rounded((bias or 0.0) / (value or 1.0)) * (value or 1.0)
     errors = f"{plain_number(abs(bias) / row.std) if row.std else '–':>7}"
     part = f"{percent(_rounded(bias / value), sign='+') if value else '–':>9}"
-    limits = f"[{_limit(reach[0])}, {_limit(reach[1])}]" if reach else f"{'–':^29}"
+    none = "–" if row.bias is None or row.bias.determined else "not determined by these data"
+    limits = f"[{_limit(reach[0])}, {_limit(reach[1])}]" if reach else f"{none:^29}"
     return f"{row.name:<{width}}  {bias:+11.3g}  {errors}  {part}  {limits}".rstrip()
 
 
@@ -224,7 +236,8 @@ def _rounded(share: float) -> float:
 def _physical_lines(result: FitResult) -> list[str]:
     rows = result.physical_parameters or []
     width = _width(rows)
-    lines = [f"{'physical':<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  {'initial':>11}  unit"]
+    between = "95 %, noise only" if result.noise_only else "95 % interval"
+    lines = [f"{'physical':<{width}}  {'value':>14}  {'std':>11}  {between:^29}  {'initial':>11}  unit"]
     for row in rows:
         cells = _value_cells(row, row.profile95 or row.ci95, width)
         lines.append(f"{cells}  {row.initial:11.5g}  {row.unit}".rstrip())
@@ -327,7 +340,8 @@ def _estimate(parameter: ParameterResult) -> str:
     spread = f" ± {parameter.std:.2g}" if parameter.std is not None else ""
     bias = parameter.bias.value if parameter.bias and parameter.std is not None else None
     large = bias is not None and parameter.std is not None and abs(bias) > parameter.std
-    return f"{parameter.value:.6g}{spread}{f' (bias {bias:+.2g})' if large else ''}"
+    digits = digits_for(parameter.value, parameter.std, 6)
+    return f"{parameter.value:.{digits}g}{spread}{f' (bias {bias:+.2g})' if large else ''}"
 
 
 def _numbers(values: Sequence[float | None] | None) -> str:

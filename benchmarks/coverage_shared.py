@@ -1,0 +1,158 @@
+"""Coverage where a column of the physics is a function of what the learner sees, on the data if not by its name.
+
+Each row is a system, and what is asked is the parameter of that column: how often its interval holds the truth, how
+often it does not and nothing is said (a silent miss), and how wide it is. Run: python -m benchmarks.coverage_shared 10
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.signal
+
+import orthaug as oa
+from orthaug.inference.nearly_shared import shared_warnings
+
+STEP = 0.01  # s
+ROWS = 800
+TRUTH = 1.5
+SEES = "speed and place"
+
+
+class Row(NamedTuple):
+    """A row of the table: `width` is the median over the draws of the interval's length over the true value."""
+
+    system: str
+    noise: str
+    sees: str
+    draws: int
+    held: int
+    warned: int
+    silent: int
+    width: float
+
+
+def _speed(rng: np.random.Generator) -> np.ndarray:
+    """A speed that passes through zero often: a sum of sines (ROWS,)."""
+    t = STEP * np.arange(ROWS)
+    waves = [rng.uniform(0.3, 1) * np.sin(2 * np.pi * rng.uniform(0.2, 3) * t + rng.uniform(0, 6.28)) for _ in range(6)]
+    return np.sum(waves, axis=0)
+
+
+def _noisy_sign(v: np.ndarray, p: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    return np.sign(v + 0.1 * v.std() * rng.normal(size=len(v)))
+
+
+COLUMNS: dict[str, Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray]] = {
+    "sign of the speed": lambda v, p, rng: np.sign(v),
+    "speed times place": lambda v, p, rng: v * p,
+    "speed times its size": lambda v, p, rng: v * np.abs(v),
+    "sign of a noisy speed": _noisy_sign,
+    "speed 20 samples ago": lambda v, p, rng: np.roll(v, 20),
+    "low-pass of the speed": lambda v, p, rng: np.asarray(scipy.signal.lfilter([0.05], [1, -0.95], v)),
+    "independent noise": lambda v, p, rng: rng.normal(size=len(v)),
+    "independent steps": lambda v, p, rng: np.repeat(rng.normal(size=len(v) // 20), 20),
+}
+
+
+def lagged(column: str, noise: float, seed: int) -> tuple[float, tuple[float, float], bool]:
+    """The force on a stage whose friction is a function of speed and place: estimate, interval, whether warned."""
+    rng = np.random.default_rng(seed)
+    v = _speed(rng)
+    p, a = np.cumsum(v) * STEP, np.gradient(v, STEP)
+    extra = COLUMNS[column](v, p, rng)
+    force = 2.0 * v + TRUTH * extra + 0.8 * a + 0.3 + 0.4 * np.sin(3 * p) + 0.3 * np.exp(-np.abs(v) / 0.1) * np.sign(v)
+    force = force + noise * np.std(force) * rng.normal(size=ROWS)
+    names = ["speed", "place", "acceleration", "extra"]
+    signals = np.column_stack([v, p, a, extra])
+    record = oa.Record.from_arrays(signals, force, sampling_time=STEP, inputs=names, outputs=["force"])
+    terms = [("c", "speed[k]"), ("e", "extra[k]"), ("m", "acceleration[k]"), ("offset", "1")]
+    baseline = oa.Baseline.from_terms([oa.Term(*term) for term in terms])
+    inputs = ("speed[k]", "place[k]")
+    fit = oa.estimate(record, baseline, learner=oa.MLP(hidden=(8,), inputs=inputs), seed=seed)
+    return _judged(fit, "e", fit.theta[1], fit.interval, 1, fit.problem.shared, inputs)
+
+
+def motion(column: str, noise: float, seed: int) -> tuple[float, tuple[float, float], bool]:
+    """A mass with friction of its speed, beside a column that acts on it."""
+    rng = np.random.default_rng(seed)
+    drive, x, v = np.repeat(rng.normal(size=ROWS // 10 + 1), 10)[:ROWS] * 6, np.zeros(ROWS), np.zeros(ROWS)
+    extra = COLUMNS[column](np.zeros(ROWS), np.zeros(ROWS), rng) if column.startswith("independent") else np.zeros(ROWS)
+    for k in range(ROWS - 1):
+        if column == "sign of the speed":
+            extra[k] = np.sign(v[k])
+        elif column == "speed times its size":
+            extra[k] = v[k] * abs(v[k])
+        pull = drive[k] - 3.0 * v[k] - 8.0 * x[k] - TRUTH * extra[k] - 0.5 * np.tanh(v[k] / 0.1)
+        for _ in range(5):
+            v_next = v[k] if _ == 0 else v_next
+            v_next = v_next + STEP / 5 * pull
+        v[k + 1] = v_next
+        x[k + 1] = x[k] + STEP * (v[k] + v[k + 1]) / 2
+    y = x + noise * x.std() * rng.normal(size=ROWS)
+    names = ["drive", "extra"]
+    signals = np.column_stack([drive, extra])
+    record = oa.Record.from_arrays(signals, y, sampling_time=STEP, inputs=names, outputs=["place"])
+    physics = oa.Motion.from_equations(
+        states=[
+            oa.State("x", "v", start="place"),
+            oa.State("v", "(drive - c*v - k*x - e*extra)/m", start="derivative of place", learned=True),
+        ],
+        outputs=[oa.Output("place", "x")],
+        parameters=[oa.PhysicalParameter(n, s) for n, s in (("m", 1.2), ("c", 2.0), ("k", 7.0), ("e", 1.0))],
+        inputs=names,
+    )
+    fit = oa.estimate(record, physics, learner=oa.MLP(hidden=(5,), inputs=("v",)), seed=seed)
+    return _judged(fit, "e", fit.values[3], fit.interval, 3, fit.shared, ("v",))
+
+
+def _judged(fit: Any, name: str, value: float, interval: Any, i: int, shared: Any, inputs: Any) -> Any:
+    warned = any(name in warning.text for warning in shared_warnings(shared, inputs))
+    held = (np.nan, np.nan) if interval is None else tuple(np.asarray(interval)[i])
+    return float(value), held, warned
+
+
+def rows(draws: int = 10) -> list[Row]:
+    """The table: every column with noise of 1 and 5 %, as lagged physics, and some as a motion."""
+    found = []
+    cases = [("lagged", lagged, column, noise) for column in COLUMNS for noise in (0.01, 0.05)]
+    moved = ("sign of the speed", "speed times its size", "independent noise", "independent steps")
+    cases += [("motion", motion, column, 0.01) for column in moved]
+    for kind, run, column, noise in cases:
+        held = warned = silent = 0
+        widths = []
+        for seed in range(max(draws // (3 if kind == "motion" else 1), 3)):
+            _, (low, high), said = run(column, noise, seed)
+            holds = bool(low <= TRUTH <= high)
+            held, warned = held + holds, warned + said
+            silent += not holds and not said and np.isfinite(low)
+            widths.append((high - low) / TRUTH)
+        sees = SEES if kind == "lagged" else "v"
+        found.append(
+            Row(
+                f"{kind}: {column}",
+                f"{noise:.0%}",
+                sees,
+                len(widths),
+                held,
+                warned,
+                silent,
+                float(np.nanmedian(widths)),
+            )
+        )
+    return found
+
+
+def main() -> None:
+    """Print the table."""
+    print("| system | noise | learner sees | draws | held | warned | silent misses | median width |")
+    print("|---|---|---|---|---|---|---|---|")
+    for row in rows(int(sys.argv[1]) if len(sys.argv) > 1 else 10):
+        print("| " + " | ".join(f"{v:.3g}" if isinstance(v, float) else str(v) for v in row) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

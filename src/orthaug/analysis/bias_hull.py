@@ -1,0 +1,113 @@
+"""The bias that a learner implies is a set: the hull over all causes that noise cannot tell from the best (F14).
+
+A cause that explains the share s of what the learner holds beside the physics leaves 1 − s of it. The truth leaves what
+the noise puts into the learner, `ν = E‖noise of it‖²/‖it‖²`, and what no form of the catalogue has; so a cause may be
+the true one where
+
+    1 − s ≤ 3 (1 − s_best) + 3 ν + 0.02.
+
+Terms that are nearly the physics itself, `|v|^1.1`, fit anything with a huge size and stay out. Every such cause has an
+interval about the estimate less its bias, as wide as noise and what it leaves. What is shown is the hull of them; where
+that is wider than the value itself, the data do not determine it beside this learner.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._base.checks import Vector
+from orthaug._base.errors import Warning
+from orthaug._base.lines import percent
+from orthaug.inference.covariance import interval, reach
+
+_AS_CLOSE = 3.0  # times what the best leaves of the learner: where no form fits, others are as likely
+_NOISE = 3.0  # times ν: over 20 draws of seven forms the true one left at most 2 ν
+_CLOSE = 0.02  # of the learner: a network smooths the cusp of √|v| and rounds a jump, whatever the noise
+MOST_PHYSICS = 0.986  # cosine with the physics: beyond it a term is six times larger than what the learner shows of it
+_LEAST = 0.5  # of the best share: what explains less is no likely cause
+_TOLD = 4  # parameters that a warning lists at most
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A cause that may be the true one: by how much the size found moves the parameters, estimate less truth."""
+
+    name: str
+    share: float
+    moved: Vector
+    declared: bool = False
+
+    @property
+    def unsure(self) -> Vector:
+        """Standard deviation of the bias that it does not explain: biased by as much for its size as the cause."""
+        return np.abs(self.moved) * np.sqrt(max(1 - self.share, 0.0) / self.share)
+
+
+@dataclass(frozen=True, eq=False)
+class Named(Candidate):
+    """The cause that is named, with the standard deviation of what it leaves."""
+
+    rest: Vector | float = 0.0
+
+    @property
+    def unsure(self) -> Vector:
+        """Standard deviation of the bias that it does not explain."""
+        return self.rest + np.zeros(len(self.moved))
+
+
+def compatible(candidates: Sequence[Candidate], noise: float) -> list[Candidate]:
+    """Return the causes that noise cannot tell from the best; of these the declared ones alone where there are any.
+
+    Args:
+        noise: ν, the share of what the learner holds that is noise.
+    """
+    likely = [c for c in candidates if c.share > 0]
+    if not likely:
+        return []
+    best = max(c.share for c in likely)
+    left = min(_AS_CLOSE * (1 - best) + _NOISE * noise + _CLOSE, 1 - _LEAST * best)
+    kept = [c for c in likely if 1 - c.share <= left]
+    return [c for c in kept if c.declared] or kept
+
+
+def hull(
+    value: Vector, std: Vector, freedom: float, candidates: Sequence[Candidate], extra: Vector | float = 0.0
+) -> Float[np.ndarray, "n 2"]:
+    """Return 95 % intervals (n, 2) that hold the truth whichever of the candidates is the cause.
+
+    Args:
+        extra: a standard deviation that every cause has beside its own.
+    """
+    each = np.array([interval(value - c.moved, np.sqrt(std**2 + c.unsure**2 + extra**2), freedom) for c in candidates])
+    return np.stack([each[..., 0].min(axis=0), each[..., 1].max(axis=0)], axis=-1)
+
+
+def is_determined(value: float, std: float, freedom: float, low: float, high: float) -> bool:
+    """Return False where an interval is wider than the value itself and it is not noise that makes it so wide."""
+    noise = 2 * reach(freedom) * std
+    return not (high - low > abs(value) and high - low > 2 * noise)
+
+
+def undetermined_warning(names: Sequence[str], candidates: Sequence[Candidate], remedies: Sequence[str]) -> Warning:
+    """The warning on parameters that the hull leaves open: why, and what would determine them."""
+    shown = ", ".join(names[:_TOLD]) + (f" and {len(names) - _TOLD} more" if len(names) > _TOLD else "")
+    apart = sorted(candidates, key=lambda c: float(np.sum(np.sign(c.moved) * c.moved**2)))
+    pair = [apart[0], apart[-1]] if len(apart) > 1 else apart
+    causes = " and ".join(f"{c.name}, {percent(c.share)} of what it found" for c in pair)
+    of = f": {causes} imply other values" if len(pair) > 1 else ""
+    cure = " or ".join(
+        remedies
+        or (
+            "split under another measure",
+            "give the learner fewer inputs",
+            "use an input that was designed for these parameters (`orthaug design`)",
+        )
+    )
+    verb = "is" if len(names) == 1 else "are"
+    return Warning(
+        "not_determined", f"{shown} {verb} not determined by these data beside this learner{of}. To determine: {cure}."
+    )

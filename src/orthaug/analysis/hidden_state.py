@@ -1,0 +1,392 @@
+"""Does the model leave structure that noise does not explain, and does the past beyond its states tell it?
+
+The errors of the free run are regressed on how the outputs follow, to first order, the parameters, the starts and any
+function of what a learner sees (`output_response`). What is added to that are simple functions of a state or an input,
+and terms with memory of it (`memory`). Run and inputs are no function of the noise: noise of any colour, on the sensor
+or in the equation, is no reason to find one. Rows and columns are filtered by the autoregression of the errors beside
+the model (Cochrane and Orcutt 1949), so that what remains of noise is white. A family of terms counts where its F-test
+rejects at the level divided by the number of families and it predicts blocks of rows that it was not fitted to.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.special
+from scipy.signal import lfilter
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug.analysis.memory import KINDS, MemoryTerm, filtered, memory_terms
+from orthaug.analysis.output_response import LinearRun, linear_runs
+from orthaug.analysis.predictability import BlockSums, Share
+from orthaug.analysis.whiteness import whitening
+from orthaug.data.record import Record
+from orthaug.models.model import Model
+from orthaug.models.motion_model import MotionModel
+
+_MOST_ROWS = 6000
+_VARIABLES, _EQUATIONS = 6, 3  # looked at, at most
+_LEVEL = 0.01
+_ROWS_PER_COLUMN = 4
+_ROUNDING = 1e-7  # of the outputs' deviation: errors below that are rounding and the integrator's
+_OWN = 1e-3  # of a column's size: what is left of it beside the model, so that it is one of its own
+_CENTRES = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95)  # quantiles about which a function of a learner's feature bends
+_STATIC = 5
+_SETTLING, _HALVINGS, _SETTLED = 8, 4, 0.01  # steps, shorter ones, and the fall of the squares that ends them
+
+
+@dataclass(frozen=True)
+class FamilyTest:
+    """A family of terms in one equation: `share` of the filtered errors' square that it predicts on held-out blocks.
+
+    `error` is the standard error of the share, `p` that of the F-test, times the number of families. `moves` is by how
+    much each parameter moves once the best `term` is fitted beside it, in the coordinates that are estimated.
+    """
+
+    equation: str
+    on: str
+    kind: str
+    share: float
+    error: float
+    p: float
+    term: MemoryTerm | None = None
+    moves: tuple[float, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """What it is, in words."""
+        return f"a function of {self.on}" if self.term is None else f"a {self.term.name}"
+
+    @property
+    def sure(self) -> bool:
+        """Whether it is surely there."""
+        return self.p < _LEVEL and self.share > 2 * self.error
+
+
+@dataclass(frozen=True)
+class StructureTest:
+    """What the errors of a free run hold beside noise.
+
+    `static` is the best family of functions of a state or an input, `memory` the best with memory, each beside what the
+    model has; `hidden` the best with memory beside all static ones, too. None where none is sure.
+    """
+
+    static: FamilyTest | None
+    memory: FamilyTest | None
+    hidden: FamilyTest | None
+    families: tuple[FamilyTest, ...]
+    """All with memory, the largest share first."""
+
+    @property
+    def found(self) -> bool:
+        """Whether there is any structure."""
+        return self.static is not None or self.memory is not None
+
+    @property
+    def has_memory(self) -> bool:
+        """Whether a hidden state is the likely cause: memory is sure beside static terms, and predicts more."""
+        return (
+            self.hidden is not None
+            and self.memory is not None
+            and (self.static is None or self.memory.share >= self.static.share)
+        )
+
+
+@dataclass(frozen=True)
+class _Family:
+    equation: str
+    on: str
+    kind: str
+    terms: tuple[MemoryTerm | None, ...]
+
+
+def structure_test(model: Model | MotionModel, record: Record) -> StructureTest | None:
+    """Test what the free run of a model leaves of its training data.
+
+    None where the run leaves all bounds or has no slopes, or there are too few rows.
+    """
+    settled = _settled(model, record)
+    if settled is None:
+        return None
+    theta, runs = settled
+    whole = np.concatenate([run.error for run in runs])
+    if np.all(whole.std(axis=0) < _ROUNDING * model.deviation):
+        return None
+    return _tested(
+        runs, _base_columns(model, runs), *_added_columns(model, runs), theta - np.asarray(model.numbers.theta)
+    )
+
+
+def _settled(model: Model | MotionModel, record: Record) -> tuple[Vector, list[LinearRun]] | None:
+    """Move the parameters of the physics to where the filtered errors of the free run are least (Gauss-Newton).
+
+    Noise on the sensor, or coloured noise, biases what was fitted one step ahead: its run is then far from the data
+    even though nothing is missing.
+    """
+    theta = np.asarray(model.numbers.theta, dtype=float)
+    runs = linear_runs(model, record, _MOST_ROWS, theta)
+    if runs is None:
+        return None
+    for _ in range(_SETTLING):
+        base = _base_columns(model, runs)
+        pieces, colours = _coloured(runs, base)
+        rows, nt = np.concatenate([_filtered(piece, colours) for piece in pieces]), len(theta)
+        step, before = _least_squares(rows[:, :-1], rows[:, -1])[:nt], _left(rows[:, nt:-1], rows[:, -1])
+        scale, trial, after = _scale(runs), None, np.inf
+        for _ in range(_HALVINGS):
+            trial, after = linear_runs(model, record, _MOST_ROWS, theta + step), np.inf
+            if trial is not None:
+                beside = [one[..., nt:] for one in _base_columns(model, trial)]
+                moved = np.concatenate([_filtered(piece, colours) for piece in _pieces(trial, beside, scale)])
+                after = _left(moved[:, :-1], moved[:, -1])
+            if after < before:
+                break
+            step = step / 4
+        if trial is None or not after < before:
+            break
+        theta, runs = theta + step, trial
+        if after > (1 - _SETTLED) * before:
+            break
+    return theta, runs
+
+
+def _least_squares(columns: Matrix, target: Vector) -> Vector:
+    size = np.linalg.norm(columns, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    return np.linalg.lstsq(columns / size, target, rcond=1e-10)[0] / size
+
+
+def _left(columns: Matrix, target: Vector) -> float:
+    """Return the sum of squares that columns leave."""
+    q = _range(columns)
+    rest = target - q @ (q.T @ target)
+    return float(rest @ rest)
+
+
+def _signals(model: Model | MotionModel, run: LinearRun) -> dict[str, Vector]:
+    """Return what terms may be of: each channel of the regressor and its velocity, or states and inputs."""
+    form = model.form
+    if isinstance(model, MotionModel):
+        names = (*model.form.motion.names_of_states, *model.form.motion.inputs)
+        found = dict(zip(names, np.concatenate([run.states, run.inputs], axis=1).T, strict=True))
+        seen = form.seen(run.states.T, run.inputs.T, np) if form.bound is not None else ()
+        found |= {str(entry): row for entry, row in zip(form.features, seen, strict=False) if str(entry) not in found}
+    else:
+        x, layout = form.regressor(run.states.T, run.rows.T, np), form.layout
+        found = {}
+        for channel in dict.fromkeys(lag.channel for lag in layout):
+            lags = sorted(lag for lag in layout if lag.channel == channel)
+            first, *others = (x[layout.index(lag)] for lag in lags)
+            found[str(lags[0])] = first
+            if others and channel in form.outputs:
+                found[f"{lags[0]} - {lags[1]}"] = first - others[0]
+    moving = {name: row for name, row in found.items() if np.isfinite(row).all() and np.ptp(row) > 0}
+    return dict(list(moving.items())[:_VARIABLES])
+
+
+def _features(model: Model | MotionModel, run: LinearRun) -> Matrix:
+    """Return what the learner sees along the run, (T, nz)."""
+    form = model.form
+    if form.bound is None:
+        return np.zeros((len(run.error), 0))
+    if isinstance(model, MotionModel):
+        return np.asarray(form.seen(run.states.T, run.inputs.T, np)).T
+    return np.asarray(form.features.evaluate(form.regressor(run.states.T, run.rows.T, np).T, form.layout, np))
+
+
+def _equations(model: Model | MotionModel) -> tuple[tuple[int, str], ...]:
+    """Return the equations that may lack something: of outputs, or of states that have a parameter or a learner."""
+    if isinstance(model, MotionModel):
+        motion = model.form.motion
+        names, places = motion.names_of_states, set(motion.learned[0])
+        places |= {i for i, name in enumerate(names) if motion.functions is not None or motion.parameters_in(name)}
+        return tuple((i, names[i]) for i in sorted(places))[:_EQUATIONS]
+    return tuple(enumerate(model.form.outputs))[:_EQUATIONS]
+
+
+def _respond(model: Model | MotionModel, run: LinearRun, place: int, columns: Matrix) -> np.ndarray:
+    """Compute how the outputs follow signals (T, k) that are added to an equation, (T, ny, k)."""
+    (t, k), n0, ny = columns.shape, run.states.shape[1], run.error.shape[1]
+    into_state, into_output = np.zeros((t, n0, k)), np.zeros((t, ny, k))
+    if not isinstance(model, MotionModel):
+        into_output[:, place] = columns
+        if n0:
+            into_state[:, place] = columns
+    elif model.form.motion.integrator == "discrete":
+        into_state[:, place] = columns
+    else:
+        half = model.sampling_time / 2
+        into_state += half * run.to_state[:, :, place, None] * columns[:, None]
+        into_state[:, place] += half * np.concatenate([columns[1:], columns[-1:]])
+    return run.respond(into_state, into_output, np.zeros((n0, k)))
+
+
+def _base_columns(model: Model | MotionModel, runs: list[LinearRun]) -> list[np.ndarray]:
+    """Return what the model explains, of every run (T, ny, k): starts, parameters, functions of what it sees."""
+    features = [_features(model, run) for run in runs]
+    bends = _bends(np.concatenate(features))
+    places = [i for i, _ in _equations(model)]
+    if isinstance(model, MotionModel):
+        places = list(model.form.motion.learned[0])
+    found = []
+    for j, (run, z) in enumerate(zip(runs, features, strict=True)):
+        starts = run.starts()
+        own = np.zeros((*starts.shape[:2], starts.shape[2] * len(runs)))
+        own[..., j * starts.shape[2] : (j + 1) * starts.shape[2]] = starts
+        learned = [_respond(model, run, place, bends(z)) for place in places] if z.shape[1] else []
+        found.append(np.concatenate([run.parameters(), own, *learned], axis=2))
+    return found
+
+
+def _bends(z: Matrix):
+    """Return a flexible function of features: of each its bends at quantiles, and products of pairs."""
+    centre, size = z.mean(axis=0), np.where(z.std(axis=0) > 0, z.std(axis=0), 1.0)
+    scaled = (z - centre) / size
+    knots = [np.unique(np.quantile(column, _CENTRES)) for column in scaled.T]
+
+    def columns(rows: Matrix) -> Matrix:
+        own = np.clip((rows - centre) / size, -5, 5)
+        found = [np.ones(len(rows))]
+        for v, at in zip(own.T, knots, strict=True):
+            found += [v, v**3, *(np.tanh((v - knot) / width) for knot in at for width in (0.05, 0.4))]
+        for i in range(own.shape[1]):
+            for j in range(i):
+                found += [own[:, i] * own[:, j], own[:, i] ** 2 * own[:, j], own[:, i] * own[:, j] ** 2]
+        return np.stack(found, axis=1)
+
+    return columns
+
+
+def _static(values: Vector, size: float) -> list[Vector]:
+    """Return simple functions of a signal."""
+    v = np.clip(values / size, -5, 5)
+    return [v, np.abs(v), v * np.abs(v), v**3, np.tanh(10 * v)]
+
+
+def _added_columns(model: Model | MotionModel, runs: list[LinearRun]) -> tuple[list[_Family], list[np.ndarray]]:
+    """Return the families of terms, and of every run the responses to all their terms, (T, ny, K)."""
+    step, signals = model.sampling_time, [_signals(model, run) for run in runs]
+    names = [name for name in signals[0] if all(name in other for other in signals)]
+    families, columns = [], [[] for _ in runs]
+    for name in names:
+        joined = np.concatenate([own[name] for own in signals])
+        size = float(np.sqrt(np.mean(joined**2))) or 1.0
+        terms = memory_terms(name, joined, step)
+        kinds = [("static", (None,) * _STATIC)]
+        kinds += [(kind, tuple(term for term in terms if term.kind == kind)) for kind in KINDS]
+        for place, equation in _equations(model):
+            families += [_Family(equation, name, kind, own) for kind, own in kinds]
+            for found, own, run in zip(columns, signals, runs, strict=True):
+                values = _static(own[name], size) + [filtered(term, own[name], step) / size for term in terms]
+                found.append(_respond(model, run, place, np.stack(values, axis=1)))
+    return families, [np.concatenate(found, axis=2) for found in columns]
+
+
+def _scale(runs: list[LinearRun]) -> Vector:
+    scale = np.sqrt(np.mean(np.concatenate([run.error for run in runs]) ** 2, axis=0))
+    return np.where(scale > 0, scale, 1.0)
+
+
+def _pieces(runs: list[LinearRun], columns: list[np.ndarray], scale: Vector) -> list[np.ndarray]:
+    """Return columns and errors of every run (T, ny, k + 1), outputs divided by the size of their errors."""
+    joined = zip(columns, runs, strict=True)
+    return [np.concatenate([one, run.error[..., None]], axis=2) / scale[:, None] for one, run in joined]
+
+
+def _coloured(runs: list[LinearRun], base: list[np.ndarray]) -> tuple[list[np.ndarray], list[Vector]]:
+    """Return columns and errors, and of each output the autoregression of what the columns leave of its errors."""
+    pieces = _pieces(runs, base, _scale(runs))
+    rest = _beside([piece[..., :-1] for piece in pieces], [piece[..., -1] for piece in pieces])
+    colours = [whitening([piece[:, o] for piece in rest]) for o in range(base[0].shape[1])]
+    return pieces, [np.ones(1) if a is None else a for a in colours]
+
+
+def _tested(
+    runs: list[LinearRun], base: list[np.ndarray], families: list[_Family], added: list[np.ndarray], shift: Vector
+) -> StructureTest | None:
+    """Filter rows and columns by the colour of the errors beside the model, and test every family."""
+    nt, known, colours = len(shift), base[0].shape[2], _coloured(runs, base)[1]
+    both = [np.concatenate(columns, axis=2) for columns in zip(base, added, strict=True)]
+    whole = np.concatenate([_filtered(piece, colours) for piece in _pieces(runs, both, _scale(runs))])
+    if len(whole) < _ROWS_PER_COLUMN * (known + len(families)) or not np.isfinite(whole).all():
+        return None
+    starts = slice(nt, nt + runs[0].states.shape[1] * len(runs))
+    q = _range(whole[:, starts])
+    whole = whole - q @ (q.T @ whole)  # they move a few rows of one run only: blocks would not tell them
+    whole[:, starts] = 0.0
+    size = np.linalg.norm(whole, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    whole = whole / size
+    static = np.concatenate([np.full(len(family.terms), family.kind == "static") for family in families])
+    own, simple = list(range(known)), [known + int(j) for j in np.flatnonzero(static)]
+    beside = _family_tests(whole, own, known, families, size, shift)
+    hidden = _family_tests(whole, own + simple, known, families, size, None)
+    memory = [entry for entry in beside if entry.kind != "static"]
+    return StructureTest(
+        _best([entry for entry in beside if entry.kind == "static"]),
+        _best(memory),
+        _best([entry for entry in hidden if entry.kind != "static"]),
+        tuple(sorted(memory, key=lambda entry: -entry.share)),
+    )
+
+
+def _best(entries: list[FamilyTest]) -> FamilyTest | None:
+    return max((entry for entry in entries if entry.sure), key=lambda entry: entry.share, default=None)
+
+
+def _beside(columns: list[np.ndarray], errors: list[np.ndarray]) -> list[np.ndarray]:
+    """Return what least squares on the columns leaves of errors, pieces of (T, ny)."""
+    flat, lengths = np.concatenate(columns), np.cumsum([len(piece) for piece in columns])[:-1]
+    target, ny = np.concatenate(errors), errors[0].shape[1]
+    q = _range(flat.reshape(len(flat) * ny, -1))
+    rest = target.reshape(-1) - q @ (q.T @ target.reshape(-1))
+    return np.split(rest.reshape(-1, ny), lengths)
+
+
+def _range(columns: Matrix) -> Matrix:
+    """Return an orthonormal basis of what columns span, each taken as of size 1."""
+    size = np.linalg.norm(columns, axis=0)
+    columns = columns[:, size > 0] / size[size > 0]
+    if not columns.size:
+        return np.zeros((len(columns), 0))
+    u, s, _ = np.linalg.svd(columns, full_matrices=False)
+    return u[:, s > 1e-9 * s[0]]
+
+
+def _filtered(piece: np.ndarray, colours: list[Vector]) -> Matrix:
+    """Return columns and errors (T, ny, k) filtered by the autoregression of each output, rows in their order."""
+    memory = max(map(len, colours)) - 1
+    rows = np.stack([lfilter(a, [1.0], piece[:, o], axis=0)[memory:] for o, a in enumerate(colours)], axis=1)
+    return rows.reshape(-1, piece.shape[2])
+
+
+def _family_tests(
+    whole: Matrix, base: list[int], known: int, families: list[_Family], size: Vector, shift: Vector | None
+) -> list[FamilyTest]:
+    """Test every family beside the columns of a base; `size` are the norms that columns were divided by."""
+    q = _range(whole[:, base])
+    rest = whole[:, known:] - q @ (q.T @ whole[:, known:])
+    target, terms = rest[:, -1], rest[:, :-1]
+    total, left = float(target @ target), len(whole) - q.shape[1]
+    sums = BlockSums.of(np.concatenate([q, terms], axis=1), whole[:, -1])
+    blocks, found, place = list(range(q.shape[1])), [], 0
+    for family in families:
+        own = list(range(place, place + len(family.terms)))
+        place += len(family.terms)
+        own = [j for j in own if np.linalg.norm(terms[:, j]) > _OWN]
+        if not own or not total > 0:
+            continue
+        basis = _range(terms[:, own])
+        gained, rank = float(np.sum((basis.T @ target) ** 2)), basis.shape[1]
+        freedom = left - rank
+        p = scipy.special.fdtrc(rank, freedom, gained / rank / (max(total - gained, 1e-300) / freedom))
+        share: Share = sums.share([len(blocks) + j for j in own], blocks)
+        chosen = max(own, key=lambda j: (terms[:, j] @ target) ** 2 / (terms[:, j] @ terms[:, j]))
+        term = family.terms[chosen - (place - len(family.terms))]
+        entry = FamilyTest(family.equation, family.on, family.kind, share.value, share.error, float(p), term)
+        if shift is not None and term is not None:
+            step = _least_squares(whole[:, [*base, known + chosen]], whole[:, -1])[: len(shift)]
+            entry = replace(entry, moves=tuple(map(float, shift + step * size[-1] / size[: len(shift)])))
+        found.append(entry)
+    return [replace(entry, p=min(entry.p * len(found), 1.0)) for entry in found]

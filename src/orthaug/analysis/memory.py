@@ -1,0 +1,78 @@
+"""Terms with memory: first-order lags, backlash, LuGre friction and Bouc-Wen hysteresis of a signal.
+
+Each has one internal state, computed by filtering the signal; its time constant or width is profiled over a small grid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import lfilter
+
+from orthaug._base.checks import Vector
+
+KINDS = ("lag", "backlash", "lugre", "bouc_wen")
+WORDS = {
+    "lag": "first-order lag",
+    "backlash": "backlash (play)",
+    "lugre": "bristle of LuGre friction",
+    "bouc_wen": "Bouc-Wen hysteresis",
+}
+TIME_CONSTANTS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)  # samples
+WIDTHS = (0.1, 0.3, 0.6, 1.0, 1.5)  # deviations of the signal
+_LONGEST = 0.1  # of the rows: a slower lag is a trend that no record shows
+
+
+@dataclass(frozen=True)
+class MemoryTerm:
+    """A term with memory of the signal `on`.
+
+    `scale` is the time constant [s] of a lag, else the width in the unit of the signal.
+    """
+
+    kind: str
+    on: str
+    scale: float
+
+    @property
+    def name(self) -> str:
+        """The term as results name it."""
+        symbol, unit = ("time constant", " s") if self.kind == "lag" else ("width", "")
+        return f"{WORDS[self.kind]} of {self.on}, {symbol} {self.scale:.3g}{unit}"
+
+
+def memory_terms(on: str, values: Vector, sampling_time: float) -> list[MemoryTerm]:
+    """Return the terms of every kind on a signal, with their grids of time constants and widths."""
+    size = float(np.std(values))
+    lags = [step for step in TIME_CONSTANTS if step <= _LONGEST * len(values)]
+    terms = [MemoryTerm("lag", on, step * sampling_time) for step in lags]
+    return terms + [MemoryTerm(kind, on, share * size) for kind in KINDS[1:] for share in WIDTHS]
+
+
+def filtered(term: MemoryTerm, values: Vector, sampling_time: float) -> Vector:
+    """Compute the internal state of a term along a signal (N,), from rest at its first value.
+
+    A lag is exact for a held input. The others are driven by the increments d of the signal:
+    play `z = min(max(z, x − w), x + w)`, LuGre `z⁺ = z + d − |d| z/w`, and Bouc-Wen
+    `z⁺ = z + d − (|d| |z| z + d z²)/(2w²)`.
+    """
+    if term.kind == "lag":
+        pole = float(np.exp(-sampling_time / term.scale))
+        return lfilter([0.0, 1 - pole], [1.0, -pole], values, zi=[values[0]])[0]
+    width, state = term.scale, 0.0
+    if term.kind == "backlash":
+        state, found = float(values[0]), []
+        for x in values.tolist():
+            state = min(max(state, x - width), x + width)
+            found.append(state)
+        return np.array(found)
+    found, steps = [0.0], np.diff(values).tolist()
+    for d in steps:
+        if term.kind == "lugre":
+            state += d - abs(d) * state / width
+        else:
+            state += d - (abs(d) * abs(state) * state + d * state * state) / (2 * width * width)
+        state = min(max(state, -width), width)
+        found.append(state)
+    return np.array(found)

@@ -1,0 +1,120 @@
+"""How the outputs of a free run follow a signal that is added to an equation, to first order, of any dynamics.
+
+With `x⁺, y = step(x)` and a signal c in an equation: `s⁺ = A s + b c`, `Δy = C s + d c`, A and C the slopes of the step
+along the run. The signal acts on the newest output of lagged physics, and on a state's derivative of a motion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.jax import jax, jnp, padded_length
+from orthaug.analysis.whiteness import LARGEST
+from orthaug.data.record import Record
+from orthaug.models.model import Model
+from orthaug.models.motion_model import MotionModel
+
+
+@dataclass(frozen=True, eq=False)
+class LinearRun:
+    """A free run of one experiment of T rows, linearised: `states` (T, n0), `error` (T, ny) measured less run."""
+
+    states: Matrix
+    inputs: Matrix
+    """The experiment's inputs (T, nu) at the same rows."""
+    rows: Matrix
+    """What the steps read, (T, nr)."""
+    error: Matrix
+    to_state: Float[np.ndarray, "T n0 n0"]
+    to_output: Float[np.ndarray, "T ny n0"]
+    theta_to_state: Float[np.ndarray, "T n0 nt"]
+    theta_to_output: Float[np.ndarray, "T ny nt"]
+
+    def respond(
+        self, into_state: Float[np.ndarray, "T n0 k"], into_output: Float[np.ndarray, "T ny k"], start: Matrix
+    ) -> Float[np.ndarray, "T ny k"]:
+        """Compute Δy of k columns that are added to the state and the output of every step, from s (n0, k) = start."""
+        found = np.array(into_output, dtype=float)
+        if not self.states.shape[1]:
+            return found
+        state = start
+        for t in range(len(found)):
+            found[t] += self.to_output[t] @ state
+            state = self.to_state[t] @ state + into_state[t]
+        return found
+
+    def starts(self) -> Float[np.ndarray, "T ny n0"]:
+        """Compute how the outputs follow the state at the first row."""
+        n0 = self.states.shape[1]
+        t, ny = self.error.shape
+        return self.respond(np.zeros((t, n0, n0)), np.zeros((t, ny, n0)), np.eye(n0))
+
+    def parameters(self) -> Float[np.ndarray, "T ny nt"]:
+        """Compute how the outputs follow the parameters of the physics."""
+        n0, nt = self.theta_to_state.shape[1:]
+        return self.respond(self.theta_to_state, self.theta_to_output, np.zeros((n0, nt)))
+
+
+def linear_runs(model: Model | MotionModel, record: Record, most: int, theta: Vector) -> list[LinearRun] | None:
+    """Linearise the free run over a record; None where it leaves all bounds or has no slopes.
+
+    Args:
+        most: rows of all experiments together, of which the first of each are taken.
+        theta: parameters of the physics, coordinates of a motion's, instead of those of the fit.
+    """
+    form: Any = model.form
+    if not form.differentiable:
+        return None
+    numbers = model.numbers._replace(theta=theta)
+    runs, share = [], min(1.0, most / max(len(record), 1))
+    for experiment in record.experiments:
+        count = int(share * len(experiment))
+        first = form.first_row
+        if count - first < 2:
+            continue
+        part = replace(experiment, inputs=experiment.inputs[:count], outputs=experiment.outputs[:count])
+        start = model.first_state(part, record)
+        rows = np.asarray(form.inputs(part, record))
+        run = _linearize(form, numbers, start, rows, part.outputs[first:], part.inputs[first:])
+        if run is None:
+            return None
+        runs.append(run)
+    return runs or None
+
+
+def _linearize(form: Any, numbers: Any, start: Any, rows: Matrix, outputs: Matrix, inputs: Matrix) -> LinearRun | None:
+    count = len(rows)
+    padded = np.pad(rows, ((0, padded_length(count) - count), (0, 0)), mode="edge")
+    found = [np.asarray(part)[:count] for part in _along(form, numbers, start, padded)]
+    states, run, a, c, b, d = found
+    if not all(np.isfinite(part).all() and np.abs(part).max(initial=0.0) < LARGEST for part in (states, run)):
+        return None
+    a, c, b, d = (np.where(np.isfinite(part), part, 0.0) for part in (a, c, b, d))
+    return LinearRun(states, inputs, rows, outputs - run, a, c, b, d)
+
+
+@partial(jax.jit, static_argnames="form")
+def _along(form: Any, numbers: Any, start: Any, rows: Any) -> Any:
+    """States, outputs, and the slopes of both by state and parameters, at every row of a free run."""
+
+    def step(state: Any, theta: Any, row: Any) -> tuple[Any, Any]:
+        own = form.prepared(numbers._replace(theta=theta))
+        following, parts = form.step(own, state, row)
+        return following, parts.total
+
+    def advance(state: Any, row: Any) -> tuple[Any, Any]:
+        following, output = step(state, theta, row)
+        return following, (state, output)
+
+    theta = jnp.asarray(numbers.theta)
+    states, outputs = jax.lax.scan(advance, jnp.asarray(start), rows)[1]
+    by_state, by_theta = (jax.vmap(jax.jacfwd(step, place), (0, None, 0)) for place in (0, 1))
+    a, c = by_state(states, theta, rows)
+    b, d = by_theta(states, theta, rows)
+    return states, outputs, a, c, b, d

@@ -1,0 +1,118 @@
+"""Structure that a model leaves, a hidden state among it: what `orthaug fit` says of it, with a learner and without."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_cli import run, write_csv
+
+import orthaug as oa
+
+TS = 0.05
+DATA = '[data]\ninputs = ["u"]\noutputs = ["y"]\nsampling_time = 0.05\ntrain = { files = ["run.csv"] }\n'
+MOTION = """[motion]
+substeps = 1
+[motion.states]
+x = { derivative = "v", start = "y" }
+v = { derivative = "(u - c*v - k*x)/m", start = "derivative of y", learned = LEARNED }
+[motion.outputs]
+y = "x"
+[motion.parameters]
+m = { initial = 1.2, min = 0 }
+c = { initial = 0.8, min = 0 }
+k = { initial = 5.0, min = 0 }
+"""
+LAGGED = "".join(
+    f'[[baseline.terms]]\nparameter = "{name}"\nregressor = "{text}"\n'
+    for name, text in (("a1", "y[k-1]"), ("a2", "y[k-2]"), ("b", "u[k-1]"))
+)
+
+
+def spring(rows: int = 700, hidden: float = 1.0, seed: int = 0, equation: float = 0.2) -> dict[str, np.ndarray]:
+    """x'' = u − 0.6 x' − 4 x − z with a hidden z' = (x − z)/0.5, noise in the equation."""
+    random = np.random.default_rng(seed)
+    u = np.repeat(random.uniform(-3, 3, rows // 12 + 1), 12)[:rows]
+    state, y, h = np.zeros(3), [], TS / 4
+
+    def rates(s: np.ndarray, f: float) -> np.ndarray:
+        return np.array([s[1], f - 0.6 * s[1] - 4 * s[0] - hidden * s[2], (s[0] - s[2]) / 0.5])
+
+    for f in u + equation * random.normal(size=rows):
+        y.append(state[0])
+        for _ in range(4):
+            middle = state + h / 2 * rates(state, f)
+            state = state + h * rates(middle, f)
+    return {"u": u, "y": np.array(y) + 1e-4 * random.normal(size=rows)}
+
+
+def lags(rows: int = 700, hidden: float = 0.1, seed: int = 0, sensor: float = 0.0) -> dict[str, np.ndarray]:
+    """y = 1.35 y₁ − 0.48 y₂ + 0.5 u₁ − 0.1 z + e with a hidden first-order lag z of y."""
+    random = np.random.default_rng(seed)
+    u, y, z = np.repeat(random.uniform(-3, 3, rows // 10 + 1), 10)[:rows], np.zeros(rows), 0.0
+    e = 0.05 * random.normal(size=rows) * (sensor == 0)
+    for k in range(2, rows):
+        z += 0.1 * (y[k - 2] - z)
+        y[k] = 1.35 * y[k - 1] - 0.48 * y[k - 2] + 0.5 * u[k - 1] - hidden * z + e[k]
+    return {"u": u, "y": y + sensor * random.normal(size=rows)}
+
+
+def codes(result: oa.FitResult | dict) -> set[str]:
+    warnings = result["warnings"] if isinstance(result, dict) else [vars(one) for one in result.warnings]
+    return {warning["code"] for warning in warnings}
+
+
+def fitted(folder: Path, physics: str, data: dict[str, np.ndarray], learner: str = "") -> tuple[dict, str, str]:
+    """result.json, the text, and the page of `orthaug fit`."""
+    write_csv(folder / "run.csv", **data)
+    physics = physics.replace("LEARNED", "true" if learner else "false")
+    (folder / "spec.toml").write_text(DATA + physics + learner)
+    done = run("fit", folder / "spec.toml", "--out", folder / "out")
+    assert done.code == 0, done.err
+    result = json.loads((folder / "out" / "result.json").read_text(encoding="utf-8"))
+    return result, done.out, (folder / "out" / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_fall_back_says_that_a_state_is_missing(tmp_path):
+    """k comes out at about 4.7 for 4; the intervals say that they count noise only, and the cause has a name."""
+    learner = '[learner]\nhidden = [3]\ninputs = ["v"]\n'
+    result, text, page = fitted(tmp_path, MOTION, spring(), learner)
+    k = next(row for row in result["parameters"] if row["name"] == "k")
+    assert not k["ci95"][0] <= 4 <= k["ci95"][1] and k["ci95_counts"] == "noise only"
+    assert {"unexplained", "hidden_state"} <= codes(result)
+    assert result["unexplained"]["hidden_state"]
+    best = result["unexplained"]["memory"][0]
+    assert best["kind"] == "lag" and abs(best["parameters"]["k"] - 4) < 0.7 * abs(k["value"] - 4)
+    assert "95 %, noise only" in text and "95 % interval  " not in text.split("part ")[0]
+    assert "95 %, noise only" in page and "count noise only" in page
+    assert "write the state out as a state of the motion" in " ".join(text.split())
+    assert result["shared"]["determined"] == [] and result["shared"]["withdrawn"] == ["m", "k"]
+    assert not re.search(r"[Tt]he fit determines", text)
+
+
+def test_lagged_physics_without_a_learner_says_so(tmp_path):
+    result, text, _ = fitted(tmp_path, LAGGED, lags())
+    assert {"unexplained", "hidden_state"} <= codes(result)
+    assert all(row["ci95_counts"] == "noise only" for row in result["parameters"])
+    assert "add lags of outputs and inputs to the physics" in " ".join(text.split())
+
+
+@pytest.mark.parametrize(
+    ("physics", "data"),
+    [
+        (MOTION, spring(hidden=0.0)),
+        (MOTION, spring(hidden=0.0, equation=0.0, seed=1)),
+        (LAGGED, lags(hidden=0.0)),
+        (LAGGED, lags(hidden=0.0, sensor=0.03)),
+    ],
+    ids=["motion", "motion, sensor", "lagged", "lagged, sensor"],
+)
+def test_noise_alone_is_no_hidden_state(tmp_path, physics, data):
+    """Noise on the sensor colours the one-step residual: that has a warning of its own."""
+    result, text, _ = fitted(tmp_path, physics, data)
+    assert not {"unexplained", "hidden_state"} & codes(result)
+    assert all("ci95_counts" not in row for row in result["parameters"]) and "unexplained" not in result
+    assert "noise only" not in text
