@@ -283,6 +283,7 @@ FORGED = [
     ({"sampling_time": -1}, {}, "sampling time"),
     ({"structure": [[1]]}, {}, "structure"),
     ({"layout": {}}, {}, "not a model"),
+    ({"layout": [["pos", 10**30], ["force", 1]]}, {}, "a lag of"),
     ({"features": {}}, {}, "."),
     ({"features": [{"text": 1e308, "constants": {}}, {"text": "x", "constants": {}}]}, {}, "."),
     ({"features": [{"text": "x", "constants": {}}, {"text": "pos[k-1]", "constants": {}}]}, {}, "."),

@@ -12,6 +12,8 @@ from orthaug._base.checks import is_number
 from orthaug._base.errors import InputError, shown
 from orthaug._base.jax import jax
 
+_LONGEST_LAG = 1_000_000  # rows: a state has an entry for each
+
 
 def check_loaded(model: Any, path: Path) -> None:
     """Refuse a model whose numbers have other sizes than its form, or are not finite.
@@ -38,6 +40,9 @@ def check_loaded(model: Any, path: Path) -> None:
     for entry in getattr(model.form.features, "entries", model.form.features):
         if not isinstance(entry.text, str):
             raise InputError(f"{path}: a learner's input is {shown(entry.text)}; expected an expression.")
+    for lag in getattr(model.form, "layout", ()):
+        if type(lag.lag) is not int or not 0 <= lag.lag <= _LONGEST_LAG:
+            raise InputError(f"{path}: its layout has a lag of {shown(lag.lag)}; expected 0 to {_LONGEST_LAG} rows.")
     if model.form.differentiable:
         _check_step(model, path)
 
