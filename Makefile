@@ -3,7 +3,7 @@
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test proofs check docs wheel smoke bench claims clean
+.PHONY: help setup demo test proofs fuzz check docs wheel smoke bench claims clean
 
 BIN := .venv/bin
 STAMP := .venv/ready
@@ -26,6 +26,9 @@ test: $(STAMP)  ## run the whole test suite, a file at a time on every core
 
 proofs: $(STAMP)  ## run the slow proofs, which the suite leaves out, and print what they measured
 	@$(BIN)/python -m pytest -q -m proof -n auto --dist loadfile --no-loadscope-reorder
+
+fuzz: $(STAMP)  ## run 3,000 seeded hostile trials and print how many held, by area
+	@$(BIN)/python benchmarks/fuzz.py
 
 check: $(STAMP) docs  ## ruff, pyright, the architecture test and the site of the documents
 	@$(BIN)/ruff check .

@@ -80,9 +80,14 @@ TRIALS = [
         2,
         "thesis",
     ),
-    Trial("folder of an older version", "cp -r fit out; rm out/manifest.json; O fit plant.toml --out out"),
     Trial(
-        "older folder with notes",
+        "folder without manifest",
+        "cp -r fit out; rm out/manifest.json; O fit plant.toml --out out",
+        2,
+        "manifest.json.*--force",
+    ),
+    Trial(
+        "folder without manifest, with notes",
         "cp -r fit out; rm out/manifest.json; echo >out/a; O fit plant.toml --out out",
         2,
         "--force",

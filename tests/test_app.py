@@ -89,7 +89,8 @@ def answer(gate: Gate, kind: str = "http", **given: Any) -> tuple[int, dict[str,
 
 def test_only_the_token_opens_the_gate():
     gate = Gate(None, 8123, token="sesame")  # type: ignore[arg-type]
-    kept = {"cookie": "a=b; orthaug-8123=sesame"}
+    kept = {"cookie": f"a=b; {answer(gate, query='token=sesame')[1]['set-cookie'].partition(';')[0]}"}
+    assert "sesame" not in kept["cookie"]
     assert gate.url == "http://127.0.0.1:8123/?token=sesame"
     for kind, refusal in (("http", 403), ("websocket", 1008)):
         for query, cookie in (
@@ -180,6 +181,64 @@ def test_a_curve_is_thinned_to_what_is_seen():
     assert len(drawn["x"]) <= 3000 and max(v for v in drawn["y"] if v is not None) == 5.0
     assert drawn["x"] == sorted(drawn["x"])  # type: ignore[type-var]
     assert thinned(x[77:200], y[77:200])["y"][:13] == [None] * 13
+
+
+def test_the_address_in_the_browsers_arguments_opens_the_page_once():
+    """Every user of the machine reads the arguments of a process: what stands there is worth nothing afterwards."""
+    gate = Gate(None, 8123, token="sesame")  # type: ignore[arg-type]
+    query = gate.ticket().partition("?")[2]
+    assert "sesame" not in query and answer(gate, "websocket", query=query)[0] == 1008
+    code, headers, _ = answer(gate, query=query)
+    assert code == 303 and query.partition("=")[2] not in headers["set-cookie"]
+    assert "HttpOnly" in headers["set-cookie"] and "SameSite=Strict" in headers["set-cookie"]
+    assert answer(gate, headers={"cookie": headers["set-cookie"].partition(";")[0]})[2]
+    assert answer(gate, query=query)[::2] == (403, False)
+
+
+def test_each_dropped_file_keeps_its_content(tmp_path):
+    session = Session("key", tmp_path, Desk())
+
+    def drop(name: str, content: str) -> tuple[str, str]:
+        partial = session.begin_file(name)
+        partial.write_text(content)
+        place, note = session.keep_file(partial, name)
+        assert place.read_text() == content and not partial.exists()
+        return place.name, note
+
+    assert drop("day1/run.csv", "first") == ("run.csv", "")
+    name, note = drop("day2/run.csv", "second")
+    assert name == "run-2.csv" and "another file called run.csv is here" in note
+    assert drop("day1/run.csv", "first") == ("run.csv", "")
+    assert drop("day2/run.csv", "second")[0] == "run-2.csv"
+    assert drop("day3/run.csv", "third")[0] == "run-3.csv"
+    assert drop("?.csv", "a")[0] == "_.csv" and drop("*.csv", "b")[0] == "_-2.csv"
+    assert (tmp_path / "run.csv").read_text() == "first"
+
+
+def test_a_file_beyond_the_limit_is_refused_before_it_comes(tmp_path, monkeypatch):
+    from starlette.requests import Request
+
+    from orthaug.commands.app import routes
+    from orthaug.commands.app.session import Sessions
+
+    monkeypatch.setattr(routes, "LARGEST", 10)
+    sessions = Sessions(tmp_path)
+    session = sessions.new()
+
+    def dropped(content: bytes, **declared: str) -> tuple[int, str]:
+        pieces = [content[i : i + 4] for i in range(0, len(content), 4)]
+
+        async def receive() -> dict[str, Any]:
+            return {"type": "http.request", "body": pieces.pop(0), "more_body": bool(pieces)}
+
+        headers = [(name.encode(), value.encode()) for name, value in declared.items()]
+        scope = {"type": "http", "method": "PUT", "headers": headers, "path": "/", "query_string": b""}
+        reply = asyncio.run(routes._kept(sessions, session.key, "run.csv", Request(scope, receive)))  # type: ignore
+        return reply.status_code, bytes(reply.body).decode()
+
+    for code, text in (dropped(b"x" * 40), dropped(b"", **{"content-length": "11"})):
+        assert code == 413 and "larger than 10 bytes" in text and "name its path" in text
+    assert list(session.folder.iterdir()) == []
 
 
 def test_a_session_keeps_to_its_folder(tmp_path):

@@ -142,9 +142,15 @@ def test_a_spoilt_state_is_none(tmp_path):
     with pytest.raises(Killed):
         fit(posed(1), **options(Streaming()), checkpoints=kept, progress=dies_at(5))
     (file,) = (tmp_path / "kept").glob("*.safetensors")
-    file.write_bytes(file.read_bytes()[:100])
-    found = fit(posed(1), **options(Streaming()), checkpoints=kept)
-    np.testing.assert_array_equal(found.theta, fit(posed(1), **options(Streaming())).theta)
+    whole, expected = file.read_bytes(), fit(posed(1), **options(Streaming())).theta
+    flipped = bytearray(whole)
+    flipped[-5] ^= 64
+    for content in (whole[:100], bytes(flipped), whole[:-8] + np.array(np.nan).tobytes(), b""):
+        file.write_bytes(content)
+        kept.spoilt.clear()
+        found = fit(posed(1), **options(Streaming()), checkpoints=kept)
+        np.testing.assert_array_equal(found.theta, expected)
+        assert kept.spoilt[:1] == [file.name], "and it is said"
 
 
 def test_states_of_another_fit_are_refused(tmp_path):

@@ -208,6 +208,15 @@ def test_demo_prints_the_comparison(demo):
     assert done.out.rstrip().endswith("out")
 
 
+def test_the_demo_keeps_files_that_only_look_like_a_result(tmp_path):
+    """A `result.json` with two keys and known names beside it, but no manifest: an edited copy of someone's own."""
+    for name, text in (("result.json", '{"schema": 1, "orthaug": "0"}'), ("train.csv", "mine"), ("spec.toml", "mine")):
+        (tmp_path / name).write_text(text)
+    done = run("demo", "--out", tmp_path)
+    assert done.code == 2 and one_line(done.err, "holds result.json and no manifest.json", "--force")
+    assert (tmp_path / "train.csv").read_text() == (tmp_path / "spec.toml").read_text() == "mine"
+
+
 def test_demo_leaves_a_complete_result(demo):
     _, out = demo
     names = {path.name for path in out.iterdir()}

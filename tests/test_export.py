@@ -6,6 +6,7 @@ import csv
 import ctypes
 import importlib.util
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -547,6 +548,37 @@ def test_equations_in_latex(tmp_path):
     text = (tmp_path / "model.tex").read_text(encoding="utf-8")
     assert r"y_{k} &= a \, y_{k-1} + b \, u_{k-1} + c \, u_{k-2} + g^{y}_{1}" in text
     assert r"\frac{\tanh\left(y_{k-1}\right)" in text
+
+
+HOSTILE = (
+    *(r"\input{/etc/passwd}", r"\write18{id}", "}{", "a~b", "a^b", "^^5cinput", "100 %", "m_2", "$x$", "&", "#1", "{"),
+    *("\\\\", r"\end{document}", r"\catcode`\@=0", "a|b", "<m>", '"', "`", r"\\[1em]\hline"),
+)
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_hostile_unit_is_text_in_latex(tmp_path, name):
+    """Read as TeX does: what is left after the commands of the escape is the unit, letter for letter."""
+    letters = {"textbackslash": "\\", "textasciicircum": "^", "textasciitilde": "~", "textless": "<"}
+    letters |= {"textgreater": ">", "textbar": "|", "textquotedbl": '"', "textasciigrave": "`"}
+    model = case("terms").model
+    first = model.form.baseline.terms[0]
+    terms = (replace(first, unit=name), *model.form.baseline.terms[1:])
+    parameters = (replace(model.form.baseline.parameters[0], unit=name), *model.form.baseline.parameters[1:])
+    form = replace(model.form, baseline=replace(model.form.baseline, terms=terms, parameters=parameters))
+    oa.export(replace(model, form=form), tmp_path, "latex")
+    row = next(r for r in (tmp_path / "model.tex").read_text(encoding="utf-8").splitlines() if r.startswith("$a$ &"))
+    cell = row.rsplit(" & ", 1)[1].removesuffix(r" \\")
+    read = re.sub(r"\\(?:([a-z]+)\{\}|([_%&#${}]))|([\\{}_%&#$^~])", _plainly(letters), cell)
+    assert f"[{name}]" in read or name in read
+
+
+def _plainly(letters):
+    def letter(found):
+        assert not found[3], f"{found[3]} begins something"
+        return letters[found[1]] if found[1] else found[2]
+
+    return letter
 
 
 def opaque(model: Model, **changed) -> Model:

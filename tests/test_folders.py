@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -12,11 +11,6 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import check_new_file, check_replaceable, whole_file, whole_folder
 
 
-def foreign(folder: Path, names: Sequence[str]) -> str | None:
-    """Older versions wrote a single file."""
-    return next((name for name in names if name != "ours"), None)
-
-
 def listing(folder: Path) -> list[str]:
     """Everything below a folder but its manifest, hidden files too."""
     names = sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
@@ -24,7 +18,7 @@ def listing(folder: Path) -> list[str]:
 
 
 def write(folder: Path, text: str = "new", extra: str | None = None) -> None:
-    with whole_folder(folder, foreign) as partial:
+    with whole_folder(folder) as partial:
         (partial / "ours").write_text(text)
         if extra:
             (partial / extra).write_text(text)
@@ -63,7 +57,7 @@ def test_ours_is_replaced_whole(tmp_path):
 
 
 def test_nothing_is_there_before_the_end(tmp_path):
-    with whole_folder(tmp_path / "out", foreign) as partial:
+    with whole_folder(tmp_path / "out") as partial:
         assert not (tmp_path / "out").exists()
         assert partial.parent == tmp_path
         (partial / "ours").touch()
@@ -72,7 +66,7 @@ def test_nothing_is_there_before_the_end(tmp_path):
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
 def test_an_interrupted_write_leaves_nothing(tmp_path, error):
-    with pytest.raises(error), whole_folder(tmp_path / "a" / "b" / "out", foreign) as partial:
+    with pytest.raises(error), whole_folder(tmp_path / "a" / "b" / "out") as partial:
         (partial / "ours").touch()
         raise error
     assert listing(tmp_path) == []
@@ -80,7 +74,7 @@ def test_an_interrupted_write_leaves_nothing(tmp_path, error):
 
 def test_an_interrupted_write_keeps_what_was_there(tmp_path):
     write(tmp_path / "out", "old")
-    with pytest.raises(KeyboardInterrupt), whole_folder(tmp_path / "out", foreign) as partial:
+    with pytest.raises(KeyboardInterrupt), whole_folder(tmp_path / "out") as partial:
         (partial / "ours").write_text("half")
         raise KeyboardInterrupt
     assert listing(tmp_path) == ["out", "out/ours"]
@@ -107,9 +101,11 @@ def test_a_rename_that_fails_keeps_what_was_there(tmp_path, monkeypatch):
 def test_something_else_is_refused_and_kept(tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.txt").write_text("mine")
-    message = "out: holds thesis.txt and is not an orthaug result; give another folder, or .* with --force"
+    message = (
+        "out: holds thesis.txt and no manifest.json that says orthaug wrote it; give another folder, or .* with --force"
+    )
     with pytest.raises(InputError, match=message):
-        check_replaceable(tmp_path / "out", foreign)
+        check_replaceable(tmp_path / "out")
     with pytest.raises(InputError, match=message):
         write(tmp_path / "out")
     assert listing(tmp_path) == ["out", "out/thesis.txt"]
@@ -147,7 +143,7 @@ def test_a_parent_that_cannot_be_written(tmp_path, monkeypatch):
 
 
 def test_a_check_leaves_nothing_behind(tmp_path):
-    check_replaceable(tmp_path / "a" / "out", foreign)
+    check_replaceable(tmp_path / "a" / "out")
     assert listing(tmp_path) == []
 
 
@@ -176,7 +172,7 @@ def exchange(folder: Path) -> None:
         (add_note, "note.txt, which orthaug did not write"),
         (change, "ours, which was changed since orthaug wrote it"),
         (link, "deep, which orthaug did not write"),
-        (exchange, "manifest.json and is not an orthaug result"),
+        (exchange, "manifest.json and no manifest.json that says orthaug wrote it"),
     ],
 )
 def test_a_result_with_something_else_is_kept_unless_forced(tmp_path, alter, words):
@@ -186,28 +182,46 @@ def test_a_result_with_something_else_is_kept_unless_forced(tmp_path, alter, wor
     with pytest.raises(InputError, match=f"out: holds {words}; .* --force"):
         write(tmp_path / "out")
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
-    with whole_folder(tmp_path / "out", foreign, force=True) as partial:
+    with whole_folder(tmp_path / "out", force=True) as partial:
         (partial / "ours").write_text("new")
     assert listing(tmp_path) == ["out", "out/ours"]
 
 
 def test_a_note_that_is_added_meanwhile_is_kept(tmp_path):
     write(tmp_path / "out", "old")
-    with pytest.raises(InputError, match="note.txt"), whole_folder(tmp_path / "out", foreign) as partial:
+    with pytest.raises(InputError, match="note.txt"), whole_folder(tmp_path / "out") as partial:
         (partial / "ours").write_text("new")
         add_note(tmp_path / "out")
     assert listing(tmp_path) == ["out", "out/note.txt", "out/ours"]
 
 
-def test_a_folder_of_an_older_version_and_what_file_managers_add(tmp_path):
+def test_what_file_managers_add_is_nobodys(tmp_path):
     write(tmp_path / "out", "old")
     (tmp_path / "out" / ".DS_Store").touch()
-    check_replaceable(tmp_path / "out", foreign)
+    check_replaceable(tmp_path / "out")
+
+
+def test_without_a_manifest_every_file_is_the_users(tmp_path):
+    """A name says nothing about who wrote a file: what older versions wrote is kept, too."""
+    write(tmp_path / "out", "old")
     (tmp_path / "out" / "manifest.json").unlink()
-    check_replaceable(tmp_path / "out", foreign)
-    add_note(tmp_path / "out")
-    with pytest.raises(InputError, match="note.txt"):
-        check_replaceable(tmp_path / "out", foreign)
+    with pytest.raises(InputError, match="out: holds ours and no manifest.json that says orthaug wrote it; .*--force"):
+        check_replaceable(tmp_path / "out")
+    assert (tmp_path / "out" / "ours").read_text() == "old"
+
+
+def test_a_run_that_replaces_what_another_wrote_meanwhile_is_noted(tmp_path):
+    folder = tmp_path / "out"
+    write(folder, "old")
+    partials.remember(folder)
+    write(folder, "same run")
+    assert folder not in partials.PARTIALS.overtaken
+    partials.remember(folder)
+    seen = dict(partials.PARTIALS.seen)
+    write(folder, "another run")
+    partials.PARTIALS.seen.update(seen)
+    write(folder, "this run")
+    assert folder in partials.PARTIALS.overtaken and (folder / "ours").read_text() == "this run"
 
 
 def test_the_target_of_a_link_is_replaced(tmp_path):
@@ -222,7 +236,7 @@ def test_nobody_is_left_without_a_folder(tmp_path, monkeypatch, place):
     (tmp_path / "a" / "b").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "a" / "b")
     with pytest.raises(InputError, match="is or holds the working folder"):
-        check_replaceable(Path(place), foreign, force=True)
+        check_replaceable(Path(place), force=True)
 
 
 # --- files
@@ -258,7 +272,7 @@ def test_a_disk_without_space(tmp_path):
         (place / "half").touch() if place.is_dir() else place.touch()
         raise OSError(28, "No space left on device")
 
-    for whole in (lambda: whole_folder(tmp_path / "out", foreign), lambda: whole_file(tmp_path / "out")):
+    for whole in (lambda: whole_folder(tmp_path / "out"), lambda: whole_file(tmp_path / "out")):
         with pytest.raises(InputError, match=r"out: cannot be written \(No space left on device\)"), whole() as partial:
             fail(partial)
     assert listing(tmp_path) == []

@@ -7,6 +7,8 @@ from collections import Counter
 
 import pytest
 from fuzzing import SPEC, TYPES, model_files, try_file, try_model, try_spec, write_original
+from fuzzing_bytes import TARGETS
+from fuzzing_runs import model_of, try_command, try_export, try_folder, try_forged, try_state
 
 LONGEST = 10.0  # s of one trial
 
@@ -45,6 +47,37 @@ def test_specs(tmp_path):
 def test_saved_models(tmp_path):
     content = model_files(tmp_path / "model")
     assert judged(lambda seed: try_model(seed, content, tmp_path / "model"), range(60))["refused"] > 40
+
+
+def test_forged_models(tmp_path):
+    content, _ = model_of(tmp_path / "model")
+    assert judged(lambda seed: try_forged(seed, content, tmp_path / "model"), range(15))["refused"] > 5
+
+
+def test_commands(tmp_path):
+    write_original("csv", tmp_path / "run.csv")
+    (tmp_path / "spec.toml").write_text(SPEC)
+    assert judged(lambda seed: try_command(seed, tmp_path), range(30))["refused"] > 20
+
+
+def test_states_of_training(tmp_path):
+    assert judged(lambda seed: try_state(seed, tmp_path), range(30)) == {"equal": 3, "refused": 27}
+
+
+def test_folders(tmp_path):
+    ends = judged(lambda seed: try_folder(seed, tmp_path), range(40))
+    assert ends["refused"] > 15 and ends["equal"] > 3
+
+
+def test_exports(tmp_path):
+    _, model = model_of(tmp_path / "model")
+    assert judged(lambda seed: try_export(seed, model, tmp_path), range(12))["equal"] > 2
+
+
+@pytest.mark.parametrize("data", [b"", b"x", b"\xff\xfe", b"(" * 4000, b"{}", b'{"kind": "motion"}', b"\x02PK\x03\x04"])
+@pytest.mark.parametrize("target", TARGETS)
+def test_entry_points_of_a_guided_fuzzer_raise_nothing(target, data):
+    TARGETS[target](data)
 
 
 def test_an_hdf5_file_whose_visit_never_ends(tmp_path):

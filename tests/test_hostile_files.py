@@ -317,3 +317,14 @@ def test_a_workbook_in_memory_is_not_left_open(tmp_path):
     path = workbook(tmp_path / "run.xlsx", sheet="<worksheet")
     refusal(path)
     path.write_bytes(io.BytesIO(b"gone").getvalue())
+
+
+def test_an_npz_that_is_made_to_fill_the_memory(tmp_path, monkeypatch):
+    """By its header, before anything is unpacked; the channel that is asked for counts, no other."""
+    from orthaug.data import variables
+
+    monkeypatch.setattr(variables, "_LARGE", 1e5)
+    path = tmp_path / "run.npz"
+    np.savez_compressed(path, u=np.zeros(100_000), y=np.random.default_rng(0).normal(size=20_000))
+    assert "'u' is 781 KiB in" in refusal(path, "u") and "store it uncompressed" in refusal(path, "u")
+    assert len(read_table(path, ("y",)).columns["y"]) == 20_000

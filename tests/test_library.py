@@ -97,7 +97,7 @@ def test_what_cannot_be_opened_or_written(job, tmp_path):
         (lambda: oa.load_spec(3), "`path` must be the name of a spec file; got 3"),  # type: ignore[arg-type]
         (lambda: oa.load_spec(os.fspath(tmp_path / "absent.toml")), "absent.toml: no such file"),
         (lambda: oa.fit_spec(job, out=3), "`out` must be the name of a folder, or None; got 3"),  # type: ignore[arg-type]
-        (lambda: oa.fit_spec(job, out=tmp_path / "notes"), "notes: holds notes.txt and is not an orthaug result"),
+        (lambda: oa.fit_spec(job, out=tmp_path / "notes"), "notes: holds notes.txt and no manifest.json"),
         (lambda: oa.compare(job, models="x"), "`models` must be a list of folders"),
         (lambda: oa.compare(job, models=[Path("absent")]), "absent: no saved model there"),
     ):

@@ -56,6 +56,39 @@ blocks = 0
 M, C, K = 1.0, 2.0, 100.0
 
 
+@pytest.fixture
+def small(tmp_path, monkeypatch) -> Path:
+    """A mass without a learner, on 60 rows in the current folder."""
+    monkeypatch.chdir(tmp_path)
+    pd.DataFrame(friction(60, 1), columns=["force", "position"]).to_csv("run.csv", index=False)
+    text = SPEC.replace('tests.steps = { files = ["steps.csv"] }\n', "")
+    text = text.replace('hidden = [3]\ninputs = ["v"]', 'kind = "none"')
+    Path("plant.toml").write_text(text.replace("learned = true, ", "").replace("segment = 150\n", ""))
+    return Path("plant.toml")
+
+
+def test_a_start_beyond_all_numbers_ends_in_a_line(small):
+    small.write_text(small.read_text().replace('"derivative of position"', "1e300"))
+    code, _, err = orthaug("fit", small, "--out", "out")
+    assert code == 1 and "training failed: physics alone has no finite free run" in err
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [("position = { scale = 1e-12", "position varies by"), ("position = { offset = 1e9", "about 1e+09"),
+     ("force = { scale = 1e12", "force varies by")],
+)  # fmt: skip
+def test_a_channel_of_an_unlikely_size_is_named_where_the_free_run_fails(small, change, words):
+    line = change if "position" in change else f'{change} }}\nchannels.position = {{ unit = "m"'
+    text = small.read_text().replace('channels.position = { unit = "m" }', f"channels.{line} }}")
+    small.write_text(text)
+    code, _, err = orthaug("fit", small, "--out", "out")
+    if code:
+        assert words in err and "check `scale`, `offset` and `unit`" in err
+    else:
+        assert "training failed" not in err
+
+
 def friction(rows: int, seed: int) -> np.ndarray:
     """Force and position of a mass with viscous and Coulomb friction under steps, 40 dB of noise."""
     random = np.random.default_rng(seed)

@@ -20,6 +20,7 @@ from test_motion_cli import put
 import orthaug as oa
 from orthaug.commands.compare import compare_report
 from orthaug.commands.fit import fit_report
+from orthaug.commands.folder import check_folder
 from orthaug.commands.job import origin_of
 from orthaug.data.record import Channel
 from orthaug.models.response import Response, Trajectory
@@ -175,6 +176,10 @@ def test_a_page_tells_how_its_result_was_made(lagged, pages, monkeypatch):
     assert origin_of(asked, "fit").command == "orthaug fit 'a b.toml' --out there --force"
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
     assert origin_of(lagged.job, "fit").date == "1970-01-02 00:00 UTC"
+    for text in ("253402300800", "9" * 30, "-1", "²", "today"):
+        monkeypatch.setenv("SOURCE_DATE_EPOCH", text)
+        with pytest.raises(oa.InputError, match="SOURCE_DATE_EPOCH: found .* expected whole seconds since 1970"):
+            check_folder(lagged.job.path.parent / "not yet there")
 
 
 def test_a_spec_that_was_changed_meanwhile_is_told_as_it_was_read(lagged):

@@ -263,10 +263,47 @@ def test_saving_twice_replaces(models, saved):
     assert sorted(p.name for p in saved.parent.iterdir()) == ["model"]
 
 
+def forge(folder: Path, arrays: dict | None = None, **declared) -> None:
+    """Change a saved model and make its checksums right again."""
+    from orthaug.models.storage import FORMAT, pack, read_packed, write_packed
+
+    place, numbers = folder / "model.json", folder / "arrays.safetensors"
+    said, held = read_packed(place, numbers, FORMAT, "model", "")
+    said = {k: v for k, v in said.items() if k not in ("format", "orthaug", "arrays_sha256")}
+    write_packed(pack(FORMAT, said | declared, held | (arrays or {})), place, numbers)
+
+
+FORGED = [
+    ({}, {"numbers.weights": np.full(16, np.inf)}, "weights"),
+    ({}, {"numbers.theta": np.array([np.nan, 0.0])}, "theta"),
+    ({}, {"numbers.theta": np.zeros(1)}, "theta has the shape"),
+    ({}, {"numbers.gain": np.zeros(3)}, "gain has the shape"),
+    ({}, {"numbers.halfwidth": np.array([-1.0, 1.0])}, "halfwidth"),
+    ({}, {"output_weight": np.zeros((2, 2))}, "output_weight has the shape"),
+    ({"sampling_time": -1}, {}, "sampling time"),
+    ({"structure": [[1]]}, {}, "structure"),
+    ({"layout": {}}, {}, "not a model"),
+    ({"layout": [["pos", 10**30], ["force", 1]]}, {}, "a lag of"),
+    ({"features": {}}, {}, "."),
+    ({"features": [{"text": 1e308, "constants": {}}, {"text": "x", "constants": {}}]}, {}, "."),
+    ({"features": [{"text": "x", "constants": {}}, {"text": "pos[k-1]", "constants": {}}]}, {}, "."),
+]
+
+
+@pytest.mark.parametrize(("declared", "arrays", "words"), FORGED, ids=range(len(FORGED)))
+def test_a_forged_model_is_refused_where_it_is_read(saved, declared, arrays, words):
+    """Its checksums hold, so only its parts tell that they do not fit; every command reads it by `load`."""
+    forge(saved)
+    load(saved)
+    forge(saved, arrays, **declared)
+    with pytest.raises(InputError, match=words):
+        load(saved)
+
+
 def test_a_folder_of_something_else_is_refused_and_kept(models, tmp_path):
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match="model: holds notes.txt and is not an orthaug result"):
+    with pytest.raises(InputError, match="model: holds notes.txt and no manifest.json that says orthaug wrote it"):
         save(models["physics"], tmp_path / "model")
     assert [p.name for p in (tmp_path / "model").iterdir()] == ["notes.txt"]
     with pytest.raises(InputError, match="notes.txt: not a folder"):

@@ -16,7 +16,7 @@ import shutil
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -24,10 +24,6 @@ from orthaug import __version__
 from orthaug._base.errors import InputError
 
 MANIFEST = "manifest.json"
-Foreign = Callable[[Path, Sequence[str]], str | None]
-"""Of a folder without manifest, as older versions wrote them, and the names of all files in it: one that is not theirs,
-None where all are."""
-
 _PARTIAL, _OLD = ".orthaug-partial-", ".orthaug-old-"
 _HOST = hashlib.sha256(platform.node().encode()).hexdigest()[:8]  # of a folder that several machines share
 _OF_THE_SYSTEM = {".DS_Store", "Thumbs.db", "desktop.ini"}  # file managers write these into every folder
@@ -39,6 +35,10 @@ class Partials:
     def __init__(self) -> None:
         self.lock = threading.RLock()
         self.placed: list[Path] = []
+        self.seen: dict[str, str] = {}
+        """By folder, the checksum of its manifest when a command that writes it began."""
+        self.overtaken: list[Path] = []
+        """Folders that were replaced although another run had written them meanwhile."""
         self._open: dict[Path, Sequence[Path]] = {}
         self._swept: set[Path] = set()
 
@@ -140,18 +140,17 @@ def _lives(name: str) -> bool:
     return True
 
 
-def check_replaceable(folder: Path, foreign: Foreign, *, force: bool = False) -> None:
+def check_replaceable(folder: Path, *, force: bool = False) -> None:
     """Raise InputError unless `folder` is absent, empty or unchanged orthaug's, and stands where one may write.
 
     Args:
-        foreign: judges a folder without manifest.
         force: whatever the folder holds may be lost.
     """
     try:
         there = folder.exists() or folder.is_symlink()
         if there and not folder.is_dir():
             raise InputError(f"{folder}: not a folder; give another name.")
-        mine = not_ours(folder, foreign) if there and not force else None
+        mine = not_ours(folder) if there and not force else None
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror}).") from None
     if mine is not None:
@@ -167,6 +166,12 @@ def check_replaceable(folder: Path, foreign: Foreign, *, force: bool = False) ->
         Path(tempfile.mkdtemp(prefix=".orthaug-", dir=ancestor)).rmdir()
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror} in {ancestor}).") from None
+
+
+def remember(folder: Path) -> None:
+    """Keep which result a folder holds now, so that another run that writes it meanwhile is noticed."""
+    place = os.path.realpath(folder)
+    PARTIALS.seen[place] = file_digest(Path(place, MANIFEST))
 
 
 def _check_parts_writable(folder: Path) -> None:
@@ -185,7 +190,7 @@ def _check_no_one_lives_there(folder: Path) -> None:
 
 
 @contextmanager
-def whole_folder(folder: Path, foreign: Foreign, *, force: bool = False) -> Iterator[Path]:
+def whole_folder(folder: Path, *, force: bool = False) -> Iterator[Path]:
     """A temporary folder that takes the place of `folder` at the end, and vanishes on any exception.
 
     A manifest is added. A link is followed: its target is replaced.
@@ -193,8 +198,9 @@ def whole_folder(folder: Path, foreign: Foreign, *, force: bool = False) -> Iter
     Raises:
         InputError: the folder cannot be written, or holds what is not orthaug's.
     """
-    check_replaceable(folder, foreign, force=force)
+    check_replaceable(folder, force=force)
     place = Path(os.path.realpath(folder))
+    before = PARTIALS.seen.pop(str(place), file_digest(place / MANIFEST))
     made = [p for p in place.parents if not p.exists()]
     partial = None
     try:
@@ -203,7 +209,9 @@ def whole_folder(folder: Path, foreign: Foreign, *, force: bool = False) -> Iter
         yield partial
         write_manifest(partial)
         with PARTIALS.lock:
-            check_replaceable(folder, foreign, force=force)
+            check_replaceable(folder, force=force)
+            if file_digest(place / MANIFEST) != before:
+                PARTIALS.overtaken.append(folder)
             _put_in_place(partial, place)
             PARTIALS.stands(partial, folder)
     except OSError as error:
@@ -317,13 +325,15 @@ def write_manifest(folder: Path) -> None:
     (folder / MANIFEST).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
-def not_ours(folder: Path, foreign: Foreign) -> str | None:
-    """A file of a folder that orthaug did not write or that was changed, in words; None where all may be replaced."""
+def not_ours(folder: Path) -> str | None:
+    """A file of a folder that orthaug did not write or that was changed, in words; None where all may be replaced.
+
+    Without a manifest nothing says who wrote a file, whatever its name: each counts as the user's own.
+    """
     listed = _listed(folder / MANIFEST)
     if listed is None:
-        names = list(_names(folder))
-        name = foreign(folder, names) if names else None
-        return None if name is None else f"{name} and is not an orthaug result"
+        name = next(_names(folder), None)
+        return None if name is None else f"{name} and no {MANIFEST} that says orthaug wrote it"
     names = [name for name in _names(folder) if name != MANIFEST]
     for name in names:
         if name not in listed:

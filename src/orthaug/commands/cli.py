@@ -106,7 +106,9 @@ def fit(
     write_result(fitted, folder, force=force)
     tell(fitted.result, fit_text(fitted.fit, fitted.result), as_json, folder)
     if not fitted.fit.status.ok:
-        raise TrainingError(f"{fitted.fit.status.message}. The account is in {folder / 'result.json'}.")
+        raise TrainingError(
+            f"{fitted.result.status.message.removesuffix('.')}. The account is in {folder / 'result.json'}."
+        )
 
 
 @app.command()

@@ -14,7 +14,6 @@ from orthaug._base.folders import whole_folder
 from orthaug._base.progress import SILENT, Progress
 from orthaug.analysis.validation import Verdict, dominance
 from orthaug.commands.fit import Fitted, cross_validated, fit_variant, judge_fit, score_part, wanted_blocks
-from orthaug.commands.folder import not_a_result
 from orthaug.commands.job import ALONE, Job, Variant, origin_of
 from orthaug.data.record import same_step
 from orthaug.fitting.criteria import Criterion, Prediction
@@ -107,7 +106,7 @@ def _verdicts(job: Job, fitted: dict[str, Fitted]) -> dict[str, Verdict]:
 
 def write(comparison: Comparison, folder: Path, *, force: bool = False) -> None:
     """result.json, models/, figures/ and report.html, whole or not at all."""
-    with whole_folder(folder, not_a_result, force=force) as partial:
+    with whole_folder(folder, force=force) as partial:
         (partial / "result.json").write_text(comparison.result.to_json() + "\n", encoding="utf-8")
         for kind, fitted in comparison.fitted.items():
             if fitted.fit.status.ok:

@@ -10,7 +10,6 @@ from orthaug._base.folders import whole_folder
 from orthaug._base.lines import fold
 from orthaug._base.progress import SILENT, Progress
 from orthaug.commands.fit import Fitted, fill_result, fit_job
-from orthaug.commands.folder import not_a_result
 from orthaug.commands.kinds import open_job
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import estimate
@@ -62,7 +61,7 @@ regularization = "none"
 def run(folder: Path, progress: Progress = SILENT, *, force: bool = False) -> str:
     """Generate the record, fit both structures, write data, spec and orthogonal fit; return the comparison."""
     example = mass_spring_damper()
-    with whole_folder(folder, not_a_result, force=force) as partial:
+    with whole_folder(folder, force=force) as partial:
         for name, record in (("train", example.train), ("test", example.test)):
             experiment = record.experiments[0]
             table = np.column_stack([experiment.inputs, experiment.outputs])

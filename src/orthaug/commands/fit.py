@@ -17,10 +17,11 @@ from orthaug._base.progress import SILENT, Progress
 from orthaug._base.views import MAKERS
 from orthaug.commands.attempt import attempt
 from orthaug.commands.doubts import doubted
-from orthaug.commands.folder import PHYSICS, not_a_result
+from orthaug.commands.folder import PHYSICS
 from orthaug.commands.job import ALONE, AS_DECLARED, DEFAULT_BLOCKS, Job, Variant, origin_of
 from orthaug.commands.kinds import kind_of
 from orthaug.commands.parts import Part
+from orthaug.commands.scales import describe_scales
 from orthaug.inference.learned_terms import equation, learned_terms
 from orthaug.reports.fields import WarningResult
 from orthaug.reports.result import FitResult, PartScores, ScoreResult
@@ -175,6 +176,12 @@ def told_of(job: Job, fit: Any) -> Fitted:
     warnings: list[Any] = [*job.warnings, *fit.warnings]
     if job.checkpoints is not None and job.checkpoints.lost:
         warnings.append(Warning("checkpoint_lost", f"the last state of training was not kept: {job.checkpoints.lost}."))
+    if job.checkpoints is not None and job.checkpoints.spoilt:
+        text = (
+            f"a kept state of training is damaged ({job.checkpoints.folder.name}/{job.checkpoints.spoilt[0]}), so "
+            "training began anew there; the result is that of a whole training."
+        )
+        warnings.append(Warning("checkpoint_spoilt", text))
     scores, responses = {}, {}
     if fit.status.ok:
         for part in job.parts:
@@ -215,7 +222,13 @@ def told_of(job: Job, fit: Any) -> Fitted:
 def _status(fit: Any, warnings: Sequence[Any]) -> Any:
     """How training ended; of a model that does not run freely its message begins with that."""
     first = next((warning.text for warning in warnings if warning.code == "one_step_only"), "")
-    return replace(fit.status, reason=f"{first} {fit.status.message}".strip()) if first else fit.status
+    last = "" if fit.status.ok else describe_scales(fit.problem.record)
+    if not (first or last):
+        return fit.status
+    message = fit.status.message
+    if last and message:
+        last = f"{'' if message.endswith('.') else '.'} {last[0].upper()}{last[1:]}"
+    return replace(fit.status, reason=f"{first} {message}{last}".strip())
 
 
 def _one_step_only(
@@ -360,7 +373,7 @@ def _scored_along(model: Any, part: Part, warnings: list[Any]) -> PartScores:
 
 def write_result(fitted: Fitted, folder: Path, *, force: bool = False) -> None:
     """result.json, model/ and figures/, whole or not at all; without a model where training failed."""
-    with whole_folder(folder, not_a_result, force=force) as partial:
+    with whole_folder(folder, force=force) as partial:
         fill_result(fitted, partial)
     if fitted.job.checkpoints is not None:
         fitted.job.checkpoints.discard()

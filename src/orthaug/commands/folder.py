@@ -4,38 +4,21 @@ from __future__ import annotations
 
 import json
 import os
-import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthaug._base.checks import check_choice
 from orthaug._base.errors import InputError
-from orthaug._base.folders import check_new_file, check_replaceable, whole_file
-from orthaug.commands.job import Job
+from orthaug._base.folders import check_new_file, check_replaceable, remember, whole_file
+from orthaug.commands.job import Job, date_of_results
 
 if TYPE_CHECKING:
     from orthaug.reports.drawing import Figure
 
 PHYSICS = "model-physics"
 """The folder of physics alone in a result folder."""
-_MODEL = r"(model\.json|arrays\.safetensors)"
-_KNOWN = re.compile(
-    r"result\.json|report\.html|spec\.toml|table\.csv|(train|test)\.csv|figures/[a-z_]+\.png"
-    rf"|model(-physics)?/{_MODEL}|models/[a-z-]+/{_MODEL}"
-)
-
-
-def not_a_result(folder: Path, names: Sequence[str]) -> str | None:
-    """A file in a folder without manifest that is no part of a result; None where an older version wrote all."""
-    strange = [name for name in names if not _KNOWN.fullmatch(name)]
-    try:
-        content = json.loads((folder / "result.json").read_text(encoding="utf-8"))
-        ours = isinstance(content, dict) and "schema" in content and "orthaug" in content
-    except (OSError, ValueError, RecursionError):
-        ours = False
-    return (strange or [None if ours else names[0]])[0]
 
 
 def chosen_model(model: Path, which: str) -> Path:
@@ -64,7 +47,9 @@ def results_beside(model: Path) -> Iterator[Any]:
 
 def check_folder(folder: Path, *, force: bool = False) -> None:
     """Raise InputError early where the result could not be written."""
-    check_replaceable(folder, not_a_result, force=force)
+    date_of_results()
+    check_replaceable(folder, force=force)
+    remember(folder)
 
 
 def check_inputs_kept(job: Job, folder: Path, models: Iterable[Path] = ()) -> None:

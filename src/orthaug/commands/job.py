@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from orthaug import __version__
-from orthaug._base.errors import InputError, Warning
+from orthaug._base.errors import InputError, Warning, shown
 from orthaug._base.parallel import Threads
 from orthaug._base.progress import SILENT, Plan, Progress
 from orthaug.commands.parts import Part
@@ -223,6 +223,26 @@ class Job(ABC):
         }
 
 
+_YEAR_10000 = 253_402_300_800  # s since 1970
+
+
+def date_of_results() -> datetime:
+    """Return the date of a result: that of SOURCE_DATE_EPOCH where it is set, now otherwise.
+
+    Raises:
+        InputError: seconds that no date is made of.
+    """
+    epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
+    if not epoch:
+        return datetime.now(UTC)
+    if not (epoch.isascii() and epoch.isdecimal() and len(epoch) <= 12 and int(epoch) < _YEAR_10000):
+        raise InputError(
+            f"SOURCE_DATE_EPOCH: found {shown(epoch)}; expected whole seconds since 1970 up to the year 9999. Unset it "
+            "for the date of today."
+        )
+    return datetime.fromtimestamp(int(epoch), UTC)
+
+
 def origin_of(job: Job, command: str) -> Origin:
     """Where a result of a job comes from. SOURCE_DATE_EPOCH, where it is set, is the date."""
     import importlib.metadata
@@ -231,8 +251,7 @@ def origin_of(job: Job, command: str) -> Origin:
 
     from orthaug.reports.page_fit import Origin
 
-    epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
-    now = datetime.fromtimestamp(int(epoch), UTC) if epoch.isdigit() else datetime.now(UTC)
+    now = date_of_results()
     versions = {"orthaug": __version__, "Python": platform.python_version()}
     versions |= {name: importlib.metadata.version(name) for name in _TOLD}
     return Origin(

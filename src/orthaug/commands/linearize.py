@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,11 +21,6 @@ if TYPE_CHECKING:
 _FIGURES = (".png", ".pdf", ".svg")
 
 
-def not_a_linearization(folder: Path, names: Sequence[str]) -> str | None:
-    """A file in a folder without manifest: every result of this command has one."""
-    return names[0]
-
-
 def check_place(out: Path | None, *read: Path, force: bool = False) -> None:
     """Raise InputError early where the folder or file could not be written, or would replace what is read."""
     if out is None:
@@ -42,7 +36,7 @@ def check_place(out: Path | None, *read: Path, force: bool = False) -> None:
     elif suffix in (".txt", ".csv", ".toml", ".html"):
         raise InputError(f"{out}: found the ending '{out.suffix}'; give a folder, or .json, .png, .pdf or .svg.")
     else:
-        check_replaceable(out, not_a_linearization, force=force)
+        check_replaceable(out, force=force)
         for file in read:
             if file.exists() and file.resolve().is_relative_to(out.resolve()):
                 raise InputError(f"{out}: holds {file}, which is read; give another folder.")
@@ -92,7 +86,7 @@ def write(found: Linearization, out: Path, *, force: bool = False) -> None:
             raise InputError("the model has no inputs, so that it has no frequency response to draw; give a folder.")
         save_figure(bode_figure(found), out, force=force)
         return
-    with whole_folder(out, not_a_linearization, force=force) as partial:
+    with whole_folder(out, force=force) as partial:
         (partial / "result.json").write_text(content, encoding="utf-8")
         (partial / "linear.txt").write_text(linear_text(found) + "\n", encoding="utf-8")
         (partial / "figures").mkdir()

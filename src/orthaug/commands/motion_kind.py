@@ -11,6 +11,7 @@ from orthaug._base.errors import InputError, RankError, Warning
 from orthaug.analysis.closed_loop import closed_loop
 from orthaug.commands.attempt import attempt, attempt_warned
 from orthaug.commands.motion_job import MotionJob
+from orthaug.commands.scales import describe_scales
 from orthaug.reports.result import CheckResult, FitResult, MeasureResult, ParameterResult, parameter_rows
 
 if TYPE_CHECKING:
@@ -50,7 +51,9 @@ def checked(job: MotionJob) -> CheckResult:
     told = identified(course)
     if told is None:
         wild = "".join(f" {warning.text}" for warning in job.warnings if warning.code == "wild_samples")
-        remedy = f"it runs on a sample that is none.{wild}" if wild else "give others."
+        scales = describe_scales(problem.record)
+        cause = f" {scales[0].upper()}{scales[1:]}" if scales else ""
+        remedy = f"it runs on a sample that is none.{wild}" if wild else f"give others.{cause}"
         raise InputError(f"{job.path}: physics alone has no finite free run from its initial values; {remedy}")
     shared, on_rows = None, []
     if spec.declared_learner() is not None and job.structure.shared != "all":

@@ -15,6 +15,7 @@ import typer.core
 from orthaug import __version__
 from orthaug._base.checks import check_choice
 from orthaug._base.errors import InputError, TrainingError
+from orthaug._base.folders import PARTIALS
 from orthaug.commands import streams
 from orthaug.commands.signals import WATCH
 
@@ -194,6 +195,11 @@ def _fail(message: str, code: int) -> None:
 def tell(result: Content, text: str, as_json: bool, place: object = None) -> None:
     """A result on standard output, as JSON or in words; then what was written."""
     written = f"\n\nwritten to {place}" if place is not None else ""
+    if place in PARTIALS.overtaken:
+        streams.say(
+            f"warning: {place}: another run wrote a result here while this one ran, and this one has replaced it; run "
+            "it again with another --out to have both."
+        )
     streams.echo(result.to_json() if as_json else f"{text}{written}")
 
 

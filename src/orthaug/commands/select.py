@@ -13,7 +13,7 @@ import tomlkit
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
 from orthaug.commands.data_sections import EngineSection, engine_of
-from orthaug.commands.folder import not_a_result, relative
+from orthaug.commands.folder import relative
 from orthaug.commands.lagged_job import LaggedJob, open_lagged
 from orthaug.commands.spec import LearnerSection, Spec, load_spec
 from orthaug.data.regressors import Lags
@@ -108,7 +108,7 @@ def write_selected(selected: Selected, folder: Path, *, force: bool = False) -> 
     from orthaug.reports.drawing import save
     from orthaug.reports.plots import selection_figure
 
-    with whole_folder(folder, not_a_result, force=force) as partial:
+    with whole_folder(folder, force=force) as partial:
         (partial / "result.json").write_text(selected.result.to_json() + "\n", encoding="utf-8")
         (partial / "spec.toml").write_text(selected.spec, encoding="utf-8")
         selected.selection.table.to_csv(partial / "table.csv", index=False)

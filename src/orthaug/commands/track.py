@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.folders import file_digest, whole_folder
-from orthaug.commands.folder import not_a_result, results_beside
+from orthaug.commands.folder import results_beside
 from orthaug.commands.run import Reading, record_for
 from orthaug.commands.split import open_training
 from orthaug.data.record import Record
@@ -166,7 +166,7 @@ def write_tracked(tracked: Tracked, folder: Path, text: str, *, force: bool = Fa
     history = online.history
     physical = None if tracked.physics is None else online.physical_history(tracked.physics)
     alarms = [alarm.time for alarm in online.alarms]
-    with whole_folder(folder, not_a_result, force=force) as partial:
+    with whole_folder(folder, force=force) as partial:
         (partial / "result.json").write_text(result.to_json() + "\n", encoding="utf-8")
         (partial / "report.txt").write_text(text + "\n", encoding="utf-8")
         history.to_csv(partial / "table.csv")

@@ -105,6 +105,9 @@ def _from_npz(path: Path, names: Wanted) -> dict[str, Vector]:
         return _taken(path, names, held)
 
 
+_LARGE, _DENSEST = 2**28, 300  # bytes of an array that may shrink as it likes, and by how much a larger one may
+
+
 def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Held:
     """An array of an archive by its header; Python objects are never opened."""
     with archive.open(info) as member:
@@ -119,6 +122,10 @@ def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Held
     size = math.prod(shape) * kind.itemsize
     if size != info.file_size - begin:
         return Held(f"cut: {in_words(info.file_size - begin)} of {in_words(size)}", None)
+
+    if size > _LARGE and size > _DENSEST * info.compress_size:
+        packed = in_words(info.compress_size)
+        return Held(f"{in_words(size)} in {packed} of the file, denser than measurements; store it uncompressed", None)
 
     def load() -> np.ndarray:
         with archive.open(info) as member:

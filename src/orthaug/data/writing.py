@@ -121,12 +121,29 @@ def _tight(node: ast.AST) -> str:
     return f"({_latex(node)})" if loose else _latex(node)
 
 
+_TEX = {
+    **{letter: rf"\{letter}" for letter in "_%&#${}"},
+    **{"\\": r"\textbackslash{}", "^": r"\textasciicircum{}", "~": r"\textasciitilde{}", "<": r"\textless{}"},
+    **{">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}", "`": r"\textasciigrave{}"},
+}
+
+
+def tex_text(text: str) -> str:
+    r"""Return plain text for TeX: no letter of it begins a command, a group or a comment.
+
+    Examples:
+        >>> print(tex_text(r"50 % of \\input{x}"))
+        50 \\% of \textbackslash{}input\\{x\\}
+    """
+    return "".join(_TEX.get(letter, letter if letter.isprintable() else " ") for letter in text)
+
+
 def symbol(name: str, index: str = "") -> str:
     """A name: one letter as it stands, with digits behind it as an index, words upright."""
     letters = name.rstrip("0123456789")
     if len(letters) == 1:
         base, below = letters, ",".join(filter(None, (name[1:], index)))
     else:
-        upright = name.replace("_", r"\_")
+        upright = tex_text(name)
         base, below = rf"\mathrm{{{upright}}}", index
     return f"{base}_{{{below}}}" if below else base

@@ -45,11 +45,6 @@ _ROWS, _SEED = 64, 0  # of the test vectors
 _HELD = 8  # rows of each level: under a new one in every row an inertia hardly moves
 
 
-def not_an_export(folder: Path, names: Sequence[str]) -> str | None:
-    """A file in a folder without manifest: every export has one."""
-    return names[0]
-
-
 def check_target(to: str) -> str:
     """`to` where it is a target.
 
@@ -71,7 +66,7 @@ def check_export(to: str, folder: Path, name: str = "model", *, force: bool = Fa
             f"{shown(name)} cannot name the exported code; use ASCII letters, digits and underscores, at most "
             f"{_LONGEST}, starting with a letter, and no word of a language or library."
         )
-    check_replaceable(folder, not_an_export, force=force)
+    check_replaceable(folder, force=force)
 
 
 def export(
@@ -110,7 +105,7 @@ def export(
     vectors = _vectors_of(model, program)
     files = dict(target.files(program, vectors))
     files |= {VECTORS: vectors.csv(program), "README.md": _readme(program, target, len(vectors.outputs))}
-    with whole_folder(folder, not_an_export, force=force) as partial:
+    with whole_folder(folder, force=force) as partial:
         for file, content in files.items():
             (partial / file).write_bytes(content if isinstance(content, bytes) else content.encode("utf-8"))
     return program

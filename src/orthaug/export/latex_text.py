@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthaug.data.writing import symbol
+from orthaug.data.writing import symbol, tex_text
 from orthaug.export.nodes import Apply, Entry, Name, Node, Number
 from orthaug.export.program import Block, Program, Signal, Vectors
 
@@ -34,7 +34,12 @@ class LatexText:
 
 
 def _document(program: Program) -> str:
-    head = [r"\documentclass{article}", r"\usepackage{amsmath}", r"\setcounter{MaxMatrixCols}{1000}"]
+    head = [
+        r"\documentclass{article}",
+        r"\usepackage[T1]{fontenc}",
+        r"\usepackage{amsmath}",
+        r"\setcounter{MaxMatrixCols}{1000}",
+    ]
     head.append(f"% Model sha256 {program.digest}")
     lines = [r"\begin{document}"]
     moves = program.scheme is not None
@@ -47,7 +52,7 @@ def _document(program: Program) -> str:
     )
     lines += [r"\begin{center}", r"\begin{tabular}{lll}"]
     lines += [
-        rf"${_constant(c.name, program)}$ & ${number(c.value)}$ & {_plain(c.meaning)} \\" for c in program.constants
+        rf"${_constant(c.name, program)}$ & ${number(c.value)}$ & {tex_text(c.meaning)} \\" for c in program.constants
     ]
     lines += [r"\end{tabular}", r"\end{center}", r"\end{document}", ""]
     return "\n".join([*head, *_letters("".join(lines)), *lines])
@@ -94,10 +99,6 @@ def number(value: float) -> str:
 
 def _constant(name: str, program: Program) -> str:
     return symbol(dict(program.symbols)[name])
-
-
-def _plain(text: str) -> str:
-    return "".join(rf"\{c}" if c in "_%&#$" else {"^": r"\^{}", "~": r"\~{}"}.get(c, c) for c in text)
 
 
 def _letters(text: str) -> list[str]:

@@ -26,6 +26,8 @@ from orthaug.models.rows import Overlap
 
 EVERY = 10.0  # s
 _ABOUT = "training.json"
+_FORMAT = b"orthaug state 1 "
+_HEAD = len(_FORMAT) + 65  # bytes: format, checksum, end of line
 _ONE: Any = 0
 _LEAVES = State(_ONE, Normal(_ONE, _ONE, _ONE, Overlap(_ONE, _ONE)), _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE)
 
@@ -43,6 +45,8 @@ class Checkpoints:
     folder: Path
     fingerprint: str
     every: float = EVERY
+    spoilt: list[str] = field(default_factory=list)
+    """Files whose state was damaged: those runs begin anew."""
     lost: str = ""
     """Why the last state could not be written; the one before it stays."""
 
@@ -97,11 +101,19 @@ class Kept:
         from safetensors.numpy import load
 
         try:
-            held = load(self.path.read_bytes())  # mapped into memory, it could not be replaced on Windows
-            leaves = [held[str(i)] for i in range(len(held))]
-            return jax.tree.unflatten(jax.tree.structure(self.form), leaves)
-        except (OSError, KeyError, ValueError, SafetensorError):
+            content = self.path.read_bytes()  # mapped into memory, it could not be replaced on Windows
+        except OSError:
             return None
+        try:
+            if content[:_HEAD] != _head(content[_HEAD:]):
+                raise ValueError
+            held = load(content[_HEAD:])
+            leaves = [held[str(i)] for i in range(len(held))]
+            state = jax.tree.unflatten(jax.tree.structure(self.form), leaves)
+        except (KeyError, ValueError, SafetensorError):
+            self.checkpoints.spoilt.append(self.path.name)
+            return None
+        return state
 
     def keep(self, state: Any, *, ended: bool = False) -> None:
         """Write the state, or what makes it, if it is time or the run `ended`. A full disk leaves the one before."""
@@ -125,9 +137,13 @@ class Kept:
         if not (folder / _ABOUT).exists():
             _replace(folder / _ABOUT, json.dumps({"fingerprint": self.checkpoints.fingerprint}).encode())
         leaves = jax.tree.leaves(state)
-        _replace(
-            self.path, save({str(i): np.atleast_1d(leaf).reshape(np.shape(leaf)) for i, leaf in enumerate(leaves)})
-        )
+        content = save({str(i): np.atleast_1d(leaf).reshape(np.shape(leaf)) for i, leaf in enumerate(leaves)})
+        _replace(self.path, _head(content) + content)
+
+
+def _head(content: bytes) -> bytes:
+    """Return what stands before a state: its format and its checksum."""
+    return _FORMAT + hashlib.sha256(content).hexdigest().encode() + b"\n"
 
 
 def _replace(path: Path, content: bytes) -> None:

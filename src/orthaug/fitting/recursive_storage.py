@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,15 +40,10 @@ class Kept(NamedTuple):
     alarms: Vector
 
 
-def not_recursive(folder: Path, names: Sequence[str]) -> str | None:
-    """A folder without manifest was not written by `save`."""
-    return names[0] if names else None
-
-
 def save(kept: Kept, folder: str | Path, *, force: bool = False) -> None:
     """Write a folder of its own, whole or not at all."""
     check_type(folder, str | os.PathLike, "folder", "a folder's name")
-    with whole_folder(Path(folder), not_recursive, force=force) as partial:
+    with whole_folder(Path(folder), force=force) as partial:
         write(kept, partial)
 
 

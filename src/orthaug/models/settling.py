@@ -64,7 +64,8 @@ def settle(
     """
     count = np.shape(states)[1]
     begun = np.pad(np.asarray(states, dtype=float), ((0, 0), (0, -count % _LANES)), mode="edge")
-    prior = 1 / np.asarray(loose, dtype=float) ** 2
+    with np.errstate(over="ignore"):  # a start beyond all others has no prior
+        prior = 1 / np.asarray(loose, dtype=float) ** 2
     laid = windows.padded()  # once for all iterations
     best, damping = begun, np.full(begun.shape[1], _FIRST_DAMPING)
     matrix, right, misfit = _linearised(form, numbers, begun, laid, weight, begun, prior)
@@ -92,7 +93,10 @@ def _steps(
     sound: Any = np.isfinite(damped).all(axis=(1, 2)) & np.isfinite(right).all(axis=1)
     damped = np.where(sound[:, None, None], damped, np.eye(matrix.shape[1]))
     right = np.where(sound[:, None], right, 0.0)
-    return np.linalg.solve(damped, right[..., None])[..., 0].T
+    try:
+        return np.linalg.solve(damped, right[..., None])[..., 0].T
+    except np.linalg.LinAlgError:  # states beyond what double precision tells apart: there is no step to take
+        return np.zeros_like(right).T
 
 
 def _linearised(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -25,6 +25,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
 from orthaug.models import lagged_storage, motion_storage
 from orthaug.models.learners import Learner
+from orthaug.models.loaded import check_loaded
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 from orthaug.physics.baseline import Baseline
@@ -33,11 +34,6 @@ from orthaug.physics.motion import Motion
 FORMAT = 2
 _DECLARATION, _ARRAYS = "model.json", "arrays.safetensors"
 _KINDS: dict[type, ModuleType] = {Model: lagged_storage, MotionModel: motion_storage}
-
-
-def not_a_model(folder: Path, names: Sequence[str]) -> str | None:
-    """A file in a folder without manifest that is no part of a model; None where an older version saved one."""
-    return next((name for name in names if name not in (_DECLARATION, _ARRAYS)), None)
 
 
 def save(model: Model | MotionModel, folder: str | Path, *, force: bool = False) -> None:
@@ -65,7 +61,7 @@ def save(model: Model | MotionModel, folder: str | Path, *, force: bool = False)
         ...     load(Path(folder, "model"))
         Model(orthogonal, θ: gain, learner: none)
     """
-    with whole_folder(Path(folder), not_a_model, force=force) as partial:
+    with whole_folder(Path(folder), force=force) as partial:
         write(model, partial)
 
 
@@ -116,7 +112,9 @@ def load(
     path = folder / _DECLARATION
     try:
         kind = motion_storage if declared.get("kind") == "motion" else lagged_storage
-        return kind.rebuild(declared, arrays, baseline, learner, path)
+        model = kind.rebuild(declared, arrays, baseline, learner, path)
+        check_loaded(model, path)
+        return model
     except InputError:
         raise
     except Exception as error:  # the checksum holds, so someone made it: there is no list of what that can hold

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import json
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -46,7 +45,6 @@ PIPELINES = {  # name, and how the page says who trained
 HYPHEN = "\N{NON-BREAKING HYPHEN}"  # a line of the page never ends within 1e-6
 WIDTH = 100  # characters of a line in a terminal
 MARK = "reproduction.json"
-_KNOWN = re.compile(r"reproduction\.json|index\.html|[a-z_]+/(runs\.csv|[\w-]+\.png)")
 StudiesTell = Callable[[str, int, int], None]
 """Called with the study's title, the runs done and all of them."""
 
@@ -121,20 +119,14 @@ def reproduce(
     return reproduced
 
 
-def not_a_reproduction(folder: Path, names: Sequence[str]) -> str | None:
-    """A file in a folder without manifest that is no part of a reproduction; None where an older version wrote all."""
-    strange = [name for name in names if not _KNOWN.fullmatch(name)]
-    return (strange or [None if MARK in names else names[0]])[0]
-
-
 def check_output(folder: Path, *, force: bool = False) -> None:
     """Raise InputError early where the page could not be written."""
-    check_replaceable(folder, not_a_reproduction, force=force)
+    check_replaceable(folder, force=force)
 
 
 def write(reproduced: Sequence[Reproduced], folder: Path, pipeline: str, *, force: bool = False) -> None:
     """index.html, and for each study its figures as PNG and its runs as CSV; whole or not at all."""
-    with whole_folder(folder, not_a_reproduction, force=force) as partial:
+    with whole_folder(folder, force=force) as partial:
         for study in reproduced:
             place = partial / study.entry.name
             place.mkdir()

@@ -34,7 +34,8 @@ _HEADERS = {
 class Gate:
     """Stands before an application: requests and websockets without the token never reach it.
 
-    The token comes in the query of the first request, which is sent on without it, and from then on in a cookie. Names
+    The token comes in the query of the first request, which is sent on without it; from then on a secret of its own in
+    a cookie opens the gate. A ticket is a token for one request: who finds it afterwards finds nothing. Names
     of the host other than this machine's are refused, so that no foreign name can be made to lead here, and so are
     requests that a page of another origin makes.
     """
@@ -43,11 +44,19 @@ class Gate:
         self.app, self.port = app, port
         self.token = secrets.token_urlsafe(32) if token is None else token
         self.cookie = f"orthaug-{port}"  # cookies know no ports
+        self._secret = secrets.token_urlsafe(32)  # of the cookie: it stands in no address
+        self._tickets: set[str] = set()
 
     @property
     def url(self) -> str:
         """Where the page is, with the token."""
         return f"http://127.0.0.1:{self.port}/?token={self.token}"
+
+    def ticket(self) -> str:
+        """Return an address that opens the page once: every user of the machine reads a browser's arguments."""
+        token = secrets.token_urlsafe(32)
+        self._tickets.add(token)
+        return f"http://127.0.0.1:{self.port}/?token={token}"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
@@ -56,9 +65,13 @@ class Gate:
         headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
         query = parse_qsl(scope.get("query_string", b"").decode("latin-1"), keep_blank_values=True)
         given = dict(query).get("token")
-        if not self._from_here(headers) or not (self._known(given) or self._known(self._kept(headers))):
+        comes = scope["type"] == "http" and scope["method"] in ("GET", "HEAD")
+        allowed = self._from_here(headers) and (
+            _same(given, self.token) or _same(self._kept(headers), self._secret) or (comes and self._spend(given))
+        )
+        if not allowed:
             await _refuse(scope, send)
-        elif scope["type"] == "http" and given is not None and scope["method"] in ("GET", "HEAD"):
+        elif comes and given is not None:
             rest = urlencode([(name, value) for name, value in query if name != "token"])
             path = "/" + quote(scope["path"].lstrip("/"))  # two slashes would be another host
             await self._sent_on(path + (f"?{rest}" if rest else ""), send)
@@ -77,15 +90,22 @@ class Gate:
             return None
         return None if morsel is None else morsel.value
 
-    def _known(self, token: str | None) -> bool:
-        return token is not None and hmac.compare_digest(token.encode(), self.token.encode())
+    def _spend(self, token: str | None) -> bool:
+        """Take a ticket: whether it was one that nobody had used."""
+        found = next((ticket for ticket in self._tickets if _same(token, ticket)), None)
+        self._tickets.discard(found or "")
+        return found is not None
 
     async def _sent_on(self, place: str, send: Send) -> None:
-        cookie = f"{self.cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+        cookie = f"{self.cookie}={self._secret}; HttpOnly; SameSite=Strict; Path=/"
         headers = [(b"location", place.encode()), (b"set-cookie", cookie.encode())]
         headers += [(b"cache-control", b"no-store"), (b"referrer-policy", b"no-referrer"), (b"content-length", b"0")]
         await send({"type": "http.response.start", "status": 303, "headers": headers})
         await send({"type": "http.response.body", "body": b""})
+
+
+def _same(given: str | None, secret: str) -> bool:
+    return given is not None and hmac.compare_digest(given.encode(), secret.encode())
 
 
 async def _refuse(scope: Scope, send: Send) -> None:

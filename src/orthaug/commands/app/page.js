@@ -26,7 +26,7 @@ function take(file) {
     bar.hidden = true;
     let answer = {};
     try { answer = JSON.parse(request.responseText); } catch { /* told below */ }
-    told.textContent = answer.refused ?? (answer.kept ? `${answer.kept} is here` : "the file could not be taken in");
+    told.textContent = answer.refused ?? (answer.kept ? answer.note || `${answer.kept} is here` : "the file could not be taken in");
     told.classList.toggle("refused", !answer.kept);
     document.getElementById("dropped").value = "";
   };

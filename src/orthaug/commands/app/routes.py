@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
@@ -19,6 +18,7 @@ from nicegui import ui
 from starlette.requests import ClientDisconnect
 
 from orthaug._base.errors import InputError
+from orthaug._base.memory import in_words
 from orthaug._base.progress import LOG
 from orthaug.commands.app.gate import PLAIN
 from orthaug.commands.app.session import Session, Sessions
@@ -28,6 +28,8 @@ from orthaug.commands.app.view_results import ExportView, ReportView
 from orthaug.commands.app.view_training import TrainingView
 from orthaug.commands.app.widgets import sentence, text
 
+LARGEST = 2 * 2**30  # bytes of a file that is dropped: it lies once more in a temporary folder
+_TOO_LARGE = "the file is larger than {}, the most that this page takes in; name its path instead, and it stays there."
 _OFTEN = 0.25  # s between looks at what has changed
 _PARTS = ("Data", "Model", "Training", "Report", "Export")
 MARK = (
@@ -183,13 +185,18 @@ async def _kept(sessions: Sessions, key: str, name: str, request: Request) -> Re
     if session is None:
         return _refused("this work is not open any more; open the page anew.", 404)
     partial: Path | None = None
+    declared = request.headers.get("content-length", "")
+    if declared.isdecimal() and int(declared) > LARGEST:
+        return _refused(_TOO_LARGE.format(in_words(LARGEST)), 413)
     try:
-        place = session.place_for(name)
-        partial = place.with_name(f"{place.name}.partial")
+        partial, size = session.begin_file(name), 0
         with partial.open("wb") as file:
             async for piece in request.stream():
+                size += len(piece)
+                if size > LARGEST:
+                    return _refused(_TOO_LARGE.format(in_words(LARGEST)), 413)
                 file.write(piece)
-        os.replace(partial, place)
+        place, note = session.keep_file(partial, name)
     except InputError as error:
         return _refused(str(error), 422)
     except ClientDisconnect:
@@ -201,7 +208,7 @@ async def _kept(sessions: Sessions, key: str, name: str, request: Request) -> Re
             with suppress(OSError):
                 partial.unlink(missing_ok=True)
     session.open_file(place)
-    return JSONResponse({"kept": place.name})
+    return JSONResponse({"kept": place.name, "note": note})
 
 
 def _refused(text: str, code: int) -> Response:

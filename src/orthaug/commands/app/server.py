@@ -113,7 +113,7 @@ async def _serve(
         await asyncio.sleep(0.02)
     streams.echo(f"{gate.url}\nThe page is at this address, on this machine only. Ctrl-C ends it.")
     if browser:
-        threading.Thread(target=webbrowser.open, args=(gate.url,), daemon=True).start()
+        threading.Thread(target=webbrowser.open, args=(gate.ticket(),), daemon=True).start()
     try:
         while not (asked.is_set() or serving.done()):
             await asyncio.sleep(_LOOK)

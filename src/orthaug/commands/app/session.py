@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from orthaug._base.errors import InputError
+from orthaug._base.folders import file_digest
 from orthaug._base.progress import LOG
 from orthaug.commands.app.processes import Command, Desk
 from orthaug.commands.app.spec_text import absolute, files, in_file, keep, kept_title, plain, section, with_value
@@ -109,6 +110,28 @@ class Session:
         if ending not in KNOWN or not Path(plain_name).stem:
             raise InputError(f"'{plain_name}': no data file that is known; known are {', '.join(KNOWN)}.")
         return self.folder / plain_name
+
+    def begin_file(self, name: str) -> Path:
+        """Return a file to write what is dropped under that name into; `keep_file` gives it its place.
+
+        Raises:
+            InputError: an ending of no data file.
+        """
+        self.place_for(name)
+        return self.folder / f"{secrets.token_hex(8)}.partial"
+
+    def keep_file(self, partial: Path, name: str) -> tuple[Path, str]:
+        """Give a dropped file its place and return that, with what the page says of it.
+
+        Nothing that is there is replaced: another content under the same name gets a number.
+        """
+        first = self.place_for(name)
+        place, number, digest = first, 1, file_digest(partial)
+        while place.exists() and file_digest(place) != digest:
+            number += 1
+            place = first.with_name(f"{first.stem}-{number}{first.suffix}")
+        os.replace(partial, place)
+        return place, f"another file called {first.name} is here, so this one is {place.name}" if number > 1 else ""
 
     def open_file(self, path: Path) -> None:
         """Look at a data file, and begin a spec for it where its columns tell what they are."""

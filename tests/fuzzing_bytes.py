@@ -1,0 +1,64 @@
+"""Entry points for a fuzzer that is guided by coverage: functions of bytes that raise only at a fault.
+
+With atheris, which is no dependency: `python benchmarks/fuzz.py --guided expression CORPUS -max_total_time=600`.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+from orthaug._base.errors import InputError
+from orthaug.data.expressions import parse_named
+from orthaug.data.tables import column_names
+from orthaug.models import storage
+
+_KNOWN = dict.fromkeys(("x", "v", "u", "k"), 1.0)
+
+
+def expression(data: bytes) -> None:
+    """Parse text as an equation of motion."""
+    try:
+        parse_named(data.decode("utf-8", "replace"), _KNOWN, "equation")
+    except InputError:
+        return
+
+
+def header(data: bytes) -> None:
+    """Read the columns of a file whose ending the first byte chooses."""
+    endings = (".csv", ".tsv", ".npz", ".mat", ".h5", ".xlsx", ".parquet")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, f"run{endings[data[0] % len(endings)] if data else '.csv'}")
+        path.write_bytes(data[1:])
+        try:
+            column_names(path)
+        except InputError:
+            return
+
+
+def model(data: bytes) -> None:
+    """Load a model whose declaration is these bytes, its checksum made right."""
+    import json
+
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            declared = json.loads(data)
+        except (ValueError, RecursionError):
+            declared = None
+        if isinstance(declared, dict):
+            said = {k: v for k, v in declared.items() if k not in ("format", "orthaug", "arrays_sha256", "checksum")}
+            packed = storage.pack(storage.FORMAT, said, {})
+            try:
+                storage.write_packed(packed, Path(folder, "model.json"), Path(folder, "arrays.safetensors"))
+            except UnicodeEncodeError:  # a lone surrogate is no text that a file holds
+                return
+        else:
+            Path(folder, "model.json").write_bytes(data)
+            Path(folder, "arrays.safetensors").write_bytes(b"")
+        try:
+            storage.load(folder)
+        except InputError:
+            return
+
+
+TARGETS = {"expression": expression, "header": header, "model": model}
