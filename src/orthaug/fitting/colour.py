@@ -37,7 +37,7 @@ class Autoregression:
         """
         rho = self.autocovariance(int(max(lengths)))
         rho = rho / rho[0]
-        pairs = sum(np.maximum(length - np.arange(len(rho)), 0) for length in lengths)
+        pairs = np.maximum(np.asarray(lengths)[:, None] - np.arange(len(rho)), 0).sum(axis=0)
         rows = float(sum(lengths))
         return rows**2 / float(rows + 2 * np.sum(pairs[1:] * rho[1:] ** 2))
 
