@@ -185,7 +185,7 @@ def test_a_bounded_correction_on_stable_physics_is_a_proof(tmp_path, monkeypatch
         y[k] = 1.2 * y[k - 1] - 0.5 * y[k - 2] + 0.3 * u[k - 1] - 0.1 * np.tanh(3 * v) + 1e-3 * rng.standard_normal()
     Path("d.csv").write_text("u,y\n" + "\n".join(f"{a},{b}" for a, b in zip(u, y, strict=True)))
     terms = [("a1", "y[k-1]"), ("a2", "y[k-2]"), ("b1", "u[k-1]")]
-    spec = '[data]\ntrain = ["d.csv"]\nsampling_time = 1.0\ninputs = ["u"]\noutputs = ["y"]\n'
+    spec = '[data]\ntrain = { files = ["d.csv"] }\nsampling_time = 1.0\ninputs = ["u"]\noutputs = ["y"]\n'
     spec += "".join(f'[[baseline.terms]]\nparameter = "{p}"\nregressor = "{r}"\n' for p, r in terms)
     spec += '[learner]\nkind = "mlp"\nhidden = [4]\nbeyond = "BEYOND"\n'
     spec += '[training]\nfocus = "prediction"\nfallback = false\n'

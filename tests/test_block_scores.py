@@ -141,10 +141,21 @@ def test_white_errors_keep_plain_intervals():
     assert fit.plain_covariance is None and fit.std_kind == "plain"
 
 
-@pytest.mark.parametrize("why", ["few rows", "short segments"])
-def test_errors_that_remember_for_too_long_have_no_interval(why):
+def test_a_record_that_is_too_short_for_blocks_has_the_errors_of_its_colour():
+    """An autoregressive model of the errors, 40 draws of 300 rows; where segments are short, too."""
+    inside = np.zeros(2)
+    for seed in range(40):
+        plain = flown(seed, 0.9, 0, 300)
+        for i, fit in enumerate((plain, plain.robust(kind="autoregressive"))):
+            inside[i] += np.mean((fit.interval[:, 0] <= THETA) & (fit.interval[:, 1] >= THETA)) / 40
+    assert inside[0] < 0.75 and 0.88 < inside[1] <= 0.99
+    fit = default(flown(0, 0.9, 50))
+    assert fit.std_kind == "autoregressive" and "an autoregressive model of the errors" in fit.summary()
+
+
+def test_errors_that_remember_for_too_long_have_no_interval():
     """Plain intervals held 40 to 75 % there; no number is called one of 95 %."""
-    plain = flown(*{"few rows": (0, 0.9, 0, 180), "short segments": (0, 0.9, 50)}[why])
+    plain = flown(0, 0.9, 0, 180)
     fit = default(plain)
     assert fit.std is None and fit.interval is None and fit.std_kind == "none"
     np.testing.assert_array_equal(fit.plain_covariance, plain.covariance)

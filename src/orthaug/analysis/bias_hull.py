@@ -1,10 +1,10 @@
-"""The bias that a learner implies is a set: the hull over all causes that noise cannot tell from the best (F14).
+"""The bias that a learner implies is a set: the hull over all causes that noise cannot tell from the best.
 
 A cause that explains the share s of what the learner holds beside the physics leaves 1 − s of it. The truth leaves what
 the noise puts into the learner, `ν = E‖noise of it‖²/‖it‖²`, and what no form of the catalogue has; so a cause may be
 the true one where
 
-    1 − s ≤ 3 (1 − s_best) + 3 ν + 0.02.
+    1 − s ≤ 8 (1 − s_best + ν),    and s at least 0.8 of s_best.
 
 Terms that are nearly the physics itself, `|v|^1.1`, fit anything with a huge size and stay out. Every such cause has an
 interval about the estimate less its bias, as wide as noise and what it leaves. What is shown is the hull of them; where
@@ -24,11 +24,9 @@ from orthaug._base.errors import Warning
 from orthaug._base.lines import percent
 from orthaug.inference.covariance import interval, reach
 
-_AS_CLOSE = 3.0  # times what the best leaves of the learner: where no form fits, others are as likely
-_NOISE = 3.0  # times ν: over 20 draws of seven forms the true one left at most 2 ν
-_CLOSE = 0.02  # of the learner: a network smooths the cusp of √|v| and rounds a jump, whatever the noise
+_AS_CLOSE = 8.0  # over 19 forms, half of them in no catalogue, the right bias was within in 128 of 130 draws
 MOST_PHYSICS = 0.986  # cosine with the physics: beyond it a term is six times larger than what the learner shows of it
-_LEAST = 0.5  # of the best share: what explains less is no likely cause
+_LEAST = 0.8  # of the best share: what explains less is no likely cause
 _TOLD = 4  # parameters that a warning lists at most
 
 
@@ -69,7 +67,7 @@ def compatible(candidates: Sequence[Candidate], noise: float) -> list[Candidate]
     if not likely:
         return []
     best = max(c.share for c in likely)
-    left = min(_AS_CLOSE * (1 - best) + _NOISE * noise + _CLOSE, 1 - _LEAST * best)
+    left = min(_AS_CLOSE * (1 - best + noise), 1 - _LEAST * best)
     kept = [c for c in likely if 1 - c.share <= left]
     return [c for c in kept if c.declared] or kept
 

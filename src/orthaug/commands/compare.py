@@ -13,6 +13,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
 from orthaug._base.progress import SILENT, Progress
 from orthaug.analysis.validation import Verdict, dominance
+from orthaug.commands.doubts import doubted
 from orthaug.commands.fit import Fitted, cross_validated, fit_variant, judge_fit, score_part, wanted_blocks
 from orthaug.commands.job import ALONE, Job, Variant, origin_of
 from orthaug.data.record import same_step
@@ -62,7 +63,7 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -
         if decided is not None and kind == job.spec.structure.kind and decided.fit.model.form.bound is not None:
             fitted[kind] = decided
             continue
-        fitted[kind] = fit_variant(job, variant, progress.after(runs=number * job.run_count))
+        fitted[kind] = doubted(fit_variant(job, variant, progress.after(runs=number * job.run_count)))
     verdicts = _verdicts(job, fitted)
     rows = [_row(kind, fit, verdicts.get(kind)) for kind, fit in fitted.items()]
     rows += [_saved_row(name, model, job) for name, model in models.items()]
@@ -83,7 +84,7 @@ def _criterion(job: Job, progress: Progress) -> tuple[Criterion, Fitted | None]:
     if not declared.automatic:
         return declared, None
     kind = job.spec.structure.kind if job.spec.structure.kind in job.compared else ALONE
-    fitted = fit_variant(job, Variant(kind), progress)
+    fitted = doubted(fit_variant(job, Variant(kind), progress))
     return (fitted.fit.criterion if fitted.fit.status.ok else Prediction()), fitted
 
 

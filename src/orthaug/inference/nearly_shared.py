@@ -1,4 +1,4 @@
-"""Intervals beside a learner that could nearly imitate a direction of the physics (F13), and what is said of it.
+"""Intervals beside a learner that could nearly imitate a direction of the physics, and what is said of it.
 
 What functions of the features leave of a direction, a share λ of its squares, is all that determines it beside *any*
 such function. So its variance is at least that of physics alone over λ, whatever the trained learner's own tangents

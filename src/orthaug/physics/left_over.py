@@ -1,4 +1,4 @@
-"""How much of each direction of the physics no function of the learner's features can follow, on measured rows (F13).
+"""How much of each direction of the physics no function of the learner's features can follow, on measured rows.
 
 Names show that a term reads what the learner does not see. They do not show a column that was computed from it, such as
 the sign of a speed. So the rows are asked: `L = Σ_k r_k r_kᵀ / N` with `r = (I − M) φ`, the part of φ that is left
