@@ -190,11 +190,11 @@ def test_what_a_learner_that_helps_may_hold_of_a_parameter_is_told_where_no_susp
     rows = {row["name"]: row for row in result["parameters"]}
     assert result["validation"]["verdict"] == "helps" and [name for name in rows if rows[name]["shared"]] == ["c"]
     (cause,) = result["bias"]  # a usual one that nobody declared
-    assert rows["c"]["bias"]["cause"] == cause["name"] and cause["name"].startswith("coulomb of v")
-    assert cause["equation"] == "v" and cause["expression"].startswith("tanh(v/")
+    assert rows["c"]["bias"]["cause"] == cause["name"] and cause["equation"] == "v"
+    assert cause["name"].startswith(("coulomb of v", "tanh(v", "saturation(v"))  # friction that ends at a force
     assert cause["coefficient_found"] * cause["bias"]["c"] == pytest.approx(rows["c"]["bias"]["value"])
     assert rows["c"]["ci95_with_bias"][0] < C < rows["c"]["ci95_with_bias"][1]
-    assert "% of what the learner found is coulomb of v" in " ".join(printed.split())
+    assert cause["name"] in " ".join(printed.split())
 
 
 def test_a_result_has_what_a_motion_has_and_null_for_the_rest(result):
@@ -438,7 +438,6 @@ kind = "dead_zone"
 on = "force"
 equation = "v"
 [training]
-restarts = 1
 """
 
 
@@ -508,7 +507,6 @@ kind = "cubic"
 on = "i"
 equation = "w"
 [training]
-restarts = 1
 iterations = 5
 [validation]
 blocks = 0
@@ -608,7 +606,7 @@ BAD = {
     "too long": ("sampling_time = 0.01", "sampling_time = 100.0", "is too long for the fastest mode of the motion"),
     "focus": ("[training]", '[training]\nfocus = "prediction"', "'training.focus' = prediction; expected simulation"),
     "solver": ("[training]", '[training]\nsolver = "adam-lbfgs"', "'training.solver' = adam-lbfgs"),
-    "ensemble": ("[training]", "[training]\nensemble = true\nrestarts = 2", "`training.ensemble`: a motion has none"),
+    "ensemble": ("restarts = 1", "ensemble = true\nrestarts = 2", "`training.ensemble`: a motion has none"),
     "structure": ("[training]", '[structure]\nkind = "additive"\n[training]', "'structure.kind' = additive; expected"),
     "lags": ("[training]", "[lags]\nna = 2\n[training]", "`lags`: found beside [motion]"),
     "suspect": (

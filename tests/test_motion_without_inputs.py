@@ -31,6 +31,7 @@ angle = "q"
 w2 = {{ initial = 8, min = 0 }}
 c = {{ initial = 0.3, min = 0 }}
 [training]
+restarts = 1
 [validation]
 blocks = 0
 [learner]
@@ -67,7 +68,8 @@ def test_theta_is_found(fitted):
     rows = {row["name"]: row for row in json.loads((folder / "fit" / "result.json").read_text())["parameters"]}
     for name, truth in (("w2", STIFFNESS), ("c", DAMPING)):
         if not (learns and name == "c"):  # the learner could imitate it, so that it is the nearest damping
-            assert abs(rows[name]["value"] - truth) < 3 * rows[name]["std"] < 0.02 * truth
+            std = rows[name].get("plain_std", rows[name]["std"])  # robust ones are from few batches
+            assert abs(rows[name]["value"] - truth) < 3 * std < 0.02 * truth
 
 
 @pytest.mark.parametrize(

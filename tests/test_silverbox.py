@@ -31,6 +31,8 @@ rows = [100, 32100]
 skip = 50
 [learner]
 kind = "none"
+[training]
+focus = "prediction"
 """
 REGRESSORS = ("V2[k-1]", "V2[k-2]", "V1[k]", "V1[k-1]", "V1[k-2]", "1")
 PUBLISHED_MILLIVOLT = {"multisine": 6.973, "arrow": 14.389, "arrow_without_extrapolation": 6.630}

@@ -33,9 +33,12 @@ def radius_beyond(model: Model | MotionModel, states: Matrix, inputs: Matrix) ->
         states: (m, n0) that a run met.
         inputs: (m, nu) of a step, there.
     """
+    bound: Any = model.form.bound
     does, size = getattr(model.form, "beyond", "free"), states.shape[1]
     finite = np.isfinite(states).all(axis=1)
     if does == "free" or model.numbers.limits is None or not 0 < size <= _LONGEST_STATE or not finite.any():
+        return None
+    if does != "hold" and not hasattr(bound.learner, "beyond"):
         return None
     found = [_far_away(_going_on(model, kind), states[finite], inputs[finite]) for kind in sorted({does, "hold"})]
     every = np.concatenate(found)
@@ -61,6 +64,8 @@ def describe_beyond(model: Model | MotionModel, radius: float | None) -> str:
 
 def _going_on(model: Model | MotionModel, kind: str) -> Model | MotionModel:
     """Return the model whose correction does something else beyond its training."""
+    if kind == getattr(model.form, "beyond", kind):
+        return model
     bound: Any = model.form.bound
     learner = replace(bound.learner, beyond=kind)
     form: Any = replace(model.form, bound=replace(bound, learner=learner))

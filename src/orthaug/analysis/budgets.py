@@ -43,6 +43,7 @@ def bias_budget(
             channels or lags that the data do not have.
 
     Examples:
+        >>> import numpy as np
         >>> import orthaug as oa
         >>> u = np.random.default_rng(0).uniform(-1, 1, 300)
         >>> record = oa.Record.from_arrays(u, 2 * u + u**3 + 0.05 * np.random.default_rng(1).normal(size=300))

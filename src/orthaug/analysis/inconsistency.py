@@ -71,7 +71,7 @@ class Inconsistency:
     def warning(self) -> Warning:
         """What to be warned of, with the values that the remedies give."""
         each = [
-            f"{self.names[i]} is then {self.modelled[i]:.6g} ± {self.modelled_std[i]:.2g} instead of "
+            f"{self.names[i]} is then {self.modelled[i]:.6g} (std {self.modelled_std[i]:.2g}) instead of "
             f"{self.theta[i]:.6g}, {abs(self.apart[i]):.1f} standard errors away"
             for i in self.moved
         ]
@@ -81,7 +81,7 @@ class Inconsistency:
             f"{'; '.join(each)}."
         )
         if self.instruments is not None and self.instruments_std is not None:
-            given = [f"{self.names[i]} = {self.instruments[i]:.6g} ± {self.instruments_std[i]:.2g}" for i in self.moved]
+            given = [f"{self.names[i]} = {self.instruments[i]:.6g} (std {self.instruments_std[i]:.2g})" for i in self.moved]
             text += f" Instruments (the outputs of the free run) give {', '.join(given)}."
         text += (
             ' No interval of the one-step θ counts that, robust or not: train on the free run (focus = "simulation"), '

@@ -181,6 +181,11 @@ class _Found:
     rivals: tuple[TermBias, ...] = ()
 
 
+def _is_clearly_less(share: float, other: float) -> bool:
+    """Return whether a term with a plain name gives way to a member of a family, which has a width to fit as well."""
+    return share < AS_MUCH * other and 1 - share > max(_AS_CLOSE * (1 - other), _CLOSE)
+
+
 def _size(cause: TermBias) -> float:
     """The coefficient by the learner, else by what the free run leaves."""
     if cause.explained is None and cause.residual is not None:
@@ -204,7 +209,7 @@ def _of_learner(
 ) -> _Found | None:
     """The term that explains most of the learner, or one of each equation that together leave much less of it."""
     best, other = max(table, key=explains, default=None), max((*smooth, *families), key=explains, default=None)
-    if other is not None and (best is None or explains(best) < AS_MUCH * explains(other)):
+    if other is not None and (best is None or _is_clearly_less(explains(best), explains(other))):
         best = other
     ground, every = ground_after(fit), (*table, *smooth)
     alone = [] if best is None else [[best, *(entry for entry in every if entry is not best)]]

@@ -132,8 +132,8 @@ def tex_text(text: str) -> str:
     r"""Return plain text for TeX: no letter of it begins a command, a group or a comment.
 
     Examples:
-        >>> print(tex_text(r"50 % of \\input{x}"))
-        50 \\% of \textbackslash{}input\\{x\\}
+        >>> print(tex_text(r"50 % of \input{x}"))
+        50 \% of \textbackslash{}input\{x\}
     """
     return "".join(_TEX.get(letter, letter if letter.isprintable() else " ") for letter in text)
 

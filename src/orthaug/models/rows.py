@@ -248,7 +248,7 @@ def laid_out(z: Matrix, q: Any, e: Matrix, gain: Any, shape: tuple[int, int]) ->
 def from_chunks(chunks: Float[np.ndarray, "k ... m"], rows: int) -> Float[np.ndarray, "N ..."]:
     """The inverse of `in_chunks`."""
     moved = np.moveaxis(np.asarray(chunks), -1, 1)
-    return moved.reshape(-1, *moved.shape[2:])[:rows]
+    return moved.reshape(moved.shape[0] * moved.shape[1], *moved.shape[2:])[:rows]
 
 
 def gram(columns: Float[Array, "n rows"]) -> Float[Array, "n n"]:

@@ -45,7 +45,10 @@ def interval(ends: Sequence[float | None] | None, digits: int = 5) -> str:
     decimals = None if not scale else digits - 1 - math.floor(math.log10(scale))
     if decimals is None or not 0 < decimals <= _MOST_DIGITS or None in ends:
         return " … ".join(number(end, digits, scale) for end in ends)
-    return " … ".join(f"{end:.{decimals}f}".replace("-", "−") for end in known)
+    texts = [f"{0.0 if abs(end) <= _ROUNDING * (scale or 0.0) else end:.{decimals}f}" for end in known]
+    while all(text.endswith("0") for text in texts) and "." in texts[0]:
+        texts = [text[:-1].removesuffix(".") for text in texts]
+    return " … ".join(texts).replace("-", "−")
 
 
 def digits_for(value: float | None, spread: float | None, least: int) -> int:

@@ -391,8 +391,8 @@ def _shades(response: Response, start: float, step: float) -> list[dict[str, Any
     first, after = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
     apart = np.flatnonzero(first[1:] - after[:-1] > rows // _MOST_SHADES)
     first, after = first[np.concatenate([[0], apart + 1])[: len(first)]], after[np.append(apart, -1)[: len(after)]]
-    place = {"yref": "paper", "y0": 0, "y1": 1}
+    place = {"yref": "paper", "y0": 0, "y1": 1, "name": "outside of training", "legendgroup": "outside"}
     return [
-        area("@reach", **place, x0=start + step * (a - 0.5), x1=start + step * (b - 0.5))
-        for a, b in zip(first.tolist(), after.tolist(), strict=True)
+        area("@reach", **place, x0=start + step * (a - 0.5), x1=start + step * (b - 0.5), showlegend=not i)
+        for i, (a, b) in enumerate(zip(first.tolist(), after.tolist(), strict=True))
     ]
