@@ -34,6 +34,8 @@ _ROUNDING = 1e-7  # of the outputs' deviation: errors below that are rounding an
 _OWN = 1e-3  # of a column's size: what is left of it beside the model, so that it is one of its own
 _CENTRES = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95)  # quantiles about which a function of a learner's feature bends
 _STATIC = 5
+_LEAST_LAG = 3.0  # samples: a faster state is a lag that is missing
+_CLEARLY = 0.1  # of the filtered errors' square, by which memory predicts more than functions of one row
 _SETTLING, _HALVINGS, _SETTLED = 8, 4, 0.01  # steps, shorter ones, and the fall of the squares that ends them
 
 
@@ -59,6 +61,10 @@ class FamilyTest:
         """What it is, in words."""
         return f"a function of {self.on}" if self.term is None else f"a {self.term.name}"
 
+    def is_short(self, least: float) -> bool:
+        """Return whether it is a lag of a time constant below a least one, in s."""
+        return self.kind == "lag" and self.term is not None and self.term.scale < least
+
     @property
     def sure(self) -> bool:
         """Whether it is surely there."""
@@ -78,6 +84,8 @@ class StructureTest:
     hidden: FamilyTest | None
     families: tuple[FamilyTest, ...]
     """All with memory, the largest share first."""
+    step: float = 0.0
+    """Sampling time of the model."""
 
     @property
     def found(self) -> bool:
@@ -86,12 +94,16 @@ class StructureTest:
 
     @property
     def has_memory(self) -> bool:
-        """Whether a hidden state is the likely cause: memory is sure beside static terms, and predicts more."""
-        return (
-            self.hidden is not None
-            and self.memory is not None
-            and (self.static is None or self.memory.share >= self.static.share)
-        )
+        """Whether a hidden state is the likely cause: memory is sure beside static terms, and predicts clearly more.
+
+        Play and hysteresis of a position follow the sign of its speed, so they stand in for friction that is not quite
+        right; a lag of a sample or two is a lag that the physics has too few of.
+        """
+        if self.hidden is None or self.memory is None:
+            return False
+        if any(one.is_short(_LEAST_LAG * self.step) for one in (self.hidden, self.memory)):
+            return False
+        return self.static is None or self.memory.share >= self.static.share + _CLEARLY
 
 
 @dataclass(frozen=True)
@@ -114,9 +126,9 @@ def structure_test(model: Model | MotionModel, record: Record) -> StructureTest 
     whole = np.concatenate([run.error for run in runs])
     if np.all(whole.std(axis=0) < _ROUNDING * model.deviation):
         return None
-    return _tested(
-        runs, _base_columns(model, runs), *_added_columns(model, runs), theta - np.asarray(model.numbers.theta)
-    )
+    moved = theta - np.asarray(model.numbers.theta)
+    found = _tested(runs, _base_columns(model, runs), *_added_columns(model, runs), moved)
+    return None if found is None else replace(found, step=float(model.sampling_time))
 
 
 def _settled(model: Model | MotionModel, record: Record) -> tuple[Vector, list[LinearRun]] | None:

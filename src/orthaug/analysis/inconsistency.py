@@ -81,7 +81,9 @@ class Inconsistency:
             f"{'; '.join(each)}."
         )
         if self.instruments is not None and self.instruments_std is not None:
-            given = [f"{self.names[i]} = {self.instruments[i]:.6g} (std {self.instruments_std[i]:.2g})" for i in self.moved]
+            given = [
+                f"{self.names[i]} = {self.instruments[i]:.6g} (std {self.instruments_std[i]:.2g})" for i in self.moved
+            ]
             text += f" Instruments (the outputs of the free run) give {', '.join(given)}."
         text += (
             ' No interval of the one-step θ counts that, robust or not: train on the free run (focus = "simulation"), '
