@@ -250,7 +250,11 @@ def test_a_declared_term_that_explains_half_hides_no_usual_one(learned: oa.Motio
     assert half.cause.suspect is drag and half.share < 0.9 and half.of("c").value < 0
     assert "what the learner found looks most like drag of size" in half.warnings[0].text
     found = told_budget(learned, [drag], table)
-    assert found.cause.suspect.name.startswith(("coulomb of v", "tanh(v")) and found.share > 0.9 and found.of("c").value > 0
+    assert (
+        found.cause.suspect.name.startswith(("coulomb of v", "tanh(v"))
+        and found.share > 0.9
+        and found.of("c").value > 0
+    )
     sure = [replace(table[0], explained=0.99)]
     assert told_budget(learned, [drag], sure).cause is sure[0]
 

@@ -163,7 +163,7 @@ class Job(ABC):
             return ({"structure": ALONE},)
         kind, validated = variant.kind or spec.structure.kind, spec.data.validation is not None
         choices = spec.regularizations(linear=self.linear, validated=validated, kind=kind)
-        starts = range(1, spec.restarts + 1)
+        starts = range(1, spec.training.restarts + 1)
         return tuple({"structure": kind, "start": i, "regularization": choice} for choice in choices for i in starts)
 
     @property
@@ -215,7 +215,7 @@ class Job(ABC):
             "criterion": variant.criterion or spec.declared_criterion(),
             "solver": solver if fold is None else solver.at_most(FOLD_ITERATIONS),
             "regularization": choices[0] if fold is not None and isinstance(choices, list) else choices,
-            "restarts": spec.restarts if fold is None else 1,
+            "restarts": training.restarts if fold is None else 1,
             "seed": training.seed,
             "blocks": 0 if fold is not None else DEFAULT_BLOCKS if blocks is None else blocks,
             "fallback": training.fallback,

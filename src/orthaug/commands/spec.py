@@ -151,9 +151,6 @@ class StructureSection(KindSection):
     measure: MeasureSection = MeasureSection()
 
 
-_MOTION_RESTARTS = 3  # as `orthaug init` writes
-
-
 class TrainingSection(KindSection):
     """Solver, criterion and regularisation."""
 
@@ -346,19 +343,7 @@ class Spec(Section):
     def runs(self, *, linear: bool) -> int:
         """How many runs a fit makes: restarts times regularizations."""
         validated = self.data.validation is not None
-        return self.restarts * len(self.regularizations(linear=linear, validated=validated))
-
-    @property
-    def restarts(self) -> int:
-        """Return how many starts training makes: those that are written, else several of a network in a motion.
-
-        Over whole experiments a free run has local minima that one start often ends in: benchmarks/defaults.py.
-        """
-        if self.motion is None or "restarts" in self.training.model_fields_set:
-            return self.training.restarts
-        learner = self.declared_learner()
-        drawn = learner is not None and not getattr(learner, "linear", False)
-        return _MOTION_RESTARTS if drawn else self.training.restarts
+        return self.training.restarts * len(self.regularizations(linear=linear, validated=validated))
 
 
 def spec_model() -> type[Spec]:
