@@ -6,6 +6,7 @@ often it does not and nothing is said (a silent miss), and how wide it is. Run: 
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -110,7 +111,7 @@ def motion(column: str, noise: float, seed: int) -> tuple[float, tuple[float, fl
 
 
 def _judged(fit: Any, name: str, value: float, interval: Any, i: int, shared: Any, inputs: Any) -> Any:
-    warned = any(name in warning.text for warning in shared_warnings(shared, inputs))
+    warned = any(re.search(rf"\b{name}\b", warning.text) for warning in shared_warnings(shared, inputs))
     held = (np.nan, np.nan) if interval is None else tuple(np.asarray(interval)[i])
     return float(value), held, warned
 
