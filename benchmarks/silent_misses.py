@@ -69,9 +69,8 @@ def main(lagged: int, motions: int) -> int:
         shown = [f"{row.held:.0f} %", f"{row.silent:.0f} %", "" if np.isnan(row.width) else f"{row.width:.2g} %"]
         print(f"| {row.system} | {row.noise} | {row.sees} | {row.draws} | {' | '.join(shown)} |", flush=True)
         missed += [row] if row.silent > row.most else []
-    print(
-        f"\n{(time.perf_counter() - began) / 60:.0f} min; rows above {ALLOWED:g} % by two standard errors: {len(missed)}"
-    )
+    minutes = (time.perf_counter() - began) / 60
+    print(f"\n{minutes:.0f} min; rows above {ALLOWED:g} % by two standard errors: {len(missed)}")
     for row in missed:
         print(f"- {row.system}, {row.noise}, learner sees {row.sees}: {row.silent:.0f} % of {row.draws}")
     return bool(missed)

@@ -33,7 +33,7 @@ def radius_beyond(model: Model | MotionModel, states: Matrix, inputs: Matrix) ->
         states: (m, n0) that a run met.
         inputs: (m, nu) of a step, there.
     """
-    bound: Any = model.form.bound
+    bound: Any = getattr(model.form, "bound", None)
     does, size = getattr(model.form, "beyond", "free"), states.shape[1]
     finite = np.isfinite(states).all(axis=1)
     if does == "free" or model.numbers.limits is None or not 0 < size <= _LONGEST_STATE or not finite.any():
