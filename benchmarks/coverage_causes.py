@@ -117,6 +117,8 @@ def judged(fit: Any, names: tuple[str, ...], true: np.ndarray) -> tuple[float, f
 
     Of the parameters that the learner could imitate: the others have no bias, and miss 5 % by chance.
     """
+    if fit.interval is None:  # withheld: nothing is claimed
+        return 1.0, 0.0, [], [True] * len(names)
     budget = oa.bias_budget(fit)
     held, silent, widths, open_ones = [], [], [], []
     for i, name in enumerate(names):

@@ -49,7 +49,7 @@ regressor = "u[k-1]"
 LEARNERS = {
     "none": "",
     "v": '[learner]\nhidden = [4]\ninputs = ["{v}"]\n',
-    "v, kept": '[learner]\nhidden = [4]\ninputs = ["{v}"]\nfallback = false\n',
+    "v, kept": '[learner]\nhidden = [4]\ninputs = ["{v}"]\n[training]\nfallback = false\n',
 }
 
 
