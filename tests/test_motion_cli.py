@@ -193,7 +193,9 @@ def test_what_a_learner_that_helps_may_hold_of_a_parameter_is_told_where_no_susp
     assert rows["c"]["bias"]["cause"] == cause["name"] and cause["equation"] == "v"
     assert cause["name"].startswith(("coulomb of v", "tanh(v", "saturation(v"))  # friction that ends at a force
     assert cause["coefficient_found"] * cause["bias"]["c"] == pytest.approx(rows["c"]["bias"]["value"])
-    assert rows["c"]["ci95_with_bias"][0] < C < rows["c"]["ci95_with_bias"][1]
+    limits = rows["c"]["ci95_with_bias"]  # of so short a training the causes that noise cannot tell apart may disagree
+    assert limits[0] < C < limits[1] if rows["c"]["bias"]["determined"] else limits is None
+    assert ("not_determined" in {w["code"] for w in result["warnings"]}) == (limits is None)
     assert cause["name"] in " ".join(printed.split())
 
 
