@@ -157,8 +157,7 @@ def _axis_check(results: Results) -> tuple[bool | None, str]:
 def went_up(result: Result) -> bool | None:
     """Whether the free run was trained as well, as far as the result says."""
     said = result.get("criterion")
-    said = said.get("focus", said.get("kind")) if isinstance(said, dict) else said
-    return None if said is None else "simulation" in str(said).lower()
+    return bool(said.get("candidates")) if isinstance(said, dict) else None
 
 
 def _time_checks(results: Results) -> list[tuple[bool | None, str]]:
