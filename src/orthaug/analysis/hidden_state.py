@@ -92,6 +92,10 @@ class StructureTest:
         """Whether there is any structure."""
         return self.static is not None or self.memory is not None
 
+    def is_a_lag(self, one: FamilyTest) -> bool:
+        """Return whether a family forgets within a few samples, as a further lag does."""
+        return one.is_short(_LEAST_LAG * self.step)
+
     @property
     def has_memory(self) -> bool:
         """Whether a hidden state is the likely cause: memory is sure beside static terms, and predicts clearly more.
@@ -101,7 +105,7 @@ class StructureTest:
         """
         if self.hidden is None or self.memory is None:
             return False
-        if any(one.is_short(_LEAST_LAG * self.step) for one in (self.hidden, self.memory)):
+        if self.is_a_lag(self.hidden) or self.is_a_lag(self.memory):
             return False
         return self.static is None or self.memory.share >= self.static.share + _CLEARLY
 

@@ -67,8 +67,9 @@ def _unexplained(test: StructureTest | None, judged: bool) -> str:
         what += " (its verdict is `unmodelled`)" if judged else ""
     else:
         best = max((one for one in (test.static, test.memory) if one is not None), key=lambda one: one.share)
+        name = f"a further lag of {best.on}" if test.is_a_lag(best) else best.name
         what = (
-            f"the model leaves more than noise: {best.name} in {best.equation} predicts {percent(best.share)} of the "
+            f"the model leaves more than noise: {name} in {best.equation} predicts {percent(best.share)} of the "
             "free run's error, beside the colour of its noise, on rows that it was not fitted to"
         )
     return (
