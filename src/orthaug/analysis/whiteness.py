@@ -13,6 +13,7 @@ import numpy as np
 import scipy.special
 
 from orthaug._base.checks import Vector
+from orthaug.fitting.colour import burg
 
 Pieces = Sequence[Vector] | Vector  # a signal in one piece per experiment; a plain vector is one experiment
 
@@ -134,28 +135,9 @@ def normality(signal: Pieces) -> Normality | None:
 
 
 def whitening(signal: Pieces, largest: int = 25) -> Vector | None:
-    """The coefficients (1, a_1, …, a_p) of `A(q) e_k = ε_k`, ε white: Burg's recursion over all experiments, p by AIC.
+    """The coefficients (1, a_1, …, a_p) of `A(q) e_k = ε_k`, ε white, of a signal less its mean, by Burg.
 
-    None for a signal that is constant or not finite. Burg's A is stable and, unlike that of Yule and Walker, hardly
-    biased near the unit circle.
+    None for a signal that is constant or not finite.
     """
-    forward = backward = standardised(signal)
-    if forward is None or backward is None:
-        return None
-    a = best = np.ones(1)
-    criterion = lowest = 0.0
-    for order in range(1, largest + 1):
-        forward, backward = [f[1:] for f in forward], [b[:-1] for b in backward]
-        rows = sum(map(len, forward))
-        energy = sum(f @ f + b @ b for f, b in zip(forward, backward, strict=True))
-        product = sum(f @ b for f, b in zip(forward, backward, strict=True))
-        k = -2 * product / energy if energy > rows * CONSTANT**2 else 1.0
-        if rows < ROWS_PER_LAG * order or 1 - k**2 < CONSTANT:  # too few rows, or nothing is left to predict
-            break
-        both = list(zip(forward, backward, strict=True))
-        forward, backward = [f + k * b for f, b in both], [b + k * f for f, b in both]
-        a = np.append(a, 0.0) + k * np.append(a, 0.0)[::-1]
-        criterion += rows * np.log(1 - k**2) + 2
-        if criterion < lowest:
-            best, lowest = a, criterion
-    return best
+    pieces = standardised(signal)
+    return None if pieces is None else burg(pieces, largest)

@@ -13,7 +13,7 @@ _NO_CORRELATION = 0.05  # below it a correlation of the errors does not count
 _ROWS_PER_LAG = 20
 _NOISE = 1.5  # deviations of a correlation: what is below it on average is noise
 _MOST_ORDERS = 30  # of an autoregression
-_ROWS_PER_ORDER = 20
+_ROUNDING = 64 * np.finfo(float).eps
 _POINTS = 1 << 16  # at least, of the spectrum that autocovariances are made of
 
 
@@ -43,30 +43,41 @@ class Autoregression:
 
 
 def autoregression(pieces: Sequence[Vector]) -> Autoregression:
-    """Return the autoregression of stretches of errors, by Burg, with the order of the least Akaike criterion (AICc).
-
-    Burg's estimate is stable always. Of stretches that are too short for an order, that order is not tried.
-    """
+    """Return the autoregression of stretches of errors, as they are: their mean counts as colour."""
     rows = sum(map(len, pieces))
-    most = max(min(_MOST_ORDERS, rows // _ROWS_PER_ORDER, max(map(len, pieces)) - 2), 0)
-    forward, backward = list(pieces), list(pieces)
-    variance = sum(float(np.sum(piece**2)) for piece in pieces) / max(rows, 1)
-    found, best = np.zeros(0), (np.log(max(variance, 1e-300)), np.zeros(0), variance)
-    for order in range(1, most + 1):
-        ahead = [f[1:] for f in forward if len(f) > 1]
-        behind = [b[:-1] for b in backward if len(b) > 1]
-        power = sum(float(f @ f + b @ b) for f, b in zip(ahead, behind, strict=True))
-        if not power > 0:
+    size = float(np.sqrt(sum(float(piece @ piece) for piece in pieces) / max(rows, 1))) or 1.0
+    a = burg([piece / size for piece in pieces], _MOST_ORDERS)
+    left = np.concatenate([np.convolve(piece, a, mode="valid") for piece in pieces if len(piece) >= len(a)])
+    return Autoregression(-a[1:], float(np.mean(left**2)))
+
+
+def burg(pieces: Sequence[Vector], largest: int) -> Vector:
+    """Return (1, a_1, …, a_p) of `A(q) e_k = ε_k`, ε white: Burg's recursion over all stretches, p by AIC.
+
+    Burg's A is stable and, unlike that of Yule and Walker, hardly biased near the unit circle.
+
+    Args:
+        pieces: stretches of a signal of RMS 1.
+        largest: order.
+    """
+    forward = backward = list(pieces)
+    a = best = np.ones(1)
+    criterion = lowest = 0.0
+    for order in range(1, largest + 1):
+        forward, backward = [f[1:] for f in forward], [b[:-1] for b in backward]
+        rows = sum(map(len, forward))
+        energy = sum(f @ f + b @ b for f, b in zip(forward, backward, strict=True))
+        product = sum(f @ b for f, b in zip(forward, backward, strict=True))
+        k = -2 * product / energy if energy > rows * _ROUNDING**2 else 1.0
+        if rows < _ROWS_PER_LAG * order or 1 - k**2 < _ROUNDING:  # too few rows, or nothing is left to predict
             break
-        reflection = 2 * sum(float(f @ b) for f, b in zip(ahead, behind, strict=True)) / power
-        found = np.append(found - reflection * found[::-1], reflection)
-        variance *= 1 - reflection**2
-        forward = [f - reflection * b for f, b in zip(ahead, behind, strict=True)]
-        backward = [b - reflection * f for f, b in zip(ahead, behind, strict=True)]
-        cost = np.log(max(variance, 1e-300)) + 2 * (order + 1) / max(rows - order - 2, 1)
-        if cost < best[0]:
-            best = (cost, found, variance)
-    return Autoregression(best[1], best[2])
+        both = list(zip(forward, backward, strict=True))
+        forward, backward = [f + k * b for f, b in both], [b + k * f for f, b in both]
+        a = np.append(a, 0.0) + k * np.append(a, 0.0)[::-1]
+        criterion += rows * np.log(1 - k**2) + 2
+        if criterion < lowest:
+            best, lowest = a, criterion
+    return best
 
 
 def autocorrelation(residuals: Matrix) -> Vector | None:
